@@ -14,7 +14,7 @@ WORKERS ?= $(shell $(PYTHON) -c 'import os; print(1 + min(os.cpu_count() or 1, 7
 # Neighbouring tests stay on one worker, which then builds what they share once.
 PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 FUZZ_S  ?= 1800
-NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.c native/*/*.h native/*/*.cpp)
+NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] native/*/*/*.[ch] native/*/*.cpp)
 
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE

@@ -33,8 +33,8 @@ import tracking_stream
 from rows import Row, medians
 
 from haselab import _core
-from haselab.rig.twin.bench import TwinBench, native_bench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, native_bench
 
 BLOCK_S = 0.01
 

@@ -21,8 +21,8 @@ from haselab.control import step_metrics
 from haselab.firmware import FrontEnd
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
 from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_design
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench
 from haselab.study.chip.loops import StepPlan, step_experiment
 
 DATA = checkout() / "tests" / "firmware" / "data"

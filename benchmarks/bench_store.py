@@ -24,8 +24,8 @@ import h5py
 import numpy as np
 from rows import Row
 
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench
 from haselab.store.session.recover import recover
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.store.video.raw import RawVideoWriter, transcode

@@ -25,8 +25,8 @@ from haselab.control import Saturation
 from haselab.controllers import pid_controller
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.real_bench import RealBench
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.client import TwinClient
 from haselab.runtime.loop import LoopSettings

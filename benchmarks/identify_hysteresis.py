@@ -16,8 +16,8 @@ from haselab.base import Estimate
 from haselab.identify import LoopRecord, fit_creep, fit_hysteresis
 from haselab.identify.hysteresis.loops import band_widths
 from haselab.models import BoucWen, PrandtlIshlinskii, PronyCreep
-from haselab.rig.twin.bench import GRAVITY_M_S2, native_bench
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, native_bench
 from haselab.signals import triangle
 
 __all__ = ["rows"]

@@ -96,14 +96,14 @@ def traces() -> Callable[[], object]:
     return lambda: trace_ensemble(plants, gains, REFERENCE, SETTING, threads=1)
 
 
-def one_by_one(bits: int = 0) -> Callable[[], NDArray[np.float32]]:
+def one_by_one(bits: int = 0) -> Callable[[], NDArray[np.void]]:
     loops = LoopTable.of(*problem(), SETTING).loops()
     ends = np.arange(1, 21, dtype=np.uint64) * (SAMPLES // 20)
-    kept = np.empty((LOOPS, ends.size, _loops.KEPT), np.float32)
+    kept = np.empty((LOOPS, ends.size), _loops.SUMMARY)
     silent = np.zeros((0, 0), np.float32), np.zeros(0, np.uint32)
     reference = REFERENCE.astype(np.float32)
 
-    def run() -> NDArray[np.float32]:
+    def run() -> NDArray[np.void]:
         loops.summaries(reference, *silent, 0.02 * LEVEL, ends, kept, bits, 1)
         return kept.copy()
 

@@ -29,8 +29,8 @@ from haselab.identify.model_comparison.hypotheses import creep_hypotheses, readi
 from haselab.identify.model_comparison.voltage_plant import fit_voltage_plant
 from haselab.identify.record import Record
 from haselab.models import VoltageMap
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import BLANKING_S, Runner, lockin_of
 from haselab.sensing import Lockin

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import Runner
@@ -25,7 +25,7 @@ from haselab.safety.watchdog.loop_watchdog import LoopWatchdog
 from haselab.study.definition import Study, builtin_study
 from haselab.study.fits.maps import Maps
 from haselab.study.pipeline import investigate
-from haselab.study.simulated.noise_free import QuietBench
+from haselab.study.simulated.noise_free import NoiseFreeBench
 
 BLOCKS_PER_S = 100
 CARRIER = (2000.0, 0.02)
@@ -71,7 +71,7 @@ def maps_of(config: TwinConfig) -> Maps:
     """Of the triangle test, without noise."""
     reference = builtin_study(quick=True).model_dump(mode="json")
     study = Study.model_validate({key: reference[key] for key in ("name", "sensing", "triangle")})
-    quiet = QuietBench(config, study)
+    quiet = NoiseFreeBench(config, study)
     with Runner(quiet.rig, quiet, quiet, *CARRIER, SilentProgress()) as runner:
         found = investigate(quiet.observation, study, quiet.rig.description, runner)
     maps = found.find(Maps)

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/identification.md and prints the figures that the page claims.
+"""Draws the pictures of docs/identify/identification.md and prints the figures that it claims.
 
     python benchmarks/pictures_identify.py docs/pictures [DATA]
 
@@ -24,7 +24,7 @@ from haselab.identify import (
     fit_transfer,
 )
 from haselab.models import Plant, SlowMode
-from haselab.report.style import BLUE, GREEN, GREY, PURPLE, RED, house_style, to_svg
+from haselab.report.style import BLUE, GREEN, GREY, PURPLE, RED, figure_style, to_svg
 
 OMEGA = float(np.sqrt(26.14))
 ZETA = 0.93 / (2.0 * OMEGA)
@@ -237,7 +237,7 @@ def _drive(rng, kind):
 
 def main(folder, data):
     folder.mkdir(parents=True, exist_ok=True)
-    with house_style():
+    with figure_style():
         figures = {
             "identify-transfer": draw_transfer(),
             "identify-frequency-response": draw_frequency_response(),

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/sensing.md and docs/how-self-sensing-works.md.
+"""Draws the pictures of docs/measure/sensing.md and docs/measure/how-self-sensing-works.md.
 
     python benchmarks/pictures_sensing.py [docs/pictures]
 
@@ -17,9 +17,9 @@ from pictures_sensing_bench import bench_figures
 from pictures_sensing_error import draw_error, draw_steps
 
 from haselab.cli.main import cli
-from haselab.report.style import BLUE, RED, house_style, to_svg
-from haselab.rig.twin.bench import make_twin
+from haselab.report.style import BLUE, RED, figure_style, to_svg
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.signals import triangle
 
 TITLES = {
@@ -83,7 +83,7 @@ def draw_triangle() -> Figure:
 
 def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    with house_style():
+    with figure_style():
         figures = {
             "sensing-triangle": draw_triangle(),
             "sensing-error": draw_error(),

@@ -64,7 +64,7 @@ def draw_strain(rig: Rig, config: LockinConfig) -> Figure:
     watch = Watch(rig)
     first = sweep(watch, config, SWEEP_S, SWING_V, down=False)
     judged = sweep(watch, config, SWEEP_S, 0.9 * SWING_V, down=True)
-    fitted = fit_strain_map(first.capacitance_f, first.strain, "monotone")
+    fitted = fit_strain_map(first.capacitance_f, first.strain, "cubic")
     inside = fitted.inside(judged.capacitance_f)
     time_s = judged.time_s[inside] - judged.time_s[0]
     sensed = fitted.strain(judged.capacitance_f[inside])

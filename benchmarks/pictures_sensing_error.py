@@ -2,7 +2,7 @@
 
     python benchmarks/pictures_sensing_error.py
 
-prints what ADR 8 and docs/how-self-sensing-works.md claim of a step at an unknown time. The
+prints what ADR 8 and docs/measure/how-self-sensing-works.md claim of a step at an unknown time. The
 records are those of `sensing_accuracy.py`; the first block of each is left out, in which the
 paper's filter still settles.
 """

@@ -1,7 +1,7 @@
-"""Draws the pictures of docs/tracking.md: `python benchmarks/pictures_tracking.py DATA OUT`.
+"""Draws pictures for docs/measure/tracking.md: `python benchmarks/pictures_tracking.py DATA OUT`.
 
 DATA holds `video/bulk-water.mov` and `video/dic-challenge-14/` (their public sources are named in
-docs/tracking.md); OUT is docs/pictures.
+docs/measure/tracking.md); OUT is docs/pictures.
 """
 
 import sys

@@ -13,9 +13,10 @@ import numpy as np
 from rows import Row
 from scipy.interpolate import CubicSpline
 
+from haselab.models.actuator import StrainMap
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.runner import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.calibration import (
@@ -24,7 +25,7 @@ from haselab.sensing.calibration import (
     fit_calibration,
     read_reference,
 )
-from haselab.sensing.strain import FittedStrainMap, fit_strain_map
+from haselab.sensing.strain import fit_strain_map
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02
@@ -244,7 +245,7 @@ class StrainError:
     held: float
 
 
-def strain_error(fitted: FittedStrainMap, judged: Motion) -> StrainError:
+def strain_error(fitted: StrainMap, judged: Motion) -> StrainError:
     inside = fitted.inside(judged.capacitance_f)
     deviation = fitted.strain(judged.capacitance_f[inside]) - judged.strain[inside]
     span = float(np.ptp(judged.strain))
@@ -274,13 +275,13 @@ def make() -> tuple[TwinBench, Rig]:
 
 
 def strain_errors(rig: Rig, config: LockinConfig, duration_s: float) -> dict[str, StrainError]:
-    """Line and monotone map, fitted on a sweep up, judged on a smaller sweep down."""
+    """Line and cubic map, fitted on a sweep up, judged on a smaller sweep down."""
     watch = Watch(rig)
     first = sweep(watch, config, duration_s, SWING_V, down=False)
     other = sweep(watch, config, duration_s, 0.9 * SWING_V, down=True)
     return {
         kind: strain_error(fit_strain_map(first.capacitance_f, first.strain, kind), other)
-        for kind in ("line", "monotone")
+        for kind in ("line", "cubic")
     }
 
 
@@ -292,7 +293,7 @@ def rows() -> list[Row]:
     load_c, load_r = load_errors(rig, config)
     own_c, own_r = actuator_errors(bench, rig, config)
     found = strain_errors(rig, config, 10.0)
-    line, curve = found["line"], found["monotone"]
+    line, curve = found["line"], found["cubic"]
     parts = ", ".join(
         f"{low:g}-{high:g} Hz {100 * part:.2f}"
         for (low, high), part in zip(BANDS_HZ, curve.by_band, strict=True)

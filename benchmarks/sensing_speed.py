@@ -46,7 +46,7 @@ def rows() -> list[Row]:
     lockin, paper = Lockin(config_of(case)), PaperChain(config_of(case))
     fit = SineFit(config_of(case))
     sections = signal.butter(4, 2001.0, fs=200e3, output="sos")
-    out, few_out = np.empty((blocks, _sense.COLUMNS)), np.empty((FEW, _sense.COLUMNS))
+    out, few_out = np.empty(blocks, _sense.RESULT), np.empty(FEW, _sense.RESULT)
     native, few = lockin._native, np.ascontiguousarray(single[:FEW])
     common = make_plan(config_of(case), vectors=COMMON).native
     v_few, i_few = v[: FEW * 2000], i[: FEW * 2000]

@@ -25,8 +25,8 @@ import h5py
 import numpy as np
 from rows import RUNNER, Row
 
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 RATE_HZ, CARRIER_HZ, BLOCK = 200e3, 2000.0, 2000

@@ -127,15 +127,16 @@ hs_impedance hs_impedance_of(const hs_impedance_config *config, const hs_phasor 
     return z;
 }
 
-hs_quarters hs_sum_quarters(const int16_t x[HS_QUARTERS])
+hs_quadrature hs_demodulate_quadrature(const int16_t x[HS_QUADRATURE_SAMPLES])
 {
-    hs_quarters sums;
+    hs_quadrature sums;
     sums.re = (int16_t)(x[1] - 2 * x[2] + x[3] + x[5] - 2 * x[6] + x[7]);
     sums.im = (int16_t)(x[2] - x[1] + x[3] - x[5] - x[6] + x[7]); /* x = re cos - im sin */
     return sums;
 }
 
-hs_capacitance hs_capacitance_of(const hs_quarters_config *config, hs_quarters v, hs_quarters i)
+hs_capacitance hs_capacitance_of(const hs_quadrature_config *config, hs_quadrature v,
+                                 hs_quadrature i)
 {
     hs_capacitance c = {0.0f, HS_AMPLITUDE_LOST};
     const int32_t v2 = (int32_t)v.re * v.re + (int32_t)v.im * v.im;

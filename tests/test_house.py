@@ -1,6 +1,7 @@
-"""The house rules that a machine can check, on every module of the public package."""
+"""The conventions of CONTRIBUTING.md that a machine can check."""
 
 import ast
+import collections
 import functools
 import importlib
 import re
@@ -32,8 +33,8 @@ QUANTITIES = {
 # fmt: on
 # The contract's own name; it is a strain.
 DIMENSIONLESS = {"hysteresis_width"}
-# Units that exist only where people read: app and report.
-SPOKEN_UNITS = {"kv", "mm", "ms", "us", "um", "mhz", "khz", "nf", "pf", "kpa", "in"}
+# Units that only cli and report may use.
+DISPLAY_UNITS = {"kv", "mm", "ms", "us", "um", "mhz", "khz", "nf", "pf", "kpa", "in"}
 
 
 def module_name(path: Path) -> str:
@@ -84,9 +85,36 @@ def _ruff_order(names: list[str]) -> bool:
 
 
 @pytest.mark.parametrize("path", MODULES, ids=IDS)
-def test_a_file_fits_one_room(path: Path) -> None:
+def test_a_file_is_not_too_long(path: Path) -> None:
     lines = len(path.read_text(encoding="utf-8").splitlines())
     assert lines <= MAX_LINES, f"{path.name} has {lines} lines, allowed are {MAX_LINES}: split it"
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    """Modules of the package that one imports, inside functions too; not for its types alone."""
+    names = {module_name(each) for each in MODULES}
+    nodes: list[ast.AST] = [tree_of(path)]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            nodes += node.orelse
+        elif isinstance(node, ast.Import):
+            yield from (each.name for each in node.names if each.name in names)
+        elif isinstance(node, ast.ImportFrom) and node.module in names:
+            inner = (f"{node.module}.{each.name}" for each in node.names)
+            yield from (each if each in names else node.module for each in inner)
+        else:
+            nodes += ast.iter_child_nodes(node)
+
+
+def test_no_modules_import_each_other() -> None:
+    """Not in a circle of any length either: an import inside a function would only hide it."""
+    left = {module_name(path): set(imported_modules(path)) for path in MODULES}
+    while free := {name for name, needed in left.items() if not needed & left.keys()}:
+        left = {name: needed for name, needed in left.items() if name not in free}
+    # What is left imports in a circle, or imports such modules.
+    needed_by_others = set().union(*left.values()) if left else set()
+    assert not left, f"modules that import each other: {sorted(needed_by_others & left.keys())}"
 
 
 def native_sources() -> list[Path]:
@@ -97,14 +125,14 @@ def native_sources() -> list[Path]:
     )  # fmt: skip
 
 
-def test_native_files_fit_one_room_too() -> None:
+def test_a_native_file_is_not_too_long() -> None:
     for path in native_sources():
         lines = len(path.read_text(encoding="utf-8").splitlines())
         assert lines <= MAX_LINES, f"{path.relative_to(ROOT)} has {lines} lines"
 
 
-def exported_by_rooms() -> set[str]:
-    """The public API: what the __init__ of a room names."""
+def exported_by_packages() -> set[str]:
+    """The public API: what the __init__ of a package names."""
     names: set[str] = set()
     for path in PUBLIC:
         if path.name == "__init__.py":
@@ -112,7 +140,7 @@ def exported_by_rooms() -> set[str]:
     return names
 
 
-API = exported_by_rooms()
+API = exported_by_packages()
 
 
 def public_functions(path: Path) -> Iterator[tuple[str, ast.FunctionDef]]:
@@ -147,7 +175,7 @@ def raised(function: ast.FunctionDef) -> set[str]:
 @pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
 def test_docstrings_have_the_heads_that_apply(path: Path) -> None:
     faults = []
-    if room_of(path) != "cli":  # there the docstring is the help text
+    if package_of(path) != "cli":  # there the docstring is the help text
         for name, function in public_functions(path):
             text = ast.get_docstring(function) or ""
             short = text.count("\n") < 1 and len(parameters(function)) <= 1
@@ -200,18 +228,18 @@ def named_numbers(path: Path) -> Iterator[tuple[str, str]]:
 
 @pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
 def test_numbers_with_a_dimension_name_their_si_unit(path: Path) -> None:
-    spoken = room_of(path) in {"cli", "report"}
+    spoken = package_of(path) in {"cli", "report"}
     faults = []
     for where, name in named_numbers(path):
         words = name.split("_")
         if words[-1] in QUANTITIES and "relative" not in words and name not in DIMENSIONLESS:
             faults.append(f"{where}.{name}: a {words[-1]} in which unit?")
-        if not spoken and len(words) > 1 and words[-1] in SPOKEN_UNITS:
-            faults.append(f"{where}.{name}: {words[-1]} is for app and report, here it is SI")
+        if not spoken and len(words) > 1 and words[-1] in DISPLAY_UNITS:
+            faults.append(f"{where}.{name}: {words[-1]} belongs in cli and report; use SI here")
     assert not faults, f"{path.relative_to(ROOT)}: {faults}"
 
 
-def test_imports_run_only_downward() -> None:
+def test_imports_only_point_downward() -> None:
     """The contract of pyproject.toml, by import-linter's own command."""
     code = "import sys; from importlinter.cli import lint_imports_command as c; sys.exit(c())"
     done = subprocess.run(
@@ -221,18 +249,18 @@ def test_imports_run_only_downward() -> None:
     assert "0 broken" in done.stdout
 
 
-# Rooms that may touch files; only these and the command line may draw.
-FILE_ROOMS = {"store", "rig", "safety", "cli"}
-PLOT_ROOMS = {"report", "cli"}
+# Packages that may touch files, and packages that may draw.
+FILE_PACKAGES = {"store", "rig", "safety", "cli"}
+PLOT_PACKAGES = {"report", "cli"}
 FILE_MODULES = {"h5py", "av", "tifffile", "serial", "socket"}
 
 
-def room_of(path: Path) -> str:
+def package_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=IDS)
-def test_only_the_rooms_for_it_draw_or_hold_files(path: Path) -> None:
+def test_only_permitted_packages_draw_or_touch_files(path: Path) -> None:
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             roots = {alias.name.split(".")[0] for alias in node.names}
@@ -240,9 +268,9 @@ def test_only_the_rooms_for_it_draw_or_hold_files(path: Path) -> None:
             roots = {(node.module or "").split(".")[0]}
         else:
             continue
-        if room_of(path) not in PLOT_ROOMS:
+        if package_of(path) not in PLOT_PACKAGES:
             assert "matplotlib" not in roots, f"{path.name} draws"
-        if room_of(path) not in FILE_ROOMS:
+        if package_of(path) not in FILE_PACKAGES:
             assert not roots & FILE_MODULES, f"{path.name} touches files: {roots & FILE_MODULES}"
 
 
@@ -263,15 +291,72 @@ def test_every_raises_has_a_match(path: Path) -> None:
             )
 
 
-def test_the_version_is_told_once() -> None:
+def test_the_version_is_the_same_in_both_places() -> None:
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     assert f'version = "{haselab.__version__}"' in text
 
 
-@pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]),
-                         ids=lambda path: str(path.relative_to(ROOT)))  # fmt: skip
-def test_links_between_pages_lead_somewhere(page: Path) -> None:
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
+)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to the headings of a page."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
-        if not re.match(r"[a-z]+:", target):
-            assert (page.parent / target).exists(), f"{page.name} points to {target}"
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", line.strip().lower()).replace(" ", "-") for line in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_to_a_file_and_a_heading_that_exist(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        other = page.parent / target if target else page
+        assert other.exists(), f"{page.name} points to {target}"
+        if anchor:
+            assert anchor in anchors(other), f"{page.name} points to {target}#{anchor}"
+
+
+def test_every_page_of_docs_is_reached_from_the_map() -> None:
+    docs = ROOT / "docs"
+    linked = re.findall(r"\]\(([^)#\s]+)", (docs / "README.md").read_text(encoding="utf-8"))
+    missing = {*docs.rglob("*.md")} - {(docs / link).resolve() for link in linked}
+    assert missing == {docs / "README.md"}, f"docs/README.md has no link to {missing}"
+
+
+def test_every_guide_links_the_glossary() -> None:
+    docs = ROOT / "docs"
+    guides = {*docs.rglob("*.md")} - {*(docs / "adr").rglob("*.md"), docs / "glossary.md"}
+    without = [
+        str(page.relative_to(docs)) for page in guides
+        if "glossary.md" not in page.read_text(encoding="utf-8")
+    ]  # fmt: skip
+    assert not without, f"link the glossary where a term is first used: {without}"
+
+
+def test_every_path_in_the_architecture_exists() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([\w/.\-]+(?:\.(?:py|c|h|cpp)|/))`", text))
+    folders = ("src/haselab", "core", "native", "firmware", "tests")
+    paths = "\n".join(str(path) for folder in folders for path in (ROOT / folder).rglob("*"))
+    missing = [n for n in named if not re.search(rf"/{re.escape(n.rstrip('/'))}$", paths, re.M)]
+    assert not missing, f"ARCHITECTURE.md names {sorted(missing)}"
+
+
+MAX_FILES = 15  # of one folder; subfolders do not count
+
+
+def test_no_folder_has_more_files_than_a_reader_can_survey() -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git repository: generated files cannot be distinguished from sources")
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    )  # fmt: skip
+    files = [Path(line) for line in listed.stdout.splitlines() if (ROOT / line).exists()]
+    counts = collections.Counter(path.parent for path in files)
+    crowded = {str(folder): n for folder, n in counts.items() if n > MAX_FILES}
+    crowded.pop("benchmarks", None)  # is being sorted
+    assert not crowded, f"more than {MAX_FILES} files, sort them into folders: {crowded}"

@@ -78,14 +78,14 @@ hs_impedance hs_impedance_of(const hs_impedance_config *config, const hs_phasor 
 /* Four readings a carrier period (or one each period and a quarter: a slow converter may skip), two
  * periods in a row, from a converter of at most 12 bits. Whole numbers as far as they go. The output
  * steps where a period begins: its first reading is left out. A level and a ramp fall out. */
-#define HS_QUARTERS 8
+#define HS_QUADRATURE_SAMPLES 8
 
-/* Four times the phasor. */
+/* In phase and in quadrature: four times the phasor. */
 typedef struct {
     int16_t re, im;
-} hs_quarters;
+} hs_quadrature;
 
-hs_quarters hs_sum_quarters(const int16_t x[HS_QUARTERS]);
+hs_quadrature hs_demodulate_quadrature(const int16_t x[HS_QUADRATURE_SAMPLES]);
 
 /* Capacitance in series with a resistance, with one division:
  *     omega Z = turn V / I,   C = -|I|^2 / Im(turn V conj(I))
@@ -94,14 +94,15 @@ typedef struct {
     float turn_re, turn_im; /* 1/F for equal readings: omega over the scale of hs_impedance_config */
     int32_t v_low, v_high;  /* squares of `re, im` that count; beyond: HS_AMPLITUDE_LOST */
     int32_t i_low;
-} hs_quarters_config;
+} hs_quadrature_config;
 
 typedef struct {
     float capacitance_f;
     uint8_t reason; /* 0: valid; else the number is 0 */
 } hs_capacitance;
 
-hs_capacitance hs_capacitance_of(const hs_quarters_config *config, hs_quarters v, hs_quarters i);
+hs_capacitance hs_capacitance_of(const hs_quadrature_config *config, hs_quadrature v,
+                                 hs_quadrature i);
 
 /* ---- maps --------------------------------------------------------------------------------- */
 

@@ -39,7 +39,8 @@ static uint8_t is_inside_positive(float x, float low, float high)
 static void sense(const app_config *c, const app_inputs *in, app_outputs *out)
 {
     const hs_capacitance farad =
-        hs_capacitance_of(&c->sensing, hs_sum_quarters(in->v), hs_sum_quarters(in->i));
+        hs_capacitance_of(&c->sensing, hs_demodulate_quadrature(in->v),
+                          hs_demodulate_quadrature(in->i));
 
     out->reason = farad.reason;
     out->capacitance_f = farad.capacitance_f;
@@ -79,7 +80,7 @@ static void judge_readings(app_state *s, const app_inputs *in, app_outputs *out)
 static void judge_level(const app_config *c, app_state *s, const app_inputs *in)
 {
     const uint16_t expected = (uint16_t)(((uint32_t)s->code * c->level_share) >> 16);
-    const int16_t off = (int16_t)(in->v[HS_QUARTERS / 2] - (int16_t)expected);
+    const int16_t off = (int16_t)(in->v[HS_QUADRATURE_SAMPLES / 2] - (int16_t)expected);
     if (off <= c->level_off && off >= -c->level_off) {
         s->astray = 0;
     } else if (s->astray < 255) {

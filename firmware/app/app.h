@@ -16,7 +16,7 @@
 #define APP_APART __attribute__((noinline))
 
 typedef struct {
-    hs_quarters_config sensing; /* scale: siemens per ratio of codes, with the channels' skew */
+    hs_quadrature_config sensing; /* scale: siemens per ratio of codes, with the channels' skew */
     float capacitance_low_f, capacitance_high_f; /* calibrated */
     hs_strain_map strain;
     hs_controller_setting controller;
@@ -42,7 +42,7 @@ typedef struct {
 typedef struct {
     /* Oldest first; the last four are new. The first reading of a frame does not count for the
      * carrier: in its place v[0] and v[4] are the level, the voltage monitor without a filter. */
-    int16_t v[HS_QUARTERS], i[HS_QUARTERS];
+    int16_t v[HS_QUADRATURE_SAMPLES], i[HS_QUADRATURE_SAMPLES];
     float reference;                        /* with run and set_reference */
     uint8_t event;                          /* HP_EVENT_ */
     uint8_t alarms;                         /* HP_ALARM_ bits since the last update */

@@ -205,7 +205,7 @@ static APP_APART uint8_t report_trace(link_state *link, const app_state *state,
     uint8_t k;
     m.update = update;
     for (k = 0; k < 8; ++k) { /* what is new of the window, as it was converted */
-        const uint8_t at = (uint8_t)(HS_QUARTERS / 2u + k / 2u);
+        const uint8_t at = (uint8_t)(HS_QUADRATURE_SAMPLES / 2u + k / 2u);
         if (k % 2u) {
             m.codes[k] = in->i[at];
         } else {

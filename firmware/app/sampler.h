@@ -64,8 +64,8 @@ static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint
 }
 
 /* The two complete frames, oldest first, while the frame from `start` on is written. */
-static inline void sampler_window(const sampler *s, uint8_t start, int16_t v[HS_QUARTERS],
-                                  int16_t i[HS_QUARTERS])
+static inline void sampler_window(const sampler *s, uint8_t start, int16_t v[HS_QUADRATURE_SAMPLES],
+                                  int16_t i[HS_QUADRATURE_SAMPLES])
 {
     uint8_t at = start, half, k, to = 0;
     for (half = 0; half < 2u; ++half) {

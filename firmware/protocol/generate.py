@@ -17,7 +17,7 @@ ROOT = HERE.parents[1]
 TABLE = HERE / "protocol.toml"
 HEADER = HERE / "hs_protocol.h"
 MODULE = ROOT / "src" / "haselab" / "firmware" / "messages.py"
-PAGE = ROOT / "docs" / "firmware-protocol.md"
+PAGE = ROOT / "docs" / "control" / "firmware-protocol.md"
 
 # type: (bytes, C, struct, Python)
 TYPES = {
@@ -241,10 +241,14 @@ def page(table: Row) -> str:
         "",
         f"Version {table['version']}. Generated from `firmware/protocol/protocol.toml`.",
         "",
+        "This page lists all messages between the computer and the [microcontroller](firmware.md).",
+        "See the [glossary](../glossary.md#bench-and-safety) for terms such as arm and trip.",
+        "",
         "A frame is COBS(code u8, sequence u16, fields, CRC-16/CCITT-FALSE u16), then one byte 0,",
-        "both ways, little endian, 500,000 baud, 8 bits, no parity. The computer counts its",
-        "frames: the chip takes a command whose sequence is 1 to 16 beyond the last one it took,",
-        "and drops every other one without a word. What is not whole is counted in `bad_frames`.",
+        "in both directions. Numbers are little endian; the link has 500,000 baud, 8 bits, no",
+        "parity. The computer numbers its frames. The chip accepts a command whose sequence number",
+        "is 1 to 16 beyond that of the last accepted one, and ignores all others without an",
+        "answer. Incomplete or damaged frames are counted in `bad_frames`.",
         "",
     ]
     for title, group in (("Commands", "command"), ("Telemetry", "telemetry")):

@@ -39,47 +39,47 @@
 #define HP_STATE_ARMED 1u /* enable pin active, output 0, carrier on */
 #define HP_STATE_RUNNING 2u /* loop closed */
 #define HP_STATE_STOPPING 3u /* ramping down, then off or tripped */
-#define HP_STATE_TRIPPED 4u /* as off, until clear_fault */
+#define HP_STATE_TRIPPED 4u /* like off, until clear_fault */
 
 /* Why it tripped; latched until clear_fault. */
 #define HP_FAULT_NONE 0u
-#define HP_FAULT_BREAKDOWN 1u /* a monitor at its end, or a level that collapsed; seen in the interrupt */
+#define HP_FAULT_BREAKDOWN 1u /* a monitor at its range end, or a collapsed level; from the interrupt */
 #define HP_FAULT_SENSING 2u /* no plausible strain in too many updates */
-#define HP_FAULT_LINK 3u /* no sign of life; the output was ramped down */
-#define HP_FAULT_LATE 4u /* updates not completed; seen in the sampling interrupt */
-#define HP_FAULT_NOT_FINITE 5u /* the drive was no number or beyond its limits: memory was damaged */
+#define HP_FAULT_LINK 3u /* no message from the computer; the output was ramped down */
+#define HP_FAULT_LATE 4u /* updates not completed; detected in the sampling interrupt */
+#define HP_FAULT_NOT_FINITE 5u /* the drive was NaN or beyond its limits: memory was damaged */
 #define HP_FAULT_WATCHDOG 6u /* the watchdog reset the chip */
 #define HP_FAULT_BROWN_OUT 7u /* the supply dipped */
-#define HP_FAULT_ASTRAY 9u /* the high voltage is not what was asked for */
+#define HP_FAULT_ASTRAY 9u /* the high voltage does not follow its set point */
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */
 
-/* Bits that the sampling interrupt raises. */
+/* Bits that the sampling interrupt sets. */
 #define HP_ALARM_RAIL 1u /* a monitor at the end of its range, or the level collapsed, while enabled */
 #define HP_ALARM_SLIP 2u /* a conversion was lost or late */
 #define HP_ALARM_LATE 4u /* updates are not completed */
 
-/* Why there is no strain; bits, those of core/include/hs.h and two of the chip's own. */
+/* Why there is no strain; bits of core/include/hs.h, and two that only the chip has. */
 #define HP_REASON_AMPLITUDE_LOST 1u /* no carrier on one of the monitors */
-#define HP_REASON_PHASE_OUT 2u /* no capacitor shows such a phase */
-#define HP_REASON_CLIPPED 4u /* a reading at the end of the converter's range */
+#define HP_REASON_PHASE_OUT 2u /* the phase is not that of a capacitor */
+#define HP_REASON_CLIPPED 4u /* a sample at the end of the converter's range */
 #define HP_REASON_SLIPPED 16u /* conversions were lost */
 #define HP_REASON_IMPLAUSIBLE 128u /* amplitude or capacitance beyond the calibrated range */
 
-/* What an update latched from the link. */
+/* What an update received from the link. */
 #define HP_EVENT_NONE 0u
-#define HP_EVENT_ARM 1u /* both steps of arming were taken */
+#define HP_EVENT_ARM 1u /* both steps of arming were done */
 #define HP_EVENT_RUN 2u
 #define HP_EVENT_SET_REFERENCE 3u
 #define HP_EVENT_ALIVE 4u
 #define HP_EVENT_STOP 5u
 #define HP_EVENT_CLEAR 6u
 
-/* What became of a command. */
+/* Result of a command. */
 #define HP_VERDICT_ACCEPTED 0u
-#define HP_VERDICT_UNKNOWN 1u /* no such command, or of another length */
-#define HP_VERDICT_BAD_VERSION 2u /* hello with this version comes first */
+#define HP_VERDICT_UNKNOWN 1u /* no such command, or wrong length */
+#define HP_VERDICT_BAD_VERSION 2u /* send hello with this version first */
 #define HP_VERDICT_BAD_STATE 3u /* not in this state */
-#define HP_VERDICT_BAD_TOKEN 4u /* not the token, or too late */
+#define HP_VERDICT_BAD_TOKEN 4u /* wrong token, or too late */
 #define HP_VERDICT_BAD_VALUE 5u /* outside the limits that were compiled in */
 #define HP_VERDICT_NOT_READY 6u /* no valid strain yet */
 
@@ -174,8 +174,8 @@ static inline void hp_get_set_telemetry(const uint8_t *bytes, hp_set_telemetry *
 typedef struct {
     uint16_t version; /* of this table */
     uint32_t settings; /* CRC-32 of the settings that were compiled in */
-    uint16_t rate_hz; /* updates a second */
-    uint16_t supply; /* code of the chip's own 1.1 V reference by its supply, 10 bits; 0: not measured */
+    uint16_t rate_hz; /* updates per second */
+    uint16_t supply; /* code of the chip's 1.1 V reference relative to its supply, 10 bits; 0: not measured */
 } hp_identity;
 
 static inline void hp_put_identity(uint8_t *bytes, const hp_identity *m)
@@ -205,13 +205,13 @@ typedef struct {
     uint16_t update; /* number of the update, modulo 65536 */
     uint8_t state; /* see states */
     uint8_t fault; /* why it tripped, see faults */
-    uint8_t reason; /* why there is no strain, see reasons; 0: there is */
+    uint8_t reason; /* why there is no strain, see reasons; 0: strain is valid */
     float strain; /* measured strain; 0 without one */
     float capacitance_f; /* measured capacitance, in F; 0 without one */
     uint16_t code; /* of the output converter, 0.5 mV each */
     uint16_t busy_cycles; /* longest update since the last status, in CPU cycles */
     uint8_t overruns; /* updates that were not ready in time, modulo 256 */
-    uint8_t bad_frames; /* frames that were not whole, modulo 256 */
+    uint8_t bad_frames; /* incomplete or damaged frames, modulo 256 */
 } hp_status;
 
 static inline void hp_put_status(uint8_t *bytes, const hp_status *m)
@@ -230,7 +230,7 @@ static inline void hp_put_status(uint8_t *bytes, const hp_status *m)
 
 typedef struct {
     uint16_t update; /* number of the update, modulo 65536 */
-    int16_t codes[8]; /* new readings: level, current, voltage, current, voltage, ... */
+    int16_t codes[8]; /* new samples: level, current, voltage, current, voltage, ... */
     uint8_t event; /* see events */
     uint8_t alarms; /* see alarms */
     uint8_t state; /* see states */

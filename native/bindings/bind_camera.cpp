@@ -6,12 +6,13 @@
 #include <stdexcept>
 #include <vector>
 
+#include "bindings/records.h"
+
 extern "C" {
 #include "twin/camera.h"
 }
 
 namespace nb = nanobind;
-using Doubles = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Floats = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Table = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Levels = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
@@ -26,29 +27,29 @@ std::vector<float> copied(const Floats &values, std::size_t size, const char *wh
 
 class Scene {
 public:
-    Scene(Doubles geometry, Floats illumination_x, Floats illumination_y, Floats clamp_x, Table blobs,
-          Floats noise, Floats normal_table, std::uint64_t seed)
+    Scene(const camera_scene &geometry, Floats illumination_x, Floats illumination_y,
+          Floats clamp_x, nb::object blobs, float shot_gain_grey, float read_noise_grey,
+          Floats normal_table, std::uint64_t seed)
         : light_x_(copied(illumination_x, illumination_x.shape(0), "illumination_x")),
           light_y_(copied(illumination_y, illumination_y.shape(0), "illumination_y")),
           clamp_x_(copied(clamp_x, light_x_.size(), "clamp_x: one value a column")),
           table_(copied(normal_table, CAMERA_TABLE_SIZE, "normal_table: 4096 values")) {
-        if (geometry.shape(0) != 11) throw std::invalid_argument("geometry: 11 values");
-        if (noise.shape(0) != 2) throw std::invalid_argument("noise: gain and read noise");
-        if (blobs.shape(1) != 5) throw std::invalid_argument("blobs: 5 columns");
-        for (std::size_t i = 0; i < blobs.shape(0); i++) {
-            const double *b = blobs.data() + 5 * i;
-            if (!(b[3] > 0.0 && b[3] <= CAMERA_SIGMA_MAX_PX))
+        const Records<const camera_blob> given(blobs);
+        blobs_.assign(given.data(), given.data() + given.size());
+        for (const camera_blob &blob : blobs_)
+            if (!(blob.sigma_px > 0.0 && blob.sigma_px <= CAMERA_SIGMA_MAX_PX))
                 throw std::invalid_argument("blobs: sigma in (0, 6] px");
-            blobs_.push_back({b[0], b[1], b[2], b[3], b[4]});
-        }
-        const double *g = geometry.data();
-        if (!(g[5] > 0.0 && g[5] <= CAMERA_EDGE_MAX_PX))
+        if (!(geometry.edge_px > 0.0 && geometry.edge_px <= CAMERA_EDGE_MAX_PX))
             throw std::invalid_argument("geometry: edge in (0, 2] px");
-        scene_ = {static_cast<int>(light_x_.size()), static_cast<int>(light_y_.size()),
-                  g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7],
-                  static_cast<float>(g[8]), static_cast<float>(g[9]), static_cast<float>(g[10]),
-                  light_x_.data(), light_y_.data(), clamp_x_.data(), blobs_.data(), blobs_.size()};
-        noise_ = {noise.data()[0], noise.data()[1], seed, table_.data()};
+        scene_ = geometry;
+        scene_.width = static_cast<int>(light_x_.size());
+        scene_.height = static_cast<int>(light_y_.size());
+        scene_.illumination_x = light_x_.data();
+        scene_.illumination_y = light_y_.data();
+        scene_.clamp_x = clamp_x_.data();
+        scene_.blobs = blobs_.data();
+        scene_.blob_count = blobs_.size();
+        noise_ = {shot_gain_grey, read_noise_grey, seed, table_.data()};
     }
     Scene(const Scene &) = delete;
     Scene &operator=(const Scene &) = delete;
@@ -93,13 +94,29 @@ private:
 
 NB_MODULE(_camera, m) {
     m.doc() = "The twin's camera in C; see native/twin/camera.h.";
+    m.attr("BLOB") = dtype_of<camera_blob>(
+        {FIELD(camera_blob, along), FIELD(camera_blob, across), FIELD(camera_blob, across_necked),
+         FIELD(camera_blob, sigma_px), FIELD(camera_blob, depth_grey)});
+    nb::class_<camera_scene>(m, "Geometry", "The numbers of struct camera_scene.")
+        .def("__init__",
+             [](camera_scene *self, double top_px, double mid_px, double half_width_px,
+                double free_length_px, double neck, double edge_px, double clamp_inside_px,
+                double clamp_outside_px, float background_grey, float sheet_grey,
+                float clamp_grey) {
+                 *self = {0, 0, top_px, mid_px, half_width_px, free_length_px, neck, edge_px,
+                          clamp_inside_px, clamp_outside_px, background_grey, sheet_grey,
+                          clamp_grey, nullptr, nullptr, nullptr, nullptr, 0};
+             },
+             nb::kw_only(), nb::arg("top_px"), nb::arg("mid_px"), nb::arg("half_width_px"),
+             nb::arg("free_length_px"), nb::arg("neck"), nb::arg("edge_px"),
+             nb::arg("clamp_inside_px"), nb::arg("clamp_outside_px"), nb::arg("background_grey"),
+             nb::arg("sheet_grey"), nb::arg("clamp_grey"));
     nb::class_<Scene>(m, "Scene", "A speckled sheet between two clamps, as a camera sees it.")
-        .def(nb::init<Doubles, Floats, Floats, Floats, Table, Floats, Floats, std::uint64_t>(),
+        .def(nb::init<const camera_scene &, Floats, Floats, Floats, nb::object, float, float, Floats,
+                      std::uint64_t>(),
              nb::kw_only(), nb::arg("geometry"), nb::arg("illumination_x"), nb::arg("illumination_y"),
-             nb::arg("clamp_x"), nb::arg("blobs"), nb::arg("noise"), nb::arg("normal_table"),
-             nb::arg("seed"),
-             "geometry: top, mid, half width, free length (px), neck, edge, clamp inside, clamp outside "
-             "(px), background, sheet, clamp (grey). blobs: rows S, X, X|X|^p, sigma, depth.")
+             nb::arg("clamp_x"), nb::arg("blobs"), nb::arg("shot_gain_grey"),
+             nb::arg("read_noise_grey"), nb::arg("normal_table"), nb::arg("seed"))
         .def("expect", &Scene::expect, nb::arg("lengths_px"), nb::arg("out").noconvert(),
              "Expected levels of each row of lengths, into out (frames, height, width) float32.")
         .def("render", &Scene::render, nb::arg("lengths_px"), nb::arg("first_index"),

@@ -39,22 +39,22 @@ using Farads = nb::ndarray<float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Reasons = nb::ndarray<uint8_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 
 /* Half a window further at each update; the caller gives one more than it wants updates. */
-void capacitances_of_quarters(const hs_quarters_config &config, Codes codes, Farads farad,
+void capacitances_from_quadrature(const hs_quadrature_config &config, Codes codes, Farads farad,
                               Reasons reason)
 {
-    constexpr size_t half = HS_QUARTERS / 2;
+    constexpr size_t half = HS_QUADRATURE_SAMPLES / 2;
     const size_t updates = farad.shape(0);
     if (reason.shape(0) != updates || codes.shape(0) != (updates + 1) * half) {
         throw std::invalid_argument("shapes of codes and results do not belong together");
     }
     for (size_t k = 0; k < updates; ++k) {
-        int16_t v[HS_QUARTERS], i[HS_QUARTERS];
-        for (size_t j = 0; j < HS_QUARTERS; ++j) {
+        int16_t v[HS_QUADRATURE_SAMPLES], i[HS_QUADRATURE_SAMPLES];
+        for (size_t j = 0; j < HS_QUADRATURE_SAMPLES; ++j) {
             v[j] = codes(k * half + j, 0);
             i[j] = codes(k * half + j, 1);
         }
         const hs_capacitance found =
-            hs_capacitance_of(&config, hs_sum_quarters(v), hs_sum_quarters(i));
+            hs_capacitance_of(&config, hs_demodulate_quadrature(v), hs_demodulate_quadrature(i));
         farad(k) = found.capacitance_f;
         reason(k) = found.reason;
     }
@@ -82,10 +82,10 @@ NB_MODULE(_core, m)
         const float out = hs_limit(value, low, high, &limited);
         return std::make_tuple(out, limited != 0);
     });
-    m.def("capacitances_of_quarters",
+    m.def("capacitances_from_quadrature",
           [](float turn_re, float turn_im, int32_t v_low, int32_t v_high, int32_t i_low, Codes codes,
              Farads farad, Reasons reason) {
-              capacitances_of_quarters({turn_re, turn_im, v_low, v_high, i_low}, codes, farad,
+              capacitances_from_quadrature({turn_re, turn_im, v_low, v_high, i_low}, codes, farad,
                                        reason);
           });
     nb::class_<Pid>(m, "Pid")

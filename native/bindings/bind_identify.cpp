@@ -287,6 +287,16 @@ NB_MODULE(_identify, m) {
              nb::arg("iterations"), nb::arg("gain"))
         .def("columns", &Transfer::columns, nb::arg("search"))
         .def("predict", &Transfer::predict, nb::arg("search"), nb::arg("shared"), nb::arg("own"));
+    nb::dict places; // of the numbers of an oscillator
+    places["log_omega"] = int(OSCILLATOR_LOG_OMEGA);
+    places["log_zeta"] = int(OSCILLATOR_LOG_ZETA);
+    places["gain"] = int(OSCILLATOR_GAIN);
+    places["q2"] = int(OSCILLATOR_Q2);
+    places["q3"] = int(OSCILLATOR_Q3);
+    places["delay"] = int(OSCILLATOR_DELAY);
+    places["start"] = int(OSCILLATOR_START);
+    places["rate"] = int(OSCILLATOR_RATE);
+    m.attr("OSCILLATOR") = places;
     m.def("oscillate", &oscillate, nb::arg("u"), nb::arg("input_rate_hz"), nb::arg("before"),
           nb::arg("first_order"), nb::arg("time_s"), nb::arg("numbers"), nb::arg("largest"));
     m.def("autocovariance", &autocovariance, nb::arg("residuals"), nb::arg("lags"));

@@ -4,7 +4,6 @@
 
 #include <algorithm>
 #include <cstdlib>
-#include <cstring>
 #include <memory>
 #include <new>
 #include <numeric>
@@ -12,6 +11,7 @@
 #include <thread>
 #include <vector>
 
+#include "bindings/records.h"
 #include "loops/loops.h"
 
 #ifdef __SSE__
@@ -29,11 +29,14 @@ constexpr size_t samples_a_thread = 50'000;
 constexpr size_t together = 4; // groups in step: enough to hide latency, few enough for the cache
 constexpr size_t chunk = 1024; // samples of noise and traces at a time: a page of each trace
 
-// A row of the table: 4 + 2 + 1 + 3 + 3 of the plant, 5 where it starts, then these.
-enum Column : size_t { KP = 18, KI, KD, FILTER_S, U_LOW, U_HIGH, U, REST, DELAY, NOISE_STD, COLUMNS };
+// A loop as Python gives it, every number a double; see struct loops_loop and plants/held.py.
+struct Row {
+    double free[4], push[2], feed, slow_decay[LOOPS_SLOW], slow_push[LOOPS_SLOW];
+    double start[2], slow_start[LOOPS_SLOW];
+    double kp, ki, kd, filter_s, u_low, u_high;
+    double u, rest, delay, noise_std;
+};
 
-static_assert(sizeof(loops_plant) + sizeof(loops_state) == KP * sizeof(double), "a row of numbers");
-static_assert(sizeof(loops_summary) == LOOPS_KEPT * sizeof(float), "a row of numbers");
 static_assert(sizeof(loops_group) % 64 == 0, "rows of registers");
 
 struct Free {
@@ -49,18 +52,24 @@ template <class T> std::unique_ptr<T[], Free> aligned(size_t count)
     return std::unique_ptr<T[], Free>(static_cast<T *>(p));
 }
 
-loops_loop loop_of(const double *row, float period_s)
+loops_loop loop_of(const Row &row, float period_s)
 {
+    const auto single = [](double number) { return static_cast<float>(number); };
     loops_loop loop;
-    std::memcpy(&loop.plant, row, sizeof loop.plant);
-    std::memcpy(&loop.start, row + sizeof loop.plant / sizeof(double), sizeof loop.start);
-    const auto number = [row](Column column) { return static_cast<float>(row[column]); };
-    loop.pid = {number(KP), number(KI), number(KD), period_s,
-                period_s / (period_s + number(FILTER_S)), number(U_LOW), number(U_HIGH)};
-    loop.u = number(U);
-    loop.rest = number(REST);
-    loop.delay = static_cast<uint32_t>(row[DELAY]);
-    loop.noise_std = number(NOISE_STD);
+    loop.plant = {row.free[0], row.free[1], row.free[2], row.free[3], row.push[0], row.push[1],
+                  row.feed,    {},          {}};
+    loop.start = {row.start[0], row.start[1], {}};
+    std::copy_n(row.slow_decay, LOOPS_SLOW, loop.plant.decay);
+    std::copy_n(row.slow_push, LOOPS_SLOW, loop.plant.push);
+    std::copy_n(row.slow_start, LOOPS_SLOW, loop.start.slow);
+    loop.pid = {single(row.kp),    single(row.ki),
+                single(row.kd),    period_s,
+                period_s / (period_s + single(row.filter_s)),
+                single(row.u_low), single(row.u_high)};
+    loop.u = single(row.u);
+    loop.rest = single(row.rest);
+    loop.delay = static_cast<uint32_t>(row.delay);
+    loop.noise_std = single(row.noise_std);
     loop.noise_key = 0;
     return loop;
 }
@@ -213,12 +222,10 @@ class Bunch {
     {
         for (size_t i = 0; i < count_; ++i) {
             const loops_group &group = groups_[i / lanes];
-            float kept[LOOPS_KEPT];
-            for (size_t n = 0; n < LOOPS_KEPT; ++n) {
-                kept[n] = group.kept[n][i % lanes];
-            }
-            std::memcpy(job_.summaries + order_[i] * job_.task.stretches + stretch, kept,
-                        sizeof kept);
+            const size_t lane = i % lanes;
+            job_.summaries[order_[i] * job_.task.stretches + stretch] = {
+                group.error_sum[lane], group.top[lane], group.bottom[lane],
+                group.last_outside[lane], group.limited[lane]};
         }
         for (size_t g = 0; g * lanes < count_; ++g) {
             loops_clear(&groups_[g]);
@@ -281,25 +288,24 @@ void run(const Job &job, int bits, size_t at_most)
 
 using Doubles = Array<double, 1>;
 
-// One loop in double. `plant`: a11, a12, a21, a22, b1, b2, feed; `state` and `line` are used up.
-void run_exact(Doubles plant, Doubles decay, Doubles push, Doubles state, Doubles pid,
-               double u_before, Doubles line, Doubles reference, Doubles noise, Doubles measured,
-               Doubles u)
+// One loop in double; `state` and `line` are used up.
+void run_exact(Doubles free, Doubles push, double feed, Doubles slow_decay, Doubles slow_push,
+               Doubles state, const loops_exact_pid &pid, double u_before, Doubles line,
+               Doubles reference, Doubles noise, Doubles measured, Doubles u)
 {
-    const size_t samples = reference.shape(0), slow = decay.shape(0);
-    if (plant.shape(0) != 7 || pid.shape(0) != 7 || push.shape(0) != slow ||
+    const size_t samples = reference.shape(0), slow = slow_decay.shape(0);
+    if (free.shape(0) != 4 || push.shape(0) != 2 || slow_push.shape(0) != slow ||
         state.shape(0) != 2 + slow || line.shape(0) == 0 || samples == 0 ||
         noise.shape(0) != samples || measured.shape(0) != samples || u.shape(0) != samples) {
         throw std::invalid_argument("shapes of the loop do not belong together");
     }
-    const double *p = plant.data(), *law = pid.data();
-    loops_exact loop = {p[0], p[1], p[2], p[3], p[4], p[5], p[6], decay.data(), push.data(),
-                        state.data(), slow, {}, u_before, line.data(), line.shape(0)};
-    std::copy(law, law + 7, loop.pid);
+    const loops_exact loop = {free(0), free(1), free(2), free(3), push(0), push(1), feed,
+                              slow_decay.data(), slow_push.data(), state.data(), slow, pid,
+                              u_before, line.data(), line.shape(0)};
     loops_run_exact(&loop, reference.data(), noise.data(), samples, measured.data(), u.data());
 }
 
-using Row = Array<const float, 1>;
+using Reference = Array<const float, 1>;
 using Noise = Array<const float, 2>;
 using Seeds = Array<const uint32_t, 1>;
 
@@ -308,41 +314,42 @@ using Seeds = Array<const uint32_t, 1>;
 // other; changes no bit of the result.
 class Loops {
   public:
-    Loops(Array<const double, 2> table, float period_s, size_t branches)
+    Loops(nb::object table, float period_s, size_t branches)
         : branches_(static_cast<unsigned>(branches))
     {
-        if (table.shape(1) != COLUMNS || table.shape(0) == 0 || branches > LOOPS_SLOW) {
+        const Records<const Row> rows(table);
+        if (rows.size() == 0 || branches > LOOPS_SLOW) {
             throw std::invalid_argument("the table does not fit the loops");
         }
-        for (size_t b = 0; b < table.shape(0); ++b) {
-            const double *row = table.data() + b * COLUMNS;
-            if (!(row[DELAY] >= 1.0 && row[DELAY] < 1u << 20)) {
+        for (size_t b = 0; b < rows.size(); ++b) {
+            const Row &row = rows.data()[b];
+            if (!(row.delay >= 1.0 && row.delay < 1u << 20)) {
                 throw std::invalid_argument("a delay is outside [1, 2^20) samples");
             }
             loops_.push_back(loop_of(row, period_s));
         }
     }
 
-    void summaries(Row reference, Noise noise, Seeds seeds, float band,
-                   Array<const uint64_t, 1> ends, Array<float, 3> out, int bits, size_t threads)
+    void summaries(Reference reference, Noise noise, Seeds seeds, float band,
+                   Array<const uint64_t, 1> ends, nb::object summaries, int bits, size_t threads)
     {
+        const Records<loops_summary> out(summaries);
         Job job = job_of(reference, noise, seeds);
         const std::vector<size_t> stretches(ends.data(), ends.data() + ends.shape(0));
         if (stretches.empty() || stretches.back() != job.samples ||
             !std::is_sorted(stretches.begin(), stretches.end()) ||
-            out.shape(0) != loops_.size() || out.shape(1) != stretches.size() ||
-            out.shape(2) != LOOPS_KEPT) {
+            out.shape(0) != loops_.size() || out.shape(1) != stretches.size()) {
             throw std::invalid_argument("the stretches do not fit the reference or the output");
         }
         job.task.ends = stretches.data();
         job.task.stretches = stretches.size();
         job.task.band = band;
-        job.summaries = reinterpret_cast<loops_summary *>(out.data());
+        job.summaries = out.data();
         nb::gil_scoped_release free_gil;
         run(job, bits, threads);
     }
 
-    void traces(Row reference, Noise noise, Seeds seeds, Array<float, 2> measured,
+    void traces(Reference reference, Noise noise, Seeds seeds, Array<float, 2> measured,
                 Array<float, 2> u, int bits, size_t threads)
     {
         Job job = job_of(reference, noise, seeds);
@@ -360,7 +367,7 @@ class Loops {
     }
 
   private:
-    Job job_of(const Row &reference, const Noise &noise, const Seeds &seeds) const
+    Job job_of(const Reference &reference, const Noise &noise, const Seeds &seeds) const
     {
         Job job{};
         job.loops = loops_;
@@ -399,20 +406,37 @@ NB_MODULE(_loops, m)
 {
     nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
     m.doc() = "Closed loops with the core's controller, many at a time";
-    m.attr("COLUMNS") = static_cast<size_t>(COLUMNS);
-    m.attr("KEPT") = static_cast<size_t>(LOOPS_KEPT);
+    m.attr("LOOP") = dtype_of<Row>(
+        {FIELD(Row, free), FIELD(Row, push), FIELD(Row, feed), FIELD(Row, slow_decay),
+         FIELD(Row, slow_push), FIELD(Row, start), FIELD(Row, slow_start), FIELD(Row, kp),
+         FIELD(Row, ki), FIELD(Row, kd), FIELD(Row, filter_s), FIELD(Row, u_low),
+         FIELD(Row, u_high), FIELD(Row, u), FIELD(Row, rest), FIELD(Row, delay),
+         FIELD(Row, noise_std)});
+    m.attr("SUMMARY") = dtype_of<loops_summary>(
+        {FIELD(loops_summary, error_sum), FIELD(loops_summary, top), FIELD(loops_summary, bottom),
+         FIELD(loops_summary, last_outside), FIELD(loops_summary, limited)});
     m.attr("SLOW") = static_cast<size_t>(LOOPS_SLOW);
     nb::class_<Loops>(m, "Loops")
-        .def(nb::init<Array<const double, 2>, float, size_t>(), nb::arg("table"),
-             nb::arg("period_s"), nb::arg("branches"))
+        .def(nb::init<nb::object, float, size_t>(), nb::arg("table"), nb::arg("period_s"),
+             nb::arg("branches"))
         .def("summaries", &Loops::summaries, nb::arg("reference"), nb::arg("noise"),
              nb::arg("seeds"), nb::arg("band"), nb::arg("ends"), nb::arg("out"),
              nb::arg("bits") = 512, nb::arg("threads") = 0)
         .def("traces", &Loops::traces, nb::arg("reference"), nb::arg("noise"), nb::arg("seeds"),
              nb::arg("measured"), nb::arg("u"), nb::arg("bits") = 512, nb::arg("threads") = 0);
-    m.def("run_exact", &run_exact, nb::arg("plant"), nb::arg("decay"), nb::arg("push"),
-          nb::arg("state"), nb::arg("pid"), nb::arg("u_before"), nb::arg("line"),
-          nb::arg("reference"), nb::arg("noise"), nb::arg("measured"), nb::arg("u"));
+    nb::class_<loops_exact_pid>(m, "ExactPid")
+        .def(
+            "__init__",
+            [](loops_exact_pid *self, double kp, double ki, double kd, double period_s,
+               double filter_constant, double u_low, double u_high) {
+                *self = {kp, ki, kd, period_s, filter_constant, u_low, u_high};
+            },
+            nb::kw_only(), nb::arg("kp"), nb::arg("ki"), nb::arg("kd"), nb::arg("period_s"),
+            nb::arg("filter_constant"), nb::arg("u_low"), nb::arg("u_high"));
+    m.def("run_exact", &run_exact, nb::kw_only(), nb::arg("free"), nb::arg("push"),
+          nb::arg("feed"), nb::arg("slow_decay"), nb::arg("slow_push"), nb::arg("state"),
+          nb::arg("pid"), nb::arg("u_before"), nb::arg("line"), nb::arg("reference"),
+          nb::arg("noise"), nb::arg("measured"), nb::arg("u"));
     // Widest vectors of this machine, in bits; 0 without a kernel for it.
     m.def("widest", [] {
         return loops_select(512) == nullptr          ? 0

@@ -12,16 +12,15 @@
 #include <tuple>
 #include <vector>
 
+#include "bindings/records.h"
 #include "sensing/paper.h"
 #include "sensing/parts.h"
 #include "sensing/sense.h"
 
 namespace nb = nanobind;
 using Doubles = nb::ndarray<nb::numpy, const double, nb::c_contig, nb::device::cpu>;
-using Out = nb::ndarray<nb::numpy, double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Any = nb::ndarray<nb::numpy, nb::ro, nb::c_contig, nb::device::cpu>;
 using Floats = nb::ndarray<nb::numpy, const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using FloatsOut = nb::ndarray<nb::numpy, float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using PaperBlocks =
     nb::ndarray<nb::numpy, const double, nb::shape<-1, -1, 2>, nb::c_contig, nb::device::cpu>;
 
@@ -29,18 +28,11 @@ using Drives =
     nb::ndarray<nb::numpy, const double, nb::shape<-1, 2, -1>, nb::c_contig, nb::device::cpu>;
 using Tables = nb::ndarray<nb::numpy, const double, nb::shape<-1, PARTS_SIZE>, nb::c_contig,
                            nb::device::cpu>;
-using Parts =
-    nb::ndarray<nb::numpy, int32_t, nb::shape<-1, -1, 4>, nb::c_contig, nb::device::cpu>;
 
 namespace {
 
 constexpr size_t samples_a_thread = 200'000;
 constexpr size_t ahead_bytes = 2048; // of memory, while a block is summed
-
-constexpr size_t columns = sizeof(sense_result) / sizeof(double);
-static_assert(sizeof(hs_sums) == 6 * sizeof(float), "a row of numbers");
-static_assert(sizeof(part) == 4 * sizeof(int32_t), "a row of numbers");
-static_assert(sizeof(parts_result) == 3 * sizeof(double), "a row of numbers");
 
 void copy(const Doubles &from, double *to, size_t count, const char *what)
 {
@@ -99,17 +91,17 @@ struct Source {
 class Plan {
   public:
     Plan(size_t samples, Doubles cosine, Doubles sine, Doubles table, Doubles turn, Doubles local,
-         Doubles whitening, Doubles choices, double period_s, double omega_rad_s, double full_scale,
-         double current_limit, int vectors)
+         Doubles whitening, nb::object choices, double period_s, double omega_rad_s,
+         double full_scale, double current_limit, int vectors)
         : cosine_(cosine.data(), cosine.data() + cosine.size()),
           sine_(sine.data(), sine.data() + sine.size())
     {
-        constexpr size_t row = sizeof(sense_choice) / sizeof(double);
+        const Records<const sense_choice> given(choices);
         plan_.sum = sum_pieces_by(vectors);
         plan_.samples = samples;
         plan_.piece = cosine_.size();
         if (samples == 0 || plan_.piece < 8 || plan_.piece > 65535 || plan_.piece > samples ||
-            sine_.size() != plan_.piece || choices.size() == 0 || choices.size() % row != 0) {
+            sine_.size() != plan_.piece || given.size() == 0) {
             throw std::invalid_argument("tables do not fit the block");
         }
         plan_.pieces = samples / plan_.piece;
@@ -132,14 +124,13 @@ class Plan {
         }
         std::memcpy(plan_.turn_cos, turn.data(), sizeof plan_.turn_cos);
         std::memcpy(plan_.turn_sin, turn.data() + SENSE_ALL, sizeof plan_.turn_sin);
-        copy(local, plan_.local_inverse, 16, "local");
-        copy(whitening, plan_.local_whitening, 3, "whitening");
+        copy(local, &plan_.local_inverse[0][0], 16, "local");
+        copy(whitening, &plan_.local_whitening[0][0], 4, "whitening");
         plan_.period_s = period_s;
         plan_.omega_rad_s = omega_rad_s;
         plan_.full_scale = static_cast<float>(full_scale);
         plan_.current_limit = static_cast<float>(current_limit);
-        choices_.resize(choices.size() / row);
-        std::memcpy(choices_.data(), choices.data(), choices.size() * sizeof(double));
+        choices_.assign(given.data(), given.data() + given.size());
         plan_.choices = choices_.data();
         plan_.choice_count = choices_.size();
         plan_.start = 0;
@@ -158,18 +149,19 @@ class Plan {
     sense_plan plan_;
 };
 
-void run_blocks(const Plan &plan, const Source &x, Out out, size_t at_most)
+void run_blocks(const Plan &plan, const Source &x, const Records<sense_result> &out,
+                size_t at_most)
 {
-    const size_t n = plan.get().samples, blocks = out.shape(0);
-    if (x.samples != blocks * n || out.shape(1) != columns) {
+    const size_t n = plan.get().samples, blocks = out.size();
+    if (x.samples != blocks * n) {
         throw std::invalid_argument("the output does not fit the blocks");
     }
     nb::gil_scoped_release free_gil;
-    auto *rows = reinterpret_cast<sense_result *>(out.data());
     const auto run = [&](size_t from, size_t to) {
+        std::vector<float> room(sense_room(&plan.get()));
         for (size_t b = from; b < to; ++b) {
             sense_block(&plan.get(), x.type, x.voltage(b * n), x.current(b * n), x.stride,
-                        to - b > 8 ? ahead_bytes : 0, 1, rows + b);
+                        to - b > 8 ? ahead_bytes : 0, 1, room.data(), out.data() + b);
         }
     };
     // A thread costs some ten microseconds to start; blocks do not depend on one another.
@@ -196,18 +188,19 @@ class Impedance {
           clear_(25.0 * quadrature)
     {
     }
-    std::tuple<float, float, unsigned> operator()(const Plan &plan, Any codes) const
+    std::tuple<float, float, unsigned> operator()(const Plan &plan, Any codes)
     {
         const Source x = Source::of_pairs(codes);
         if (x.samples != plan.get().samples) {
             throw std::invalid_argument("a step needs one whole block, voltage and current");
         }
+        room_.resize(sense_room(&plan.get()));
         sense_result r;
-        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, 0, 0, &r);
+        sense_block(&plan.get(), x.type, x.v, x.i, x.stride, 0, 0, room_.data(), &r);
         const hs_phasor v = {static_cast<float>(r.v_re), static_cast<float>(r.v_im)};
         const hs_phasor i = {static_cast<float>(r.i_re), static_cast<float>(r.i_im)};
         const hs_impedance z = hs_impedance_of(&config_, &v, &i);
-        auto reason = z.reason | static_cast<unsigned>(r.reason);
+        unsigned reason = z.reason | r.reason;
         if (!(r.v_re * r.v_re + r.v_im * r.v_im > clear_ * r.v_noise &&
               r.i_re * r.i_re + r.i_im * r.i_im > clear_ * r.i_noise)) {
             reason |= HS_AMPLITUDE_LOST;
@@ -218,6 +211,7 @@ class Impedance {
   private:
     hs_impedance_config config_;
     double clear_; // five standard deviations of a quadrature, squared, a variance of the readings
+    std::vector<float> room_; // grows with the first block
 };
 
 class Paper {
@@ -236,28 +230,26 @@ class Paper {
             std::memcpy(filter_.a[k], row + 4, sizeof filter_.a[k]);
         }
     }
-    // Rows of the results of the voltage, then of the current. The filter starts at rest at the
+    // Results of the voltage and of the current, a block a row. The filter starts at rest at the
     // first readings, and anew behind what is no number.
-    void step(PaperBlocks x, Out out)
+    void step(PaperBlocks x, nb::object results)
     {
-        constexpr size_t row = sizeof(paper_result) / sizeof(double);
+        const Records<paper_result> out(results);
         const size_t blocks = x.shape(0), n = x.shape(1), period = wave_.size() / 2;
-        if (out.shape(0) != blocks || out.shape(1) != 2 * row || n % period != 0 ||
-            n < 2 * period) {
+        if (out.shape(0) != blocks || out.shape(1) != 2 || n % period != 0 || n < 2 * period) {
             throw std::invalid_argument("the output does not fit the blocks");
         }
         nb::gil_scoped_release free_gil;
         std::vector<double> mean(2 * period), fundamentals(4 * (n / period));
         for (size_t b = 0; b < blocks; ++b) {
             const double *block = x.data() + 2 * n * b;
-            paper_result both[2];
+            paper_result *both = out.data() + 2 * b;
             if (!started_) {
                 start(block);
             }
             paper_block(&filter_, &state_, block, n, period, wave_.data(), mean.data(),
                         fundamentals.data(), both);
             started_ = std::isfinite(both[0].re) && std::isfinite(both[1].re);
-            std::memcpy(out.data() + 2 * row * b, both, sizeof both);
         }
     }
 
@@ -282,15 +274,16 @@ class Paper {
 
 // Cuts of many blocks. y: (blocks, 2, 2 pieces); each table: 2 rows a piece for runs of 1, 2 ...
 // pieces; limits: least and most columns of each table, then gap and spare; prices: of a parameter,
-// of a cut, of a piece left out. parts: (blocks, pieces, 4), result: (blocks, 3).
+// of a cut, of a piece left out. parts: PART (blocks, pieces), results: PARTS_RESULT (blocks,).
 void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<size_t> &limits,
-               const std::vector<double> &prices, Parts parts, Out result)
+               const std::vector<double> &prices, nb::object parts_out, nb::object results)
 {
+    const Records<parts_part> parts(parts_out);
+    const Records<parts_result> result(results);
     const size_t blocks = y.shape(0), pieces = y.shape(2) / 2, kinds = tables.size();
     if (pieces == 0 || pieces > PARTS_PIECES || y.shape(2) != 2 * pieces || kinds == 0 ||
         kinds > PARTS_KINDS || limits.size() != 2 * kinds + 2 || prices.size() != 3 ||
-        parts.shape(0) != blocks || parts.shape(1) != pieces || result.shape(0) != blocks ||
-        result.shape(1) != 3) {
+        parts.shape(0) != blocks || parts.shape(1) != pieces || result.size() != blocks) {
         throw std::invalid_argument("the tables or the output do not fit the blocks");
     }
     parts_plan plan{};
@@ -310,9 +303,7 @@ void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<si
     plan.left_out = prices[2];
     nb::gil_scoped_release free_gil;
     for (size_t b = 0; b < blocks; ++b) {
-        cut_parts(&plan, y.data() + 4 * pieces * b,
-                  reinterpret_cast<part *>(parts.data()) + pieces * b,
-                  reinterpret_cast<parts_result *>(result.data()) + b);
+        parts_cut(&plan, y.data() + 4 * pieces * b, parts.data() + pieces * b, result.data() + b);
     }
 }
 
@@ -324,19 +315,42 @@ NB_MODULE(_sense, m)
     m.doc() = "Sensing on the desktop: the core's sums, what follows from them, and the paper's chain";
     m.attr("PIECES") = SENSE_PIECES;
     m.attr("ROOM") = SENSE_ALL;
-    m.attr("COLUMNS") = columns;
-    // Sums of every piece, six numbers each: which vectors add them changes no bit.
-    m.def("sum_pieces", [](Floats x, Floats cosine, Floats sine, int bits, FloatsOut out) {
+    m.attr("RESULT") = dtype_of<sense_result>(
+        {FIELD(sense_result, v_re), FIELD(sense_result, v_im), FIELD(sense_result, i_re),
+         FIELD(sense_result, i_im), FIELD(sense_result, v_noise), FIELD(sense_result, i_noise),
+         FIELD(sense_result, v_level), FIELD(sense_result, i_level), FIELD(sense_result, v_slope),
+         FIELD(sense_result, i_slope), FIELD(sense_result, excess),
+         FIELD(sense_result, offset_rad_s), FIELD(sense_result, v3_re), FIELD(sense_result, v3_im),
+         FIELD(sense_result, i3_re), FIELD(sense_result, i3_im), FIELD(sense_result, choice),
+         FIELD(sense_result, reason), FIELD(sense_result, suspicion)});
+    m.attr("CHOICE") = dtype_of<sense_choice>(
+        {FIELD(sense_choice, used), FIELD(sense_choice, after), FIELD(sense_choice, inverse),
+         FIELD(sense_choice, samples), FIELD(sense_choice, full),
+         FIELD(sense_choice, after_share)});
+    m.attr("SUMS") = dtype_of<hs_sums>({FIELD(hs_sums, first), FIELD(hs_sums, cosine),
+                                        FIELD(hs_sums, sine), FIELD(hs_sums, level),
+                                        FIELD(hs_sums, ramp), FIELD(hs_sums, square)});
+    m.attr("PART") = dtype_of<parts_part>({FIELD(parts_part, first), FIELD(parts_part, count),
+                                           FIELD(parts_part, size), FIELD(parts_part, kind)});
+    m.attr("PARTS_RESULT") =
+        dtype_of<parts_result>({FIELD(parts_result, score), FIELD(parts_result, misfit),
+                                FIELD(parts_result, parts)});
+    m.attr("PAPER_RESULT") = dtype_of<paper_result>(
+        {FIELD(paper_result, peak_to_peak), FIELD(paper_result, re), FIELD(paper_result, im),
+         FIELD(paper_result, scatter), FIELD(paper_result, most)});
+    // Sums of every piece: which vectors add them changes no bit.
+    m.def("sum_pieces", [](Floats x, Floats cosine, Floats sine, int bits, nb::object sums) {
+        const Records<hs_sums> out(sums);
         const size_t piece = cosine.size();
         if (x.size() == 0 || piece == 0 || piece > 65535 || sine.size() != piece ||
-            out.shape(0) != (x.size() + piece - 1) / piece || out.shape(1) != 6) {
+            out.size() != (x.size() + piece - 1) / piece) {
             throw std::invalid_argument("the output does not fit the pieces");
         }
         sum_pieces_by(bits)(x.data(), x.size(), cosine.data(), sine.data(), piece, 0,
-                            reinterpret_cast<hs_sums *>(out.data()));
+                            out.data());
     });
     nb::class_<Plan>(m, "Plan").def(
-        nb::init<size_t, Doubles, Doubles, Doubles, Doubles, Doubles, Doubles, Doubles, double,
+        nb::init<size_t, Doubles, Doubles, Doubles, Doubles, Doubles, Doubles, nb::object, double,
                  double, double, double, int>(),
         nb::kw_only(), nb::arg("samples"), nb::arg("cosine"), nb::arg("sine"), nb::arg("table"),
         nb::arg("turn"), nb::arg("local"), nb::arg("whitening"), nb::arg("choices"),
@@ -345,14 +359,14 @@ NB_MODULE(_sense, m)
     m.def("vectors", [] { return sum_pieces_bits(512); });
     m.def(
         "blocks",
-        [](const Plan &plan, Any x, Out out, size_t threads) {
-            run_blocks(plan, Source::of_pairs(x), out, threads);
+        [](const Plan &plan, Any x, nb::object out, size_t threads) {
+            run_blocks(plan, Source::of_pairs(x), Records<sense_result>(out), threads);
         },
         nb::arg("plan"), nb::arg("readings"), nb::arg("out"), nb::arg("threads") = 0);
     m.def(
         "channels",
-        [](const Plan &plan, Any v, Any i, Out out, size_t threads) {
-            run_blocks(plan, Source::of_channels(v, i), out, threads);
+        [](const Plan &plan, Any v, Any i, nb::object out, size_t threads) {
+            run_blocks(plan, Source::of_channels(v, i), Records<sense_result>(out), threads);
         },
         nb::arg("plan"), nb::arg("voltage"), nb::arg("current"), nb::arg("out"),
         nb::arg("threads") = 0);

@@ -10,6 +10,8 @@
 #include <string>
 #include <vector>
 
+#include "bindings/records.h"
+
 extern "C" {
 #include "tracking/track_step.h"
 }
@@ -62,13 +64,15 @@ class Points {
   public:
     Points(Array<float, 2> shape, Array<float, 3> gradient, Array<float, 3> inverse,
            Array<float, 2> place, Array<double, 2> centre, Array<double, 2> offset,
-           Array<double, 2> base, Array<float, 2> noise, Array<float, 1> white, Array<int, 2> near,
+           Array<double, 2> base, nb::object noise, Array<float, 1> white, Array<int, 2> near,
            Array<double, 3> lever, Array<double, 3> weights, Array<double, 2> smooth,
            Array<double, 3> rough, int side)
         : shape_(shape), gradient_(gradient), inverse_(inverse), place_(place), centre_(centre),
-          offset_(offset), base_(base), noise_(noise), white_(white), near_(near), lever_(lever),
+          offset_(offset), base_(base), white_(white), near_(near), lever_(lever),
           weights_(weights), smooth_(smooth),
           rough_(rough) {
+        const Records<const track_noise> given(noise);
+        noise_.assign(given.data(), given.data() + given.size());
         const size_t n = shape.shape(0), stride = shape.shape(1), m = inverse.shape(1);
         const size_t k = near.shape(1), pixels = static_cast<size_t>(side) * side;
         const bool templates = gradient.shape(0) == n && gradient.shape(1) == 2 &&
@@ -77,7 +81,7 @@ class Points {
                                place.shape(1) == stride && (m == 2 || m == 6);
         const bool places = centre.shape(0) == n && centre.shape(1) == 2 && offset.shape(0) == n &&
                             offset.shape(1) == 2 && base.shape(0) == n && base.shape(1) == 4 &&
-                            noise.shape(0) == n && noise.shape(1) == TRACK_NOISE_ROW &&
+                            noise_.size() == n &&
                             white.shape(0) == TRACK_WHITE_STEPS + 1;
         const bool around =
             k == 0 || (k <= 32 && near.shape(0) == n && lever.shape(0) == n &&
@@ -103,7 +107,7 @@ class Points {
     Array<float, 3> gradient_, inverse_;
     Array<float, 2> place_;
     Array<double, 2> centre_, offset_, base_;
-    Array<float, 2> noise_;
+    std::vector<track_noise> noise_;
     Array<float, 1> white_;
     Array<int, 2> near_;
     Array<double, 3> lever_, weights_;
@@ -112,41 +116,48 @@ class Points {
     track_points view_{};
 };
 
+track_found found_in(double *position, double *std, double *quality, size_t n) {
+    return {position, position + n, std, std + n, quality};
+}
+
 track_summary step(const Points &points, const track_rules &rules, Frame frame, int bits,
-          Array<double, 2> poses, Array<double, 2> velocity, Array<unsigned char, 1> reasons,
-          Array<double, 1> gain, Out<double, 2> next_poses, Out<double, 2> next_velocity,
-          Out<unsigned char, 1> next_reasons, Out<double, 1> next_gain,
-          Out<double, 2> found, Out<double, 1> quality, const std::string &kernels) {
+          nb::object poses_before, Array<double, 2> velocity, Array<unsigned char, 1> reasons,
+          Array<double, 1> gain, nb::object poses_after, Out<double, 2> next_velocity,
+          Out<unsigned char, 1> next_reasons, Out<double, 1> next_gain, Out<double, 2> position,
+          Out<double, 2> std, Out<double, 1> quality, const std::string &kernels) {
+    const Records<const track_pose> poses(poses_before);
+    const Records<track_pose> next_poses(poses_after);
     const track_points &p = points.view();
     const auto n = static_cast<size_t>(p.count);
     const auto is = [](const auto &a, size_t rows, size_t columns) {
         return a.shape(0) == rows && a.shape(1) == columns;
     };
-    if (!is(poses, n, 6) || !is(velocity, n, 2) || !is(next_poses, n, 6) ||
-        !is(next_velocity, n, 2) || !is(found, 4, n) || reasons.shape(0) != n ||
+    if (poses.size() != n || !is(velocity, n, 2) || next_poses.size() != n ||
+        !is(next_velocity, n, 2) || !is(position, 2, n) || !is(std, 2, n) || reasons.shape(0) != n ||
         next_reasons.shape(0) != n || quality.shape(0) != n || gain.shape(0) != 1 ||
         next_gain.shape(0) != 1 || poses.data() == next_poses.data())
         throw std::invalid_argument("the state does not fit the points");
     const track_frame pixels = view(frame, bits);
     const track_kernels *chosen = kernels_named(kernels);
     // the C side only reads what comes before
-    const track_memory before{const_cast<double *>(poses.data()),
+    const track_memory before{const_cast<track_pose *>(poses.data()),
                               const_cast<double *>(velocity.data()),
                               const_cast<unsigned char *>(reasons.data()),
                               const_cast<double *>(gain.data())};
     const track_memory after{next_poses.data(), next_velocity.data(), next_reasons.data(),
                              next_gain.data()};
-    const track_found out{found.data(), quality.data()};
+    const track_found out = found_in(position.data(), std.data(), quality.data(), n);
     nb::gil_scoped_release release;
     return track_step(chosen, &p, &rules, &pixels, &before, &after, &out,
                       scratch(track_step_size(&p, &pixels, rules.search_px)));
 }
 
-void samples(const Points &points, Frame frame, int bits, Array<double, 2> poses,
-             Out<float, 2> out, const std::string &kernels) {
+void samples(const Points &points, Frame frame, int bits, nb::object at, Out<float, 2> out,
+             const std::string &kernels) {
+    const Records<const track_pose> poses(at);
     const track_points &p = points.view();
     const auto n = static_cast<size_t>(p.count);
-    if (poses.shape(0) != n || poses.shape(1) != 6 || out.shape(0) != n ||
+    if (poses.size() != n || out.shape(0) != n ||
         out.shape(1) != static_cast<size_t>(p.stride))
         throw std::invalid_argument("the poses or the samples do not fit the points");
     const track_frame pixels = view(frame, bits);
@@ -155,11 +166,15 @@ void samples(const Points &points, Frame frame, int bits, Array<double, 2> poses
     track_samples(chosen, &p, &pixels, poses.data(), out.data(), scratch(track_scratch_size(p.side)));
 }
 
-std::pair<float, int> audit(const Points &points, Array<double, 2> found) {
-    if (found.shape(0) != 4 || found.shape(1) != static_cast<size_t>(points.view().count))
+std::pair<float, int> audit(const Points &points, Array<double, 2> position, Array<double, 2> std) {
+    const auto n = static_cast<size_t>(points.view().count);
+    if (position.shape(0) != 2 || position.shape(1) != n || std.shape(0) != 2 || std.shape(1) != n)
         throw std::invalid_argument("the positions do not fit the points");
-    auto *moves = static_cast<double *>(scratch(4 * sizeof(double) * found.shape(1)));
-    const track_audit made = track_audit_frame(&points.view(), found.data(), moves);
+    auto *moves = static_cast<double *>(scratch(4 * sizeof(double) * n));
+    // the audit only reads them
+    const track_found found = found_in(const_cast<double *>(position.data()),
+                                       const_cast<double *>(std.data()), nullptr, n);
+    const track_audit made = track_audit_frame(&points.view(), &found, moves);
     return {made.ratio, made.numbers};
 }
 
@@ -198,7 +213,7 @@ NB_MODULE(_track, m) {
              nb::arg("noise_slope"));
     nb::class_<Points>(m, "Points", "struct track_points.")
         .def(nb::init<Array<float, 2>, Array<float, 3>, Array<float, 3>, Array<float, 2>,
-                      Array<double, 2>, Array<double, 2>, Array<double, 2>, Array<float, 2>,
+                      Array<double, 2>, Array<double, 2>, Array<double, 2>, nb::object,
                       Array<float, 1>, Array<int, 2>, Array<double, 3>, Array<double, 3>,
                       Array<double, 2>, Array<double, 3>, int>(),
              nb::kw_only(), nb::arg("shape"), nb::arg("gradient"), nb::arg("inverse"),
@@ -220,17 +235,23 @@ NB_MODULE(_track, m) {
         .def_prop_ro("audit", [](const track_summary &s) {
             return std::pair<float, int>{s.audit.ratio, s.audit.numbers};
         });
-    m.def("audit", &audit, nb::arg("points"), nb::arg("found"),
+    m.attr("POSE") = dtype_of<track_pose>({{"centre_px", "(2,)f8", offsetof(track_pose, x)},
+                                           {"deformation", "(2,2)f8", offsetof(track_pose, f)}});
+    m.attr("NOISE") = dtype_of<track_noise>(
+        {FIELD(track_noise, even), FIELD(track_noise, shaped), FIELD(track_noise, reference),
+         FIELD(track_noise, norm), FIELD(track_noise, level), FIELD(track_noise, residual_share),
+         FIELD(track_noise, averaged)});
+    m.def("audit", &audit, nb::arg("points"), nb::arg("position"), nb::arg("std"),
           "Mean square of the scatter about a smooth field over that stated, and of how many.");
     m.def("samples", &samples, nb::arg("points"), nb::arg("frame"), nb::arg("bits"),
           nb::arg("poses"), nb::arg("out").noconvert(), nb::arg("kernels") = "",
           "Grey levels at the samples of all subsets, less half the range; NaN over the edge.");
     m.def("step", &step, nb::arg("points"), nb::arg("rules"), nb::arg("frame"), nb::arg("bits"),
           nb::arg("poses"), nb::arg("velocity"), nb::arg("reasons"),
-          nb::arg("gain"), nb::arg("next_poses").noconvert(),
+          nb::arg("gain"), nb::arg("next_poses"),
           nb::arg("next_velocity").noconvert(), nb::arg("next_reasons").noconvert(),
-          nb::arg("next_gain").noconvert(), nb::arg("found").noconvert(),
-          nb::arg("quality").noconvert(), nb::arg("kernels") = "",
+          nb::arg("next_gain").noconvert(), nb::arg("position").noconvert(),
+          nb::arg("std").noconvert(), nb::arg("quality").noconvert(), nb::arg("kernels") = "",
           "All points in the next frame; writes the arrays from next_poses on.");
     m.def("coefficients", &coefficients, nb::arg("frame"), nb::arg("bits"),
           nb::arg("out").noconvert(), nb::arg("kernels") = "", "Spline coefficients of a frame.");

@@ -11,12 +11,12 @@
  * derivative by the pole. */
 typedef struct {
     double r;
-    complex_number decay, push, push_slope, ramp, ramp_slope;
+    held_complex decay, push, push_slope, ramp, ramp_slope;
 } stretch;
 
-static complex_number plain(double complex z)
+static held_complex plain(double complex z)
 {
-    const complex_number out = {creal(z), cimag(z)};
+    const held_complex out = {creal(z), cimag(z)};
     return out;
 }
 
@@ -47,7 +47,7 @@ static void phi(double complex z, double complex e, double complex out[4])
     out[3] = (out[2] - out[1]) / z;
 }
 
-static stretch stretch_of(complex_number pole, double r)
+static stretch stretch_of(held_complex pole, double r)
 {
     const double complex p = pole.re + pole.im * I, z = p * r, e = cexp(z);
     double complex f[4];
@@ -94,7 +94,7 @@ typedef struct {
     double *re, *im, *slope_re, *slope_im, *ramp;
 } edge_states;
 
-static void run(const held_record *record, complex_number pole, edge_states x)
+static void run(const held_record *record, held_complex pole, edge_states x)
 {
     const stretch s = stretch_of(pole, record->period_s);
     double re = 0.0, im = 0.0, slope_re = 0.0, slope_im = 0.0;
@@ -136,7 +136,7 @@ static void rest(held_states out, int32_t m)
     out.re[m] = out.im[m] = out.slope_re[m] = out.slope_im[m] = 0.0;
 }
 
-void held_forced(const held_record *record, complex_number pole, double delay_s, double *scratch,
+void held_forced(const held_record *record, held_complex pole, double delay_s, double *scratch,
                  held_states out)
 {
     const int32_t edges = record->n_edges;
@@ -175,12 +175,12 @@ void held_forced(const held_record *record, complex_number pole, double delay_s,
     }
 }
 
-void held_free(const held_record *record, complex_number pole, double *scratch, held_states out)
+void held_free(const held_record *record, held_complex pole, double *scratch, held_states out)
 {
     const double complex p = pole.re + pole.im * I;
-    const complex_number step = plain(cexp(p * record->period_s));
-    complex_number *const powers = (complex_number *)(void *)scratch;
-    complex_number *const parts = powers + record->n_edges;
+    const held_complex step = plain(cexp(p * record->period_s));
+    held_complex *const powers = (held_complex *)(void *)scratch;
+    held_complex *const parts = powers + record->n_edges;
     double re = 1.0, im = 0.0;
     int32_t k, g, m;
     for (k = 0; k < record->n_edges; ++k) {
@@ -195,9 +195,9 @@ void held_free(const held_record *record, complex_number pole, double *scratch, 
     }
     for (m = 0; m < record->n; ++m) {
         const int32_t at = record->edge[m];
-        const complex_number part = parts[record->group[m]];
+        const held_complex part = parts[record->group[m]];
         const double t = (at + record->phase[record->group[m]]) * record->period_s;
-        const complex_number whole =
+        const held_complex whole =
             at >= 0 && at < record->n_edges ? powers[at] : plain(cexp(p * record->period_s * at));
         out.re[m] = whole.re * part.re - whole.im * part.im;
         out.im[m] = whole.re * part.im + whole.im * part.re;

@@ -15,7 +15,7 @@ extern "C" {
 
 typedef struct {
     double re, im;
-} complex_number;
+} held_complex;
 
 /* One experiment. An output at time t lies `phase[group]` of a period after edge `edge`. */
 typedef struct {
@@ -42,11 +42,11 @@ typedef struct {
 int64_t held_scratch(const held_record *record);
 
 /* States and their derivatives by the pole for an output that is `delay_s` late. */
-void held_forced(const held_record *record, complex_number pole, double delay_s, double *scratch,
+void held_forced(const held_record *record, held_complex pole, double delay_s, double *scratch,
                  held_states out);
 
 /* e^{p t} and t e^{p t} at the outputs. */
-void held_free(const held_record *record, complex_number pole, double *scratch, held_states out);
+void held_free(const held_record *record, held_complex pole, double *scratch, held_states out);
 
 /* The input at the outputs, `delay_s` late; n values. */
 void held_input(const held_record *record, double delay_s, double *out);

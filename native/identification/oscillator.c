@@ -4,7 +4,6 @@
 
 #define N OSCILLATOR_NUMBERS
 #define STEP 0.12 /* of a radian of the fastest motion: relative error of its frequency 2e-6 */
-enum { LOG_OMEGA, LOG_ZETA, GAIN, SQUARE, CUBE, DELAY, START, RATE };
 
 typedef struct {
     double x, v;
@@ -26,12 +25,12 @@ static void rates(const plant *p, const state *s, double u, double late, state *
         out->dx[k] = s->dv[k];
         out->dv[k] = -p->damping * s->dv[k] - slope * s->dx[k];
     }
-    out->dv[LOG_OMEGA] += 2.0 * p->stiffness * (p->gain * u - spring) - p->damping * v;
-    out->dv[LOG_ZETA] -= p->damping * v;
-    out->dv[GAIN] += p->stiffness * u;
-    out->dv[SQUARE] -= p->stiffness * x * x;
-    out->dv[CUBE] -= p->stiffness * x * x * x;
-    out->dv[DELAY] += p->stiffness * p->gain * late;
+    out->dv[OSCILLATOR_LOG_OMEGA] += 2.0 * p->stiffness * (p->gain * u - spring) - p->damping * v;
+    out->dv[OSCILLATOR_LOG_ZETA] -= p->damping * v;
+    out->dv[OSCILLATOR_GAIN] += p->stiffness * u;
+    out->dv[OSCILLATOR_Q2] -= p->stiffness * x * x;
+    out->dv[OSCILLATOR_Q3] -= p->stiffness * x * x * x;
+    out->dv[OSCILLATOR_DELAY] += p->stiffness * p->gain * late;
 }
 
 static void moved(const state *s, const state *rate, double h, state *out) {
@@ -76,15 +75,16 @@ static void piece(const oscillator_record *r, int64_t edge, double *u, double *s
 
 int32_t oscillator_simulate(const oscillator_record *record, const double *numbers, double largest,
                             double *x, double *by_number) {
-    const double omega = exp(numbers[LOG_OMEGA]), zeta = exp(numbers[LOG_ZETA]);
-    const double delay = numbers[DELAY], period = record->period_s;
-    const plant p = {2.0 * zeta * omega, omega * omega, numbers[GAIN], numbers[SQUARE],
-                     numbers[CUBE]};
+    const double omega = exp(numbers[OSCILLATOR_LOG_OMEGA]);
+    const double zeta = exp(numbers[OSCILLATOR_LOG_ZETA]);
+    const double delay = numbers[OSCILLATOR_DELAY], period = record->period_s;
+    const plant p = {2.0 * zeta * omega, omega * omega, numbers[OSCILLATOR_GAIN],
+                     numbers[OSCILLATOR_Q2], numbers[OSCILLATOR_Q3]};
     state s = {0};
-    s.x = numbers[START];
-    s.v = numbers[RATE];
-    s.dx[START] = 1.0;
-    s.dv[RATE] = 1.0;
+    s.x = numbers[OSCILLATOR_START];
+    s.v = numbers[OSCILLATOR_RATE];
+    s.dx[OSCILLATOR_START] = 1.0;
+    s.dv[OSCILLATOR_RATE] = 1.0;
     int64_t edge = (int64_t)floor(-delay / period);
     if (edge < -1) edge = -1;
     double t = 0.0, from = (double)edge * period + delay, u, slope;
@@ -112,7 +112,8 @@ int32_t oscillator_simulate(const oscillator_record *record, const double *numbe
                 const double old = u + slope * (next - from);
                 from = next;
                 piece(record, ++edge, &u, &slope);
-                s.dv[DELAY] += p.stiffness * p.gain * (old - u); /* a later jump pushes later */
+                /* a later jump pushes later */
+                s.dv[OSCILLATOR_DELAY] += p.stiffness * p.gain * (old - u);
                 if (t < next) t = next;
             }
         }

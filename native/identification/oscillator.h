@@ -13,8 +13,18 @@
 extern "C" {
 #endif
 
-/* Numbers: log w, log zeta, gain, q2, q3, delay, x and x' at t = 0. */
-#define OSCILLATOR_NUMBERS 8
+/* Places of the numbers; x and x' at t = 0 are the last. */
+enum {
+    OSCILLATOR_LOG_OMEGA,
+    OSCILLATOR_LOG_ZETA,
+    OSCILLATOR_GAIN,
+    OSCILLATOR_Q2,
+    OSCILLATOR_Q3,
+    OSCILLATOR_DELAY,
+    OSCILLATOR_START,
+    OSCILLATOR_RATE,
+    OSCILLATOR_NUMBERS
+};
 
 typedef struct {
     const double *u;

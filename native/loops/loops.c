@@ -91,17 +91,13 @@ void loops_one(const struct loops_loop *loop, const struct loops_task *task, con
     }
 }
 
-struct exact_config {
-    double kp, ki, kd, period_s, filter_constant, u_low, u_high;
-};
-
 struct exact_state {
     double integral, filtered;
 };
 
 #define PID_NUMBER double
 #define PID_STEP exact_pid_step
-#define PID_CONFIG struct exact_config
+#define PID_CONFIG struct loops_exact_pid
 #define PID_STATE struct exact_state
 #include "hs_pid_step.h"
 
@@ -123,16 +119,15 @@ static double exact_plant_step(const struct loops_exact *p, double u)
 void loops_run_exact(const struct loops_exact *loop, const double *reference, const double *noise,
                      size_t samples, double *measured, double *u)
 {
-    const double *const pid = loop->pid;
-    const struct exact_config config = {pid[0], pid[1], pid[2], pid[3], pid[4], pid[5], pid[6]};
+    const struct loops_exact_pid *const pid = &loop->pid;
     struct exact_state state = {loop->u, loop->line[0] + noise[0]};
 
     for (size_t k = 0; k < samples; ++k) {
         double *const place = loop->line + k % loop->delay;
         const double y = *place + noise[k];
-        const double free_u = exact_pid_step(&config, &state, reference[k] - y, y, 1);
+        const double free_u = exact_pid_step(pid, &state, reference[k] - y, y, 1);
         measured[k] = y;
-        u[k] = fmin(fmax(free_u, config.u_low), config.u_high);
+        u[k] = fmin(fmax(free_u, pid->u_low), pid->u_high);
         *place = exact_plant_step(loop, u[k]);
     }
 }
@@ -184,12 +179,12 @@ void loops_pack(struct loops_group *group, const struct loops_loop loops[LOOPS_L
 
 void loops_clear(struct loops_group *group)
 {
-    float first[LOOPS_KEPT];
-    memcpy(first, &nothing, sizeof first);
-    for (int i = 0; i < LOOPS_KEPT; ++i) {
-        for (int j = 0; j < LOOPS_LANES; ++j) {
-            group->kept[i][j] = first[i];
-        }
+    for (int j = 0; j < LOOPS_LANES; ++j) {
+        group->error_sum[j] = nothing.error_sum;
+        group->top[j] = nothing.top;
+        group->bottom[j] = nothing.bottom;
+        group->last_outside[j] = nothing.last_outside;
+        group->limited[j] = nothing.limited;
     }
 }
 

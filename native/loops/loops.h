@@ -18,9 +18,8 @@ extern "C" {
 #endif
 
 enum {
-    LOOPS_SLOW = 3,   /* slow branches at most */
-    LOOPS_LANES = 16, /* loops of a group */
-    LOOPS_KEPT = 5    /* numbers of a summary */
+    LOOPS_SLOW = 3,  /* slow branches at most */
+    LOOPS_LANES = 16 /* loops of a group */
 };
 
 /* One step: v = z1 + sum(slow) + feed u is the output that arrives `delay` samples later; then
@@ -83,15 +82,19 @@ uint32_t loops_noise_key(uint32_t n, uint32_t seed);
 void loops_one(const struct loops_loop *loop, const struct loops_task *task, const float *noise,
                float *line, struct loops_traces traces, struct loops_summary *summaries);
 
-/* One loop in double, its PID too: `pid` has the fields of hs_pid_config in their order. Any number
- * of slow branches; `state` holds z1, z2 and theirs. `line`: `delay` measurements before the first
- * output arrives, oldest first, used as a ring. */
+/* hs_pid_config in double. */
+struct loops_exact_pid {
+    double kp, ki, kd, period_s, filter_constant, u_low, u_high;
+};
+
+/* One loop in double, its PID too. Any number of slow branches; `state` holds z1, z2 and theirs.
+ * `line`: `delay` measurements before the first output arrives, oldest first, used as a ring. */
 struct loops_exact {
     double a11, a12, a21, a22, b1, b2, feed;
     const double *decay, *push;
     double *state;
     size_t slow;
-    double pid[7];
+    struct loops_exact_pid pid;
     double u; /* output before the first sample */
     double *line;
     size_t delay; /* samples, 1 or more */
@@ -117,7 +120,9 @@ struct LOOPS_ALIGNED loops_group {
     float kp[LOOPS_LANES], ki[LOOPS_LANES], kd[LOOPS_LANES], filter_constant[LOOPS_LANES];
     float u_low[LOOPS_LANES], u_high[LOOPS_LANES];
     float integral[LOOPS_LANES], filtered[LOOPS_LANES];
-    float kept[LOOPS_KEPT][LOOPS_LANES]; /* as in struct loops_summary */
+    /* as in struct loops_summary */
+    float error_sum[LOOPS_LANES], top[LOOPS_LANES], bottom[LOOPS_LANES];
+    float last_outside[LOOPS_LANES], limited[LOOPS_LANES];
     int32_t back[LOOPS_LANES];           /* 16 delay - lane: how far behind a reading lies */
     float noise_std[LOOPS_LANES];
     uint32_t noise_key[LOOPS_LANES];

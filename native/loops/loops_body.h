@@ -111,8 +111,8 @@ INLINE vf pid_step(struct loops_group *g, int at, vf desired, vf measured, vf pe
 /* sum_up() of loops.c */
 INLINE void sum_up(struct loops_group *g, int at, vf desired, vf arrived, vf band, vf sample, vf u)
 {
-    float *const sum = g->kept[0] + at, *const top = g->kept[1] + at, *const low = g->kept[2] + at;
-    float *const last = g->kept[3] + at, *const limited = g->kept[4] + at;
+    float *const sum = g->error_sum + at, *const top = g->top + at, *const low = g->bottom + at;
+    float *const last = g->last_outside + at, *const limited = g->limited + at;
     const vf size = vf_size(vf_sub(desired, arrived)), count = vf_load(limited);
     const vm at_limit = vm_or(vm_reaches(u, vf_load(g->u_high + at)),
                               vm_reaches(vf_load(g->u_low + at), u));

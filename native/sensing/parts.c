@@ -84,7 +84,7 @@ static void judge_runs(const parts_plan *plan, const double *y, run runs[][PARTS
     }
 }
 
-void cut_parts(const parts_plan *plan, const double *y, part *parts, parts_result *out)
+void parts_cut(const parts_plan *plan, const double *y, parts_part *parts, parts_result *out)
 {
     const size_t pieces = plan->pieces;
     run runs[PARTS_PIECES][PARTS_PIECES];
@@ -127,7 +127,7 @@ void cut_parts(const parts_plan *plan, const double *y, part *parts, parts_resul
     for (end = pieces; end > 0;) {
         if (in_part) {
             const run *taken = &runs[begins[end]][end - begins[end] - 1];
-            const part one = {(int32_t)begins[end], (int32_t)(end - begins[end]), taken->size,
+            const parts_part one = {(int32_t)begins[end], (int32_t)(end - begins[end]), taken->size,
                               taken->kind};
             out->misfit += taken->cost - plan->price * taken->size;
             parts[found++] = one;
@@ -137,5 +137,5 @@ void cut_parts(const parts_plan *plan, const double *y, part *parts, parts_resul
         }
         in_part = !in_part;
     }
-    out->parts = (double)found;
+    out->parts = (int32_t)found;
 }

@@ -33,17 +33,17 @@ typedef struct {
 
 typedef struct {
     int32_t first, count, size, kind;
-} part;
+} parts_part;
 
 typedef struct {
     double score;  /* chi-square and prices */
     double misfit; /* chi-square of what counts */
-    double parts;
+    int32_t parts;
 } parts_result;
 
 /* y: level and slope of each piece in standard deviations, voltage then current. Gives the cut of
  * least score; parts: room for `pieces` of them, the last one first. */
-void cut_parts(const parts_plan *plan, const double *y, part *parts, parts_result *out);
+void parts_cut(const parts_plan *plan, const double *y, parts_part *parts, parts_result *out);
 
 #ifdef __cplusplus
 }

@@ -3,7 +3,6 @@
 
 #include <string.h>
 
-#define PIECE_MOST 65535
 #define LINE 64 /* bytes that memory gives at once */
 
 /* ---- readings of any type as floats ------------------------------------------------------- */
@@ -87,8 +86,8 @@ static void load(sense_type type, const void *v, const void *i, size_t stride, s
     }
 }
 
-void load_readings(sense_type type, const void *v, const void *i, size_t stride, size_t at,
-                   size_t n, float *out_v, float *out_i)
+void sense_load(sense_type type, const void *v, const void *i, size_t stride, size_t at, size_t n,
+                float *out_v, float *out_i)
 {
     load(type, later(type, v, stride * at), later(type, i, stride * at), stride, n, 0, out_v,
          out_i);
@@ -109,7 +108,8 @@ HS_CLONES static int32_t largest(const float *x, size_t n, int32_t most)
 
 /* ---- sums ---------------------------------------------------------------------------------- */
 
-static void keep_all(const sense_plan *plan, const hs_sums *sums, columns *all, unsigned *reason)
+static void keep_all(const sense_plan *plan, const hs_sums *sums, sense_columns *all,
+                     unsigned *reason)
 {
     static const hs_sums none = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     const size_t pieces = (plan->samples + plan->piece - 1) / plan->piece;
@@ -126,8 +126,8 @@ static void keep_all(const sense_plan *plan, const hs_sums *sums, columns *all, 
     }
 }
 
-HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, size_t p, float *x,
-                               size_t n)
+HS_CLONES static void take_off(const sense_plan *plan, const sense_carrier *known, size_t p,
+                               float *x, size_t n)
 {
     const float a = (float)(known->a * plan->turn_cos[p] + known->b * plan->turn_sin[p]);
     const float b = (float)(known->b * plan->turn_cos[p] - known->a * plan->turn_sin[p]);
@@ -137,13 +137,14 @@ HS_CLONES static void take_off(const sense_plan *plan, const carrier *known, siz
     }
 }
 
-unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                   size_t stride, size_t ahead, const carrier *known, columns all[2])
+unsigned sense_sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                         size_t stride, size_t ahead, const sense_carrier *known, float *room,
+                         sense_columns all[2])
 {
     const int limited = plan->full_scale <= HS_LARGEST || plan->current_limit <= HS_LARGEST;
     const int as_they_are = type == SENSE_FLOAT && stride == 1 && known == NULL;
+    float *rooms[2] = {room, room + plan->piece};
     hs_sums sums[2][SENSE_ALL];
-    float room[2][PIECE_MOST];
     int32_t bits[2] = {0, 0};
     float most[2];
     unsigned reason = 0;
@@ -152,17 +153,17 @@ unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const
     for (p = 0, from = 0; from < plan->samples; ++p, from += plan->piece) {
         const size_t left = plan->samples - from, n = left < plan->piece ? left : plan->piece;
         const void *at[2] = {later(type, v, stride * from), later(type, i, stride * from)};
-        const float *x[2] = {room[0], room[1]};
+        const float *x[2] = {rooms[0], rooms[1]};
         if (as_they_are) {
             x[0] = at[0];
             x[1] = at[1];
         } else {
-            load(type, at[0], at[1], stride, n, ahead, room[0], room[1]);
+            load(type, at[0], at[1], stride, n, ahead, rooms[0], rooms[1]);
         }
         for (j = 0; j < 2; ++j) {
             bits[j] = limited ? largest(x[j], n, bits[j]) : 0;
             if (known != NULL) {
-                take_off(plan, &known[j], p, room[j], n);
+                take_off(plan, &known[j], p, rooms[j], n);
             }
             plan->sum(x[j], n, plan->cosine, plan->sine, plan->piece, as_they_are ? ahead : 0,
                       &sums[j][p]);
@@ -182,18 +183,18 @@ unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const
 
 /* ---- each piece ---------------------------------------------------------------------------- */
 
-HS_CLONES void fit_pieces(const sense_plan *plan, const columns *x, channel *out)
+HS_CLONES void sense_fit_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out)
 {
     const double m = (double)plan->piece, middle = 0.5 * (m - 1.0), first = x->first[plan->start];
-    const double *w = plan->local_inverse;
+    const double(*w)[4] = plan->local_inverse;
     size_t p;
     for (p = 0; p < plan->padded; ++p) {
         const double c = x->cosine[p], s = x->sine[p], l = x->level[p];
         const double u = (x->ramp[p] - middle * l) / m;
-        const double a = w[0] * c + w[1] * s + w[2] * l + w[3] * u;
-        const double b = w[4] * c + w[5] * s + w[6] * l + w[7] * u;
-        const double h = w[8] * c + w[9] * s + w[10] * l + w[11] * u;
-        const double g = w[12] * c + w[13] * s + w[14] * l + w[15] * u;
+        const double a = w[0][0] * c + w[0][1] * s + w[0][2] * l + w[0][3] * u;
+        const double b = w[1][0] * c + w[1][1] * s + w[1][2] * l + w[1][3] * u;
+        const double h = w[2][0] * c + w[2][1] * s + w[2][2] * l + w[2][3] * u;
+        const double g = w[3][0] * c + w[3][1] * s + w[3][2] * l + w[3][3] * u;
         out->a[p] = a;
         out->b[p] = b;
         out->height[p] = h + x->first[p] - first;
@@ -201,7 +202,7 @@ HS_CLONES void fit_pieces(const sense_plan *plan, const columns *x, channel *out
     }
 }
 
-HS_CLONES void turn_pieces(const sense_plan *plan, const columns *x, channel *out)
+HS_CLONES void sense_turn_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out)
 {
     const double m = (double)plan->piece, n = (double)plan->samples, first = x->first[plan->start];
     const size_t rest = plan->samples - plan->pieces * plan->piece;

@@ -17,32 +17,33 @@ typedef struct {
     double square[SENSE_ALL];
     /* Each full piece on its own: phasor (a cos + b sin) from its first sample, level, residual. */
     double a[SENSE_ALL], b[SENSE_ALL], height[SENSE_ALL], rest[SENSE_ALL];
-} channel;
+} sense_channel;
 
 /* Raw sums, one array a kind so that all pieces go through one vector instruction. */
 typedef struct {
     double first[SENSE_ALL], cosine[SENSE_ALL], sine[SENSE_ALL], level[SENSE_ALL];
     double ramp[SENSE_ALL], square[SENSE_ALL];
-} columns;
+} sense_columns;
 
 /* A carrier that is taken off the readings before they are summed, from the block's first sample. */
 typedef struct {
     double a, b; /* a cos + b sin */
-} carrier;
+} sense_carrier;
 
-/* Sums of all pieces of both channels. known: what is taken off both channels, or NULL. Returns the
- * reasons that the readings themselves give. */
-unsigned sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                   size_t stride, size_t ahead, const carrier *known, columns all[2]);
+/* Sums of all pieces of both channels. known: what is taken off both channels, or NULL. room: as
+ * sense_room() says. Returns the reasons that the readings themselves give. */
+unsigned sense_sum_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                         size_t stride, size_t ahead, const sense_carrier *known, float *room,
+                         sense_columns all[2]);
 
 /* `n` readings of both channels from sample `at` on, as floats. */
-void load_readings(sense_type type, const void *v, const void *i, size_t stride, size_t at,
-                   size_t n, float *out_v, float *out_i);
+void sense_load(sense_type type, const void *v, const void *i, size_t stride, size_t at, size_t n,
+                float *out_v, float *out_i);
 
 /* Full pieces on their own: least squares over cos, sin, 1, ramp. */
-void fit_pieces(const sense_plan *plan, const columns *x, channel *out);
+void sense_fit_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out);
 
 /* The pieces' sums about one reading and over the basis of the whole block. */
-void turn_pieces(const sense_plan *plan, const columns *x, channel *out);
+void sense_turn_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out);
 
 #endif

@@ -111,7 +111,7 @@ HS_CLONES static float sum_products(const float *v, const float *i, size_t n, fl
 }
 
 /* The carrier's table a piece further on, the model's constants at sample `from` of piece p. */
-static void leave_strip(const sense_plan *plan, const plain_model *model, size_t p, size_t from,
+static void leave_strip(const sense_plan *plan, const sense_model *model, size_t p, size_t from,
                         double after, const float *x, size_t n, float *rest, strip_sums *out)
 {
     const double size = (double)plan->samples, start = (double)(p * plan->piece + from);
@@ -129,9 +129,9 @@ static void leave_strip(const sense_plan *plan, const plain_model *model, size_t
     rest[n] = 0.0f;
 }
 
-void sum_residual(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                  size_t stride, const sense_choice *choice, const plain_model model[2],
-                  residual *out)
+void sense_sum_residual(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                        size_t stride, const sense_choice *choice, const sense_model model[2],
+                        sense_residual *out)
 {
     float readings[2][STRIP], rest[2][STRIP + 1];
     strip_sums sums[2];
@@ -148,7 +148,7 @@ void sum_residual(const sense_plan *plan, sense_type type, const void *v, const 
         for (from = 0; from < plan->piece; from += STRIP) {
             const size_t left = plan->piece - from, n = left < STRIP ? left : STRIP;
             const size_t at = p * plan->piece + from;
-            load_readings(type, v, i, stride, at, n, readings[0], readings[1]);
+            sense_load(type, v, i, stride, at, n, readings[0], readings[1]);
             for (j = 0; j < 2; ++j) {
                 leave_strip(plan, &model[j], p, from, choice->after[p], readings[j], n, rest[j],
                             &sums[j]);

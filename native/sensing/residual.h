@@ -10,7 +10,7 @@ typedef struct {
     double level, slope;  /* in the block's middle, unit of the readings; per block */
     double step;          /* of the pieces after an update */
     double turn;          /* rad a piece that the carrier runs ahead of its nominal frequency */
-} plain_model;
+} sense_model;
 
 /* Sums over the residual r of the samples that count. */
 typedef struct {
@@ -21,11 +21,11 @@ typedef struct {
     double most[2];        /* largest |r| */
     double cross;          /* sum of r_v r_i */
     double samples;
-} residual;
+} sense_residual;
 
 /* One more pass over the readings of the pieces that count. */
-void sum_residual(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                  size_t stride, const sense_choice *choice, const plain_model model[2],
-                  residual *out);
+void sense_sum_residual(const sense_plan *plan, sense_type type, const void *v, const void *i,
+                        size_t stride, const sense_choice *choice, const sense_model model[2],
+                        sense_residual *out);
 
 #endif

@@ -10,34 +10,34 @@
 /* ---- least squares over the pieces of a choice -------------------------------------------- */
 
 typedef struct {
-    double x[SENSE_BASIS]; /* cos, sin, level, ramp, step */
+    double x[SENSE_BASIS];
     double noise;          /* variance of a reading, from the pieces on their own */
     double explained;      /* sum of squares that the fit takes */
 } fit;
 
-HS_CLONES static void solve(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                            fit *out)
+HS_CLONES static void solve(const sense_plan *plan, const sense_channel *ch,
+                            const sense_choice *choice, fit *out)
 {
     double b[SENSE_BASIS] = {0};
     size_t p, i, j;
     for (p = 0; p < plan->padded; ++p) {
-        b[0] += choice->used[p] * ch->cosine[p];
-        b[1] += choice->used[p] * ch->sine[p];
-        b[2] += choice->used[p] * ch->level[p];
-        b[3] += choice->used[p] * ch->ramp[p];
-        b[4] += choice->after[p] * ch->level[p];
+        b[SENSE_COS] += choice->used[p] * ch->cosine[p];
+        b[SENSE_SIN] += choice->used[p] * ch->sine[p];
+        b[SENSE_LEVEL] += choice->used[p] * ch->level[p];
+        b[SENSE_RAMP] += choice->used[p] * ch->ramp[p];
+        b[SENSE_STEP] += choice->after[p] * ch->level[p];
     }
     out->explained = 0.0;
     for (i = 0; i < SENSE_BASIS; ++i) {
         out->x[i] = 0.0;
         for (j = 0; j < SENSE_BASIS; ++j) {
-            out->x[i] += choice->inverse[SENSE_BASIS * i + j] * b[j];
+            out->x[i] += choice->inverse[i][j] * b[j];
         }
         out->explained += out->x[i] * b[i];
     }
 }
 
-static double noise_of(const sense_plan *plan, const channel *ch, const sense_choice *choice)
+static double noise_of(const sense_plan *plan, const sense_channel *ch, const sense_choice *choice)
 {
     double rest = 0.0;
     size_t p;
@@ -49,7 +49,7 @@ static double noise_of(const sense_plan *plan, const channel *ch, const sense_ch
 }
 
 /* Squared residual over the pieces of a choice. */
-static double left_over(const sense_plan *plan, const channel *ch, const sense_choice *choice,
+static double left_over(const sense_plan *plan, const sense_channel *ch, const sense_choice *choice,
                         const fit *f)
 {
     double square = 0.0;
@@ -77,11 +77,11 @@ typedef struct {
 } scatter;
 
 /* turn: rad a piece, taken out before. */
-HS_CLONES static void scatter_of(const sense_plan *plan, const channel *ch,
+HS_CLONES static void scatter_of(const sense_plan *plan, const sense_channel *ch,
                                  const sense_choice *choice, double noise, double turn,
                                  scatter *out)
 {
-    const double *w = plan->local_whitening, size = choice->full;
+    const double(*w)[2] = plan->local_whitening, size = choice->full;
     double re[SENSE_ALL], im[SENSE_ALL], at[SENSE_ALL], counts[SENSE_ALL];
     double middle = 0.0, spread = 0.0, re0 = 0.0, im0 = 0.0, re1 = 0.0, im1 = 0.0, chi2 = 0.0;
     double square;
@@ -122,7 +122,7 @@ HS_CLONES static void scatter_of(const sense_plan *plan, const channel *ch,
         const double x = re[p] - re0 - re1 * at[p], y = im[p] - im0 - im1 * at[p];
         const double a = x * plan->turn_cos[p] - y * plan->turn_sin[p];
         const double b = -x * plan->turn_sin[p] - y * plan->turn_cos[p];
-        chi2 += counts[p] * (w[0] * a * a + 2.0 * w[1] * a * b + w[2] * b * b);
+        chi2 += counts[p] * (w[0][0] * a * a + 2.0 * w[0][1] * a * b + w[1][1] * b * b);
     }
     square = re0 * re0 + im0 * im0;
     noise += ROUNDED * square + ROUNDED_LEVEL * ch->first * ch->first;
@@ -130,14 +130,14 @@ HS_CLONES static void scatter_of(const sense_plan *plan, const channel *ch,
     out->freedom = 2.0 * size - 4.0;
     if (square > 0.0) {
         out->turn = turn + (im1 * re0 - re1 * im0) / square;
-        out->turn_weight = square * spread * 0.5 * (w[0] + w[2]) / noise;
+        out->turn_weight = square * spread * 0.5 * (w[0][0] + w[1][1]) / noise;
     }
 }
 
 /* Turned with the carrier where it is clearly off its nominal frequency: that turns both monitors
  * alike and leaves their ratio. Returns the turn in rad a piece. */
-static double follow_carrier(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                             double noise, scatter *s)
+static double follow_carrier(const sense_plan *plan, const sense_channel *ch,
+                             const sense_choice *choice, double noise, scatter *s)
 {
     double turn = 0.0;
     size_t round;
@@ -154,8 +154,8 @@ static double follow_carrier(const sense_plan *plan, const channel *ch, const se
 }
 
 /* Levels of the pieces about the fit's straight line, in variances of the noise. */
-static double level_misfit(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                           const fit *f, double noise)
+static double level_misfit(const sense_plan *plan, const sense_channel *ch,
+                           const sense_choice *choice, const fit *f, double noise)
 {
     const double m = (double)plan->piece, n = (double)plan->samples;
     double sum = 0.0;
@@ -165,14 +165,15 @@ static double level_misfit(const sense_plan *plan, const channel *ch, const sens
     }
     for (p = 0; p < plan->pieces; ++p) {
         const double at = (m * (double)p + 0.5 * (m - 1.0) - 0.5 * (n - 1.0)) / n;
-        const double off = ch->height[p] - f->x[2] - f->x[3] * at - choice->after[p] * f->x[4];
+        const double off = ch->height[p] - f->x[SENSE_LEVEL] - f->x[SENSE_RAMP] * at -
+                           choice->after[p] * f->x[SENSE_STEP];
         sum += choice->used[p] * off * off;
     }
-    return sum / (noise * plan->local_inverse[10]);
+    return sum / (noise * plan->local_inverse[SENSE_LEVEL][SENSE_LEVEL]);
 }
 
 /* Noise that one disturbed place cannot raise: the smaller of both halves of the block. */
-static double calm_noise(const sense_plan *plan, const channel *ch)
+static double calm_noise(const sense_plan *plan, const sense_channel *ch)
 {
     const size_t half = plan->pieces / 2;
     const double freedom = (double)half * ((double)plan->piece - 4.0);
@@ -187,7 +188,7 @@ static double calm_noise(const sense_plan *plan, const channel *ch)
 }
 
 /* The choice under which both channels together leave least, if an update hit the block at all. */
-static size_t find_update(const sense_plan *plan, const channel ch[2])
+static size_t find_update(const sense_plan *plan, const sense_channel ch[2])
 {
     const sense_choice *planned = plan->choices;
     const double expected = (double)plan->pieces;
@@ -250,16 +251,23 @@ static unsigned judge(const sense_plan *plan, const scatter *s, double turn, sen
     return reason;
 }
 
-static void put_channel(const sense_plan *plan, const channel *ch, const sense_choice *choice,
-                        double *phasor, double *noise, double *level, double *slope,
-                        fit *f)
+/* The plain model of one channel, as the result has it. */
+typedef struct {
+    fit f;
+    double re, im, noise, level, slope;
+} channel_fit;
+
+static channel_fit fit_channel(const sense_plan *plan, const sense_channel *ch,
+                               const sense_choice *choice)
 {
-    solve(plan, ch, choice, f);
-    phasor[0] = ch->known_a + f->x[0];
-    phasor[1] = -(ch->known_b + f->x[1]); /* x = re cos - im sin */
-    *noise = noise_of(plan, ch, choice);
-    *level = ch->first + f->x[2] + choice->after_share * f->x[4];
-    *slope = f->x[3] / ((double)plan->samples * plan->period_s);
+    channel_fit out;
+    solve(plan, ch, choice, &out.f);
+    out.re = ch->known_a + out.f.x[SENSE_COS];
+    out.im = -(ch->known_b + out.f.x[SENSE_SIN]); /* x = re cos - im sin */
+    out.noise = noise_of(plan, ch, choice);
+    out.level = ch->first + out.f.x[SENSE_LEVEL] + choice->after_share * out.f.x[SENSE_STEP];
+    out.slope = out.f.x[SENSE_RAMP] / ((double)plan->samples * plan->period_s);
+    return out;
 }
 
 /* ---- is what is left noise? --------------------------------------------------------------- */
@@ -276,27 +284,27 @@ static int beyond(double chi2, double freedom)
 }
 
 static unsigned suspect(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                        size_t stride, const channel ch[2], const sense_choice *choice,
-                        const fit f[2], double turn, sense_result *out)
+                        size_t stride, const sense_channel ch[2], const sense_choice *choice,
+                        const channel_fit fits[2], double turn, sense_result *out)
 {
-    const double noise[2] = {out->v_noise, out->i_noise};
     const double root = sqrt(choice->samples);
     double third[2], variance[2];
-    plain_model model[2];
-    residual r;
+    sense_model model[2];
+    sense_residual r;
     scatter s;
     unsigned found = 0;
     size_t j, clear = 0;
 
     for (j = 0; j < 2; ++j) {
-        model[j].a = ch[j].known_a + f[j].x[0];
-        model[j].b = ch[j].known_b + f[j].x[1];
-        model[j].level = ch[j].first + f[j].x[2];
-        model[j].slope = f[j].x[3];
-        model[j].step = f[j].x[4];
+        const double *x = fits[j].f.x;
+        model[j].a = ch[j].known_a + x[SENSE_COS];
+        model[j].b = ch[j].known_b + x[SENSE_SIN];
+        model[j].level = ch[j].first + x[SENSE_LEVEL];
+        model[j].slope = x[SENSE_RAMP];
+        model[j].step = x[SENSE_STEP];
         model[j].turn = turn;
     }
-    sum_residual(plan, type, v, i, stride, choice, model, &r);
+    sense_sum_residual(plan, type, v, i, stride, choice, model, &r);
     out->v3_re = r.third_re[0];
     out->v3_im = r.third_im[0];
     out->i3_re = r.third_re[1];
@@ -314,10 +322,11 @@ static unsigned suspect(const sense_plan *plan, sense_type type, const void *v, 
         found |= fabs(r.next[j]) > OFTEN / root * r.square[j] ? SENSE_COLOUR : 0u;
         found |= third[j] * r.samples > 2.0 * RARE * variance[j] ? SENSE_THIRD : 0u;
         found |= r.most[j] * r.most[j] > LONE * LONE * variance[j] ? SENSE_PEAK : 0u;
-        found |= beyond(level_misfit(plan, &ch[j], choice, &f[j], noise[j]), choice->full - 2.0)
+        found |= beyond(level_misfit(plan, &ch[j], choice, &fits[j].f, fits[j].noise),
+                        choice->full - 2.0)
                      ? SENSE_DRIVE
                      : 0u;
-        scatter_of(plan, &ch[j], choice, noise[j], turn, &s);
+        scatter_of(plan, &ch[j], choice, fits[j].noise, turn, &s);
         found |= beyond(s.chi2, s.freedom) ? SENSE_SCATTER : 0u;
     }
     if (clear == 2) {
@@ -328,7 +337,7 @@ static unsigned suspect(const sense_plan *plan, sense_type type, const void *v, 
 }
 
 /* Squares of the carrier and of the noise are too far apart for single precision. */
-static int drowned(const sense_plan *plan, const channel *ch)
+static int drowned(const sense_plan *plan, const sense_channel *ch)
 {
     double square = 0.0, rest = 0.0;
     size_t p;
@@ -341,20 +350,20 @@ static int drowned(const sense_plan *plan, const channel *ch)
 
 /* Sums of a block without its carrier, which is added again to what follows from them. */
 static void sum_again(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                      size_t stride, columns all[2], channel ch[2])
+                      size_t stride, float *room, sense_columns all[2], sense_channel ch[2])
 {
-    carrier known[2];
+    sense_carrier known[2];
     size_t j, p;
     for (j = 0; j < 2; ++j) {
         fit f;
         solve(plan, &ch[j], plan->choices, &f);
-        known[j].a = f.x[0];
-        known[j].b = f.x[1];
+        known[j].a = f.x[SENSE_COS];
+        known[j].b = f.x[SENSE_SIN];
     }
-    sum_block(plan, type, v, i, stride, 0, known, all);
+    sense_sum_block(plan, type, v, i, stride, 0, known, room, all);
     for (j = 0; j < 2; ++j) {
-        fit_pieces(plan, &all[j], &ch[j]);
-        turn_pieces(plan, &all[j], &ch[j]);
+        sense_fit_pieces(plan, &all[j], &ch[j]);
+        sense_turn_pieces(plan, &all[j], &ch[j]);
         ch[j].known_a = known[j].a;
         ch[j].known_b = known[j].b;
         for (p = 0; p < plan->pieces; ++p) {
@@ -364,38 +373,49 @@ static void sum_again(const sense_plan *plan, sense_type type, const void *v, co
     }
 }
 
+size_t sense_room(const sense_plan *plan) { return 2 * plan->piece; }
+
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, size_t ahead, int tested, sense_result *out)
+                 size_t stride, size_t ahead, int tested, float *room, sense_result *out)
 {
     const sense_choice *choice;
-    columns all[2];
-    channel ch[2];
-    fit f[2];
+    sense_columns all[2];
+    sense_channel ch[2];
+    channel_fit fits[2];
     scatter s;
     double turn;
     unsigned reason;
     size_t j, taken;
 
-    reason = sum_block(plan, type, v, i, stride, ahead, NULL, all);
+    memset(out, 0, sizeof *out);
+    reason = sense_sum_block(plan, type, v, i, stride, ahead, NULL, room, all);
     for (j = 0; j < 2; ++j) {
-        fit_pieces(plan, &all[j], &ch[j]);
-        turn_pieces(plan, &all[j], &ch[j]);
+        sense_fit_pieces(plan, &all[j], &ch[j]);
+        sense_turn_pieces(plan, &all[j], &ch[j]);
     }
     if (drowned(plan, &ch[0]) || drowned(plan, &ch[1])) {
-        sum_again(plan, type, v, i, stride, all, ch);
+        sum_again(plan, type, v, i, stride, room, all, ch);
     }
     taken = plan->choice_count > 1 && reason == 0 ? find_update(plan, ch) : 0;
     choice = &plan->choices[taken];
-    put_channel(plan, &ch[0], choice, &out->v_re, &out->v_noise, &out->v_level, &out->v_slope,
-                &f[0]);
-    put_channel(plan, &ch[1], choice, &out->i_re, &out->i_noise, &out->i_level, &out->i_slope,
-                &f[1]);
+    for (j = 0; j < 2; ++j) {
+        fits[j] = fit_channel(plan, &ch[j], choice);
+    }
+    out->v_re = fits[0].re;
+    out->v_im = fits[0].im;
+    out->v_noise = fits[0].noise;
+    out->v_level = fits[0].level;
+    out->v_slope = fits[0].slope;
+    out->i_re = fits[1].re;
+    out->i_im = fits[1].im;
+    out->i_noise = fits[1].noise;
+    out->i_level = fits[1].level;
+    out->i_slope = fits[1].slope;
     turn = follow_carrier(plan, &ch[0], choice, out->v_noise, &s);
     reason |= judge(plan, &s, turn, out);
-    out->suspicion = out->v3_re = out->v3_im = out->i3_re = out->i3_im = 0.0;
     if (tested) {
-        out->suspicion = (double)suspect(plan, type, v, i, stride, ch, choice, f, turn, out);
+        out->suspicion = suspect(plan, type, v, i, stride, ch, choice, fits, turn, out);
     }
-    out->choice = (double)taken;
-    out->reason = (double)reason;
+    out->choice = (uint32_t)taken;
+    out->reason = reason;
 }

@@ -19,7 +19,9 @@ extern "C" {
 
 #define SENSE_PIECES 32 /* full pieces in a block, at most */
 #define SENSE_ALL (SENSE_PIECES + 8) /* and the rest; a multiple of 8 */
-#define SENSE_BASIS 5 /* cos, sin, 1, ramp over the block (-1/2 to 1/2), 1 after the update */
+
+/* Functions over a block: the ramp goes from -1/2 to 1/2, the step is 1 after the update. */
+enum { SENSE_COS, SENSE_SIN, SENSE_LEVEL, SENSE_RAMP, SENSE_STEP, SENSE_BASIS };
 
 typedef enum { SENSE_INT16, SENSE_FLOAT, SENSE_DOUBLE } sense_type;
 
@@ -27,7 +29,7 @@ typedef enum { SENSE_INT16, SENSE_FLOAT, SENSE_DOUBLE } sense_type;
 typedef struct {
     double used[SENSE_ALL];
     double after[SENSE_ALL];
-    double inverse[SENSE_BASIS * SENSE_BASIS];
+    double inverse[SENSE_BASIS][SENSE_BASIS];
     double samples;     /* that count */
     double full;        /* full pieces that count */
     double after_share; /* of the samples that count, those after the update */
@@ -45,8 +47,8 @@ typedef struct {
     const float *cosine3, *sine3;       /* of its third harmonic */
     double table[2][2];                 /* sums of cosine and sine: full piece, rest */
     double turn_cos[SENSE_ALL], turn_sin[SENSE_ALL]; /* phase at each piece's first sample */
-    double local_inverse[16];           /* (B'B)^-1 of one full piece: cos, sin, 1, ramp */
-    double local_whitening[3];          /* inverse of its upper left 2 x 2: cc, cs, ss */
+    double local_inverse[4][4];         /* (B'B)^-1 of one full piece: cos, sin, 1, ramp */
+    double local_whitening[2][2];       /* inverse of its upper left 2 x 2 */
     double period_s;                    /* between samples */
     double omega_rad_s;                 /* nominal carrier */
     float full_scale, current_limit;    /* unit of the readings */
@@ -62,10 +64,10 @@ typedef struct {
     double v_slope, i_slope;       /* per s */
     double excess; /* scatter of the pieces' phasors over that of the noise, variances; 1: none */
     double offset_rad_s;           /* of the carrier from its nominal frequency */
-    double choice;                 /* index of the choice that was taken */
-    double reason;                 /* HS_CLIPPED and the like, as a number */
-    double suspicion;              /* SENSE_DRIVE and the like; 0: the plain model explains it all */
     double v3_re, v3_im, i3_re, i3_im; /* third harmonic of the carrier, at the first sample */
+    uint32_t choice;               /* index of the choice that was taken */
+    uint32_t reason;               /* HS_CLIPPED and the like */
+    uint32_t suspicion;            /* SENSE_DRIVE and the like; 0: the plain model explains it all */
 } sense_result;
 
 /* What the plain model leaves; each is exceeded by noise in about one block of 10,000. */
@@ -76,11 +78,14 @@ typedef struct {
 #define SENSE_PEAK 16u  /* a single reading */
 #define SENSE_CROSS 32u /* both channels' residuals at one instant */
 
+/* Floats of room that one call of sense_block needs: both channels of a piece. */
+size_t sense_room(const sense_plan *plan);
+
 /* One block of `plan->samples` readings a channel, `stride` apart. ahead: memory so many bytes
  * further on is asked for as the block is read; 0 where none follows. tested: whether what the
  * plain model leaves is looked at, which takes as long as the fit and more. */
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
-                 size_t stride, size_t ahead, int tested, sense_result *out);
+                 size_t stride, size_t ahead, int tested, float *room, sense_result *out);
 
 #ifdef __cplusplus
 }

@@ -4,7 +4,7 @@
 #include <math.h>   /* ceil, fabs, sqrtf, isfinite */
 #include <string.h> /* strcmp, memset */
 
-#include "tracking/track_kernels.h"
+#include "tracking/kernels/track_kernels.h"
 
 enum {
     BLOCK = 32,

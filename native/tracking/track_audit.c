@@ -84,8 +84,8 @@ static double ratio_of(double left, double spread)
     return ratio < MOST_RATIO ? ratio : MOST_RATIO;
 }
 
-struct track_audit track_audit_frame(const struct track_points *p, const double *found,
-                                     double *scratch)
+struct track_audit track_audit_frame(const struct track_points *p,
+                                     const struct track_found *found, double *scratch)
 {
     const int count = p->count, step = (count + AUDITED - 1) / AUDITED;
     double quadratic = 0.0, affine = 0.0, *moves = scratch;
@@ -93,11 +93,10 @@ struct track_audit track_audit_frame(const struct track_points *p, const double 
     for (int i = 0; p->neighbours && i < count; ++i) {
         double rest[2];
         rest_place(p, i, rest);
-        for (int m = 0; m < 2; ++m) {
-            const double std = found[(2 + m) * count + i];
-            moves[4 * i + m] = found[m * count + i] - rest[m];
-            moves[4 * i + 2 + m] = std * std;
-        }
+        moves[4 * i] = found->x[i] - rest[0];
+        moves[4 * i + 1] = found->y[i] - rest[1];
+        moves[4 * i + 2] = found->std_x[i] * found->std_x[i];
+        moves[4 * i + 3] = found->std_y[i] * found->std_y[i];
     }
     for (int i = 0; p->neighbours && i < count; i += step) {
         double left[4] = {0.0}, spread[4] = {0.0};

@@ -31,7 +31,17 @@ enum track_reason {
     TRACK_AMBIGUOUS = 128 /* set by the caller: another place explains the frame as well */
 };
 
-enum { TRACK_NOISE_ROW = 13, TRACK_WHITE_STEPS = 32 };
+enum { TRACK_WHITE_STEPS = 32 };
+
+/* Of one point: covariances as xx, xy, yy. */
+struct track_noise {
+    float even[3];      /* of the displacement times amplitude^2, for a variance of 1 that is even */
+    float shaped[3];    /* and for one that follows the shape */
+    float reference[3]; /* of the reference, px^2 */
+    float norm, level;  /* of the template */
+    float residual_share; /* of white noise that the residual keeps */
+    float averaged;       /* one over the frames averaged into the template */
+};
 
 struct track_points {
     int count, side, stride, unknowns;
@@ -39,11 +49,7 @@ struct track_points {
     const double *centre; /* of each subset in the first reference, px: x, y */
     const double *offset; /* the point less its subset's centre, px */
     const double *base;   /* inverse of the deformation gradient at which the template was taken */
-    /* of each point: covariance of the displacement for a variance of 1 that is even, and that
-     * follows the shape (xx, xy, yy each, times amplitude^2); covariance of the reference, px^2;
-     * norm and level of the template; share of white noise that the residual keeps; one over the
-     * frames averaged into the template */
-    const float *noise;
+    const struct track_noise *noise;
     const float *white; /* share of white noise left by sampling at fraction k / 32 */
 
     int neighbours;        /* of each point, 0 for none */
@@ -75,20 +81,21 @@ struct track_rules {
     float noise_floor, noise_slope; /* variance = floor + slope * grey */
 };
 
-/* What is carried from frame to frame: poses (x, y, f), last motion px (x, y), reasons; and the
+/* What is carried from frame to frame: poses, last motion px (x, y), reasons; and the
  * common gain, the median over the points of their contrast over the reference's, 0 before the
  * first frame. It may double or halve from one frame to the next, no more, unless three quarters of
  * the points agree on it to a quarter: then the light has changed. A frame in which most points
  * sit on something else does not make that the rule. */
 struct track_memory {
-    double *poses, *velocity;
+    struct track_pose *poses;
+    double *velocity;
     unsigned char *reasons;
     double *gain;
 };
 
-/* x of all points, then y, std x and std y, px; NaN where one is not valid. And correlations. */
+/* All points and their deviations, px; NaN where one is not valid. And correlations. */
 struct track_found {
-    double *points, *quality;
+    double *x, *y, *std_x, *std_y, *quality;
 };
 
 size_t track_step_size(const struct track_points *points, const struct track_frame *frame,
@@ -118,15 +125,15 @@ struct track_summary track_step(const struct track_kernels *kernels,
                                 const struct track_memory *after, const struct track_found *found,
                                 void *scratch);
 
-/* The audit of one frame, from a sample of at most 60 points; `found` as in track_found.points,
+/* The audit of one frame, from a sample of at most 60 points; the quality does not matter.
  * `scratch` of 4 doubles a point. */
-struct track_audit track_audit_frame(const struct track_points *points, const double *found,
-                                     double *scratch);
+struct track_audit track_audit_frame(const struct track_points *points,
+                                     const struct track_found *found, double *scratch);
 
 /* The frame's grey levels, less half the range, at the samples of each point's subset as its pose
  * puts them: `stride` floats a point. A point whose subset reaches over the edge has only NaN. */
 void track_samples(const struct track_kernels *kernels, const struct track_points *points,
-                   const struct track_frame *frame, const double *poses, float *out,
+                   const struct track_frame *frame, const struct track_pose *poses, float *out,
                    void *scratch);
 
 #endif

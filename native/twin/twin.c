@@ -260,19 +260,19 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
 
 /* First-order lag, exact for an input that is a straight line from sample to sample. Without a lag
  * the output is the input, bit for bit. */
-static void prepare_lag(double *lag, double lag_s, double sample_s)
+static void prepare_lag(twin_lag *lag, double lag_s, double sample_s)
 {
     const double x = lag_s > 0.0 ? sample_s / lag_s : 0.0;
     const double decay = lag_s > 0.0 ? exp(-x) : 0.0;
     const double mean = lag_s > 0.0 ? (1.0 - decay) / x : 0.0;
-    lag[0] = decay;
-    lag[1] = mean - decay;
-    lag[2] = 1.0 - mean;
+    lag->last_output = decay;
+    lag->last_input = mean - decay;
+    lag->input = 1.0 - mean;
 }
 
-static double follow(const double *lag, double *shown, double *seen, double input)
+static double follow(const twin_lag *lag, double *shown, double *seen, double input)
 {
-    *shown = lag[0] * *shown + lag[1] * *seen + lag[2] * input;
+    *shown = lag->last_output * *shown + lag->last_input * *seen + lag->input * input;
     *seen = input;
     return *shown;
 }
@@ -291,22 +291,22 @@ void twin_prepare(twin_parameters *p)
     const double w = p->amplifier_rad_s, z = p->amplifier_damping, t = p->sample_s;
     const double d = w * sqrt(1.0 - z * z), e = exp(-z * w * t);
     const double c = cos(d * t), s = sin(d * t);
-    p->amp_a[0] = e * (c + z * w / d * s);
-    p->amp_a[1] = e * s / d;
-    p->amp_a[2] = -e * w * w / d * s;
-    p->amp_a[3] = e * (c - z * w / d * s);
-    p->amp_b[0] = 1.0 - p->amp_a[0];
-    p->amp_b[1] = -p->amp_a[2];
-    prepare_lag(p->v_lag, p->v_monitor_lag_s, t);
-    prepare_lag(p->i_lag, p->i_monitor_lag_s, t);
+    p->amp_a[0][0] = e * (c + z * w / d * s);
+    p->amp_a[0][1] = e * s / d;
+    p->amp_a[1][0] = -e * w * w / d * s;
+    p->amp_a[1][1] = e * (c - z * w / d * s);
+    p->amp_b[0] = 1.0 - p->amp_a[0][0];
+    p->amp_b[1] = -p->amp_a[1][0];
+    prepare_lag(&p->v_lag, p->v_monitor_lag_s, t);
+    prepare_lag(&p->i_lag, p->i_monitor_lag_s, t);
 }
 
 /* The amplifier for one sample: linear dynamics, then the slew and the current it can deliver. */
 static void amplify(const twin_parameters *p, twin_state *s, double target_v, double largest_step)
 {
     const double v0 = s->amp_v;
-    double v = p->amp_a[0] * v0 + p->amp_a[1] * s->amp_v_s + p->amp_b[0] * target_v;
-    double rate = p->amp_a[2] * v0 + p->amp_a[3] * s->amp_v_s + p->amp_b[1] * target_v;
+    double v = p->amp_a[0][0] * v0 + p->amp_a[0][1] * s->amp_v_s + p->amp_b[0] * target_v;
+    double rate = p->amp_a[1][0] * v0 + p->amp_a[1][1] * s->amp_v_s + p->amp_b[1] * target_v;
     if (fabs(v - v0) > largest_step) {
         const double step = v > v0 ? largest_step : -largest_step;
         v = v0 + step;
@@ -387,11 +387,11 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
             amps = later < 0.5 ? i0 + (s->current_a - i0) * (later + 0.5)
                                : s->current_a;
             normal_pair(s->random, &noise_v, &noise_i);
-            codes[2 * n] = convert(follow(p->v_lag, &s->v_shown, &s->v_seen, v0) * p->v_monitor +
+            codes[2 * n] = convert(follow(&p->v_lag, &s->v_shown, &s->v_seen, v0) * p->v_monitor +
                                        p->v_noise_v * (double)noise_v + p->v_offset_v,
                                    p->lsb_v);
             codes[2 * n + 1] =
-                convert(follow(p->i_lag, &s->i_shown, &s->i_seen, amps) * p->i_monitor +
+                convert(follow(&p->i_lag, &s->i_shown, &s->i_seen, amps) * p->i_monitor +
                             p->i_noise_v * (double)noise_i + p->i_offset_v,
                         p->lsb_v);
             sum += pulls * s->plate_v;

@@ -13,6 +13,11 @@
 #define TWIN_LENGTHS 1024
 #define TWIN_VOLTAGES 9
 
+/* One sample of a first-order lag whose input goes in straight lines. */
+typedef struct {
+    double last_output, last_input, input;
+} twin_lag;
+
 /* An actuator law as numbers on a grid of lengths and voltages, with cubics between the knots; see
  * haselab.actuators. It replaces the built-in shell, electrodes and capacitance. Losses, softening
  * and charge creep act on it as on the built-in law. */
@@ -53,9 +58,8 @@ typedef struct {
     /* converters */
     double sample_s, skew_s, lsb_v, v_noise_v, i_noise_v;
     /* zero-order-hold matrices of the amplifier for sample_s, filled by twin_prepare */
-    double amp_a[4], amp_b[2], series_decay;
-    /* the same of the monitors, whose input goes in straight lines: last output, last input, input */
-    double v_lag[3], i_lag[3];
+    double amp_a[2][2], amp_b[2], series_decay;
+    twin_lag v_lag, i_lag; /* of the monitors */
     twin_table law;
 } twin_parameters;
 

@@ -27,7 +27,7 @@ def strain_from_capacitance(
     capacitance_f: float,
 ) -> float: ...
 def limit(value: float, low: float, high: float) -> tuple[float, bool]: ...
-def capacitances_of_quarters(
+def capacitances_from_quadrature(
     turn_re: float,
     turn_im: float,
     v_low: int,

@@ -55,6 +55,9 @@ class Transfer:
 
 def autocovariance(residuals: Sequence[Floats], lags: int) -> Floats: ...
 def autoregression(covariance: Sequence[float], count: int) -> tuple[Floats, float]: ...
+
+OSCILLATOR: dict[str, int]  # place of each number of native/identification/oscillator.h
+
 def oscillate(
     u: Floats,
     input_rate_hz: float,

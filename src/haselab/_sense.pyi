@@ -5,8 +5,15 @@ from numpy.typing import NDArray
 
 PIECES: int
 ROOM: int
-COLUMNS: int
 PART_COLUMNS: int
+
+# Structs of native/sensing as numpy dtypes with the same names of fields.
+RESULT: np.dtype[np.void]
+CHOICE: np.dtype[np.void]
+SUMS: np.dtype[np.void]
+PART: np.dtype[np.void]
+PARTS_RESULT: np.dtype[np.void]
+PAPER_RESULT: np.dtype[np.void]
 
 class Plan:
     def __init__(
@@ -19,7 +26,7 @@ class Plan:
         turn: NDArray[np.float64],
         local: NDArray[np.float64],
         whitening: NDArray[np.float64],
-        choices: NDArray[np.float64],
+        choices: NDArray[np.void],
         period_s: float,
         omega_rad_s: float,
         full_scale: float,
@@ -33,16 +40,14 @@ def sum_pieces(
     cosine: NDArray[np.float32],
     sine: NDArray[np.float32],
     bits: int,
-    out: NDArray[np.float32],
+    out: NDArray[np.void],
 ) -> None: ...
-def blocks(
-    plan: Plan, readings: NDArray[Any], out: NDArray[np.float64], threads: int = 0
-) -> None: ...
+def blocks(plan: Plan, readings: NDArray[Any], out: NDArray[np.void], threads: int = 0) -> None: ...
 def channels(
     plan: Plan,
     voltage: NDArray[Any],
     current: NDArray[Any],
-    out: NDArray[np.float64],
+    out: NDArray[np.void],
     threads: int = 0,
 ) -> None: ...
 def parts(
@@ -50,8 +55,8 @@ def parts(
     tables: list[NDArray[np.float64]],
     limits: list[int],
     prices: list[float],
-    parts: NDArray[np.int32],
-    result: NDArray[np.float64],
+    parts: NDArray[np.void],
+    result: NDArray[np.void],
 ) -> None: ...
 
 class Impedance:
@@ -74,4 +79,4 @@ class Paper:
         rest: NDArray[np.float64],
         wave: NDArray[np.float64],
     ) -> None: ...
-    def step(self, blocks: NDArray[np.float64], out: NDArray[np.float64]) -> None: ...
+    def step(self, blocks: NDArray[np.float64], out: NDArray[np.void]) -> None: ...

@@ -3,6 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
+# Structs of native/tracking as numpy dtypes.
+POSE: np.dtype[np.void]  # centre_px (2,), deformation (2, 2): struct track_pose
+NOISE: np.dtype[np.void]  # struct track_noise
+
 class Rules:
     """struct track_rules."""
 
@@ -49,7 +53,7 @@ class Points:
         centre: NDArray[np.float64],
         offset: NDArray[np.float64],
         base: NDArray[np.float64],
-        noise: NDArray[np.float32],
+        noise: NDArray[np.void],
         white: NDArray[np.float32],
         near: NDArray[np.int32],
         lever: NDArray[np.float64],
@@ -64,24 +68,27 @@ def step(
     rules: Rules,
     frame: NDArray[np.uint8] | NDArray[np.uint16],
     bits: int,
-    poses: NDArray[np.float64],
+    poses: NDArray[np.void],
     velocity: NDArray[np.float64],
     reasons: NDArray[np.uint8],
     gain: NDArray[np.float64],
-    next_poses: NDArray[np.float64],
+    next_poses: NDArray[np.void],
     next_velocity: NDArray[np.float64],
     next_reasons: NDArray[np.uint8],
     next_gain: NDArray[np.float64],
-    found: NDArray[np.float64],
+    position: NDArray[np.float64],
+    std: NDArray[np.float64],
     quality: NDArray[np.float64],
     kernels: str = "",
 ) -> Summary: ...
-def audit(points: Points, found: NDArray[np.float64]) -> tuple[float, int]: ...
+def audit(
+    points: Points, position: NDArray[np.float64], std: NDArray[np.float64]
+) -> tuple[float, int]: ...
 def samples(
     points: Points,
     frame: NDArray[np.uint8] | NDArray[np.uint16],
     bits: int,
-    poses: NDArray[np.float64],
+    poses: NDArray[np.void],
     out: NDArray[np.float32],
     kernels: str = "",
 ) -> None: ...

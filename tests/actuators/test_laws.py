@@ -18,8 +18,8 @@ from haselab.actuators import (
     equilibrium_m,
 )
 from haselab.base import InputError, LimitError, Limits
-from haselab.rig.twin.bench import native_bench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import native_bench
 
 LAWS = [PlanarHasel, DeaStack]
 H = 1e-3

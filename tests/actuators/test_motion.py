@@ -19,8 +19,8 @@ from haselab.actuators import (
     simulate,
 )
 from haselab.base import InputError, SafetyError
-from haselab.rig.twin.bench import TwinBench, native_bench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, native_bench
 
 STEP_S = 1e-4
 SLOW_OIL = {"dielectric": {"relaxation_share": 0.4, "relaxation_s": 0.3}}

@@ -32,7 +32,7 @@ def run_traces(table, reference, noise=SILENT, *, bits, threads=0):
 
 
 def run_summaries(table, reference, ends, noise=SILENT, *, bits, threads=0):
-    kept = np.empty((len(table.rows), len(ends), _loops.KEPT), np.float32)
+    kept = np.empty((len(table.rows), len(ends)), _loops.SUMMARY)
     table.loops().summaries(reference, *noise, 0.05, np.array(ends, np.uint64), kept, bits, threads)
     return kept.view(np.uint32)
 
@@ -124,9 +124,9 @@ def test_each_controller_is_the_c_core_bit_for_bit(problem):
     table, reference, noise = problem
     measured, u = (x.view(np.float32) for x in run_traces(table, reference, noise, bits=512))
     for row, seen, given_out in list(zip(table.rows, measured, u, strict=True))[:4]:
-        kp, ki, kd, filter_s, low, high, start = row[18:25]
-        pid = _core.Pid(kp, ki, kd, 0.001, filter_s, low, high)
-        pid.reset(start)
+        low, high = row["u_low"], row["u_high"]
+        pid = _core.Pid(row["kp"], row["ki"], row["kd"], 0.001, row["filter_s"], low, high)
+        pid.reset(row["u"])
         out = [pid.step(float(r), float(m)) for r, m in zip(reference, seen, strict=True)]
         expected = np.array([_core.limit(value, low, high)[0] for value in out], np.float32)
         np.testing.assert_array_equal(given_out.view(np.uint32), expected.view(np.uint32))

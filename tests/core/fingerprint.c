@@ -29,8 +29,8 @@ static void demodulation(uint32_t *seed)
     hs_impedance z;
     hs_phasor v, i;
     float inverse[8];
-    const hs_quarters_config few = {1.1e9f, -0.9e9f, 100, 2147483647, 100};
-    int16_t quarters[2][HS_QUARTERS];
+    const hs_quadrature_config few = {1.1e9f, -0.9e9f, 100, 2147483647, 100};
+    int16_t samples[2][HS_QUADRATURE_SAMPLES];
     hs_capacitance farad;
     int k;
     for (k = 0; k < SAMPLES; ++k) {
@@ -50,11 +50,12 @@ static void demodulation(uint32_t *seed)
     i = hs_phasor_of_piece(inverse, &sums[1]);
     z = hs_impedance_of(&c, &v, &i);
     mix(v.re), mix(v.im), mix(i.re), mix(i.im);
-    for (k = 0; k < HS_QUARTERS; ++k) {
-        quarters[0][k] = (int16_t)(check_draw(seed) >> 20);
-        quarters[1][k] = (int16_t)(check_draw(seed) >> 20);
+    for (k = 0; k < HS_QUADRATURE_SAMPLES; ++k) {
+        samples[0][k] = (int16_t)(check_draw(seed) >> 20);
+        samples[1][k] = (int16_t)(check_draw(seed) >> 20);
     }
-    farad = hs_capacitance_of(&few, hs_sum_quarters(quarters[0]), hs_sum_quarters(quarters[1]));
+    farad = hs_capacitance_of(&few, hs_demodulate_quadrature(samples[0]),
+                              hs_demodulate_quadrature(samples[1]));
     mix(farad.capacitance_f), mix((float)farad.reason);
     mix(z.capacitance_f), mix(z.resistance_ohm), mix((float)z.reason);
 }

@@ -232,7 +232,7 @@ static void a_lost_carrier_and_a_phase_of_no_capacitor_are_told(void)
 
 /* Readings of 12 bits every 5 quarter periods, rounded: half a unit each, weights 8 and 6 of a
  * quarter. The first of each period may hold anything. */
-static void quarters_give_the_phasor_whatever_drifts_beneath(void)
+static void quadrature_samples_give_the_phasor_whatever_drifts_beneath(void)
 {
     uint32_t seed = 7;
     int trial, k;
@@ -241,22 +241,22 @@ static void quarters_give_the_phasor_whatever_drifts_beneath(void)
         const double im = (double)check_uniform(&seed, -800.0f, 800.0f);
         const double level = (double)check_uniform(&seed, 1500.0f, 2500.0f);
         const double ramp = (double)check_uniform(&seed, -40.0f, 40.0f);
-        int16_t x[HS_QUARTERS];
-        hs_quarters sums;
-        for (k = 0; k < HS_QUARTERS; ++k) {
+        int16_t x[HS_QUADRATURE_SAMPLES];
+        hs_quadrature sums;
+        for (k = 0; k < HS_QUADRATURE_SAMPLES; ++k) {
             const double angle = 1.25 * 2.0 * 3.14159265358979 * k;
             x[k] = (int16_t)lrint(re * cos(angle) - im * sin(angle) + level + ramp * k);
         }
         x[0] = (int16_t)(check_draw(&seed) >> 20);
         x[4] = (int16_t)(check_draw(&seed) >> 20);
-        sums = hs_sum_quarters(x);
+        sums = hs_demodulate_quadrature(x);
         CHECK(fabs(sums.re - 4.0 * re) <= 4.0 + 1e-6, "%d of 4 * %g", sums.re, re);
         CHECK(fabs(sums.im - 4.0 * im) <= 3.0 + 1e-6, "%d of 4 * %g", sums.im, im);
     }
 }
 
 /* omega Z in double. */
-static void reactance(double turn_re, double turn_im, hs_quarters v, hs_quarters i, double z[2])
+static void reactance(double turn_re, double turn_im, hs_quadrature v, hs_quadrature i, double z[2])
 {
     const double i2 = (double)i.re * i.re + (double)i.im * i.im;
     const double re = ((double)v.re * i.re + (double)v.im * i.im) / i2;
@@ -268,13 +268,13 @@ static void reactance(double turn_re, double turn_im, hs_quarters v, hs_quarters
 /* 5 roundings of the largest term in the sum that is divided by, and 3 of the quotient. */
 static void capacitance_is_the_reactance_turned_over(void)
 {
-    const hs_quarters_config c = {1.1e9f, -0.9e9f, 1601, 2147483647, 1601};
+    const hs_quadrature_config c = {1.1e9f, -0.9e9f, 1601, 2147483647, 1601};
     uint32_t seed = 77;
     int trial, valid = 0;
     for (trial = 0; trial < 20000; ++trial) {
-        const hs_quarters v = {(int16_t)(check_draw(&seed) >> 17),
+        const hs_quadrature v = {(int16_t)(check_draw(&seed) >> 17),
                                (int16_t)(check_draw(&seed) >> 18)};
-        const hs_quarters i = {(int16_t)(check_draw(&seed) >> 18),
+        const hs_quadrature i = {(int16_t)(check_draw(&seed) >> 18),
                                (int16_t)(check_draw(&seed) >> 17)};
         const hs_capacitance got = hs_capacitance_of(&c, v, i);
         double z[2];
@@ -296,8 +296,8 @@ static void capacitance_is_the_reactance_turned_over(void)
 static void one_division_gives_what_five_give(void)
 {
     const hs_impedance_config full = {2.0e-5f, 0.0f, 0.0f, 0.0f, 31415.9f, 10.0f};
-    const hs_quarters_config few = {31415.9f / 2.0e-5f, 0.0f, 1601, 2147483647, 1601};
-    const hs_quarters v = {1000, -300}, i = {260, 900}; /* a lead of 90.6 degrees */
+    const hs_quadrature_config few = {31415.9f / 2.0e-5f, 0.0f, 1601, 2147483647, 1601};
+    const hs_quadrature v = {1000, -300}, i = {260, 900}; /* a lead of 90.6 degrees */
     const hs_phasor vf = {250.0f, -75.0f}, vi = {65.0f, 225.0f};
     const hs_impedance z = hs_impedance_of(&full, &vf, &vi);
     const hs_capacitance c = hs_capacitance_of(&few, v, i);
@@ -306,11 +306,11 @@ static void one_division_gives_what_five_give(void)
           "%.9g of %.9g", (double)c.capacitance_f, (double)z.capacitance_f);
 }
 
-static void quarters_know_what_hides_the_capacitance(void)
+static void quadrature_knows_what_hides_the_capacitance(void)
 {
-    const hs_quarters_config c = {1e9f, 0.0f, 1600, 1000000, 1600};
-    const hs_quarters good = {400, 0}, small = {39, 0}, large = {1001, 0}, lead = {0, 400};
-    const hs_quarters widest = {32760, -32760}; /* the squares just stay within 31 bits */
+    const hs_quadrature_config c = {1e9f, 0.0f, 1600, 1000000, 1600};
+    const hs_quadrature good = {400, 0}, small = {39, 0}, large = {1001, 0}, lead = {0, 400};
+    const hs_quadrature widest = {32760, -32760}; /* the squares just stay within 31 bits */
     CHECK(hs_capacitance_of(&c, good, lead).reason == 0, "capacitor");
     CHECK(hs_capacitance_of(&c, small, lead).reason == HS_AMPLITUDE_LOST, "no voltage");
     CHECK(hs_capacitance_of(&c, large, lead).reason == HS_AMPLITUDE_LOST, "too much voltage");
@@ -323,10 +323,10 @@ static void quarters_know_what_hides_the_capacitance(void)
 
 int main(void)
 {
-    quarters_give_the_phasor_whatever_drifts_beneath();
+    quadrature_samples_give_the_phasor_whatever_drifts_beneath();
     capacitance_is_the_reactance_turned_over();
     one_division_gives_what_five_give();
-    quarters_know_what_hides_the_capacitance();
+    quadrature_knows_what_hides_the_capacitance();
     random_readings_agree_with_sums_in_double();
     a_block_falls_into_pieces_the_last_of_which_is_shorter();
     nothing_beyond_the_block_is_read();

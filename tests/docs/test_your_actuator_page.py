@@ -14,9 +14,9 @@ from haselab.base import InputError
 from haselab.cli.main import main
 from haselab.rig.chip import find_tool
 from haselab.rig.chip.build import simavr_header
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.history import precondition
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.study.definition import load_study
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "your-actuator.md"

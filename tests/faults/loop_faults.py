@@ -16,8 +16,8 @@ from haselab.base import SafetyError, SilentProgress
 from haselab.control import PidGains, Saturation
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import Runner
@@ -408,8 +408,8 @@ STUCK = "Strain (stuck|repeating)"
 JUMP = "Strain (jumped|alternates)"
 SWINGS = "Output (oscillates|charges)"
 AGAINST = "against the drive"
-DEAD = "does not react"
-DELAY = "Delay grown"
+DEAD = "does not respond"
+DELAY = "Delay too long"
 NOT_FOLLOWING = "Output does not follow"
 
 CASES = [
@@ -454,7 +454,7 @@ CASES = [
     Case("monitors swapped", f"{NOT_FOLLOWING}|Breakdown",
          on_codes(lambda k, codes, rng: codes[:, ::-1].copy())),
     Case("carrier lost", LOST, carrier_off),
-    # Noise of its own looks like a reaction in one of about 24 runs: docs/safety.md says so.
+    # Noise of its own looks like a reaction in one of about 24 runs: docs/bench/safety.md says so.
     Case("sensor of another actuator", f"{DEAD}|{AGAINST}", other_actuator, reference="step",
          misses=1),
     Case("gains too high: kp = 50", SWINGS, loop=gains(50.0, 1.5), onset=0, readings=("hz",)),

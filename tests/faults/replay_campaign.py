@@ -89,7 +89,7 @@ def inside(recorded: Path, folder: Path, fault: str, moment: str) -> Any:
 
         def now() -> None:
             nonlocal struck_s, highest_v
-            struck_s, highest_v = time.monotonic(), abs(bench._asked_v) * campaign.GAIN
+            struck_s, highest_v = time.monotonic(), abs(bench._requested_v) * campaign.GAIN
             strike(bench)
 
         counted: list[int] = []
@@ -103,7 +103,7 @@ def inside(recorded: Path, folder: Path, fault: str, moment: str) -> Any:
             getattr(bench, "undo", lambda: None)()
             for number, handler in kept.items():
                 signal.signal(number, handler)
-        after_s, left_v = time.monotonic() - struck_s, abs(bench._asked_v) * campaign.GAIN
+        after_s, left_v = time.monotonic() - struck_s, abs(bench._requested_v) * campaign.GAIN
     events, readable = campaign.left(folder)
     blocks = counted[-1]
     return campaign.Outcome(after_s, left_v, told, events, blocks, readable, highest_v)

@@ -31,8 +31,8 @@ from pathlib import Path
 import numpy as np
 
 from haselab.cli.main import main as haselab
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.manifest import Manifest
 from haselab.store.session import opening as session_open
 from haselab.store.session import probe as session_probe

@@ -12,8 +12,8 @@ import pytest
 from haselab.base import InputError
 from haselab.firmware import ChipSettings, FrontEnd, settings_header
 from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_design
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench
 
 DATA = Path(__file__).resolve().parent / "data"
 ROOT = checkout()

@@ -13,7 +13,7 @@ static void readings(app_inputs *in, float share)
     /* Both carriers about 512; the current leads by 90 degrees and is seen 225 degrees later. */
     const double v = 290.0, i = 190.0 * (double)share;
     int k;
-    for (k = 0; k < HS_QUARTERS; ++k) {
+    for (k = 0; k < HS_QUADRATURE_SAMPLES; ++k) {
         const double angle = 1.5707963267948966 * k;
         in->v[k] = (int16_t)lrint(512.0 + v * cos(angle));
         in->i[k] = (int16_t)lrint(512.0 + i * cos(angle + 1.5707963267948966 + 3.9269908169872414));
@@ -171,7 +171,7 @@ static void a_phase_of_no_capacitor_and_a_capacitance_of_no_strain_do_not_count(
 {
     app_state s;
     app_inputs in;
-    int16_t swap[HS_QUARTERS];
+    int16_t swap[HS_QUADRATURE_SAMPLES];
     run(&s, &in);
     readings(&in, 5.0f);
     CHECK(step(&s, &in).reason == HP_REASON_IMPLAUSIBLE, "too large");

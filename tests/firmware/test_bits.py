@@ -13,7 +13,7 @@ import pytest
 
 from haselab.firmware.messages import VERSION, Event, Hello, Run, SetReference, SetTelemetry, Trace
 from haselab.rig.chip import CoSim, Firmware, checkout
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 ROOT = checkout()
 CORE = sorted((ROOT / "core").glob("*.c"))

@@ -13,7 +13,7 @@ import pytest
 from haselab.cli.main import main
 from haselab.control import step_metrics
 from haselab.firmware import ChipSettings, settings_header
-from haselab.rig.chip import Firmware, MegaFile, find_tool, read_design
+from haselab.rig.chip import ChipFile, Firmware, find_tool, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.chip.loops import SLOW, StepPlan, desktop_loop
@@ -39,9 +39,9 @@ def answer(
     reading = request.param
     data = DATA if reading == "hz" else DATA / "rad"
     with pytest.raises(SystemExit) as stop:
-        main(["firmware", "simulate", str(data), "--reading", reading, "--hold", "6", "--last",
-              "6", "--plot", str(folder / "step.png"), "--out", str(folder / "step.json")],
-             )  # fmt: skip
+        main(["firmware", "simulate", str(data), "--reading", reading, "--before-s", "6",
+              "--after-s", "6", "--plot", str(folder / "step.png"), "--out",
+              str(folder / "step.json")])  # fmt: skip
     assert stop.value.code == 0
     assert (folder / "step.png").stat().st_size > 10_000
     return dict(json.loads((folder / "step.json").read_text(encoding="utf-8")))
@@ -76,7 +76,7 @@ def test_build_gives_a_program_for_the_programmer(
     firmware: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, text, error = run(capsys, "firmware", "build", DATA, "--structure", "pi", "--json",
-                            "--to", tmp_path)  # fmt: skip
+                            "--build-dir", tmp_path)  # fmt: skip
     assert (code, error) == (0, "")
     answer = json.loads(text)
     assert answer["flash_bytes"] < 16 * 1024
@@ -90,16 +90,16 @@ def test_build_takes_the_front_end_of_a_rig_file(
     rig = tmp_path / "mega.toml"
     rig.write_text(f'kind = "mega"\nrun = "{DATA}"\n[simulator]\n[front_end]\n'
                    "correction = [1.01, 0.002]\n", encoding="utf-8")  # fmt: skip
-    code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--to", tmp_path)
+    code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--build-dir", tmp_path)
     assert (code, error) == (0, "")
     file = load_rig(rig)
-    assert isinstance(file, MegaFile)
+    assert isinstance(file, ChipFile)
     settings = read_design(DATA, "pid", file.front_end.front_end()).settings
     assert settings.front_end.correction == 1.01 + 0.002j
     assert (tmp_path / "settings.h").read_text(encoding="ascii") == settings_header(settings)
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--board", "stm32g071")
     assert code == 2
-    assert "allowed are 'mega' and atmega2560" in error
+    assert "only kind 'mega' with board" in error
 
 
 def test_a_folder_that_is_no_run_is_told_in_one_line(
@@ -107,7 +107,7 @@ def test_a_folder_that_is_no_run_is_told_in_one_line(
 ) -> None:
     code, _, error = run(capsys, "firmware", "build", tmp_path)
     assert code == 2
-    assert "No such actuator file" in error
+    assert "There is no such actuator file" in error
     assert error.count("\n") == 1
     shutil.copy(DATA / "model.json", tmp_path)
     code, _, error = run(capsys, "firmware", "build", tmp_path)

@@ -26,14 +26,14 @@ from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Ack, Run, SetReference, Trace, Verdict
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
-from haselab.rig.chip import CoSim, Firmware, MegaBench, SerialChip
-from haselab.rig.chip.bench import describe_chip
+from haselab.rig.chip import ChipBench, CoSim, Firmware, SerialChip
+from haselab.rig.chip.chip_bench import describe_chip
 from haselab.rig.chip.link import ChipLink
 from haselab.rig.operator import BenchStand, OperatorWeights
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
-from haselab.sensing import sense_quarters
+from haselab.sensing import sense_quadrature
 from haselab.store.session.writer import SessionReader
 
 DATA = Path(__file__).resolve().parent / "data"
@@ -63,7 +63,7 @@ class NoCamera:
     def take(self) -> None: ...
 
 
-def rig_of(bench: MegaBench, settings: ChipSettings) -> Rig:
+def rig_of(bench: ChipBench, settings: ChipSettings) -> Rig:
     described = describe_chip(
         settings, shell_area_m2=1e-4, lateral_stretch=3.0, scale_m_per_px=1e-4, mass_kg=0.25
     )
@@ -72,7 +72,7 @@ def rig_of(bench: MegaBench, settings: ChipSettings) -> Rig:
 
 
 def armed(
-    bench: MegaBench, settings: ChipSettings, safety: SafetySettings | None = None
+    bench: ChipBench, settings: ChipSettings, safety: SafetySettings | None = None
 ) -> GuardedRig:
     rig = guard(rig_of(bench, settings), Safety(safety or SafetySettings()))
     request = rig.safety.request()
@@ -82,11 +82,11 @@ def armed(
 
 
 @pytest.fixture
-def bench(chip: CoSim, settings: ChipSettings) -> MegaBench:
-    return MegaBench(chip, settings)
+def bench(chip: CoSim, settings: ChipSettings) -> ChipBench:
+    return ChipBench(chip, settings)
 
 
-class Told(MegaBench):
+class Told(ChipBench):
     """Keeps what the chip told, to compare with what was recorded."""
 
     def _append(self, trace: Trace) -> None:
@@ -107,17 +107,17 @@ def follow(rig: GuardedRig, strain: float, blocks: int) -> np.ndarray:
 
 
 def test_the_loop_reaches_its_strain_and_every_way_out_is_0_v(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.03, 400)
     wanted_v = VoltageMap(*settings.voltage_map).voltage_v(np.array([0.03]))[0]
-    assert rig.standing_v == pytest.approx(wanted_v, abs=0.3)  # the plant is not its map
+    assert rig.present_drive_v == pytest.approx(wanted_v, abs=0.3)  # the plant is not its map
     assert chip.outputs[-1].on
     rig.safe()
     assert not chip.outputs[-1].on
     assert not chip.outputs[-1].enable
-    assert rig.read_back().startswith("output at 0 V")
+    assert rig.read_back().at_zero
 
 
 def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
@@ -126,7 +126,7 @@ def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
     bench = Told(chip, settings)
     rig = armed(bench, settings)
     codes = follow(rig, 0.02, 100)
-    capacitance_f = sense_quarters(codes, settings)
+    capacitance_f = sense_quadrature(codes, settings)
     rows = [tuple(map(int, row)) for row in codes.reshape(-1, 8)]
     told = bench.told
     first = next(k for k in range(len(told)) if [t.codes for t in told[k : k + len(rows)]] == rows)
@@ -144,11 +144,11 @@ def test_a_chip_with_another_firmware_is_refused(chip: CoSim, settings: ChipSett
     with pytest.raises(
         InputError, match=r"The chip holds settings .* needed are .* Build with 'haselab fir"
     ):
-        MegaBench(chip, other)
+        ChipBench(chip, other)
 
 
 def test_a_drive_or_a_strain_that_the_chip_does_not_take_is_refused_before_it_is_armed(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     with pytest.raises(LimitError, match=r"closes its own loop takes 0 V alone\. Ask it"):
@@ -161,7 +161,7 @@ def test_a_drive_or_a_strain_that_the_chip_does_not_take_is_refused_before_it_is
 
 
 def test_nothing_moves_before_the_bench_is_armed(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = guard(rig_of(bench, settings))
     with pytest.raises(SafetyError, match="The bench is off"):
@@ -173,7 +173,7 @@ def test_nothing_moves_before_the_bench_is_armed(
     ("fault", "reason"), [("breakdown", "breakdown"), ("wire_i", "sensing"), ("carrier", "sensing")]
 )
 def test_a_trip_of_the_chip_ends_the_loop_with_its_reason(
-    fault: str, reason: str, chip: CoSim, bench: MegaBench, settings: ChipSettings
+    fault: str, reason: str, chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.03, 100)
@@ -187,7 +187,7 @@ def test_a_trip_of_the_chip_ends_the_loop_with_its_reason(
 
 
 def test_a_trip_is_told_where_a_new_reference_meets_it(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.02, 50)
@@ -198,7 +198,7 @@ def test_a_trip_is_told_where_a_new_reference_meets_it(
 
 
 def test_a_chip_that_sees_no_carrier_says_so_when_it_is_armed(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     chip.fault("carrier")
@@ -208,7 +208,7 @@ def test_a_chip_that_sees_no_carrier_says_so_when_it_is_armed(
 
 
 def test_one_bad_update_at_the_moment_of_running_is_no_fault(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings, monkeypatch: pytest.MonkeyPatch
+    chip: CoSim, bench: ChipBench, settings: ChipSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig, asked, plain = armed(bench, settings), [], chip.ask
 
@@ -225,7 +225,7 @@ def test_one_bad_update_at_the_moment_of_running_is_no_fault(
 
 
 def test_what_passes_while_the_output_goes_down_belongs_to_no_block(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.03, 100)
@@ -234,11 +234,11 @@ def test_what_passes_while_the_output_goes_down_belongs_to_no_block(
     rig.plain.stand.wait(0.3)
     assert chip.time_s - before_s == pytest.approx(0.3, abs=0.02)
     rig.acquisition.read()
-    assert rig.standing_v == 0.0
+    assert rig.present_drive_v == 0.0
 
 
 def test_a_chip_that_is_reset_says_why(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.03, 50)
@@ -247,11 +247,11 @@ def test_a_chip_that_is_reset_says_why(
         follow(rig, 0.03, 20)
     rig.safe()
     assert not chip.outputs[-1].on
-    assert rig.read_back().startswith("output at 0 V")
+    assert rig.read_back().at_zero
 
 
 def test_zero_comes_first_though_a_command_was_refused(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.03, 50)
@@ -265,7 +265,7 @@ def test_zero_comes_first_though_a_command_was_refused(
 
 
 def test_a_program_that_stops_reading_lets_the_chip_ramp_down_by_itself(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.03, 100)
@@ -276,7 +276,7 @@ def test_a_program_that_stops_reading_lets_the_chip_ramp_down_by_itself(
 
 
 def test_lost_updates_are_a_gap_in_the_recording(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.0, 10)
@@ -289,7 +289,7 @@ def test_lost_updates_are_a_gap_in_the_recording(
 
 
 def test_a_chip_that_tripped_is_cleared_by_whoever_arms_again(
-    chip: CoSim, bench: MegaBench, settings: ChipSettings
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.03, 50)
@@ -353,11 +353,11 @@ def test_on_a_serial_port_it_is_the_same_bench(
         chip.run(0.02)
         with behind_port(chip) as port:
             link: ChipLink = SerialChip(port, patience_s=60.0, reset_s=0.05)
-            bench = MegaBench(link, settings)
+            bench = ChipBench(link, settings)
             # As on a port: the clock is the wall's. The chip meets its own deadlines.
             rig = armed(bench, settings, SafetySettings(real_time=True))
             codes = follow(rig, 0.02, 60)
-            assert np.isfinite(sense_quarters(codes, settings)[1:]).mean() > 0.9
+            assert np.isfinite(sense_quadrature(codes, settings)[1:]).mean() > 0.9
             assert chip.outputs[-1].on
             rig.safe()
             assert not chip.outputs[-1].on
@@ -454,7 +454,7 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
     code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "twin.toml", "--out",
                    tmp_path / "out")  # fmt: skip
     assert code == 2
-    assert "kind 'mega' plays alone" in capsys.readouterr().err
+    assert 'which only a rig with kind = "mega" plays' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from haselab.firmware import (
 )
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
 from haselab.rig.chip import CoSim, build_firmware, checkout, read_design
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 from haselab.store.actuator_file import read_run, write_sections
 from haselab.study.chip.trials import Chip
 

@@ -24,7 +24,7 @@ from haselab.firmware.messages import (
     Verdict,
 )
 from haselab.rig.chip import CoSim, Firmware, Output, build_firmware
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 CODE_HIGH = 3800  # 1.9 V in steps of 0.5 mV
 # Registers, input and output, memory, stack.

@@ -25,7 +25,7 @@ static sampler fresh(void)
 static void a_window_is_the_last_two_frames_oldest_first(void)
 {
     sampler s = fresh();
-    int16_t v[HS_QUARTERS], i[HS_QUARTERS];
+    int16_t v[HS_QUADRATURE_SAMPLES], i[HS_QUADRATURE_SAMPLES];
     uint16_t frame;
     int k;
     for (frame = 0; frame < 7; ++frame) {
@@ -47,7 +47,7 @@ static void a_lost_conversion_is_told_and_the_next_ones_keep_their_places(void)
     uint8_t lost;
     for (lost = 0; lost < SAMPLER_SLOTS; ++lost) {
         sampler s = fresh();
-        int16_t v[HS_QUARTERS], i[HS_QUARTERS];
+        int16_t v[HS_QUADRATURE_SAMPLES], i[HS_QUADRATURE_SAMPLES];
         feed(&s, 0, 8, 100);
         feed(&s, 0, lost, 200);
         feed(&s, (uint8_t)(lost + 1u), 8, 200);

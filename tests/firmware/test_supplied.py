@@ -13,16 +13,16 @@ import pytest
 from haselab.base import InputError
 from haselab.firmware import ChipSettings
 from haselab.rig.chip import (
+    ChipBench,
+    ChipFile,
     CoSim,
     Firmware,
-    MegaBench,
-    MegaFile,
     SuppliedCoSim,
     SupplyModel,
     build_firmware,
 )
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 GAIN = 5000.0
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
@@ -49,17 +49,17 @@ def supplied(
 def test_the_supply_follows_the_chip_and_goes_to_0_v_with_it(
     supplied: SuppliedCoSim, slower: ChipSettings
 ) -> None:
-    bench = MegaBench(supplied, slower)
+    bench = ChipBench(supplied, slower)
     supplied.command("track 8")
     codes = []
     for _ in range(200):
         bench.follow(-0.02)
         codes.append(bench.read())
     high_v = np.array([track.high_v for track in supplied.tracks[-200:]])
-    asked_v = bench.output_v * GAIN
+    requested_v = bench.output_v * GAIN
     # The supply lags by a few commands of 10 ms, in which the chip asks for 70 V more at most each.
-    assert high_v[-20:].mean() == pytest.approx(asked_v, abs=600.0)
-    assert asked_v > 500.0
+    assert high_v[-20:].mean() == pytest.approx(requested_v, abs=600.0)
+    assert requested_v > 500.0
     assert supplied.commands > 150
     assert supplied.supply.rail_v <= 5000.0
     bench.zero()
@@ -72,7 +72,7 @@ def test_the_supply_follows_the_chip_and_goes_to_0_v_with_it(
 def test_the_enable_pin_cuts_the_supply_at_once(
     supplied: SuppliedCoSim, slower: ChipSettings
 ) -> None:
-    bench = MegaBench(supplied, slower)
+    bench = ChipBench(supplied, slower)
     supplied.command("track 1")
     for _ in range(60):
         bench.follow(-0.02)
@@ -103,8 +103,8 @@ def test_a_rig_file_names_the_supply_and_the_limits_of_its_module(
         encoding="utf-8",
     )
     file = load_rig(path)
-    assert isinstance(file, MegaFile)
+    assert isinstance(file, ChipFile)
     assert file.simulator is not None
     assert file.simulator.supply == SupplyModel(ripple_v=2.0)
     assert file.limited(settings) == replace(settings, drive_high_v=1.95, rise_v_per_s=7.0)
-    assert MegaFile(kind="mega", run="run", simulator=file.simulator).limited(settings) == settings
+    assert ChipFile(kind="mega", run="run", simulator=file.simulator).limited(settings) == settings

@@ -9,9 +9,9 @@ import pytest
 from haselab.base import DeviceError
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import VERSION, Hello, Identity
-from haselab.rig.chip import CoSim, Firmware, MegaBench
+from haselab.rig.chip import ChipBench, CoSim, Firmware
 from haselab.rig.chip.supply_check import check_supply
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 
 def started(program: Path, firmware: Firmware, twin: TwinBench, supply_v: float) -> CoSim:
@@ -38,15 +38,15 @@ def test_a_chip_on_a_weak_supply_is_not_opened(
         with pytest.raises(
             DeviceError, match=r"runs on about 4\.2. V .* needed are 5 V within 5 %.*not from USB"
         ):
-            MegaBench(chip, settings)
+            ChipBench(chip, settings)
         assert not any(output.on for output in chip.outputs)
     with started(cosim_program, firmware, twin, 4.6) as chip:
-        assert MegaBench(chip, settings).identity.endswith("supply 4.62 V to 9 %")
+        assert ChipBench(chip, settings).identity.endswith("supply 4.62 V to 9 %")
     with (
         started(cosim_program, firmware, twin, 4.6) as chip,
         pytest.raises(DeviceError, match=r"runs on about 4\.6"),
     ):
-        MegaBench(chip, settings, bandgap_v=1.1)
+        ChipBench(chip, settings, bandgap_v=1.1)
 
 
 @pytest.mark.parametrize(

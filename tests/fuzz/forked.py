@@ -163,10 +163,6 @@ def _fault(code: int, printed: str, cpu_s: float, resident: int, in_time: bool) 
         return f"signal {-code}"
     if "Traceback (most recent call last)" in printed:
         return (
-            "exit 4"
-            if code == 4 and "The system refuses" in printed
-            else ""
-            if code == 4
-            else "traceback"
+            "exit 4" if code == 4 and "File error" in printed else "" if code == 4 else "traceback"
         )
     return "" if code in _ALLOWED else f"exit {code}"

@@ -19,8 +19,8 @@ from nptdms import ChannelObject, RootObject, TdmsWriter
 from numpy.typing import NDArray
 
 from haselab.pipelines.calibration_file import save_calibration
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.sensing.calibration import Reference, ReferenceReading, fit_calibration
 from haselab.store.manifest import Manifest
 from haselab.store.session.writer import ExperimentPlan, SessionWriter

@@ -30,7 +30,7 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "design, actuator file": (
         "design actuator.toml --structure pi --accept-shortfalls", {}),
     "compare": ("compare actuator.toml record.csv", {}),
-    "firmware build, actuator file": ("firmware build actuator.toml --to out", {}),
+    "firmware build, actuator file": ("firmware build actuator.toml --build-dir out", {}),
     "transfer, actuator file": (
         "identify transfer record.csv --delay 0 --actuator actuator.toml", {}),
     "voltage-map, actuator file": (
@@ -51,8 +51,10 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "calibrate": ("calibrate --rig rig.toml --capacitor 1e-9 --capacitor 2e-9,5,0.01 "
                   "--carrier-hz 2000 --carrier-v 0.1 --duration-s 0.1 --out c.toml",
                   {"twin.toml": "twin.toml"}),
-    "firmware build": ("firmware build run --to out", _RUN),
-    "firmware build, front end": ("firmware build run --to out --rig rig.toml", _RUN | _MEGA),
+    "firmware build": ("firmware build run --build-dir out", _RUN),
+    "firmware build, front end": (
+        "firmware build run --build-dir out --rig rig.toml", _RUN | _MEGA
+    ),
     "report": ("report run", _RUN),
     "rig check": ("rig check rig.toml", _BENCH),
     "sense, calibrated": (f"sense monitors.csv {_SENSE} --calibration calibration.toml", {}),
@@ -67,7 +69,7 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "creep": ("identify creep creep.csv --model prony", {}),
     "hysteresis": (f"identify hysteresis {_RECORD} --model prandtl-ishlinskii --operators 4", {}),
     "map": ("identify map voltage.csv --x strain --y voltage_v", {}),
-    "regions": ("identify regions load.csv --pieces 2", {}),
+    "regions": ("identify regions load.csv --segments 2", {}),
     "voltage-map": ("identify voltage-map voltage.csv", {}),
     "capacitance-map": ("identify capacitance-map farad.csv", {}),
     "hyperelastic": ("identify hyperelastic sheet.csv --model neo-hooke --at-stretch 1.5", {}),

@@ -21,7 +21,7 @@ def fuzzed(*arguments: str) -> None:
 
 
 def test_no_case_that_was_once_found_is_a_defect_again() -> None:
-    fuzzed("--replay", *map(str, sorted((HERE / "corpus").glob("*.json"))))
+    fuzzed("--replay", *map(str, sorted((HERE / "corpus").rglob("*.json"))))
 
 
 @pytest.mark.parametrize("part", range(SLICES))

@@ -11,8 +11,8 @@ from haselab.base import InputError, ResultError
 from haselab.identify import LoopRecord, fit_hysteresis
 from haselab.identify.hysteresis.loops import band_widths
 from haselab.models import BoucWen, DeadZones, PrandtlIshlinskii
-from haselab.rig.twin.bench import GRAVITY_M_S2, native_bench
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, native_bench
 from haselab.signals import triangle
 
 NOISE = 0.005

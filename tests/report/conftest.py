@@ -198,8 +198,8 @@ def free_response(rng):
     trials = []
     for amplitude_m in (0.020, 0.022):
         decay, wd = 1.1, 9.4
-        hull = amplitude_m * np.exp(-decay * time_s)
-        fit = hull * np.cos(wd * time_s)
+        envelope = amplitude_m * np.exp(-decay * time_s)
+        fit = envelope * np.cos(wd * time_s)
         peaks = np.arange(5) * 2 * math.pi / wd
         troughs = peaks + math.pi / wd
         trials.append(
@@ -208,8 +208,8 @@ def free_response(rng):
                 "displacement_m": (fit + 2e-4 * rng.standard_normal(time_s.size)).tolist(),
                 "displacement_std_m": [3e-4] * time_s.size,
                 "creeping_m": fit.tolist(),
-                "envelope_positive_m": hull.tolist(),
-                "envelope_negative_m": (-hull).tolist(),
+                "envelope_positive_m": envelope.tolist(),
+                "envelope_negative_m": (-envelope).tolist(),
                 "peaks_positive": {
                     "time_s": peaks.tolist(),
                     "m": (amplitude_m * np.exp(-decay * peaks)).tolist(),

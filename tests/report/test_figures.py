@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from haselab.report.figures import PLANS, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.results import Results
-from haselab.report.style import house_style
+from haselab.report.style import figure_style
 
 UNITS = {"px", "mm", "%", "1", "V", "kV", "s", "nF", "a.u.", "N", "rad/s", "Hz", "dB", "°"}
 PANELS = [(plan, panel) for plan in PLANS for panel in plan.panels]
@@ -45,7 +45,7 @@ def drawn_axes(run, name):
     """The axes of one panel, drawn alone, then every axis in another unit beside them."""
     _, panel = PANELS[NAMES.index(name)]
     figure = Figure(figsize=(6.8, panel.height_in), layout="constrained")
-    with house_style():
+    with figure_style():
         panel.draw(figure, run)
         figure.draw_without_rendering()
     seconds = [child for axes in figure.axes for child in axes.child_axes]
@@ -83,7 +83,7 @@ def test_a_missing_section_leaves_out_its_panels_alone_and_says_so(run, section)
             continue
         drawing = draw_figure(plan, less)
         assert len(drawing.panels) == len(plan.panels) - len(lost)
-        assert [note.split(" is left out: ")[1] for note in drawing.notes] == [
+        assert [note.split(" was left out: ")[1] for note in drawing.notes] == [
             f"analysis.json has no section '{section}'."
         ] * len(lost)
         assert bool(drawing.document) == bool(drawing.panels)
@@ -94,9 +94,24 @@ def test_a_missing_section_leaves_out_its_panels_alone_and_says_so(run, section)
     [
         ("fig3", ("triangle", "strain"), [0.0], "'triangle.strain' in analysis.json has 1 values"),
         ("fig3", ("triangle", "drive_v"), None, "'triangle' in analysis.json has no 'drive_v'"),
-        ("fig4", ("static", "load_n"), "much", "'static.load_n' in analysis.json is not numbers"),
-        ("fig4", ("static", "chosen"), 3, "'static.chosen' in analysis.json is none of 3 regions"),
-        ("fig4", ("static", "regions"), 3, "'static.regions' in analysis.json is no mapping"),
+        (
+            "fig4",
+            ("static", "load_n"),
+            "much",
+            "'static.load_n' in analysis.json contains something other",
+        ),
+        (
+            "fig4",
+            ("static", "chosen"),
+            3,
+            "'static.chosen' in analysis.json is not one of 3 regions",
+        ),
+        (
+            "fig4",
+            ("static", "regions"),
+            3,
+            "'static.regions' in analysis.json is neither a mapping",
+        ),
         ("fig5", ("free_response", "trials"), [], "has no 'trials'"),
         ("fig7", ("loop", "plant"), [1], "'loop.plant' in analysis.json is not a mapping"),
         ("fig6", ("steps", "time_s"), [None, None], "has no finite number"),

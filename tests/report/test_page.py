@@ -189,7 +189,7 @@ def test_a_folder_without_analysis_gives_a_page_of_notes_and_no_old_figures(make
     page = compose_page(read_folder(folder))
     text = save_page(page, folder, folder / "report.html").read_text(encoding="utf-8")
     assert set(page.left_out) == {drawing.plan.name for drawing in page.drawings}
-    assert "The figure is left out: analysis.json has no section &#39;loop&#39;." in text
+    assert "The figure was left out: analysis.json has no section &#39;loop&#39;." in text
     assert "analysis.json has no section 'd_rows'" in text
     assert [path.name for path in (folder / "figures").iterdir()] == ["mine.svg"]
     assert Reader(text).open == []

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from haselab.report.track_page import TrackReport, TrackStrain, track_page
-from haselab.tracking import Reason, Tracks
+from haselab.tracking import LossReason, Tracks
 
 FRAMES = 40
 
@@ -21,7 +21,7 @@ def report():
     place_y = rest[:, 1] * (1 + strain[:, None])
     shape = place_y.shape
     reason = np.zeros(shape, np.uint8)
-    reason[10:20, 30] = Reason.COVERED
+    reason[10:20, 30] = LossReason.COVERED
     valid = reason == 0
     std = np.full(shape, 0.02)
     tracks = Tracks(
@@ -66,7 +66,7 @@ def test_the_page_tells_the_strain_of_gauge_and_field(report):
 
 def test_lost_positions_are_told_with_their_reason_and_share(report):
     page = track_page(report)
-    assert re.search(r"covered by something</th><td>0\.4 %", page)  # 10 of 40 x 63
+    assert re.search(r"covered</th><td>0\.4 %", page)  # 10 of 40 x 63
     assert "99.6 % of the positions found" in page
 
 
@@ -89,7 +89,7 @@ def test_a_clip_in_which_nothing_is_found_still_has_its_page(report):
     t = report.tracks
     lost = np.full(t.x_px.shape, np.nan)
     none = Tracks(lost, lost, lost, lost, np.full(lost.shape, 0.1), lost > 0,
-                  np.full(lost.shape, int(Reason.UNLIKE), np.uint8))  # fmt: skip
+                  np.full(lost.shape, int(LossReason.UNLIKE), np.uint8))  # fmt: skip
     page = track_page(replace(report, tracks=none, strain=None))
     assert "0.0 % of the positions found" in page
     assert re.search(r"too unlike the reference</th><td>1e\+02 %|<td>100 %", page)

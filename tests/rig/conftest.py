@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 from haselab.store.video.writer import VideoWriter
 

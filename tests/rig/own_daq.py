@@ -15,8 +15,8 @@ from haselab.rig.instruments import (
     GeneratorInstrument,
     OpenContext,
 )
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench
 
 BENCHES: list[TwinBench] = []  # the one that was opened last stands at the end
 

@@ -12,7 +12,6 @@ import pytest
 
 from haselab.base import HaselabError
 from haselab.rig import Rig
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.checks import (
     CheckResult,
@@ -24,6 +23,7 @@ from haselab.rig.checks import (
 )
 from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.registry import daq_of
+from haselab.rig.real_bench import RealBench
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.faults import FAULTS, BenchFaults
 from haselab.rig.twin.serve.generator.state import GeneratorFaults

@@ -12,14 +12,14 @@ import pytest
 
 from haselab.base import HaselabError, InputError, LimitError
 from haselab.rig import ReportsOutput, ReportsOutputState, Rig
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.chip import ChipFile, opened_chip
+from haselab.rig.real_bench import RealBench
 from haselab.rig.replay import ReplayBench
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.gate import Gate
 from haselab.testing.bench_conformance import CARRIER_HZ, CARRIER_V, carrier_v, drive_v, pass_queue
 from haselab.testing.conformance import (
@@ -69,7 +69,7 @@ def wire(board: str, seed: int, opened: ExitStack) -> Bench:
 def chip(seed: int, opened: ExitStack) -> Bench:
     """The microcontroller in co-simulation: it finds its output itself, and takes 0 V alone."""
     data = Path(__file__).resolve().parents[1] / "firmware" / "data"
-    file = MegaFile.model_validate({"kind": "mega", "run": str(data), "simulator": {"seed": seed}})
+    file = ChipFile.model_validate({"kind": "mega", "run": str(data), "simulator": {"seed": seed}})
     try:
         rig = opened.enter_context(opened_chip(file, data / "mega.toml", gate := Gate())).rig
         gate.permit(gate.interlock.revision)

@@ -120,7 +120,7 @@ def test_a_rig_file_names_an_instrument_of_another_package(packages: Packages) -
         ('kind = "aravis"\nhighest_v = 1.0', r"supply: no supply of kind 'aravis'"),
         ('kind = 3\nhighest_v = 1.0', r"supply: no supply of kind '3'"),
         (ON_THE_SHELF + "\nplaice = 1",
-         r"supply\.plaice: no such key; allowed are highest_v, kind, place, tolerance_v"),
+         r"supply\.plaice: no such key; the keys are highest_v, kind, place, tolerance_v"),
         ('kind = "mine"', r"supply\.highest_v: Field required"),
         ("", r"supply\.highest_v: Field required; |supply\.port: Field required"),
     ],

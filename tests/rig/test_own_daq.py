@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from haselab.rig.bench import identify
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.instruments import registry
+from haselab.rig.real_bench import identify
 from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.safety.gate import Gate
 from haselab.safety.guardian.make_safe import make_safe, revoke_and_make_safe

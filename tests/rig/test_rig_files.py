@@ -23,7 +23,12 @@ def test_the_file_of_a_reading_is_the_default_twin(reading):
 @pytest.fixture
 def manual(tmp_path: Path) -> Path:
     """The rig file that the manual shows."""
-    text = (_ROOT / "docs" / "real-bench.md").read_text().split("```toml\n")[1].partition("```")[0]
+    text = (
+        (_ROOT / "docs" / "bench" / "real-bench.md")
+        .read_text()
+        .split("```toml\n")[1]
+        .partition("```")[0]
+    )
     path = tmp_path / "rig.toml"
     path.write_text(text)
     return path
@@ -42,7 +47,7 @@ def test_the_manuals_rig_file_has_no_fault(manual):
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ('device = "Dev1"', 'devise = "Dev1"', r"daq\.devise: no such key; allowed are .*device"),
+        ('device = "Dev1"', 'devise = "Dev1"', r"daq\.devise: no such key; the keys are .*device"),
         ("drive_low_v = 0.0", "drive_low_v = 0.5", r"must hold 0 V between them"),
         ("drive_high_v = 2.0", "drive_high_v = 0.0", r"leave no voltage to drive with"),
         ("drive_high_v = 2.0", "drive_high_v = 20.0", r"daq\.drive_high_v: Input should be less"),
@@ -78,7 +83,7 @@ def test_a_fault_in_a_bench_is_told_with_its_place(manual, old, new, told):
 )
 @pytest.mark.parametrize("character", ["\\u0000", "\\n", "\\u001b", "\\u2028"])
 def test_a_name_with_a_control_character_is_refused_in_one_line(manual, section, key, character):
-    """A null character in supply.port was "A fault of haselab itself" to the doctor."""
+    """A null character in supply.port was "A bug in haselab" to the doctor."""
     tables = tomllib.loads(manual.read_text())
     tables["camera"] = {"kind": "aravis"}
     tables.pop("exposure", None)

@@ -16,13 +16,13 @@ import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig import RigDescription
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.drivers import load_driver
 from haselab.rig.instruments.keysight33500.generator import KeysightGenerator
 from haselab.rig.instruments.nidaq.link import NidaqLink
 from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.petapicovoltron.supply import PetaPicoVoltron
+from haselab.rig.real_bench import RealBench
 from haselab.rig.twin.client import TwinClient
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.hub import TwinHub

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from haselab.base import LimitError, SafetyError, SilentProgress
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.twin.bench import TwinBench, rig_of
+from haselab.rig.real_bench import RealBench
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety.gate import Gate

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, HaselabError
 from haselab.rig import Rig
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.twin.bench import TwinBench, rig_of
+from haselab.rig.real_bench import RealBench
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.guardian.make_safe import revoke_and_make_safe
@@ -370,7 +370,7 @@ class Interleavings(RuleBasedStateMachine):
         assert self.rig is not None
         self.now_s += 2.0 * SafetySettings().permit_age_s
         with self.step("permission expires"):
-            self.rig.safety.sign_of_life(0.0)
+            self.rig.safety.heartbeat(0.0)
 
     # ---- others ----
 

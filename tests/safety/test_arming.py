@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.runner import Runner
 from haselab.safety import shutdown
@@ -59,14 +59,14 @@ def test_nothing_but_zero_goes_out_before_both_steps(twin: TwinBench) -> None:
 def test_a_permit_arms_once_and_only_the_last_one_does(twin: TwinBench) -> None:
     safety = guarded(twin).safety
     first, second = safety.request(), safety.request()
-    with pytest.raises(SafetyError, match=r"Arming request 1 is not open \(the last one is 2\)"):
+    with pytest.raises(SafetyError, match=r"request 1 is no longer valid \(the last one is 2\)"):
         safety.arm(first)
     safety.arm(second)
     assert safety.stage is Stage.ARMED
     with pytest.raises(SafetyError, match="already armed"):
         safety.request()
     safety.end_run()
-    with pytest.raises(SafetyError, match="Arming request 2 is not open"):
+    with pytest.raises(SafetyError, match="Arming request 2 is no longer valid"):
         safety.arm(second)
 
 
@@ -170,7 +170,7 @@ def test_an_instrument_that_never_returns_is_left_behind_and_told(
     rig.safe()
     rig.acquisition.read()
     assert abs(twin.output_v) < 1.0
-    assert "generator: off() has not returned within 0.01 s" in rig.read_back()
+    assert "generator: off() has not returned within 0.01 s" in rig.read_back().text
     hanging.leave.set()
 
 

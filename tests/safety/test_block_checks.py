@@ -8,8 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.safety.state_machine import SafetySettings
 from haselab.safety.watchdog.block_checks import BlockWatch
 
@@ -49,15 +49,15 @@ def test_the_hardest_drives_of_an_honest_bench_never_trip(config: dict[str, obje
 def test_outputs_that_are_queued_are_expected_when_they_take_effect() -> None:
     # One output is queued ahead: what is asked before a block shows in the block after it.
     rig = dataclasses.replace(RIG, switch_sample=2000 + 400)
-    asked_v = [0.0, 0.0, 0.0, 0.5, 1.0, 2.0, 0.0, 1.5, 1.5, 0.7]
+    requested_v = [0.0, 0.0, 0.0, 0.5, 1.0, 2.0, 0.0, 1.5, 1.5, 0.7]
     honest, early = BlockWatch(rig, SETTINGS), BlockWatch(rig, SETTINGS)
-    for k in range(2, len(asked_v)):
-        codes = block(asked_v[k - 1])
-        codes[:400] = block(asked_v[k - 2])[:400]
-        assert honest.fault(codes, asked_v[k]) == ""
-    told = [early.fault(block(value), value) for value in asked_v]
+    for k in range(2, len(requested_v)):
+        codes = block(requested_v[k - 1])
+        codes[:400] = block(requested_v[k - 2])[:400]
+        assert honest.fault(codes, requested_v[k]) == ""
+    told = [early.fault(block(value), value) for value in requested_v]
     # Shown a block too early, all changes above a tenth of the range of 2 V are found.
-    changes = np.flatnonzero(np.abs(np.diff(asked_v, prepend=0.0)) > 0.2)
+    changes = np.flatnonzero(np.abs(np.diff(requested_v, prepend=0.0)) > 0.2)
     assert [k for k, text in enumerate(told) if text] == changes.tolist()
 
 
@@ -112,13 +112,13 @@ def test_outputs_that_waited_may_be_skipped_where_blocks_may_be_passed_over() ->
     # A loop ends with a hard drive while three outputs wait; then the computer is late, the stream
     # is let go, and the last one stands at once.
     rig = dataclasses.replace(RIG, switch_sample=3 * 2000 + 400)
-    asked_v = [1.8, 1.8, 1.7, 1.4, 0.9, 0.1, 0.0]
+    requested_v = [1.8, 1.8, 1.7, 1.4, 0.9, 0.1, 0.0]
     for follows in (True, False):
         watch = BlockWatch(rig, SETTINGS)
         watch.rest(1.8)
-        for value in asked_v[:-1]:
+        for value in requested_v[:-1]:
             watch.fault(block(1.8), value)
-        fault = watch.fault(block(0.0), asked_v[-1], follows=follows)
+        fault = watch.fault(block(0.0), requested_v[-1], follows=follows)
         assert bool(fault) == follows
     # Soon only the last one asked for is right, whatever was passed over.
     for _ in range(8):

@@ -12,8 +12,8 @@ import pytest
 from haselab.base import InputError, Limits
 from haselab.models.maps import VoltageMap
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import describe
 from haselab.safety.rig_limits import safety_of
 from haselab.safety.watchdog.loop_model import capacitance_range, loop_model
 from haselab.safety.watchdog.loop_signals import Delay, Repeats

@@ -16,8 +16,8 @@ from haselab.controllers import pid_controller
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.runner import Runner

@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.base import InputError
+from haselab.models.actuator import ActuatorTables
 from haselab.store.actuator_file import Provenance, hashed, read_run, write_section
+from haselab.store.toml import validated
 
 TYPED = """\
 # my actuator, do not lend
@@ -118,3 +120,11 @@ def test_an_older_run_reads_as_an_actuator_file(tmp_path):
     assert found["controller"]["alternatives"][0]["parameters"] == {"kp": 1.0}
     assert found["controller"]["alternatives"][0]["limits"] == {"low": -0.1, "high": 0.1}
     assert found["actuator"]["geometry"]["zero_length_m"] == 0.05
+
+
+@pytest.mark.parametrize("rows", ["[[1.0, 0.0], [0.0]]", "[]", "[[1.0], 2.0, [3.0], [4.0]]"])
+def test_a_covariance_that_is_no_matrix_of_four_rows_is_refused(path, rows):
+    table = f"slope_per_f = 1e9\noffset = 0\ncovariance = {rows}\n"
+    path.write_text(f"[sensing.strain_map]\n{table}")
+    with pytest.raises(InputError, match=r"covariance"):
+        validated(ActuatorTables, read_run(path), path).strain_map()

@@ -56,7 +56,7 @@ def test_a_folder_with_content_is_refused_or_moved_aside_but_never_emptied(tmp_p
         with claimed_folder(folder, force=number > 0) as aside:
             assert aside == (None if number == 0 else tmp_path / f"run.previous-{number}")
             (folder / "data").write_text(str(number))
-        with pytest.raises(InputError, match=r"not empty; nothing in it was changed"):
+        with pytest.raises(InputError, match=r"not empty; it was not changed"):
             claimed_folder(folder).__enter__()
     found = {path.parent.name: path.read_text() for path in tmp_path.rglob("data")}
     assert found == {"run.previous-1": "0", "run.previous-2": "1", "run": "2"}
@@ -99,7 +99,7 @@ def test_files_move_to_the_next_free_number(tmp_path):
 
 def test_a_file_is_created_once(tmp_path):
     create_exclusively(tmp_path / "a")
-    with pytest.raises(InputError, match="This file exists; nothing in it was changed"):
+    with pytest.raises(InputError, match="This file exists already; it was not changed"):
         create_exclusively(tmp_path / "a")
 
 

@@ -77,7 +77,7 @@ def test_a_file_that_is_no_json_is_an_input_error_with_the_path_last(tmp_path, c
 
 
 def test_a_folder_is_no_json_file(tmp_path):
-    with pytest.raises(InputError, match="This is a folder"):
+    with pytest.raises(InputError, match="The path is a folder"):
         read_json(tmp_path)
 
 

@@ -21,9 +21,9 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="named pipes, devices
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("pipe", "This is a named pipe. Give a regular file"),
-        ("device", "This is a device"),
-        ("folder", "This is a folder"),
+        ("pipe", "The path is a named pipe. Name a regular file"),
+        ("device", "The path is a device"),
+        ("folder", "The path is a folder"),
         ("loop", "Too many levels of symbolic links"),
         ("dangling", "No such rig file"),
     ],
@@ -63,7 +63,7 @@ def test_a_file_beyond_the_limit_is_not_read(
     monkeypatch.setattr(text_file, "_MOST_BYTES", 3)
     path = tmp_path / "a.txt"
     path.write_text("abcd")
-    with pytest.raises(InputError, match="has 4 bytes, but a text file may have 3"):
+    with pytest.raises(InputError, match="has 4 bytes, more than the 3 of"):
         read_text(path)
 
 
@@ -115,6 +115,6 @@ def test_a_message_stays_short_whatever_is_in_the_file() -> None:
     many = {f"key{k}": "x" * 1000 for k in range(1000)}
     with pytest.raises(InputError, match="1001 fault") as caught:
         validated(_Table, {"length_m": "y" * 10_000, **many}, "a.toml")
-    assert str(caught.value).startswith("1001 fault(s): length_m: ")
+    assert str(caught.value).startswith("1001 error(s): length_m: ")
     assert "and 993 more" in str(caught.value)
     assert len(str(caught.value)) < 2000

@@ -13,8 +13,8 @@ import pytest
 
 from haselab.base import Estimate, InputError, LimitError, ResultError
 from haselab.cli.main import main
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import describe
 from haselab.safety.feasibility import Drive
 from haselab.store.toml import Section
 from haselab.study import Analysis, Experiment, NotPlayedError, Outcome, Player, Quantity

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from haselab.models.actuator.strain_map import StrainMap
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.session.writer import ExperimentRecord, SessionWriter
 from haselab.study.definition import builtin_study
 from haselab.study.fits.observe import observe

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from haselab.base import InputError
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import describe
 from haselab.study.definition import Study
 from haselab.study.feasibility import judge_study, rating_of_twin
 from haselab.study.simulated.truth import parameters, set_in_twin, twin_of
@@ -43,7 +43,7 @@ def test_a_stack_that_collapses_is_refused_before_it_is_energised(study):
     twin = stack(shear_modulus_pa=4e3)
     rating = rating_of_twin(twin, study)
     assert math.isinf(rating.stretch)
-    with pytest.raises(InputError, match=r"stretch: no end in triangle, .* Lower the voltage"):
+    with pytest.raises(InputError, match=r"stretch is infinite in triangle, .* Lower the voltage"):
         judge_study(study, describe(twin), rating).require()
 
 

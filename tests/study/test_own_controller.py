@@ -11,8 +11,8 @@ from haselab.base import Estimate, InputError
 from haselab.control import LoopSetting, PidGains
 from haselab.controllers import chosen_controller
 from haselab.models.actuator import ActuatorTables
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import describe
 from haselab.store.actuator_file import ACTUATOR, read_actuator
 from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of

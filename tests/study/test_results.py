@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from haselab.base import Estimate
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.definition import builtin_study
-from haselab.study.results import Quantity, quantities, quantity_rows, reading_verdict, verdict
+from haselab.study.results import Quantity, axis_interpretation, quantities, quantity_rows, verdict
 from haselab.study.simulated.truth import follows_from_twin, is_simulated, set_in_twin
 
 HZ = twin_of_reading("hz").model_dump(mode="json")
@@ -139,14 +139,14 @@ def test_a_bench_is_neither_simulated_nor_set() -> None:
 @pytest.mark.parametrize(("config", "word"), [(HZ, "No verdict"), (BENCH, "The data support")])
 def test_only_a_bench_decides_the_reading(config: dict[str, object], word: str) -> None:
     names = {"S20.omega_n": 32.1, "S19.omega_0": 32.0, "S19.decay_1": 3.6, "S19.decay_2": 4.2}
-    found = reading_verdict({k: Estimate.normal(v, 0.1, "") for k, v in names.items()}, config)
+    found = axis_interpretation({k: Estimate.normal(v, 0.1, "") for k, v in names.items()}, config)
     assert found["verdict"].startswith(word)
     assert "reading Hz" in found["verdict"]
 
 
 def test_the_decay_under_each_reading_has_the_printed_damping() -> None:
     names = ("S20.omega_n", "S19.omega_0", "S19.decay_1", "S19.decay_2")
-    found = reading_verdict({key: Estimate.normal(4.0, 0.1, "") for key in names}, BENCH)
+    found = axis_interpretation({key: Estimate.normal(4.0, 0.1, "") for key in names}, BENCH)
     row = found["evidence"][-1]
     assert row["rad"] == pytest.approx(0.09 * 5.11)
     assert row["hz"] / row["rad"] == pytest.approx(2.0 * math.pi)

@@ -1,4 +1,4 @@
-"""The Python of docs/study.md runs as it stands and gives the product's own strain."""
+"""The Python of docs/study/study.md runs as it stands and gives the product's own strain."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-PAGE = Path(__file__).parents[2] / "docs" / "study.md"
+PAGE = Path(__file__).parents[2] / "docs" / "study" / "study.md"
 
 
 @pytest.fixture

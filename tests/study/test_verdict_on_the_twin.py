@@ -5,8 +5,8 @@ import pytest
 
 from haselab.base import SilentProgress
 from haselab.identify import Record, compare, creep_hypotheses, reading_hypotheses
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime.runner import BLANKING_S, Runner, lockin_of
 from haselab.signals import constant, linear_chirp, square
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from haselab.tracking import PointTracker, Reason, TrackOptions
+from haselab.tracking import LossReason, PointTracker, TrackOptions
 from haselab.tracking.audit import expected_wrong, wrong_share
 from haselab.tracking.guided import GuidedTracker, find_guides
 from haselab.tracking.particles.follow import ParticleTracker
@@ -70,7 +70,7 @@ def test_a_jump_in_a_grid_without_end_is_ambiguous_and_a_slow_motion_is_not(shee
     for shift in (19.0, 9.0, 9.0):
         state, found = tracker.step(state, grid.frame(shift=(shift, 0.0)))
         assert not found.valid.any()
-    assert np.mean((found.reason & Reason.AMBIGUOUS) > 0) > 0.9
+    assert np.mean((found.reason & LossReason.AMBIGUOUS) > 0) > 0.9
 
 
 def test_a_sudden_loss_of_light_that_all_points_share_hides_none(sheet):

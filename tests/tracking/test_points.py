@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from haselab.base import InputError
 from haselab.store.video.opening import open_video
-from haselab.tracking import PointTracker, Reason, TrackOptions, track_frames
+from haselab.tracking import LossReason, PointTracker, TrackOptions, track_frames
 
 STRETCH = np.array([[-0.03, 0.0], [0.0, 0.10]])
 RNG = np.random.default_rng(2)
@@ -170,12 +170,14 @@ def test_a_point_says_why_it_is_lost(sheet):
     state, found = tracker.step(state, frame)
     assert ((found.reason == 0) == found.valid).all()
     assert hidden.sum() >= 4
-    assert (found.reason[hidden] & (Reason.UNLIKE | Reason.UNSETTLED | Reason.COVERED)).all()
+    assert (
+        found.reason[hidden] & (LossReason.UNLIKE | LossReason.UNSETTLED | LossReason.COVERED)
+    ).all()
     shift = (0.0, 38.0)  # the lowest row, at 200 px of 240, leaves the picture
     state = tracker.placed(state, made.place(shift=shift))
     state, gone = tracker.step(state, made.frame(shift=shift))
     low = made.place(shift=shift)[:, 1] > 240 - 7
-    assert (gone.reason[low] & Reason.LEFT).all()
+    assert (gone.reason[low] & LossReason.LEFT).all()
     assert gone.valid[~low].all()
 
 
@@ -229,7 +231,7 @@ def test_a_contrast_that_the_noise_explains_is_not_believed():
     shown = np.rint(160.0 - 1.2 * dots).astype(np.uint8)
     _, found = tracker.step(state, shown)
     assert not found.valid.any()
-    assert (found.reason & Reason.UNLIKE).all()
+    assert (found.reason & LossReason.UNLIKE).all()
     assert np.isnan(found.std_x_px).all()
 
 
@@ -250,7 +252,7 @@ def test_a_place_known_to_a_pixel_only_is_no_place():
         _, found = tracker.step(state, frame)
         assert found.quality[0] > 0.9
         assert found.valid[0] == known
-        assert found.reason[0] == (0 if known else Reason.UNLIKE)
+        assert found.reason[0] == (0 if known else LossReason.UNLIKE)
 
 
 def test_a_match_of_another_contrast_is_not_believed(sheet):
@@ -263,7 +265,7 @@ def test_a_match_of_another_contrast_is_not_believed(sheet):
     cut = np.s_[y - 9 : y + 10, x - 9 : x + 10]
     ideal[cut] = 160 - 0.3 * (160 - ideal[cut])  # a faint copy stands in the point's place
     state, found = tracker.step(state, made.noisy(ideal))
-    assert found.reason[24] & Reason.COVERED
+    assert found.reason[24] & LossReason.COVERED
     assert np.delete(found.valid, 24).all()
 
 
@@ -343,7 +345,7 @@ def test_a_point_without_neighbours_that_may_have_jumped_to_another_dot_is_ambig
     for _ in range(3):  # and stays so: nothing brings its name back
         state, found = tracker.step(state, made.frame(shift=(10.0, 0.0)))
         assert not found.valid.any()
-        assert (found.reason & Reason.AMBIGUOUS).all()
+        assert (found.reason & LossReason.AMBIGUOUS).all()
 
 
 def test_stepping_through_frames_equals_tracking_the_clip(sheet):
@@ -401,7 +403,7 @@ def test_an_affine_subset_turns_with_its_texture():
     np.testing.assert_allclose(
         [found.x_px[0], found.y_px[0]], [60 + 25 * np.cos(0.2), 60 + 25 * np.sin(0.2)], atol=0.01
     )
-    turn = state.poses[0, 2:].reshape(2, 2)
+    turn = state.poses["deformation"][0]
     np.testing.assert_allclose(turn, [[0.98007, -0.19867], [0.19867, 0.98007]], atol=2e-3)
 
 

@@ -68,12 +68,12 @@ class Connection:
         return identity
 
     def switch_off(self) -> None:
-        """Off, confirmed by the instrument's own report."""
+        """Switch off, confirmed by the instrument's own report."""
         if self.ask("OUTP OFF;:VOLT 0;:OUTP?") != "0" or self.number("VOLT?") != 0.0:
             raise self.fault("the output is not off after OUTP OFF")
 
     def switch_off_and_discharge(self) -> None:
-        """Off, confirmed by its meter too."""
+        """Switch off, confirmed by its meter too."""
         self.switch_off()
         end_s = time.monotonic() + self._config.discharge_s
         while (left_v := abs(self.number("MEAS:VOLT?"))) > self._config.tolerance_v:
@@ -101,7 +101,7 @@ class MySupplyDevice:
             raise
 
     def set_voltage(self, voltage_v: float) -> None:
-        if not 0.0 <= voltage_v <= self._config.highest_v:  # also refuses what is no number
+        if not 0.0 <= voltage_v <= self._config.highest_v:  # also refuses NaN
             raise LimitError(
                 f"Supply voltage = {voltage_v:g} V is outside [0, {self._config.highest_v:g}] V."
             )
@@ -117,7 +117,7 @@ class MySupplyDevice:
         return self._connection.ask("OUTP?") == "0"
 
     def off(self) -> None:
-        """Output off. Never raises: the way to 0 V goes on, and `is_off` is asked afterwards."""
+        """Switch off. Never raises: the shutdown must continue, and then calls `is_off`."""
         with contextlib.suppress(DeviceError):
             self._connection.switch_off()
 

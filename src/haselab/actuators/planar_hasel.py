@@ -53,7 +53,7 @@ class PlanarHasel(ActuatorLaw):
         charge_share: see `Losses`.
         charge_relaxation_s: see `Losses`.
         breakdown_v_per_m: see `Circuit`.
-    Source: docs/adr/0003-the-twins-numbers.md; Arruda and Boyce (1993), eq. 19.
+    Source: docs/adr/study/0003-parameters-of-the-twin.md; Arruda and Boyce (1993), eq. 19.
     Example:
         >>> law = PlanarHasel()
         >>> round(1e3 * law.free_length_m, 1), round(1e12 * float(law.capacitance_f(0.036)))

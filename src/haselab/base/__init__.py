@@ -1,5 +1,6 @@
-"""What every room may use: estimates, limits, errors, progress."""
+"""Foundations that every package uses: estimates, limits, errors, progress."""
 
+from haselab.base.closing import Closing
 from haselab.base.errors import (
     DeviceError,
     HaselabError,
@@ -14,6 +15,7 @@ from haselab.base.plain import to_plain
 from haselab.base.progress import Progress, SilentProgress
 
 __all__ = [
+    "Closing",
     "DeviceError",
     "Estimate",
     "HaselabError",

@@ -1,4 +1,4 @@
-"""What a figure shows, as data: panels of curves, points and bands. `haselab.report` draws it."""
+"""Figures as data: panels of curves, points and bands, which `haselab.report` draws."""
 
 from __future__ import annotations
 

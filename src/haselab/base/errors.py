@@ -1,10 +1,10 @@
-"""One tree of errors. Each says what, got, allowed and what to do; the path comes last."""
+"""The error classes. A message says what is wrong, the value found and what to do."""
 
 __all__ = ["DeviceError", "HaselabError", "InputError", "LimitError", "ResultError", "SafetyError"]
 
 
 class HaselabError(Exception):
-    """Root of all errors raised on purpose; `exit_code` is the command line's answer."""
+    """Root of all errors that haselab raises; the command line exits with `exit_code`."""
 
     exit_code = 1
 
@@ -16,11 +16,11 @@ class InputError(HaselabError, ValueError):
 
 
 class LimitError(InputError):
-    """A number lies outside its stated limits."""
+    """A number is outside its limits."""
 
 
 class ResultError(HaselabError, RuntimeError):
-    """An analysis could not reach a result from the data it was given."""
+    """An analysis cannot compute a result from the given data."""
 
     exit_code = 3
 
@@ -32,4 +32,4 @@ class DeviceError(HaselabError, OSError):
 
 
 class SafetyError(DeviceError):
-    """A protection tripped; the output was taken to 0 V."""
+    """A protection tripped; the output was commanded to 0 V."""

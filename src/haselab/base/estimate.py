@@ -1,4 +1,4 @@
-"""A number that was estimated: value, standard deviation, 95 % interval, unit."""
+"""An estimated number: value, standard deviation, 95 % interval, unit."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Estimate:
         return cls(value, abs(value) * relative_std, (low, high), unit)
 
     def scaled(self, factor: float, unit: str) -> Estimate:
-        """The same quantity times an exactly known factor, in another unit."""
+        """Multiply by an exactly known factor, in another unit."""
         low, high = sorted((self.ci95[0] * factor, self.ci95[1] * factor))
         return Estimate(self.value * factor, self.std * abs(factor), (low, high), unit)
 
     def to_dict(self) -> dict[str, Any]:
-        """The form of the public contract: value, std, ci95, unit."""
+        """Convert to a dictionary: value, std, ci95, unit."""
         return {
             "value": self.value,
             "std": self.std,

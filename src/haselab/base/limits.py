@@ -1,4 +1,4 @@
-"""Allowed ranges. A value outside is refused, never clipped in silence."""
+"""Ranges of quantities. A value outside is refused, never clipped."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Limits:
     """A closed range `[low, high]` of one named quantity.
 
     Args:
-        name: quantity, as the user knows it.
+        name: of the quantity, for error messages.
         low: smallest allowed value, in `unit`.
         high: largest allowed value, in `unit`.
         unit: SI unit.

@@ -1,4 +1,4 @@
-"""Results as JSON types."""
+"""Convert results to JSON types."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ __all__ = ["to_plain"]
 
 
 def to_plain(value: Any) -> Any:
-    """Estimates, arrays and numbers as JSON types; a number that is not finite becomes null.
+    """Convert estimates, arrays and numbers to JSON types; NaN and infinity become null.
 
     Args:
-        value: estimate, mapping, sequence, array or number; anything else stays as it is.
+        value: estimate, mapping, sequence, array or number; anything else is returned unchanged.
     Returns:
-        The same in dictionaries, lists, numbers, text and None.
+        The value as dictionaries, lists, numbers, text and None.
     Example:
         >>> to_plain({"wn": Estimate(5.0, 0.1, (4.8, 5.2), "rad/s"), "bad": float("nan")})
         {'wn': {'value': 5.0, 'std': 0.1, 'ci95': [4.8, 5.2], 'unit': 'rad/s'}, 'bad': None}

@@ -1,4 +1,4 @@
-"""Progress of long work, told to whoever listens."""
+"""Progress reports of long jobs."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ __all__ = ["Progress", "SilentProgress"]
 
 
 class Progress(Protocol):
-    """Listener of a long job."""
+    """Listener for the progress of a long job."""
 
     def start(self, total: float) -> None:
-        """A job of `total` units of work begins."""
+        """Start a job of `total` units of work."""
 
     def advance(self, amount: float, what: str) -> None:
-        """`amount` further units are done; `what` names the present step."""
+        """Report `amount` more units as done; `what` names the present step."""
 
     def stop(self) -> None:
-        """The job is over, done or not."""
+        """End the job, finished or not."""
 
 
 class SilentProgress:
-    """Listens to nothing."""
+    """A listener that ignores everything."""
 
     def start(self, total: float) -> None:
         """Ignore."""

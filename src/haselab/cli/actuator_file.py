@@ -1,4 +1,4 @@
-"""What commands share that read or write an actuator file: the option, reading, writing."""
+"""Read and write actuator files, with the running command as provenance."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _WARNED = "haselab.misspelled"  # in the context of the command
 
 
 def load_actuator(path: Path) -> ActuatorTables:
-    """The sections of an actuator file.
+    """Read the sections of an actuator file.
 
     Raises:
-        InputError: no such file, or values that cannot be.
+        InputError: no such file, or an impossible value.
     """
     sections = read_actuator(path)
     warn_misspelled(sections, path)
@@ -40,10 +40,10 @@ def load_actuator(path: Path) -> ActuatorTables:
 
 
 def load_run(path: Path) -> ActuatorTables:
-    """The same for an actuator file or the folder of a run, also of an older one.
+    """Read the sections of an actuator file or of the folder of a run, also of an older one.
 
     Raises:
-        InputError: no such file, or values that cannot be.
+        InputError: no such file, or an impossible value.
     """
     sections = read_run(path)
     warn_misspelled(sections, path)
@@ -74,18 +74,18 @@ def save_section(
     owned: Collection[str] = (),
     status: str = "ok",
 ) -> None:
-    """Write a section with the command that is running as its provenance.
+    """Write a section, with the running command as its provenance.
 
     Args:
         path: of the actuator file.
-        section: its name: "model".
+        section: its name, such as "model".
         values: its keys.
         inputs: files that the command read.
-        owned: keys that are removed where `values` lacks them.
+        owned: keys that are removed if `values` lacks them.
         status: of the result.
     Raises:
         InputError: the file cannot be read.
-        DeviceError: the disk refuses.
+        DeviceError: the file cannot be written.
     """
     write_section(path, section, values, _origin(hashed(inputs), status), owned)
 
@@ -93,12 +93,12 @@ def save_section(
 def mark_sections(
     path: Path, sections: Sequence[str], inputs: Mapping[str, str], *, simulated: bool = False
 ) -> None:
-    """Write the command that is running as the provenance of sections.
+    """Write the running command as the provenance of sections.
 
     Args:
         path: of the actuator file.
         sections: their names.
-        inputs: names and hashes of what was read.
+        inputs: names and hashes of the files that were read.
         simulated: the numbers are those of a twin; written as `simulated = true`.
     """
     table = dict(_origin(inputs, "ok").table())

@@ -1,4 +1,4 @@
-"""Options that name the columns of a file and their units, one meaning in every command."""
+"""Options that name the columns of a file and state their units."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Quantity:
     """A quantity that a command reads from a column.
 
     Args:
-        option: that names the column, such as `--strain`.
-        names: of the column where the option is not given; the first that the file has is used.
+        option: the option that names the column, such as `--strain`.
+        names: default names of the column; the first that the file has is used.
         si: the SI unit of the quantity; None: any.
         what: the quantity, for --help.
     """
@@ -48,11 +48,11 @@ class Quantity:
 
     @property
     def parameter(self) -> str:
-        """Name of the option's parameter in the code."""
+        """Name of the parameter that receives the option."""
         return f"{self.option.lstrip('-').replace('-', '_')}_column"
 
     def column(self, file: Path, given: str | None) -> str:
-        """The column of this quantity in a file."""
+        """Return the name of the column that holds this quantity in a file."""
         if given is not None or len(self.names) == 1:
             return given or self.names[0]
         with open_archive(file) as archive:
@@ -65,7 +65,7 @@ def column_option(quantity: Quantity) -> Callable[[F], F]:
     default = " or ".join(quantity.names)
     return click.option(
         quantity.option, quantity.parameter, metavar="COLUMN",
-        help=f"Column of {quantity.what}. Default: {default}.",
+        help=f"Name the column of {quantity.what}. Default: {default}.",
     )  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def _units(pairs: Sequence[str]) -> Mapping[str, str]:
         name, mark, unit = pair.rpartition("=")
         if not (mark and name.strip() and unit.strip()):
             raise InputError(
-                f"--unit {pair} has no COLUMN=UNIT. Name the column and its unit, for example "
+                f"--unit {pair} is not COLUMN=UNIT. Name the column and its unit, for example "
                 "--unit U=mV."
             )
         found[name.strip()] = unit.strip()
@@ -87,13 +87,13 @@ def column_options(function: F) -> F:
 
     @click.option(
         "--time", "time_column", metavar="COLUMN",
-        help="Column of the times, in s or in the unit it states. Default: time_s, time, t, Zeit "
-        "or X_Value.",
+        help="Name the column of the times, in s or in the unit in its header. Default: time_s, "
+        "time, t, Zeit or X_Value.",
     )  # fmt: skip
     @click.option(
         "--unit", "unit_pairs", multiple=True, metavar="COLUMN=UNIT",
-        help="State the unit of a column, for example U=mV. Default: the unit in the header, else "
-        "SI. Repeat it for more columns.",
+        help="State the unit of a column, for example U=mV. Repeat the option for more columns. "
+        "Default: the unit in the header, else SI.",
     )  # fmt: skip
     @functools.wraps(function)
     def wrapper(
@@ -106,7 +106,7 @@ def column_options(function: F) -> F:
 
 @contextmanager
 def advice_on_columns(options: Sequence[str]) -> Iterator[None]:
-    """Say in the error about missing columns which options name them."""
+    """Add to an error about missing columns which options name them."""
     try:
         yield
     except MissingColumnsError as error:
@@ -114,10 +114,10 @@ def advice_on_columns(options: Sequence[str]) -> Iterator[None]:
 
 
 def check_unit(column: str, unit: Unit | None, quantity: Quantity, file: Path) -> None:
-    """Refuse a column whose stated unit is of another quantity.
+    """Refuse a column whose stated unit belongs to another quantity.
 
     Raises:
-        InputError: it is.
+        InputError: the unit belongs to another quantity.
     """
     if unit is None or quantity.si is None or unit.si == quantity.si:
         return
@@ -138,11 +138,11 @@ def note_seconds(name: str, file: Path) -> None:
 
 
 def note_units(table: Table, file: Path) -> None:
-    """Say on stderr which columns were converted, and times whose unit nobody states."""
+    """Report on stderr which columns were converted, and times whose unit nobody states."""
     if table.assumed_seconds:
         note_seconds(str(table.time_name), file)
     for name, unit in table.units.items():
         if unit is not None and unit.factor != 1.0:
             to = "a pure number" if unit.si == "1" else unit.si
-            click.echo(f"haselab: column {name} is converted from {unit.symbol} to {to}. {file}",
+            click.echo(f"haselab: column {name} was converted from {unit.symbol} to {to}. {file}",
                        err=True)  # fmt: skip

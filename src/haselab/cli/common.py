@@ -1,4 +1,4 @@
-"""What all commands share: the options --json, --out, --force, --debug; output; short errors."""
+"""What all commands share: --json, --out, --force and --debug, number types, and output."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import click
 
 from haselab.base import InputError, Progress, SilentProgress, to_plain
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule, reserved
 from haselab.cli.plot import PLOT
 from haselab.cli.readable import readable
@@ -31,8 +32,8 @@ __all__ = [
     "emit",
     "progress_bar",
     "refuse_two_twins",
-    "tell_doubt",
     "unverified_option",
+    "warn_unverified",
 ]
 
 _LARGEST = 1e30
@@ -51,14 +52,14 @@ class Real(click.FloatRange):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """The number; `BadParameter` where it is none."""
+        """Return the number, or raise `BadParameter` if the value is not one."""
         number: float = super().convert(value, param, ctx)
         if not (abs(number) <= _LARGEST or (self.unbounded and number == math.inf)):
             self.fail(f"{number:g} is not a finite number of at most {_LARGEST:g}.", param, ctx)
         return number
 
     def _describe_range(self) -> str:
-        """What --help shows; click has no words for a range without an end."""
+        """Describe the range for --help; click cannot describe a range without ends."""
         return "" if self.min is None and self.max is None else super()._describe_range()
 
 
@@ -69,7 +70,7 @@ class _Limit(Real):
 
 
 class _Integer(click.IntRange):
-    """A whole number whose range is checked, and named, by what takes it."""
+    """A whole number whose range is checked, with a better message, by the function it goes to."""
 
     def _describe_range(self) -> str:
         return ""
@@ -84,25 +85,27 @@ SEED = click.IntRange(0, 2**63 - 1)
 
 def answer_options(
     rule: OutputRule | None = None,
-    out_help: str = "File to write the result to.",
+    out_detail: str = "A JSON file. Default: none.",
     *,
     plot: bool = False,
 ) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 
     Args:
-        rule: what the command does about results that exist; None: `--out` must be new.
-        out_help: what `--out` names.
+        rule: what the command does about existing results; None: `--out` must be new.
+        out_detail: what the command writes to `--out`.
         plot: add `--plot` too (passed on as `plot`).
+    Returns:
+        The decorator.
     """
     rule = rule or OutputRule()
     if plot:
         rule = replace(rule, options=(*rule.options, "plot"))
-    text = "Move an existing result aside, to NAME.previous-1, instead of refusing it."
+    text = "Move an existing result to NAME.previous-1 instead of refusing to write."
 
     def decorate(function: F) -> F:
         @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
-        @click.option("--out", type=click.Path(path_type=Path), help=out_help)
+        @shared_option("--out", type=click.Path(path_type=Path), detail=out_detail)
         @click.option("--force", is_flag=True, help=text)
         @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
         @functools.wraps(function)
@@ -116,16 +119,16 @@ def answer_options(
     return decorate
 
 
-def actuator_option(text: str) -> Callable[[F], F]:
+def actuator_option(detail: str) -> Callable[[F], F]:
     """Add `--actuator`, passed on as `actuator`: a path, or None.
 
     Args:
-        text: what the command reads from the file and writes into it.
+        detail: which sections the command reads and writes.
+    Returns:
+        The decorator.
     """
-    return click.option(
-        "--actuator", type=click.Path(path_type=Path), metavar="A.toml",
-        help=f"Actuator file: {text}",
-    )  # fmt: skip
+    text = f"{detail} Default: none."
+    return shared_option("--actuator", type=click.Path(path_type=Path), detail=text)
 
 
 def unverified_option(function: F) -> F:
@@ -134,27 +137,27 @@ def unverified_option(function: F) -> F:
     return click.option("--unverified", is_flag=True, help=text)(function)
 
 
-def tell_doubt(doubt: str, path: Path) -> None:
-    """Say in one line that the numbers of a session are not verified, and why."""
+def warn_unverified(doubt: str, path: Path) -> None:
+    """Warn in one line that the numbers of a session are not verified, and why."""
     if doubt:
         click.echo(f"haselab: unverified numbers: {doubt}. {path}", err=True)
 
 
 def refuse_two_twins(reading: str | None, twin: Path | None) -> None:
-    """Refuse `--reading` beside `--twin`, where one of them would have no effect.
+    """Refuse `--reading` together with `--twin`: one of them would have no effect.
 
     Raises:
         InputError: both were given.
     """
     if reading is not None and twin is not None:
         raise InputError(
-            f"--reading {reading} chooses a default twin, --twin describes one, with a reading of "
-            f"its own. Leave one of them out. {twin}"
+            f"--reading {reading} chooses a default twin, but --twin describes another one. Leave "
+            f"one of them out. {twin}"
         )
 
 
 def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:
-    """Print an answer (JSON or readable lines) and, if asked, write its JSON to `out`."""
+    """Print an answer (JSON or readable lines) and, if `out` is given, write its JSON there."""
     text = json.dumps(to_plain(answer), indent=2)
     if out is not None:
         write_text(out, text + "\n")
@@ -195,7 +198,7 @@ class _BarProgress:
             self._bar.stop()
 
     def stop(self) -> None:
-        """Take the bar away, whatever its state."""
+        """Remove the bar, whatever its state."""
         self._bar.stop()
 
 

@@ -1,4 +1,4 @@
-"""The first lines of every command: from here on Ctrl-C ends it with 130 and one line at most."""
+"""Entry point of the console script: Ctrl-C ends it with code 130 and at most one line."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ try:
 except KeyboardInterrupt:
     raise SystemExit(130) from None
 
-# The matrices of a command are small: threads of the linear algebra would wait for each other.
+# The matrices of a command are small: more threads in the linear algebra would only cost time.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 __all__ = ["StartUp", "main"]
 
 _INTERRUPTED = 130
-_REPEAT_S = 1.0  # a signal this soon after another one leaves the clean-up alone
+_REPEAT_S = 1.0  # a signal this soon after another one does not interrupt the clean-up
 _AGAIN_S = 0.05
 
 
@@ -32,7 +32,7 @@ def _leave() -> None:
 
 
 def _ask_main_thread() -> None:
-    """Send it SIGINT, which also ends a system call in which it waits."""
+    """Send the main thread SIGINT, which also ends a system call in which it waits."""
     if sys.platform == "win32":
         signal.raise_signal(signal.SIGINT)
     else:
@@ -40,19 +40,19 @@ def _ask_main_thread() -> None:
 
 
 class StartUp:
-    """Ctrl-C before, in and after a command.
+    """Handles Ctrl-C before, during and after a command.
 
-    While modules are imported it ends the process at once: an import that is interrupted can fail
-    as any error, or not at all. Once a command runs it raises `KeyboardInterrupt`, but not again
-    within 1 s, so that a second one does not break off the clean-up of the first. Python drops an
-    exception that comes up inside a finaliser; it is then raised again a little later.
+    While modules are imported it ends the process at once: an interrupted import can fail with any
+    error, or not at all. Once a command runs it raises `KeyboardInterrupt`, but not again within
+    1 s, so that a second Ctrl-C does not interrupt the clean-up of the first. Python drops an
+    exception that is raised inside a finaliser; it is then raised again a little later.
     """
 
     def __init__(self) -> None:
         self._importing = True
         self._last_s = float("-inf")
         self._unraisable = sys.unraisablehook
-        # nohup, and a shell that starts a command in the background, have it ignored.
+        # nohup, and a shell that starts a command in the background, ignore the signal.
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
             signal.signal(signal.SIGINT, self._ask)
             sys.unraisablehook = self._dropped
@@ -75,11 +75,11 @@ class StartUp:
         again.start()
 
     def imported(self) -> None:
-        """The command's modules are there: from now on it may have something to clean up."""
+        """Note that all modules are imported: from now on there may be something to clean up."""
         self._importing = False
 
     def finished(self) -> None:
-        """The command is over: what is left of the process is not interrupted any more."""
+        """Note that the command is over: ignore further signals."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and a closed terminal end a run once, and are not lost."""
+"""End a run on Ctrl-C, SIGTERM or a closed terminal: once, and without losing the signal."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ __all__ = ["Interruptible"]
 
 
 def _leave_terminal() -> None:
-    """A closed terminal takes no words: writing to it would be an error in mid-clean-up."""
+    """Discard output to a closed terminal: writing to it would fail during the clean-up."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
-        # A terminal that is gone is no terminal either; a file or a pipe still takes words.
+        # isatty is false for a closed terminal; a file or a pipe can still be written to.
         if stat.S_ISCHR(os.fstat(stream).st_mode):
             os.dup2(nowhere, stream)
     os.close(nowhere)
 
 
 class Interruptible:
-    """A progress listener that ends the job when a signal has asked for it.
+    """A progress listener that ends the job after a signal.
 
-    The first signal raises `KeyboardInterrupt` where the program stands. Python drops an exception
-    that comes up inside a finaliser and tells of it on stderr, so the wish is also kept and raised
-    again at the next step, and not told; later signals leave the clean-up alone.
+    The first signal raises `KeyboardInterrupt` wherever the program is. Python drops an exception
+    that is raised inside a finaliser and prints it on stderr. The signal is therefore also kept and
+    raised again at the next step, and the print is suppressed. Later signals do not interrupt the
+    clean-up.
 
     Args:
-        progress: who is told.
+        progress: the listener to forward to.
     """
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
-        self._asked = False
+        self._signalled = False
         self._ended = False
         for name in ("SIGINT", "SIGTERM", "SIGHUP"):
             number = getattr(signal, name, None)  # Windows has no SIGHUP
@@ -46,27 +47,27 @@ class Interruptible:
         sys.unraisablehook = self._dropped
 
     def _dropped(self, what: sys.UnraisableHookArgs) -> None:
-        if not (self._asked and issubclass(what.exc_type, KeyboardInterrupt)):
+        if not (self._signalled and issubclass(what.exc_type, KeyboardInterrupt)):
             self._unraisable(what)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        first, self._asked = not self._asked, True
+        first, self._signalled = not self._signalled, True
         if number == getattr(signal, "SIGHUP", None):
             _leave_terminal()
         if first:
             raise KeyboardInterrupt
 
     def start(self, total: float) -> None:
-        """A job of `total` units of work begins."""
+        """Start a job of `total` units of work."""
         self._progress.start(total)
 
     def advance(self, amount: float, what: str) -> None:
-        """Tell it on, or end here when a signal has asked for it."""
-        if self._asked and not self._ended:
+        """Forward the progress, or end the job after a signal."""
+        if self._signalled and not self._ended:
             raise KeyboardInterrupt
         self._progress.advance(amount, what)
 
     def stop(self) -> None:
-        """The job is over, done or not."""
+        """End the job, finished or not."""
         self._ended = True
         self._progress.stop()

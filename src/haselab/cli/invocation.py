@@ -1,4 +1,4 @@
-"""How the program was called: for the provenance of results, and for Ctrl-C at the start."""
+"""How the program was called: for the provenance of results and for early Ctrl-C."""
 
 from __future__ import annotations
 

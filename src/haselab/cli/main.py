@@ -1,4 +1,4 @@
-"""Entry point: finds the command, turns errors into one line and an exit code."""
+"""Command line: find the command, and turn errors into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ __all__ = ["cli", "main"]
 
 # name: (module with an attribute `command`, one line of help). Modules load when they are used.
 _COMMANDS = {
-    "reproduce": ("haselab.cli.study.reproduce", "The whole reference study on the twin."),
-    "run": ("haselab.cli.study.run", "Any study on any rig."),
-    "analyse": ("haselab.cli.study.analyse", "Fits, designs and report again from recorded data."),
-    "sense": ("haselab.cli.data.sense", "Monitors to capacitance, block by block."),
+    "reproduce": ("haselab.cli.study.reproduce", "Run the reference study on the simulated bench."),
+    "run": ("haselab.cli.study.run", "Run a study on a bench, real or simulated."),
+    "analyse": ("haselab.cli.study.analyse", "Repeat fits, design and report from a recording."),
+    "sense": ("haselab.cli.data.sense", "Compute capacitance from both monitors."),
     "init": ("haselab.cli.model.init", "Write an actuator file to start from."),
-    "calibrate": ("haselab.cli.bench.calibrate", "Monitors against reference capacitors."),
-    "plan": ("haselab.cli.bench.plan", "Choices before an experiment: the carrier."),
+    "calibrate": ("haselab.cli.bench.calibrate", "Calibrate the monitors with known capacitors."),
+    "plan": ("haselab.cli.bench.plan", "Choose the carrier and check a study's feasibility."),
     "plan-experiment": (
         "haselab.cli.identify.plan_experiment",
-        "The next drive signal for a model.",
+        "Design the drive signal of the next experiment.",
     ),
-    "track": ("haselab.cli.data.track", "Video to displacements and strain."),
-    "identify": ("haselab.cli.identify.group", "Models with uncertainty from records."),
-    "design": ("haselab.cli.model.design", "Controller gains and margins from a model."),
-    "compare": ("haselab.cli.model.compare", "Predict a record that the model has not seen."),
-    "margins": ("haselab.cli.model.margins", "Stability margins of given gains on a model."),
-    "export": ("haselab.cli.model.export", "A model in the form of another tool."),
-    "session": ("haselab.cli.data.session", "A recording in the form of other tools, and back."),
-    "example": ("haselab.cli.data.example", "Small data sets and the commands that use them."),
+    "track": ("haselab.cli.data.track", "Measure displacements and strain in a video."),
+    "identify": ("haselab.cli.identify.group", "Identify models, with intervals, from records."),
+    "design": ("haselab.cli.model.design", "Design controller gains and report their margins."),
+    "compare": ("haselab.cli.model.compare", "Predict records that were not used for the fit."),
+    "margins": ("haselab.cli.model.margins", "Compute the stability margins of given gains."),
+    "export": ("haselab.cli.model.export", "Convert a model for another tool."),
+    "session": ("haselab.cli.data.session", "Export a recording for another tool, or import one."),
+    "example": ("haselab.cli.data.example", "Write example data and the commands that use it."),
     "recover": ("haselab.cli.data.recover", "Repair a recording whose program was killed."),
-    "report": ("haselab.cli.study.report", "The page of a run, or of an actuator file."),
-    "twin": ("haselab.cli.bench.twin", "The simulated bench: its parameters and its instruments."),
+    "report": ("haselab.cli.study.report", "Write the report of a run or of an actuator file."),
+    "twin": ("haselab.cli.bench.twin", "Describe or serve a simulated bench."),
     "rig": ("haselab.cli.bench.rig", "Check a bench in stages, or make it safe."),
-    "firmware": ("haselab.cli.model.firmware", "The controller on a microcontroller."),
-    "doctor": ("haselab.cli.doctor.command", "What is installed and what answers."),
+    "firmware": ("haselab.cli.model.firmware", "Build, simulate or flash the microcontroller."),
+    "doctor": ("haselab.cli.doctor.command", "Report what is installed and which devices answer."),
 }
 
 
@@ -56,19 +56,19 @@ _BAD_PATHS = (
     IsADirectoryError,
     NotADirectoryError,
 )
-_CLOSED_PIPE = 141  # 128 + SIGPIPE, the exit status of a program that the signal ended
+_CLOSED_PIPE = 141  # 128 + SIGPIPE, the exit status of a program that this signal ended
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 
 
 class _BrokenPipe(Exception):  # noqa: N818 -- never seen outside of this file
-    """Around the error that says that nobody reads a pipe or a connection any more."""
+    """Wraps a `BrokenPipeError`: the reader of a pipe or a connection is gone."""
 
     def __init__(self, error: BrokenPipeError) -> None:
         self.error = error
 
 
 class _LazyGroup(click.Group):
-    """A group whose commands are imported on demand, so that --help answers at once."""
+    """A group that imports its commands on demand, so that --help is fast."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
@@ -80,14 +80,14 @@ class _LazyGroup(click.Group):
         return command
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Read the options; a pipe that broke is handed on, for click would exit with 1."""
+        """Parse the options; wrap a broken pipe, for which click would exit with 1."""
         try:
             return super().make_context(*args, **kwargs)
         except BrokenPipeError as error:
             raise _BrokenPipe(error) from error
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command, in the same way."""
+        """Run the command; wrap a broken pipe in the same way."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError as error:
@@ -96,7 +96,7 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Import the command, and say so."""
+        """Import the command, then call `on_command`."""
         found = super().resolve_command(ctx, args)
         if isinstance(ctx.obj, Invocation):
             ctx.obj.on_command()
@@ -110,31 +110,34 @@ class _LazyGroup(click.Group):
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="haselab")
 def cli() -> None:
-    """haselab: the open bench for soft electrostatic actuators."""
+    """Measure, model and control soft electrostatic actuators (HASEL, DEA).
+
+    A simulated bench, the twin, is built in, so every command can be tried without hardware.
+    """
 
 
 def _fail(message: str, exit_code: int) -> int:
     try:
         click.echo(f"haselab: {' '.join(message.split())}", err=True)
-    except OSError:  # nobody reads this either
+    except OSError:  # stderr is closed too
         _silence(sys.stderr)
     return exit_code
 
 
 def _notes(error: BaseException) -> list[str]:
-    """What is known of the output and the recording, noted where the interrupt passed."""
+    """Notes about the output and the recording that were added to the interrupt."""
     cause = error.__cause__  # click turns KeyboardInterrupt into Abort
     return [*getattr(cause, "__notes__", []), *getattr(error, "__notes__", [])]
 
 
 def _silence(stream: TextIO) -> None:
-    """Let what is still written to a stream go nowhere."""
-    with contextlib.suppress(OSError, ValueError):  # no descriptor: nothing to be silenced
+    """Discard what is still written to a stream."""
+    with contextlib.suppress(OSError, ValueError):  # no descriptor: nothing to silence
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _is_unread(stream: TextIO) -> bool:
-    """Whether this stream is a pipe that nobody reads."""
+    """Whether this stream is a pipe whose reader is gone."""
     try:
         stream.flush()
         poll = select.poll()
@@ -147,13 +150,13 @@ def _is_unread(stream: TextIO) -> bool:
 
 
 def _broken_pipe(error: BrokenPipeError) -> int:
-    """A reader such as `head` that has seen enough is no fault; a lost connection is one."""
+    """Exit code: `head` may stop reading early, but a lost connection is a fault."""
     unread = [stream for stream in (sys.stdout, sys.stderr) if _is_unread(stream)]
     for stream in unread:
         _silence(stream)
     if unread:
         return _CLOSED_PIPE
-    return _fail(f"A connection was lost ({error.strerror}); check the instrument.", 4)
+    return _fail(f"A connection was lost ({error.strerror}). Check the instrument.", 4)
 
 
 def main(
@@ -161,11 +164,10 @@ def main(
 ) -> None:
     """Run one command and exit: 0, 2 bad input, 3 no result, 4 device or safety, 130 Ctrl-C.
 
-    A fault of the program itself is 1. Where nobody reads the output any more it is 141, as with
-    other programs in a pipe.
+    A fault of the program itself exits with 1; a closed output pipe with 141, as other programs do.
 
     Args:
-        arguments: of the command line; None: those of the process.
+        arguments: of the command line; None: those of this process.
         on_command: called when the command's modules are imported, before it does anything.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -195,12 +197,12 @@ def main(
         if debug:
             raise
         if isinstance(error, _BAD_PATHS) or error.errno in _BAD_NAMES:
-            sys.exit(_fail(f"{error.strerror}; name another path. {error.filename}", 2))
-        what = f"The system refuses ({error.strerror or error}); check the disk and its rights."
+            sys.exit(_fail(f"{error.strerror}. Name another path. {error.filename}", 2))
+        what = f"File error: {error.strerror or error}. Check the disk and your permissions."
         sys.exit(_fail(f"{what} {error.filename or ''}", 4))
     except Exception as error:
         if debug:
             raise
-        what = f"A fault of haselab itself ({type(error).__name__}: {error})."
-        sys.exit(_fail(f"{what} Repeat it with --debug and report what that shows.", 1))
+        what = f"A bug in haselab ({type(error).__name__}: {error})."
+        sys.exit(_fail(f"{what} Run again with --debug and report the traceback.", 1))
     sys.exit(0)

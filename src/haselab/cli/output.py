@@ -1,4 +1,4 @@
-"""What a command does about a result that lies where it is to write: refuse, or move it aside."""
+"""Protect existing results: a command refuses to overwrite them, or moves them aside."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class OutputRule:
     """Where a command writes.
 
     Args:
-        kind: of `out`, or what tells it from the parameters. `file` must not exist and is made at
-            once, `folder` is new or empty and locked until the command ends, `late` is a file that
-            must not exist and is made when it is whole, `last` a file that is checked when it is
-            written, because the command has something more important to do.
+        kind: of `out`, or a function of the parameters that returns it. `file` must not exist and
+            is created at once; `folder` is new or empty, and locked until the command ends; `late`
+            is a file that must not exist and is created when it is complete; `last` is a file that
+            is checked only when it is written, because the command has more urgent work.
         options: names of parameters besides `out` that name a file.
-        built: names of parameters that name a folder whose files are made anew each time.
-        beside: endings of the files that are written beside `out`, in the place of its own ending.
-        own: the path, if any, whose derived files this command writes anew by purpose.
+        built: names of parameters that name a folder whose files are rewritten each time.
+        beside: endings of the files that are written beside `out`, in place of its own ending.
+        own: the path, if any, whose derived files this command rewrites on purpose.
     """
 
     kind: OutputKind | Callable[[Mapping[str, Any]], OutputKind] = "file"
@@ -63,7 +63,7 @@ class OutputRule:
 
 
 def _option_of(name: str) -> str:
-    """The option of a parameter, which may have another name in the code."""
+    """The option that sets a parameter, which may have another name in the code."""
     context = click.get_current_context(silent=True)
     for parameter in context.command.params if context else ():
         if parameter.name == name and parameter.opts:
@@ -79,14 +79,14 @@ def _same(one: Path, other: Path) -> bool:
 
 @contextlib.contextmanager
 def reserved(rule: OutputRule, parameters: Mapping[str, Any], *, force: bool) -> Iterator[None]:
-    """See that a command overwrites nothing.
+    """Make sure that a command overwrites nothing.
 
     Args:
         rule: of the command.
-        parameters: of the command, as it gets them.
-        force: move what is there aside.
+        parameters: of the command, as it receives them.
+        force: move existing results aside.
     Raises:
-        InputError: there is a result already, or `force` would move what the command reads.
+        InputError: a result exists already, or `force` would move what the command reads.
     """
     outputs = rule.outputs(parameters)
     _refuse_inputs(rule, parameters, outputs, force)
@@ -95,7 +95,7 @@ def reserved(rule: OutputRule, parameters: Mapping[str, Any], *, force: bool) ->
             if kind == "folder":
                 aside = opened.enter_context(claimed_folder(path, force=force))
                 if aside is not None:
-                    _tell(path, aside)
+                    _report_move(path, aside)
             elif kind != "last":
                 _reserve_file(opened, option, path, kind, force)
         for name in rule.built:
@@ -111,8 +111,8 @@ def _reserve_file(
     if is_occupied(path):
         if not force:
             raise InputError(
-                f"{option} names an existing result; nothing in it was changed. Name a new path, "
-                f"or add --force to move this one aside. {path}"
+                f"{option} names an existing result, which was not changed. Name a new path, or "
+                f"add --force to move it aside. {path}"
             )
         opened.enter_context(_moved(path))
     if kind == "file":
@@ -125,7 +125,7 @@ def _refuse_inputs(
     outputs: Sequence[tuple[str, Path, OutputKind]],
     force: bool,
 ) -> None:
-    """Refuse to write over, or to move, what the command reads."""
+    """Refuse to overwrite or move a file that the command reads."""
     given: list[Any] = []
     for name, value in parameters.items():
         if name not in ("out", *rule.options, *rule.built):
@@ -135,7 +135,7 @@ def _refuse_inputs(
     for option, path, _ in outputs:
         for source in sources:
             if _same(source, path) and path.is_file():
-                raise InputError(f"{option} names what is read. Name another file. {path}")
+                raise InputError(f"{option} names a file that is read. Name another file. {path}")
         for source, file in [*((each, None) for each in sources), *named]:
             if force and source.resolve().is_relative_to(path.resolve()):
                 why = "this command reads" if file is None else f"{file} names"
@@ -145,19 +145,19 @@ def _refuse_inputs(
 
 
 def _as_path(value: Any) -> Path | None:
-    """A parameter that is a path, or a text that looks like one: some options take either."""
+    """Return a parameter as a path if it is one or looks like one; some options take both."""
     if isinstance(value, str) and Path(value).suffix:
         return Path(value)
     return value if isinstance(value, Path) else None
 
 
 def _named_in(source: Path) -> list[Path]:
-    """What exists of the paths in a settings file, such as the session of a rig of kind replay."""
+    """Existing paths in a settings file, such as the session of a rig of kind replay."""
     if source.suffix.lower() != ".toml" or not source.is_file():
         return []
     try:
         texts = [text for text in _texts(parse_toml(read_text(source))) if "\0" not in text]
-    except (InputError, ValueError, RecursionError):  # the command says what is wrong with it
+    except (InputError, ValueError, RecursionError):  # the command reports what is wrong
         return []
     found = [folder / text for text in texts for folder in (source.parent, Path()) if text]
     return [path for path in found if _exists(path)]
@@ -174,19 +174,19 @@ def _texts(value: Any) -> list[str]:
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except OSError:  # a text that is too long for a name
+    except OSError:  # too long for a file name
         return False
 
 
-def _tell(path: Path, aside: Path) -> None:
+def _report_move(path: Path, aside: Path) -> None:
     click.echo(f"haselab: moved {path} to {aside}", err=True)
 
 
 @contextlib.contextmanager
 def _moved(path: Path) -> Iterator[None]:
-    """Move a result aside; back again where the command fails before it has written another."""
+    """Move a result aside, and back if the command fails before it writes a new one."""
     aside = move_aside(path)
-    _tell(path, aside)
+    _report_move(path, aside)
     try:
         yield
     except BaseException:

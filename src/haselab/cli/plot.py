@@ -16,7 +16,7 @@ _ENDINGS = (".svg", ".png", ".html")
 
 
 def _checked(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
-    """Refuse an ending that is no figure before anything is computed."""
+    """Refuse a file name that is not a figure before anything is computed."""
     del context, parameter
     if path is not None and path.suffix.lower() not in _ENDINGS:
         raise InputError(
@@ -33,9 +33,9 @@ PLOT = click.option(
 
 
 def save_plot(path: Path | None, chart: Callable[[], Chart]) -> None:
-    """Draw and write the figure, where one is wanted."""
+    """Draw the figure and write it to `path`, if one is given."""
     if path is None:
         return
-    from haselab.report.chart_file import write_chart  # matplotlib: a second at the start
+    from haselab.report.chart_file import write_chart  # matplotlib takes a second to import
 
     write_chart(chart(), path)

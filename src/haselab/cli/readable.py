@@ -1,4 +1,4 @@
-"""An answer as lines for a reader: one number, or one row of a table, a line."""
+"""Format an answer as readable lines: one number, or one row of a table, per line."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from haselab.base import Estimate, to_plain
 __all__ = ["readable"]
 
 _NAME_WIDTH, _INDENT, _WIDEST = 32, 2, 100
-_MOST_NUMBERS = 8  # of a list that is shown
+_MOST_NUMBERS = 8  # longest list of numbers that is shown
 
 
 def readable(answer: Mapping[str, Any]) -> list[str]:
-    """The lines of an answer.
+    """Format an answer as lines.
 
     Args:
         answer: numbers, estimates, texts, and tables and lists of them.
@@ -49,7 +49,7 @@ def _lines(table: Mapping[str, Any], indent: int) -> Iterator[str]:
 
 
 def _items(values: Sequence[Any], indent: int) -> Iterator[str]:
-    """Each on lines of its own; rows of a table with a number."""
+    """Format each item on its own lines; number the rows of a table."""
     for number, value in enumerate(values, start=1):
         if isinstance(value, Mapping):
             yield f"{' ' * indent}{number}"
@@ -59,7 +59,7 @@ def _items(values: Sequence[Any], indent: int) -> Iterator[str]:
 
 
 def _short(value: Any) -> str | None:
-    """One value on one line; None where it needs several."""
+    """Format a value on one line; None if it needs several."""
     if isinstance(value, Estimate):
         return _estimate(value)
     if hasattr(value, "shape") and getattr(value, "size", 0) > _MOST_NUMBERS:

@@ -106,7 +106,7 @@ def simulate_ensemble(
     """
     loops, desired, noise = _prepared(plants, gains, reference, setting, measurement_noise)
     window = _Window.of(desired)
-    kept = np.empty((len(plants), window.ends.size, _loops.KEPT), np.float32)
+    kept = np.empty((len(plants), window.ends.size), _loops.SUMMARY)
     loops.summaries(desired, *noise, window.band, window.ends, kept, threads=_threads(threads))
     return window.summaries(kept, 1.0 / setting.rate_hz)
 
@@ -194,10 +194,13 @@ class _Window:
         """Of the stretches that are run: one more before the window where there is something."""
         return self.edges[0 if self.start else 1 :].astype(np.uint64)
 
-    def summaries(self, kept: NDArray[np.float32], period_s: float) -> LoopSummaries:
-        """`kept`: five numbers each loop and stretch, see `native/loops/loops.h`."""
-        after = kept[:, 1 if self.start else 0 :].transpose(2, 0, 1).astype(float, order="C")
-        error_sum, top, bottom, last, limited = after
+    def summaries(self, kept: NDArray[np.void], period_s: float) -> LoopSummaries:
+        """`kept`: a summary each loop and stretch, see `native/loops/loops.h`."""
+        after = kept[:, 1 if self.start else 0 :]
+        error_sum, top, bottom, last, limited = (
+            after[name].astype(float, order="C")
+            for name in ("error_sum", "top", "bottom", "last_outside", "limited")
+        )
         tenths = (len(kept), _TENTHS, self.pieces)
         tops, bottoms = top.reshape(tenths).max(axis=2), bottom.reshape(tenths).min(axis=2)
         highest, lowest = tops.max(axis=1), bottoms.min(axis=1)

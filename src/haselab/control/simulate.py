@@ -153,20 +153,30 @@ def _run(
     )
     weight = period_s / (period_s + gains.derivative_filter_s)
     limits = setting.saturation
-    pid = (gains.kp, gains.ki, gains.kd, period_s, weight, limits.low, limits.high)
+    pid = _loops.ExactPid(
+        kp=gains.kp,
+        ki=gains.ki,
+        kd=gains.kd,
+        period_s=period_s,
+        filter_constant=weight,
+        u_low=limits.low,
+        u_high=limits.high,
+    )
     u_all, measured = np.empty(reference.size), np.empty(reference.size)
     _loops.run_exact(
-        np.concatenate([held.free[0].ravel(), held.push[0], held.feed[:1]]),
-        held.slow_decay[0].copy(),
-        held.slow_push[0].copy(),
-        u * held.rest[0],
-        np.array(pid),
-        u,
-        np.full(int(held.samples[0]), u * float(held.static_gain[0])),
-        reference,
-        noise,
-        measured,
-        u_all,
+        free=held.free[0].copy(),
+        push=held.push[0].copy(),
+        feed=float(held.feed[0]),
+        slow_decay=held.slow_decay[0].copy(),
+        slow_push=held.slow_push[0].copy(),
+        state=u * held.rest[0],
+        pid=pid,
+        u_before=u,
+        line=np.full(int(held.samples[0]), u * float(held.static_gain[0])),
+        reference=reference,
+        noise=noise,
+        measured=measured,
+        u=u_all,
     )
     return u_all, measured
 

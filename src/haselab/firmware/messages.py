@@ -41,26 +41,26 @@ class State(IntEnum):
     ARMED = 1  # enable pin active, output 0, carrier on
     RUNNING = 2  # loop closed
     STOPPING = 3  # ramping down, then off or tripped
-    TRIPPED = 4  # as off, until clear_fault
+    TRIPPED = 4  # like off, until clear_fault
 
 
 class Fault(IntEnum):
     """Why it tripped; latched until clear_fault."""
 
     NONE = 0
-    BREAKDOWN = 1  # a monitor at its end, or a level that collapsed; seen in the interrupt
+    BREAKDOWN = 1  # a monitor at its range end, or a collapsed level; from the interrupt
     SENSING = 2  # no plausible strain in too many updates
-    LINK = 3  # no sign of life; the output was ramped down
-    LATE = 4  # updates not completed; seen in the sampling interrupt
-    NOT_FINITE = 5  # the drive was no number or beyond its limits: memory was damaged
+    LINK = 3  # no message from the computer; the output was ramped down
+    LATE = 4  # updates not completed; detected in the sampling interrupt
+    NOT_FINITE = 5  # the drive was NaN or beyond its limits: memory was damaged
     WATCHDOG = 6  # the watchdog reset the chip
     BROWN_OUT = 7  # the supply dipped
-    ASTRAY = 9  # the high voltage is not what was asked for
+    ASTRAY = 9  # the high voltage does not follow its set point
     LOST_STATE = 8  # the state machine's memory was damaged
 
 
 class Alarm(IntFlag):
-    """Bits that the sampling interrupt raises."""
+    """Bits that the sampling interrupt sets."""
 
     RAIL = 1  # a monitor at the end of its range, or the level collapsed, while enabled
     SLIP = 2  # a conversion was lost or late
@@ -68,20 +68,20 @@ class Alarm(IntFlag):
 
 
 class Reason(IntFlag):
-    """Why there is no strain; bits, those of core/include/hs.h and two of the chip's own."""
+    """Why there is no strain; bits of core/include/hs.h, and two that only the chip has."""
 
     AMPLITUDE_LOST = 1  # no carrier on one of the monitors
-    PHASE_OUT = 2  # no capacitor shows such a phase
-    CLIPPED = 4  # a reading at the end of the converter's range
+    PHASE_OUT = 2  # the phase is not that of a capacitor
+    CLIPPED = 4  # a sample at the end of the converter's range
     SLIPPED = 16  # conversions were lost
     IMPLAUSIBLE = 128  # amplitude or capacitance beyond the calibrated range
 
 
 class Event(IntEnum):
-    """What an update latched from the link."""
+    """What an update received from the link."""
 
     NONE = 0
-    ARM = 1  # both steps of arming were taken
+    ARM = 1  # both steps of arming were done
     RUN = 2
     SET_REFERENCE = 3
     ALIVE = 4
@@ -90,21 +90,21 @@ class Event(IntEnum):
 
 
 class Verdict(IntEnum):
-    """What became of a command."""
+    """Result of a command."""
 
     ACCEPTED = 0
-    UNKNOWN = 1  # no such command, or of another length
-    BAD_VERSION = 2  # hello with this version comes first
+    UNKNOWN = 1  # no such command, or wrong length
+    BAD_VERSION = 2  # send hello with this version first
     BAD_STATE = 3  # not in this state
-    BAD_TOKEN = 4  # not the token, or too late
+    BAD_TOKEN = 4  # wrong token, or too late
     BAD_VALUE = 5  # outside the limits that were compiled in
     NOT_READY = 6  # no valid strain yet
 
 
 @dataclass(frozen=True)
 class Hello:
-    """Says which version of this table the computer speaks; answered by identity. Only while the
-    output is off: it starts the count of sequences anew.
+    """States the version of this table that the computer uses; answered by identity. Only while
+    the output is off: it restarts the sequence numbers.
 
     Args:
         version: of this table.
@@ -118,7 +118,7 @@ class Hello:
 
 @dataclass(frozen=True)
 class RequestArming:
-    """First of two steps; the ack carries a token that holds for one second."""
+    """First of two steps; the ack contains a token that is valid for one second."""
 
     CODE: ClassVar[int] = 2
     LAYOUT: ClassVar[str] = "<"
@@ -154,7 +154,7 @@ class Run:
 
 @dataclass(frozen=True)
 class SetReference:
-    """New desired strain while the loop is closed; also a sign of life.
+    """New desired strain while the loop is closed; also counts as keep_alive.
 
     Args:
         reference: desired strain.
@@ -168,7 +168,7 @@ class SetReference:
 
 @dataclass(frozen=True)
 class KeepAlive:
-    """A sign of life: without one the output is ramped down."""
+    """The program is still running: without this message the output is ramped down."""
 
     CODE: ClassVar[int] = 6
     LAYOUT: ClassVar[str] = "<"
@@ -192,7 +192,7 @@ class ClearFault:
 
 @dataclass(frozen=True)
 class SetTelemetry:
-    """How often status is sent, and whether every update is told in full.
+    """How often status is sent, and whether every update is reported in full.
 
     Args:
         every: updates from one status to the next; 0: none.
@@ -213,8 +213,8 @@ class Identity:
     Args:
         version: of this table.
         settings: CRC-32 of the settings that were compiled in.
-        rate_hz: updates a second.
-        supply: code of the chip's own 1.1 V reference by its supply, 10 bits; 0: not measured.
+        rate_hz: updates per second.
+        supply: code of the chip's 1.1 V reference relative to its supply, 10 bits; 0: not measured.
     """
 
     CODE: ClassVar[int] = 65
@@ -254,13 +254,13 @@ class Status:
         update: number of the update, modulo 65536.
         state: see states.
         fault: why it tripped, see faults.
-        reason: why there is no strain, see reasons; 0: there is.
+        reason: why there is no strain, see reasons; 0: strain is valid.
         strain: measured strain; 0 without one.
         capacitance_f: measured capacitance, in F; 0 without one.
         code: of the output converter, 0.5 mV each.
         busy_cycles: longest update since the last status, in CPU cycles.
         overruns: updates that were not ready in time, modulo 256.
-        bad_frames: frames that were not whole, modulo 256.
+        bad_frames: incomplete or damaged frames, modulo 256.
     """
 
     CODE: ClassVar[int] = 67
@@ -280,11 +280,11 @@ class Status:
 
 @dataclass(frozen=True)
 class Trace:
-    """One update in full: everything that it latched and what it made of it.
+    """One update in full: all its inputs and results.
 
     Args:
         update: number of the update, modulo 65536.
-        codes: new readings: level, current, voltage, current, voltage, ....
+        codes: new samples: level, current, voltage, current, voltage, ....
         event: see events.
         alarms: see alarms.
         state: see states.

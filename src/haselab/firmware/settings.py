@@ -208,7 +208,7 @@ class ChipSettings:
 
     @property
     def sensing(self) -> tuple[float, float, int, int, int]:
-        """Of `hs_quarters_config`: the turn, in 1/F, and the squares of amplitudes that count."""
+        """Of `hs_quadrature_config`: the turn, in 1/F, and the squares of amplitudes that count."""
         turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
         v_low, v_high, i_low = (
             round((4.0 * share * self.front_end.carrier_codes) ** 2) for share in (0.6, 1.4, 0.2)

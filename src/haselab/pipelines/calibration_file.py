@@ -1,4 +1,4 @@
-"""A calibration as a TOML file: what was found, and everything it was found from."""
+"""Calibration files (TOML): the result, and the references that it was computed from."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ __all__ = ["calibration_section", "load_calibration", "save_calibration"]
 
 _HEAD = """\
 # Calibration of the monitors: Y = scale_s * I / V - stray_s, complex numbers as [real, imaginary].
-# For this carrier, sampling rate and amplifier alone. SI units.
+# Valid only for this carrier, sampling rate and amplifier. SI units.
 """
-_ROUNDING = 1e-9  # relative: the same fit on another machine
+_ROUNDING = 1e-9  # relative difference of the same fit on another machine
 
 
 class _Strict(BaseModel):
@@ -54,13 +54,13 @@ class _File(_Strict):
 
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Write a calibration file; an older one is replaced in one step.
+    """Write a calibration file; replace an older one atomically.
 
     Args:
-        calibration: what was found.
+        calibration: the calibration.
         path: of the file.
     Raises:
-        DeviceError: the disk refuses.
+        DeviceError: the file cannot be written.
     """
     head, tables = _tables(calibration)
     parts = [_HEAD + _rows(head), *("[[reference]]\n" + _rows(table) for table in tables)]
@@ -68,13 +68,13 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
 
 
 def calibration_section(calibration: Calibration) -> Mapping[str, object]:
-    """The keys of a calibration in `[sensing]` of an actuator file."""
+    """Keys of a calibration for `[sensing]` of an actuator file."""
     head, tables = _tables(calibration)
     return {**head, "reference": tables}
 
 
 def _tables(calibration: Calibration) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What was found, and the references that it was found from."""
+    """The result, and the references that it was computed from."""
     c = calibration
     head = {
         "date": c.date,
@@ -114,21 +114,21 @@ def _literal(value: Any) -> str:
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Read a calibration; what it claims must follow from the references in it.
+    """Read a calibration, and check that it follows from its references.
 
     Args:
         path: of a calibration file, or of an actuator file with a calibration in `[sensing]`.
     Returns:
         The calibration.
     Raises:
-        InputError: no such file, a fault in it, or numbers that contradict its references.
+        InputError: no such file, an error in it, or numbers that contradict its references.
     """
     data = read_toml(path, "calibration file")
     if isinstance(data.get("sensing"), dict):
         data = {key: data["sensing"][key] for key in _File.model_fields if key in data["sensing"]}
         if "scale_s" not in data:
             raise InputError(
-                "[sensing] has no calibration. Make one with: haselab calibrate --actuator "
+                "[sensing] has no calibration. Add one with: haselab calibrate --actuator "
                 f"{path.name}  {path}"
             )
     file = validated(_File, data, path)
@@ -150,7 +150,7 @@ def load_calibration(path: Path) -> Calibration:
         size = max(abs(found.scale_s), abs(found.stray_s))
         if not abs(claimed - follows) <= _ROUNDING * size or not math.isfinite(abs(follows)):
             raise InputError(
-                f"{name} = {claimed:.6g} S contradicts the references in the file, which give "
-                f"{follows:.6g} S. Calibrate anew, or undo the change. {path}"
+                f"{name} is {claimed:.6g} S, but the references in the file give {follows:.6g} S. "
+                f"Calibrate again, or undo the change. {path}"
             )
     return found

@@ -1,4 +1,4 @@
-"""Work that goes on in the background while what is done is used."""
+"""Do work in background threads while earlier results are used."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _END = object()
 
 
 def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
-    """The same items, the next ones made in a thread of their own.
+    """Produce items ahead of time in a background thread.
 
     Args:
-        items: whatever takes time to make; its errors are raised here, in their place.
-        depth: how many items are made ahead at most.
+        items: an iterator that takes time; its errors are raised here, in order.
+        depth: how many items are produced ahead at most.
     Returns:
-        The items in their order.
+        The items, in order.
     Example:
         >>> list(ahead(iter([1, 2, 3])))
         [1, 2, 3]
@@ -37,13 +37,13 @@ def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
 
 
 def in_order(work: Callable[[S], T], items: Iterator[S], workers: int) -> Iterator[T]:
-    """The work on each item, done in threads while earlier results are used.
+    """Apply a function to each item in threads, and return the results in order.
 
     Args:
-        work: must let other threads run where it is heavy, as reading and the C kernels do. With
-            one worker it may go on from item to item; with more it must not.
-        items: as many as workers are taken ahead, and one more.
-        workers: threads.
+        work: the function. Its heavy parts must release the interpreter lock, as reading and the C
+            kernels do. It may carry state from item to item only with one worker.
+        items: of these, one more than there are workers is taken ahead.
+        workers: number of threads.
     Returns:
         The results in the order of the items.
     Example:

@@ -1,4 +1,4 @@
-"""The time axis of a file: its rate, jitter, missing rows, and the records that follow from it."""
+"""Analyse the times of a file: rate, jitter, missing rows; split it into records."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from haselab.store.columns.table import Table
 __all__ = ["TimeAxis", "records_of", "time_axis"]
 
 Floats = NDArray[np.float64]
-_FEW_MISSING = 3  # rows whose input is drawn between its neighbours
+_FEW_MISSING = 3  # rows whose input is interpolated
 _LEAST_ROWS = 50  # of a part between two gaps
-_JITTER = 0.45  # of a step: beyond it, rows cannot be numbered
+_JITTER = 0.45  # of a step: with more, rows cannot be numbered
 
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Times of rows on a clock of one rate.
+    """Times of rows on a clock with a constant rate.
 
     Args:
-        rate_hz: rows a second, missing ones counted.
-        number: number of each row on that clock; a missing row leaves its number out. `(N,)`.
+        rate_hz: rows per second, including missing ones.
+        number: number of each row on that clock; numbers of missing rows are left out. `(N,)`.
         time_s: times since the first row, in s. Shape `(N,)`.
     """
 
@@ -37,34 +37,34 @@ class TimeAxis:
 
     @property
     def missing(self) -> int:
-        """Rows that are missing."""
+        """Number of missing rows."""
         return int(self.number[-1]) + 1 - self.number.size
 
     @property
     def jitter_s(self) -> float:
-        """Rms distance of the times from the clock, in s."""
+        """Rms deviation of the times from the clock, in s."""
         return float(np.std(self.time_s - self.number / self.rate_hz))
 
 
 def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
-    """Rate and row numbers of recorded times.
+    """Find the rate and the row numbers of recorded times.
 
     Args:
         time_s: of the rows, in s. Shape `(N,)`.
-        file: where they are from, for messages.
+        file: of the times, for messages.
         name: of their column, for messages.
     Returns:
-        The clock on which these times lie.
+        The clock of these times.
     Raises:
-        InputError: the times do not rise, or are too uneven for one rate.
+        InputError: the times do not increase, or are too uneven for one rate.
     """
     steps = np.diff(time_s)
     usual_s = float(np.median(steps))
     if not (steps > 0.0).all():
         at = int(np.flatnonzero(~(steps > 0.0))[0])
         raise InputError(
-            f"Column {name} does not rise after row {at + 1} ({steps[at]:g} s). Sort the rows, or "
-            f"remove repeated ones: {file}"
+            f"Column {name} does not increase after row {at + 1} (step of {steps[at]:g} s). Sort "
+            f"the rows, or remove repeated ones: {file}"
         )
     since_s = time_s - time_s[0]
     number = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / usual_s), 1.0))])
@@ -76,7 +76,7 @@ def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
     if (np.diff(number) < 1.0).any() or off > _JITTER * slope_s:
         raise InputError(
             f"Column {name} is too uneven for one rate: steps of {steps.min():g} to "
-            f"{steps.max():g} s. Cut the file into parts of one rate: {file}"
+            f"{steps.max():g} s. Split the file into parts with one rate: {file}"
         )
     return TimeAxis(1.0 / slope_s, number.astype(np.intp), since_s)
 
@@ -84,17 +84,17 @@ def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
 def records_of(
     table: Table, columns: Sequence[str], axis: TimeAxis, hold: str
 ) -> tuple[list[Record], list[str]]:
-    """Records of rows that are missing or uneven, and sentences about what was done.
+    """Split uneven rows into records, and report what was done.
 
-    The input is taken as updated on the clock, the output as read at its own times. Up to 3
-    missing rows in a place: their input is drawn between its neighbours. More: a new record
-    begins, with its own initial state.
+    The input is assumed to change on the clock; the output is used at its own times. The input of
+    up to 3 missing rows in one place is interpolated. After a larger gap a new record begins, with
+    its own initial state.
 
     Args:
-        table: holds the columns.
+        table: with the columns.
         columns: names of input and output.
         axis: times of the rows.
-        hold: the input between its updates, see `Record`.
+        hold: how the input behaves between its updates, see `Record`.
     """
     u, y = table[columns[0]], table[columns[1]]
     cuts = np.flatnonzero(np.diff(axis.number) > _FEW_MISSING + 1) + 1
@@ -114,12 +114,13 @@ def records_of(
     if axis.missing:
         notes.append(
             f"{axis.missing} rows are missing in {int((np.diff(axis.number) > 1).sum())} places; "
-            f"{len(records)} record{'s' if len(records) > 1 else ''} with an initial state each."
+            f"split into {len(records)} record{'s' if len(records) > 1 else ''}, each with its own "
+            "initial state."
         )
     if axis.jitter_s > 1e-3 / axis.rate_hz:
         notes.append(
-            f"The times jitter by {axis.jitter_s:.2g} s rms: the output is taken at its own times, "
-            f"the input as updated every {1.0 / axis.rate_hz:.6g} s."
+            f"The times jitter by {axis.jitter_s:.2g} s rms: the output is used at its own times, "
+            f"the input is assumed to change every {1.0 / axis.rate_hz:.6g} s."
         )
     if left_out:
         notes.append(

@@ -1,4 +1,4 @@
-"""Figures, page and table of a run, from the files that the run left in its folder."""
+"""Figures, page and table of a run, from the files in its folder."""
 
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.page import Page, compose_page, save_page, write_report

@@ -21,7 +21,7 @@ from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 from haselab.report.chart_file import draw_chart
 from haselab.report.numbers import value_text
-from haselab.report.style import house_style, inline_svg, to_svg
+from haselab.report.style import figure_style, inline_svg, to_svg
 
 __all__ = ["ActuatorReport", "actuator_page", "missing_sections"]
 
@@ -118,7 +118,7 @@ def actuator_page(report: ActuatorReport) -> str:
         svg, caption = "", ""
         if name in charts:
             chart, caption = charts[name]
-            with house_style():
+            with figure_style():
                 svg = inline_svg(to_svg(draw_chart(chart), name.replace(".", "-"), chart.title))
         rows = list(_rows_of(report, name))
         parts.append(_Part(name, title, rows, absent.get(name, ""), svg, caption))
@@ -141,7 +141,7 @@ def actuator_page(report: ActuatorReport) -> str:
 
 
 def _packaged(name: str) -> str:
-    return resources.files("haselab.report").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("haselab.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _provenance(table: Any, name: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:

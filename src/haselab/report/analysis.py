@@ -1,4 +1,4 @@
-"""analysis.json, read piece by piece: what a figure asks for is there and fits, or it says why."""
+"""Read analysis.json section by section, with an error for each missing or invalid value."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class LeftOutError(InputError):
-    """A figure cannot be drawn from what the folder holds; the message is the note on the page."""
+    """A figure cannot be drawn from the folder; the page shows the message as a note."""
 
 
 class Section:
@@ -63,7 +63,9 @@ class Section:
         try:
             values = np.asarray(item, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise LeftOutError(f"'{self.name}.{key}' in analysis.json is not numbers.") from error
+            raise LeftOutError(
+                f"'{self.name}.{key}' in analysis.json contains something other than numbers."
+            ) from error
         if values.ndim != 1 or values.size == 0:
             raise LeftOutError(f"'{self.name}.{key}' in analysis.json is not a list of numbers.")
         if not np.isfinite(values).any():
@@ -75,7 +77,7 @@ class Section:
         return values
 
     def optional(self, key: str, *, like: Array | None = None) -> Array | None:
-        """The same, or `None` where the file has no such key or no number in it."""
+        """A list of numbers, or `None` if the file has no such key or no number in it."""
         values = self._data.get(key)
         if values is None or (isinstance(values, list) and all(v is None for v in values)):
             return None
@@ -100,7 +102,7 @@ class Section:
         return float(value)
 
     def text(self, key: str) -> str:
-        """A text; empty where the file has none."""
+        """A text; empty if the file has none."""
         value = self._data.get(key)
         return value if isinstance(value, str) else ""
 
@@ -118,6 +120,8 @@ class Section:
             return {}
         items = self._data[key]
         if not isinstance(items, (Mapping, list)):
-            raise LeftOutError(f"'{self.name}.{key}' in analysis.json is no mapping and no list.")
+            raise LeftOutError(
+                f"'{self.name}.{key}' in analysis.json is neither a mapping nor a list."
+            )
         named = items.items() if isinstance(items, Mapping) else enumerate(items, start=1)
         return {str(name): Section(f"{self.name}.{key}.{name}", item) for name, item in named}

@@ -17,7 +17,7 @@ from haselab.report.style import (
     GREY,
     PALETTE,
     band,
-    house_style,
+    figure_style,
     label_text,
     thinned,
     to_svg,
@@ -38,7 +38,7 @@ def draw_chart(chart: Chart) -> Figure:
     Args:
         chart: what to show.
     Returns:
-        The figure; save it inside `house_style`.
+        The figure; save it inside `figure_style`.
     """
     count = len(chart.panels)
     height_in = _PANEL_IN * max(count, 1.5) + _REST_IN
@@ -86,7 +86,7 @@ def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
 
 
 def write_chart(chart: Chart, path: Path) -> None:
-    """Write a chart as a file.
+    """Write a chart to a file.
 
     Args:
         chart: what to show.
@@ -94,12 +94,12 @@ def write_chart(chart: Chart, path: Path) -> None:
     Raises:
         InputError: another ending.
     """
-    with house_style():
+    with figure_style():
         write_figure(draw_chart(chart), chart.title, path)
 
 
 def write_figure(figure: Figure, title: str, path: Path) -> None:
-    """Write a figure as a file, inside `house_style`.
+    """Write a figure as a file, inside `figure_style`.
 
     Args:
         figure: as it was drawn.

@@ -1,4 +1,4 @@
-"""Figures that an experiment describes as data: any experiment's, also of other packages."""
+"""Figures that experiments, also those of other packages, describe as data."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,60}", re.IGNORECASE)
 
 
 def chart_plans(analysis: Mapping[str, Any], taken: frozenset[str]) -> tuple[FigurePlan, ...]:
-    """The figures that section `charts` of analysis.json describes.
+    """Plan the figures that section `charts` of analysis.json describes.
 
     Args:
         analysis: parsed analysis.json.
-        taken: names of figures that the report draws by itself.
+        taken: names of the report's own figures.
     Returns:
-        One plan a chart, in the file's order; those whose name cannot be that of a file, or is
-        taken, are numbered instead.
+        One plan per chart, in the file's order. A chart whose name is taken or cannot be a file
+        name gets a number instead.
     """
     charts = analysis.get("charts")
     plans, names = [], set(taken)

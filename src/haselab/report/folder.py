@@ -1,4 +1,4 @@
-"""What the folder of a run holds for the report."""
+"""Read the folder of a run for the report."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ __all__ = ["RunFolder", "read_folder"]
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run, read.
+    """The contents of a run's folder.
 
     Args:
         path: the folder.
         results: checked content of results.json.
-        analysis: parsed analysis.json, empty when the folder has none; its section `chip` is that
-            of firmware/simulation.json, where there is one.
+        analysis: parsed analysis.json, empty if the folder has none; its section `chip` comes from
+            firmware/simulation.json, if that exists.
     """
 
     path: Path
@@ -50,7 +50,7 @@ class RunFolder:
         return Section(name, self.analysis[name])
 
     def picture(self, relative: str) -> Array | None:
-        """A grey picture of the folder, or `None` where the file is not there.
+        """A grey picture of the folder, or `None` if the file does not exist.
 
         Args:
             relative: path inside the folder.
@@ -59,11 +59,11 @@ class RunFolder:
             Grey level from 0 to 1, shape `(rows, columns)`.
 
         Raises:
-            LeftOutError: the path leaves the folder, or the file is no picture.
+            LeftOutError: the path leaves the folder, or the file is not a picture.
         """
         path = (self.path / relative).resolve()
         if not path.is_relative_to(self.path.resolve()):
-            raise LeftOutError(f"the picture {relative} lies outside the folder of the run.")
+            raise LeftOutError(f"the picture {relative} is outside the folder of the run.")
         if not path.is_file():
             return None
         try:
@@ -78,7 +78,7 @@ def _document(path: Path) -> Any:
 
 
 def read_folder(folder: Path) -> RunFolder:
-    """Read results.json and, if there, analysis.json.
+    """Read results.json and, if it exists, analysis.json.
 
     Args:
         folder: the folder of a run.
@@ -87,14 +87,14 @@ def read_folder(folder: Path) -> RunFolder:
         The checked content.
 
     Raises:
-        InputError: no such folder, no results.json, or a file that is not what it should be.
+        InputError: no such folder, no results.json, or an invalid file.
     """
     if not folder.is_dir():
-        raise InputError(f"no folder of a run there. Give the --out of a run: {folder}")
+        raise InputError(f"The folder does not exist. Name the --out folder of a run: {folder}")
     results = folder / "results.json"
     if not results.is_file():
         raise InputError(
-            f"the folder holds no results.json. Make it with 'haselab analyse {folder}': {folder}"
+            f"The folder has no results.json. Create it with 'haselab analyse {folder}': {folder}"
         )
     try:
         checked = Results.from_dict(_document(results))
@@ -105,7 +105,7 @@ def read_folder(folder: Path) -> RunFolder:
     data = _document(analysis) if analysis.is_file() else {}
     if not isinstance(data, Mapping):
         raise InputError(
-            f"analysis.json holds a {type(data).__name__}, not a mapping of sections. "
+            f"analysis.json contains a {type(data).__name__} instead of a mapping of sections. "
             f"Write it again with 'haselab analyse {folder}': {analysis}"
         )
     chip = folder / "firmware" / "simulation.json"

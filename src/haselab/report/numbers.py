@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them: digits that the uncertainty supports, powers of ten as such."""
+"""Format numbers with the digits that their uncertainty supports, and with powers of ten."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def _exponent(size: float) -> int:
-    """Power of ten to factor out: 0 for sizes that read well as they are."""
+    """Power of ten to factor out; 0 for numbers that are readable without one."""
     if size == 0.0 or 1e-3 <= size < 1e5:
         return 0
     return math.floor(math.log10(size))
@@ -26,10 +26,10 @@ def _with_power(text: str, exponent: int) -> str:
 
 
 def number_text(value: float | None) -> str:
-    """A number without uncertainty, to five significant digits.
+    """Format a number without uncertainty, to five significant digits.
 
     Args:
-        value: any number; `None` and numbers that are not finite stand for "no value".
+        value: any number; `None`, NaN and infinity mean "no value".
 
     Returns:
         Text with a true minus sign.
@@ -50,7 +50,7 @@ def number_text(value: float | None) -> str:
 def interval_text(
     value: float | None, std: float | None, ci95: Sequence[float | None]
 ) -> tuple[str, str]:
-    """Value and 95 % interval, rounded alike: two significant digits of the standard deviation.
+    """Format value and 95 % interval to two significant digits of the standard deviation.
 
     Args:
         value: best value.
@@ -84,7 +84,7 @@ def interval_text(
 
 
 def value_text(value: Any) -> str:
-    """Whatever a results file holds in a cell: number, text, range, estimate, nothing.
+    """Format a cell of a results file: number, text, range, estimate or nothing.
 
     Args:
         value: number, text, list (a range), mapping (an estimate or named values) or `None`.

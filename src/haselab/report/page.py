@@ -1,4 +1,4 @@
-"""The page: results, figures and provenance of a run as one self-contained HTML document."""
+"""Compose the report: results, figures and provenance in one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _TITLE = "Soft electrostatic actuator: identification and closed-loop control"
 _METRICS = {
     "rise_time_s": "Rise time 10–90 %",
     "settling_time_s": "Settling time",
-    "overshoot": "Overshoot, ringing included",
-    "error": "Error at the end",
+    "overshoot": "Overshoot, including ringing",
+    "error": "Final error",
     "delay_s": "Delay",
     "phase_margin_deg": "Phase margin (°)",
 }
@@ -38,7 +38,7 @@ class Page:
 
     Args:
         html: the page.
-        drawings: all figures in order, those without data too.
+        drawings: all figures in order, including those without data.
     """
 
     html: str
@@ -62,7 +62,7 @@ def write_report(folder: Path) -> Path:
         Path of the page.
 
     Raises:
-        InputError: the folder, results.json or analysis.json is missing or not readable.
+        InputError: the folder, results.json or analysis.json is missing or unreadable.
 
     Example:
         >>> import tempfile
@@ -79,10 +79,10 @@ def compose_page(run: RunFolder) -> Page:
     """Draw the figures and fill the page.
 
     Args:
-        run: what the folder holds.
+        run: the contents of the folder.
 
     Returns:
-        The page and its drawings; equal input gives equal bytes.
+        The page and its drawings; the same input gives the same bytes.
     """
     drawings = tuple(draw_figure(plan, run) for plan in _plans(run.analysis))
     rows, is_study = run.results.quantities, "only" not in run.analysis
@@ -124,7 +124,7 @@ def _title(results: Results, is_study: bool) -> str:
 
 
 def _plans(analysis: Mapping[str, Any]) -> tuple[FigurePlan, ...]:
-    """The figures that such a run has: all of them, or those that it names."""
+    """The figures of a run: all of them, or those that it names."""
     only = analysis.get("only")
     drawn = tuple(
         plan
@@ -135,7 +135,7 @@ def _plans(analysis: Mapping[str, Any]) -> tuple[FigurePlan, ...]:
 
 
 def save_page(page: Page, folder: Path, path: Path) -> Path:
-    """Write the figures below `folder`, and the page.
+    """Write the page, and the figures to `folder`/figures.
 
     Args:
         page: composed report.
@@ -147,7 +147,7 @@ def save_page(page: Page, folder: Path, path: Path) -> Path:
 
     Raises:
         InputError: `figures` is a link; nothing was written.
-        DeviceError: the disk refuses.
+        DeviceError: a file cannot be written.
     """
     refuse_linked_folders(folder, "figures")
     figures = folder / "figures"
@@ -162,7 +162,7 @@ def save_page(page: Page, folder: Path, path: Path) -> Path:
 
 
 def _packaged(name: str) -> str:
-    return resources.files("haselab.report").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("haselab.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _template() -> jinja2.Template:
@@ -172,23 +172,23 @@ def _template() -> jinja2.Template:
     environment.filters["value"] = value_text
     environment.filters["tone"] = _tone
     environment.filters["row"] = _row
-    return environment.from_string(_packaged("template.html.j2"))
+    return environment.from_string(_packaged("run.html.j2"))
 
 
 def _tone(verdict: Any) -> str:
-    """Colour of a verdict; the words stand beside it."""
+    """Colour of a verdict, which is also shown as text."""
     word = str(verdict).split()[0] if str(verdict).split() else ""
     word = word.strip(".,:;").lower()
     return word if word in ("agrees", "disagrees", "inconclusive") else "neutral"
 
 
 def _row(identifier: str) -> str:
-    """Row of the study that a result belongs to: `S20` of `S20.zeta`."""
+    """Row of the study that a result belongs to: `S20` for `S20.zeta`."""
     return identifier.partition(".")[0]
 
 
 def _mappings(items: Any) -> tuple[Mapping[str, Any], ...]:
-    """The mappings of a list; a cell that a row lacks reads as absent."""
+    """The mappings of a list; a missing cell is `None`."""
     if not isinstance(items, Sequence) or isinstance(items, str):
         return ()
     return tuple(_Cells(item) for item in items if isinstance(item, Mapping))
@@ -211,7 +211,7 @@ def _reading(data: Any) -> dict[str, Any] | None:
 
 
 def _step_metrics(steps: Any) -> dict[str, Any] | None:
-    """Rows and columns of the table below figure 6."""
+    """Rows and columns of the table of step metrics, below figure 6."""
     groups = steps.get("metrics") if isinstance(steps, Mapping) else None
     if not isinstance(groups, Mapping):
         return None

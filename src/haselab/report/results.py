@@ -1,4 +1,4 @@
-"""results.json, checked: the quantities of a study and where they come from."""
+"""Read and check results.json: the quantities of a study and their provenance."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ class Quantity:
     """One row of the table paper / recomputed / measured.
 
     Args:
-        id: stable name of the contract, such as `S20.omega_n`.
+        id: stable name, such as `S20.omega_n`.
         name: the quantity in words.
         unit: SI unit, `""` when dimensionless.
         paper: what the paper prints: number, text, range or `None`.
-        recomputed: the same from the paper's own numbers, or `None`.
-        measured: the study's estimate, or `None` when the fit reached no result.
+        recomputed: the value computed from the paper's own numbers, or `None`.
+        measured: the study's estimate, or `None` if the fit gave no result.
         noise_free: the same experiment and fit on the twin with all noise off, in `unit`; `None` on
             a real bench.
-        truth: parameter of the twin, in `unit`; `None` where the quantity is none.
+        truth: the parameter of the twin, in `unit`; `None` if the quantity is not one.
         verdict: agrees, disagrees, inconclusive, not in paper.
         note: one sentence of explanation, or `""`.
-        set_in_twin: what of the twin was set to the paper's value; `""` where nothing was.
-        set_in_study: what of the study was; `""` where nothing was.
-        follows_from_twin: parameters of the twin that give the value; `""` where none do alone.
-        same_as: id of the row that holds the same printed quantity; `""` where none does.
+        set_in_twin: what in the twin was set to the paper's value; `""`: nothing.
+        set_in_study: what in the study was set to the paper's value; `""`: nothing.
+        follows_from_twin: parameters of the twin that determine the value; `""`: none.
+        same_as: id of the row with the same printed quantity; `""`: none.
     """
 
     id: str
@@ -55,7 +55,7 @@ class Quantity:
 
     @property
     def measured_text(self) -> str:
-        """Best value, with the digits its standard deviation supports."""
+        """The value, with the digits that its standard deviation supports."""
         return self._texts()[0]
 
     @property
@@ -65,27 +65,27 @@ class Quantity:
 
     @property
     def has_paper(self) -> bool:
-        """Whether there is anything beside it to compare with: printed, or recomputed from it."""
+        """Whether the paper has a value to compare with, printed or recomputed."""
         return self.paper is not None or self.recomputed is not None
 
     @property
     def was_set(self) -> bool:
-        """Whether the value was put in, so that its verdict is no evidence."""
+        """Whether the value was set beforehand, so that agreement is no evidence."""
         return bool(self.set_in_twin or self.set_in_study or self.follows_from_twin)
 
     @property
     def is_compared(self) -> bool:
-        """Whether it counts as a comparison with the paper: each printed quantity does once."""
+        """Whether the row counts as a comparison with the paper, each printed quantity once."""
         return self.verdict in VERDICTS and not self.same_as
 
     @property
     def noise_free_inside(self) -> bool | None:
-        """Whether the interval holds the value without noise; `None` where that cannot be said."""
+        """Whether the interval contains the noise-free value; `None` if that is unknown."""
         return self._inside(self.noise_free)
 
     @property
     def truth_inside(self) -> bool | None:
-        """Whether the interval holds the twin's parameter; `None` where that cannot be said."""
+        """Whether the interval contains the twin's parameter; `None` if that is unknown."""
         return self._inside(self.truth)
 
     def _inside(self, value: float | None) -> bool | None:
@@ -109,9 +109,9 @@ class Results:
     Args:
         quantities: rows of the table, in the file's order.
         provenance: versions, seeds, configuration, as the study wrote them.
-        simulated: whether the bench was.
-        verdict_rule: how the verdicts came about, `""` where the file does not say.
-        not_played: results that the study has and this run has not: their ids, and why.
+        simulated: whether the bench was simulated.
+        verdict_rule: how agreement was decided; `""` if the file does not say.
+        not_played: results of the study that this run does not have: their ids, and why.
     """
 
     quantities: tuple[Quantity, ...]
@@ -139,7 +139,7 @@ class Results:
         """
         if not isinstance(data, Mapping) or not isinstance(data.get("quantities"), list):
             raise InputError(
-                "results.json holds no list 'quantities'. Write the folder again with "
+                "results.json has no list 'quantities'. Write the folder again with "
                 "'haselab analyse DIR'."
             )
         rows = tuple(_quantity(row, at) for at, row in enumerate(data["quantities"]))
@@ -160,14 +160,14 @@ class Results:
 def _not_played(data: Any) -> tuple[tuple[tuple[str, ...], str], ...]:
     items = data if isinstance(data, list) else []
     return tuple(
-        (tuple(map(str, item["ids"])), str(item.get("reason") or "no reason is given."))
+        (tuple(map(str, item["ids"])), str(item.get("reason") or "no reason given."))
         for item in items
         if isinstance(item, Mapping) and isinstance(item.get("ids"), list)
     )
 
 
 def _number(value: Any) -> float:
-    """A JSON number; null, which stands for a number that is not finite, becomes NaN."""
+    """Read a JSON number; null, written for NaN and infinity, becomes NaN."""
     return math.nan if value is None else float(value)
 
 
@@ -199,8 +199,8 @@ def _quantity(row: Any, at: int) -> Quantity:
         raise InputError(
             f"{where}: 'measured' = {row.get('measured')!r}, "
             + ", ".join(f"{name!r} = {value!r}" for name, value in alone.items())
-            + '; allowed are null or {"value", "std", "ci95": [low, high], "unit"} and null or a '
-            "number. "
+            + '. The first must be null or {"value", "std", "ci95": [low, high], "unit"}, the '
+            "others null or a number. "
             "Write the folder again with 'haselab analyse'."
         ) from error
     return Quantity(

@@ -1,4 +1,4 @@
-"""One look for all figures, and the way from a figure to SVG that is the same every time."""
+"""One style for all figures, and reproducible SVG output."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = [
     "SKY",
     "YELLOW",
     "band",
-    "house_style",
+    "figure_style",
     "inline_svg",
     "label_text",
     "legend_below",
@@ -35,7 +35,7 @@ __all__ = [
     "to_svg",
 ]
 
-# Okabe and Ito's palette: told apart with any colour vision.
+# Okabe and Ito's palette: distinguishable with any colour vision.
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
 YELLOW, PURPLE, SKY, GREY = "#f0e442", "#aa4499", "#56b4e9", "#555555"
 PALETTE = (RED, BLUE, PURPLE, GREEN, "#e69f00", SKY)
@@ -69,8 +69,8 @@ _FALLBACK_FONTS = "'DejaVu Sans', Verdana, Arial, sans-serif"
 
 
 @contextmanager
-def house_style() -> Iterator[None]:
-    """Settings of all figures, whatever the user's own matplotlib settings."""
+def figure_style() -> Iterator[None]:
+    """Settings of all figures, independent of the user's own matplotlib settings."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_SETTINGS)
@@ -78,11 +78,11 @@ def house_style() -> Iterator[None]:
 
 
 def to_svg(figure: Figure, name: str, title: str) -> str:
-    """A figure as one SVG document, equal bytes for equal input.
+    """Convert a figure to one SVG document; the same input gives the same bytes.
 
     Args:
-        figure: drawn inside `house_style`.
-        name: put before each id, so that several documents can stand on one page.
+        figure: drawn inside `figure_style`.
+        name: prefix of each id, so that one page can contain several documents.
         title: what a screen reader says.
 
     Returns:
@@ -101,9 +101,9 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
 
 
 def _named_ids(text: str, name: str) -> str:
-    """Ids with the figure's name before them, counted where they were hashes.
+    """Prefix ids with the figure's name, and replace hashes in them by numbers.
 
-    The hashes are of clip paths before rounding, whose last bit is the layout solver's whim.
+    The hashes are those of clip paths before rounding, whose last bit is not reproducible.
     """
     counted: dict[str, str] = {}
 
@@ -117,26 +117,26 @@ def _named_ids(text: str, name: str) -> str:
 
 
 def inline_svg(document: str) -> str:
-    """The document as a part of an HTML page: no name spaces, size left to the style sheet."""
+    """Convert a document to a part of an HTML page: no name spaces, size from the style sheet."""
     head, rest = document.split(">", 1)
     head = re.sub(r'\s+(xmlns(:\w+)?|width|height|version)="[^"]*"', "", head)
     return f"{head}>{rest}"
 
 
 def label_text(name: str) -> str:
-    """A name from a file as the label of a curve: never taken for mathematics, never hidden."""
+    """Escape a name from a file as the label of a curve: no mathematics, never hidden."""
     text = name.replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
 
 def legend_below(host: FigureBase, axes: Axes, columns: int) -> None:
-    """Legend of `axes` under the whole panel, where it hides no data."""
+    """Add the legend of `axes` below the panel, where it hides no data."""
     handles, labels = axes.get_legend_handles_labels()
     host.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def scale_by(factor: float) -> tuple[Callable[[ArrayLike], Array], Callable[[ArrayLike], Array]]:
-    """Functions of a second axis in another unit: to it, and back."""
+    """Functions of a second axis in another unit: forward and inverse."""
     return (
         lambda values: np.asarray(values, dtype=np.float64) * factor,
         lambda values: np.asarray(values, dtype=np.float64) / factor,
@@ -144,12 +144,12 @@ def scale_by(factor: float) -> tuple[Callable[[ArrayLike], Array], Callable[[Arr
 
 
 def thinned(count: int, limit: int) -> slice:
-    """Stride that leaves at most `limit` of `count` samples, for drawing only."""
+    """Stride that keeps at most `limit` of `count` samples, for drawing only."""
     return slice(None, None, max(1, -(-count // limit)))
 
 
 def band(axes: Axes, x: Array, centre: Array, half_width: Array | None, colour: str) -> None:
-    """A faint band of one standard deviation about a curve; nothing without `half_width`."""
+    """Draw a faint band of one standard deviation around a curve; nothing without `half_width`."""
     if half_width is not None and np.isfinite(half_width).any():
         axes.fill_between(
             x, centre - half_width, centre + half_width, color=colour, alpha=0.2, linewidth=0

@@ -1,4 +1,4 @@
-"""The paragraph at the head of the page: the main numbers in words."""
+"""The summary at the top of the page: the main numbers in one paragraph."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from haselab.report.results import VERDICTS, Quantity, Results
 __all__ = ["counted", "summary_text", "verdict_counts"]
 
 _MAIN = (
-    ("S20.omega_n", "The fast mode lies at {}"),
+    ("S20.omega_n", "The natural frequency of the fast mode is {}"),
     ("S20.zeta", "its damping ratio is {}"),
-    ("S24.rise_open", "the open-loop step rises in {}"),
-    ("S24.rise_closed", "the closed-loop step in {}"),
-    ("S24.error_open", "the open loop keeps an error of {}"),
-    ("S24.error_closed", "the closed loop one of {}"),
-    ("S26.rise", "the step on the chip rises in {}"),
-    ("S26.error", "its loop keeps an error of {}"),
+    ("S24.rise_open", "the open-loop rise time is {}"),
+    ("S24.rise_closed", "the closed-loop rise time is {}"),
+    ("S24.error_open", "the open-loop final error is {}"),
+    ("S24.error_closed", "the closed-loop final error is {}"),
+    ("S26.rise", "on the microcontroller the rise time is {}"),
+    ("S26.error", "its final error is {}"),
 )
 _MANY = {"agrees": "agree", "disagrees": "disagree"}
 
 
 def summary_text(results: Results) -> str:
-    """Main numbers, how many rows agree with the paper, how many intervals hold what has no noise.
+    """Summarise the main numbers, the agreement with the paper and the noise-free comparison.
 
     Args:
         results: checked content of results.json.
@@ -49,8 +49,8 @@ def summary_text(results: Results) -> str:
     if results.not_played:
         missing = sum(len(ids) for ids, _ in results.not_played)
         sentences.append(
-            f"{counted(missing, 'result is', 'results are')} missing; the list below the table of "
-            "results says why"
+            f"{counted(missing, 'result is', 'results are')} missing, for the reasons listed below "
+            "the table of results"
         )
     return " ".join(sentence[0].upper() + sentence[1:] + "." for sentence in sentences)
 
@@ -62,7 +62,7 @@ def _in_words(row: Quantity) -> str:
 
 
 def _verdicts(rows: Sequence[Quantity], simulated: bool) -> str:
-    """What can be compared with the paper, each printed quantity once; of a twin nothing can."""
+    """Agreement with the paper, each printed quantity once; a twin is no evidence."""
     compared = [row for row in rows if row.is_compared]
     found = [row for row in compared if not row.was_set]
     if simulated:
@@ -72,26 +72,26 @@ def _verdicts(rows: Sequence[Quantity], simulated: bool) -> str:
             "were set in the study": sum(bool(row.set_in_study) for row in compared),
             "come from simulated trials": len(found),
         }
-        told = ", ".join(f"{count} {what}" for what, count in groups.items() if count)
+        text = ", ".join(f"{count} {what}" for what, count in groups.items() if count)
         return (
             "the bench is simulated, so agreement or disagreement with the paper is no evidence: "
-            f"of {counted(len(compared), 'printed quantity', 'printed quantities')}, {told}"
+            f"of {counted(len(compared), 'printed quantity', 'printed quantities')}, {text}"
         )
-    told = f"{counted(len(found), 'result', 'results')} can be compared with the paper"
+    text = f"{counted(len(found), 'result', 'results')} can be compared with the paper"
     if found:
-        told += f": {verdict_counts(found)}"
+        text += f": {verdict_counts(found)}"
     if len(found) < len(compared):
-        told += f"; {len(compared) - len(found)} more were set in the study and are no evidence"
-    return told
+        text += f"; {len(compared) - len(found)} more were set in the study and are no evidence"
+    return text
 
 
 def counted(count: int, one: str, more: str) -> str:
-    """A number with its noun."""
+    """A number with its noun, singular or plural."""
     return f"{count} {one if count == 1 else more}"
 
 
 def verdict_counts(rows: Sequence[Quantity]) -> str:
-    """How many rows have which verdict, in words."""
+    """How many rows have each verdict, as text."""
     found = [row.verdict for row in rows]
     words = [word for word in (*VERDICTS, *sorted(set(found) - set(VERDICTS))) if word in found]
     return ", ".join(

@@ -12,20 +12,29 @@ from haselab.report.summary import counted, verdict_counts
 
 __all__ = ["results_table"]
 
-_HEAD = ("id", "unit", "paper", "recomputed", "measured", "95 % interval", "noise-free", "verdict")
+_HEAD = (
+    "id",
+    "unit",
+    "paper",
+    "recomputed",
+    "measured",
+    "95 % interval",
+    "noise-free",
+    "agreement",
+)
 _GAP = "  "
 
 
 def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
-    """Plain text of a results document, wrapped to the terminal.
+    """Format a results document as plain text for the terminal.
 
     Args:
         results: the parsed results.json.
         columns: width of the terminal, at least 60.
 
     Returns:
-        Lines of at most `columns` characters; the column `noise-free` only where a row has one,
-        those about a paper only where a row is compared with one.
+        Lines of at most `columns` characters. The column `noise-free` is left out if no row has
+        such a value, and those about a paper if no row is compared with one.
 
     Raises:
         InputError: the document is not a results document.
@@ -34,18 +43,18 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
         >>> row = {"id": "S20.zeta", "paper": 0.09, "verdict": "agrees", "measured":
         ...        {"value": 0.0912, "std": 0.0011, "ci95": [0.0891, 0.0934], "unit": ""}}
         >>> print(results_table({"quantities": [row]}))  # doctest: +NORMALIZE_WHITESPACE
-        id        unit  paper  recomputed  measured  95 % interval     verdict
-        --------  ----  -----  ----------  --------  ----------------  -------
+        id        unit  paper  recomputed  measured  95 % interval     agreement
+        --------  ----  -----  ----------  --------  ----------------  ---------
         S20.zeta        0.09   —           0.0912    [0.0891, 0.0934]  agrees
         <BLANKLINE>
         1 quantity: 1 agrees
     """
     found = Results.from_dict(results)
     rows = found.quantities
-    quiet = any(row.noise_free is not None for row in rows)
+    noise_free = any(row.noise_free is not None for row in rows)
     paper = any(row.has_paper for row in rows)
-    hidden = set() if quiet else {"noise-free"}
-    hidden |= set() if paper or not rows else {"paper", "recomputed", "verdict"}
+    hidden = set() if noise_free else {"noise-free"}
+    hidden |= set() if paper or not rows else {"paper", "recomputed", "agreement"}
     keep = [at for at, name in enumerate(_HEAD) if name not in hidden]
     cells = [[_cells(row)[at] for at in keep] for row in rows]
     head = [_HEAD[at] for at in keep]
@@ -77,7 +86,7 @@ def _mark(row: Quantity) -> str:
 
 
 def _widths(rows: list[list[str]], columns: int) -> list[int]:
-    """Natural widths, the widest column after the id narrowed until all fit."""
+    """Widths of the columns; the widest after the id are narrowed until all fit."""
     widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
     while sum(widths) + len(_GAP) * (len(widths) - 1) > columns:
         widths[widths.index(max(widths[1:]), 1)] -= 1
@@ -96,22 +105,22 @@ def _wrapped(row: list[str], widths: list[int]) -> list[str]:
 
 def _count(results: Results) -> str:
     rows = results.quantities
-    told = counted(len(rows), "quantity", "quantities")
+    text = counted(len(rows), "quantity", "quantities")
     if any(row.has_paper for row in rows):
-        told += f": {verdict_counts(rows)}"
+        text += f": {verdict_counts(rows)}"
     if any(row.was_set for row in rows):
-        told += (
+        text += (
             ". (set): set in the twin or in the study; (twin): follows from the twin's parameters; "
             "neither is evidence"
         )
     if results.simulated:
         compared = any(row.has_paper for row in rows)
-        told += ". SIMULATED" + (": no verdict is evidence about the paper" if compared else "")
-    return told
+        text += ". SIMULATED" + (": no verdict is evidence about the paper" if compared else "")
+    return text
 
 
 def _missing(results: Results, columns: int) -> list[str]:
-    """Results of the study that the run does not have."""
+    """Lines about results of the study that the run does not have."""
     lines = []
     for ids, reason in results.not_played:
         lines += textwrap.wrap(

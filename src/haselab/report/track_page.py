@@ -1,4 +1,4 @@
-"""The page of one tracked clip: paths, strain field, strain and quality over time."""
+"""The page about one tracked video: paths, strain field, strain and quality over time."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from haselab.report.style import (
     RED,
     SKY,
     band,
-    house_style,
+    figure_style,
     inline_svg,
     thinned,
     to_svg,
 )
-from haselab.tracking import Reason, Tracks, strain_field
+from haselab.tracking import LossReason, Tracks, strain_field
 from haselab.tracking.audit import LEAST_WRONG, expected_wrong, wrong_share
 
 __all__ = ["TrackReport", "TrackStrain", "track_page"]
@@ -38,14 +38,14 @@ _SHOWN_PX = 1024
 _FEWEST_FOR_FIELD = 12
 _WRONG_PX = 0.5
 _WORDS = {
-    Reason.UNLIKE: "too unlike the reference",
-    Reason.LEFT: "out of the picture",
-    Reason.BENT: "deformed too far",
-    Reason.UNSETTLED: "no convergence",
-    Reason.STRAYED: "not with its neighbours",
-    Reason.COVERED: "covered by something",
-    Reason.UNTIED: "no fixed point found",
-    Reason.AMBIGUOUS: "another place explains the frame as well",
+    LossReason.UNLIKE: "too unlike the reference",
+    LossReason.LEFT: "outside the frame",
+    LossReason.BENT: "deformed too far",
+    LossReason.UNSETTLED: "no convergence",
+    LossReason.STRAYED: "moved away from its neighbours",
+    LossReason.COVERED: "covered",
+    LossReason.UNTIED: "no fixed point found",
+    LossReason.AMBIGUOUS: "another position fits the frame as well",
 }
 
 
@@ -54,7 +54,7 @@ class TrackStrain:
     """Strain of the gauge between upper* and lower*.
 
     Args:
-        time_s, strain, std: of all frames; NaN where it is not known. Shape `(F,)`.
+        time_s, strain, std: of all frames; NaN where unknown. Shape `(F,)`.
         marks: how many marks of the gauge were valid. Shape `(F,)`.
     """
 
@@ -73,12 +73,12 @@ class TrackReport:
         frame: the first frame. Shape `(H, W)`.
         rest_px: points at rest. Shape `(P, 2)`.
         gauge: indices of the points of the gauge.
-        time_s: times of the frames in `tracks`; frame numbers where no time is known. `(K,)`.
-        has_time: whether they are times.
+        time_s: times of the frames in `tracks`, or frame numbers if the times are unknown. `(K,)`.
+        has_time: whether `time_s` holds times.
         tracks: all points in these frames. Shape `(K, P)`.
-        strain: of the gauge, if there is one.
+        strain: of the gauge; None: there is none.
         facts: name and text, for the table.
-        warnings: what the reader must know.
+        warnings: shown at the top of the page.
     """
 
     title: str
@@ -102,18 +102,26 @@ class _Figure:
 
 
 def track_page(report: TrackReport) -> str:
-    """One self-contained HTML document.
+    """Compose one self-contained HTML document.
 
     Args:
-        report: what it shows.
+        report: its contents.
 
     Returns:
-        The page; equal input gives equal bytes.
+        The page; the same input gives the same bytes.
     """
     parts = (_paths, _motion, _field, _strain, _quality, _std)
     drawn = [part(report) for part in parts]
-    style = resources.files("haselab.report").joinpath("style.css").read_text(encoding="utf-8")
-    text = resources.files("haselab.report").joinpath("track.html.j2").read_text(encoding="utf-8")
+    style = (
+        resources.files("haselab.report")
+        .joinpath("templates", "style.css")
+        .read_text(encoding="utf-8")
+    )
+    text = (
+        resources.files("haselab.report")
+        .joinpath("templates", "track.html.j2")
+        .read_text(encoding="utf-8")
+    )
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
@@ -153,7 +161,7 @@ def _stds(tracks: Tracks) -> Array:
 
 
 def _moved_px(report: TrackReport) -> Array:
-    """Distances from rest over the points: 10 %, median and 90 % in each frame. Shape `(3, K)`."""
+    """Displacements in each frame: 10 %, median and 90 % of the points. Shape `(3, K)`."""
     tracks = report.tracks
     away = np.hypot(tracks.x_px - report.rest_px[:, 0], tracks.y_px - report.rest_px[:, 1])
     away[~tracks.valid] = np.nan
@@ -177,7 +185,7 @@ def _motion(report: TrackReport) -> _Figure | None:
         axes.set_ylim(bottom=0.0)
         _over_time(axes, report, "displacement (px)")
 
-    caption = "Distance of the points from rest: median, and the middle 80 % of them."
+    caption = "Displacement of the points from rest: median, and the range of the middle 80 %."
     return _drawn("motion", "Displacement over time", caption, (4.6, 2.8), draw)
 
 
@@ -196,7 +204,7 @@ def _losses(tracks: Tracks) -> list[tuple[str, str]]:
 def _drawn(
     name: str, title: str, caption: str, size: tuple[float, float], draw: Callable[[Axes], None]
 ) -> _Figure:
-    with house_style():
+    with figure_style():
         figure = Figure(figsize=size, layout="constrained")
         draw(figure.subplots())
         return _Figure(name, inline_svg(to_svg(figure, name, title)), caption, size[0] > 5.0)
@@ -231,7 +239,7 @@ def _paths(report: TrackReport) -> _Figure:
             markersize=7,
         )
 
-    caption = "Paths of all points on the first frame; dots: at rest"
+    caption = "Paths of all points on the first frame; dots: positions at rest"
     caption += "; circles: the points of the gauge." if report.gauge.size else "."
     return _drawn("paths", "Paths", caption, _portrait(report), draw)
 
@@ -242,7 +250,7 @@ def _portrait(report: TrackReport) -> tuple[float, float]:
 
 
 def _field(report: TrackReport) -> _Figure | None:
-    """Strain along y in the frame where the sheet is stretched most, of those that hold most."""
+    """Strain along y in the frame with the largest stretch, of those with most valid points."""
     tracks = report.tracks
     if len(report.rest_px) < _FEWEST_FOR_FIELD:
         return None
@@ -277,7 +285,7 @@ def _field(report: TrackReport) -> _Figure | None:
     caption = (
         f"Strain along y {when}, where the displacements differ most: at each point from an affine "
         f"fit to its 12 neighbours; median {np.median(strain[known]):.3f} %, standard deviation "
-        f"{deviation:.3f} %. The picture behind is the first frame."
+        f"{deviation:.3f} %. The background is the first frame."
     )
     return _drawn("field", "Strain field", caption, _portrait(report), draw)
 
@@ -307,14 +315,14 @@ def _strain(report: TrackReport) -> _Figure | None:
 
 
 def _marks(report: TrackReport, strain: TrackStrain) -> str:
-    """How many marks the strain is from."""
+    """How many marks the strain is computed from."""
     count, known = report.gauge.size, np.isfinite(strain.strain)
     fewer = known & (strain.marks < count)
-    text = f"From {count} marks"
+    text = f"Computed from {count} marks"
     if fewer.any():
-        text += f", but from {strain.marks[fewer].min()} or more in {fewer.sum()} frames"
+        text += f", but from only {strain.marks[fewer].min()} or more in {fewer.sum()} frames"
     if not known.all():
-        text += f"; not known in {np.count_nonzero(~known)} frames"
+        text += f"; unknown in {np.count_nonzero(~known)} frames"
     return text + "."
 
 

@@ -11,12 +11,12 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError, LimitError, Limits
+from haselab.base import Closing, DeviceError, InputError, LimitError, Limits
 from haselab.rig import Frames, Rig, RigDescription
 from haselab.rig.operator import check_mass, check_wait
 from haselab.store.session.writer import SessionReader
@@ -64,7 +64,7 @@ def _films(folder: Path) -> list[_Film]:
     return found
 
 
-class ReplayBench:
+class ReplayBench(Closing):
     """Plays a session; fulfils the protocols of `haselab.rig`. Use as a context.
 
     Args:
@@ -90,7 +90,7 @@ class ReplayBench:
         self._films = _films(path.parent / "video")
         self._next = 0
         self._now_s = self._blocks[0].start_s
-        self._asked_v = 0.0
+        self._requested_v = 0.0
         self._filming = False
         self._seen_s = self._now_s
         self.rig = Rig(self.description, self, self, self, self, self, simulated=True)
@@ -109,22 +109,16 @@ class ReplayBench:
         """Close the session."""
         self._session.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     # ---- VoltageSource -------------------------------------------------------------------------
 
     def write(self, voltage_v: float) -> None:
         """See `haselab.rig.VoltageSource`; compared with the recording when its block is read."""
         self.description.drive_limits.check(voltage_v)
-        self._asked_v = float(voltage_v)
+        self._requested_v = float(voltage_v)
 
     def zero(self) -> None:
         """See `haselab.rig.VoltageSource`."""
-        self._asked_v = 0.0
+        self._requested_v = 0.0
 
     # ---- Acquisition ---------------------------------------------------------------------------
 
@@ -147,9 +141,9 @@ class ReplayBench:
         block = self._blocks[self._next]
         record = self._records[block.experiment]
         recorded_v = float(record.drive_v[block.index])
-        if not abs(recorded_v - self._asked_v) <= _SAME_V:
+        if not abs(recorded_v - self._requested_v) <= _SAME_V:
             raise DeviceError(
-                f"Output = {self._asked_v:g} V in block {block.index} of {block.experiment!r}, "
+                f"Output = {self._requested_v:g} V in block {block.index} of {block.experiment!r}, "
                 f"recorded was {recorded_v:g} V. Ask for what was recorded, or use the twin. "
                 f"{self._path}"
             )

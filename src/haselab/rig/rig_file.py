@@ -12,7 +12,6 @@ from pydantic import BaseModel, Field
 
 from haselab.base import DeviceError, InputError
 from haselab.rig import Gate, Rig
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import (
     BenchConfig,
     BenchOutputs,
@@ -21,11 +20,12 @@ from haselab.rig.bench_config import (
     InstrumentOfFile,
     SupplyField,
 )
-from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.instruments.registry import instrument_of
+from haselab.rig.real_bench import RealBench
 from haselab.rig.replay import ReplayBench
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.toml import PrintableSection, read_toml, validated
 
 __all__ = [
@@ -101,11 +101,11 @@ _OUTPUTS: dict[str, type[BaseModel]] = {
     "generator": _GeneratorSection,
     "supply": _SupplySection,
 }
-RigFile = TwinFile | BenchConfig | MegaFile | ReplayFile
-_KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[MegaFile] | type[ReplayFile]] = {
+RigFile = TwinFile | BenchConfig | ChipFile | ReplayFile
+_KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[ChipFile] | type[ReplayFile]] = {
     "twin": TwinFile,
     "bench": BenchConfig,
-    "mega": MegaFile,
+    "mega": ChipFile,
     "replay": ReplayFile,
 }
 
@@ -180,7 +180,7 @@ def opened_rig(file: RigFile, path: Path, gate: Gate) -> Iterator[Rig]:
     elif isinstance(file, BenchConfig):
         with RealBench(file, gate) as bench:
             yield bench.rig
-    elif isinstance(file, MegaFile):
+    elif isinstance(file, ChipFile):
         with opened_chip(file, path, gate) as chip:
             yield chip.rig
     else:

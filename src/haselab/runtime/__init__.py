@@ -1,1 +1,1 @@
-"""Runs a protocol on a rig, closes the loop, keeps it safe."""
+"""Play experiments on a rig, close the loop, and record."""

@@ -1,4 +1,4 @@
-"""The camera, independent of the monitors: frames to fiducials on the acquisition's clock."""
+"""Record the camera independently of the monitors: fiducials on the acquisition's clock."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 from haselab.base import HaselabError, ResultError
 from haselab.rig import Camera, Frames
 from haselab.rig.cameras.source import KnownCamera
+from haselab.runtime.helper_process import HelperProcess
 from haselab.runtime.observer import FIDUCIALS, PARTICLES, Seen
-from haselab.runtime.side_process import SideProcess
 from haselab.store.session.writer import SessionWriter
 from haselab.store.video.raw import RawVideoWriter, transcode
 from haselab.store.video.writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
-from haselab.tracking.tracks import FrameTracks, Reason, TrackState
+from haselab.tracking.tracks import FrameTracks, LossReason, TrackState
 
 __all__ = ["CameraRecorder", "KeepVideo"]
 
 KeepVideo = Literal["none", "sample", "all"]
 _REST_FRAMES = 10
 _SAMPLE_S = 1.0
-_SURE = 0.9  # correlation at which a fiducial found near its old place needs no search
+_SURE = 0.9  # correlation above which a fiducial found near its last position needs no search
 _PARTICLE_RATE_HZ = 20.0
-_CLAMP_PX = 28.0  # the clamp's bar about its row of fiducials
+_CLAMP_PX = 28.0  # half height of the clamp's bar around its row of fiducials
 _OPTIONS = TrackOptions(subset_px=21, search_px=40)
 
 
@@ -42,7 +42,7 @@ def _particles_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def _in_doubt(found: FrameTracks) -> bool:
-    return found.reason is not None and bool((found.reason & Reason.AMBIGUOUS).any())
+    return found.reason is not None and bool((found.reason & LossReason.AMBIGUOUS).any())
 
 
 _Search = Callable[[NDArray[np.uint8]], NDArray[np.float64]]
@@ -54,7 +54,7 @@ def _here(search: _Search, images: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 class _Particles:
-    """Row S11: the sheet's particles, followed at a lower rate than the camera's."""
+    """Row S11: the sheet's particles, tracked at a lower rate than the camera's."""
 
     def __init__(self, session: SessionWriter, name: str, rate_hz: float, call: _Call) -> None:
         self._session = session
@@ -77,7 +77,7 @@ class _Particles:
             self._state = self._tracker.init(list(images))
 
     def follow(self, frames: Frames, mass_kg: float) -> None:
-        """Track every so many frames and record; points that are lost are not valid."""
+        """Track the particles in every n-th frame and record them; lost points are not valid."""
         first = -self._seen % self._stride
         self._seen += len(frames.images)
         chosen = range(first, len(frames.images), self._stride)
@@ -92,19 +92,19 @@ class _Particles:
 
 
 class CameraRecorder:
-    """Follows the fiducials of both clamps through one experiment after the other.
+    """Tracks the fiducials of both clamps through all experiments of a session.
 
-    Use as a context: leaving it makes videos of the raw frames of a run in real time. The first ten
-    frames of the session, at rest, are the reference of all experiments, so that a length has the
-    same error in each.
+    Use as a context: after a run in real time, leaving it makes videos of the raw frames. The first
+    ten frames of the session, without motion, are the reference of all experiments, so that a
+    length has the same error in each.
 
     Args:
         camera: of the rig.
-        session: where the tracks go.
-        folder: where videos go.
+        session: to which the tracks are written.
+        folder: to which videos are written.
         keep: which frames are kept: none, the first and last second, or all.
-        real_time: a loop runs meanwhile: points are searched for in a process of its own, and
-            videos are made of raw frames at the end.
+        real_time: a loop runs at the same time, so points are searched for in a helper process,
+            and videos are made from raw frames at the end.
     """
 
     def __init__(
@@ -130,8 +130,8 @@ class CameraRecorder:
         self._waiting: list[Frames] = []
         self._video: RawVideoWriter | VideoWriter | None = None
         self._raws: list[Path] = []
-        self._aside = SideProcess([__name__]) if real_time else None
-        self._call: _Call = _here if self._aside is None else self._aside.call
+        self._helper = HelperProcess([__name__]) if real_time else None
+        self._call: _Call = _here if self._helper is None else self._helper.call
         self._first_s: float | None = None
         self._last_s = 0.0
         self._particles: _Particles | None = None
@@ -140,7 +140,7 @@ class CameraRecorder:
     def start(
         self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
     ) -> None:
-        """Begin an experiment, or a part of it, at rest."""
+        """Begin an experiment, or a part of it; the actuator must not move."""
         self._particles = (
             _Particles(self._session, particles, rate_hz, self._call) if particles else None
         )
@@ -150,14 +150,14 @@ class CameraRecorder:
         self._tail.clear()
         if self._keep != "none":
             path = self._folder / f"{name}{part}.mkv"
-            if self._aside is None:
+            if self._helper is None:
                 self._video = VideoWriter(path, rate_hz, hashed=True)
             else:
                 self._video = RawVideoWriter(path, rate_hz)
         self._camera.start(rate_hz)
 
     def look(self) -> Seen | None:
-        """Track and record the frames that have come in; what the last one shows."""
+        """Track and record the frames that have arrived; return what the last one shows."""
         frames = self._camera.take()
         if frames is None:
             return None
@@ -174,7 +174,7 @@ class CameraRecorder:
         return self._track(frames)
 
     def _place(self, images: NDArray[np.uint8]) -> None:
-        """Find the fiducials; in the session's first frames they also become the reference."""
+        """Find the fiducials; in the session's first frames, also make them the reference."""
         if self._tracker is None:
             rest = images[:_REST_FRAMES]
             points = self._call(_fiducials_of, rest)
@@ -191,7 +191,7 @@ class CameraRecorder:
             write_png(self._folder / f"{self._name}.png", images[0])
 
     def _find(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Where the fiducials are now: near where they were last, or anywhere."""
+        """Find the fiducials, near their last positions first, then in the whole image."""
         assert self._tracker is not None and self._state is not None
         state, found = self._tracker.step(self._tracker.placed(self._state, self._points), image)
         points = np.stack([found.x_px, found.y_px], axis=1)
@@ -204,7 +204,7 @@ class CameraRecorder:
     def _track(self, frames: Frames) -> Seen:
         assert self._tracker is not None and self._state is not None
         rows = np.empty((len(frames.images), FIDUCIALS), dtype=SessionWriter.track_dtype())
-        searches = len(rows) if self._aside is None else 1  # a loop does not wait for more
+        searches = len(rows) if self._helper is None else 1  # a loop must not wait longer
         for row, image in zip(rows, frames.images, strict=True):
             before = self._state
             self._state, found = self._tracker.step(before, image)
@@ -225,17 +225,17 @@ class CameraRecorder:
     def _named(
         self, before: TrackState, after: TrackState, found: FrameTracks, image: NDArray[np.uint8]
     ) -> tuple[TrackState, FrameTracks]:
-        """The fiducials after a jump: the two rows of all of them give each its name.
+        """Identify the fiducials after a jump by their places in the two rows.
 
-        Alone, a fiducial that jumped cannot be distinguished from the one beside it.
+        A single fiducial that jumped cannot be distinguished from its neighbour.
         """
         assert self._tracker is not None
         try:
             points = self._call(_fiducials_of, image[np.newaxis])
-        except ResultError:  # not all are in view
+        except ResultError:  # not all of them are in view
             return after, found
         state, found = self._tracker.step(self._tracker.placed(before, points), image)
-        motion = state.poses[:, :2] - before.poses[:, :2]
+        motion = state.poses["centre_px"] - before.poses["centre_px"]
         return replace(state, velocity_px=motion), found
 
     def _store(self, frames: Frames) -> None:
@@ -268,32 +268,33 @@ class CameraRecorder:
                     self._raws.append(video.recorded)
 
     def finish(self) -> None:
-        """Record what is left of this experiment and stop the camera."""
+        """Record the remaining frames of this experiment and stop the camera."""
         self.look()
         self._note_camera()
         self._camera.stop()
         self._end_video()
         if not self._placed:
             raise ResultError(
-                f"Fewer than {_REST_FRAMES} frames in {self._name!r}. Record for longer or faster."
+                f"Fewer than {_REST_FRAMES} frames arrived in {self._name!r}. Record for longer, "
+                "or raise the frame rate."
             )
 
     def _note_camera(self) -> None:
-        """What a camera that keeps its own time lost, and how well it knows the time."""
+        """Record how many frames a camera with its own clock lost, and its timing uncertainty."""
         if not isinstance(self._camera, KnownCamera) or not self._camera.uncertainty_s:
             return
-        told = f"times to {1e3 * self._camera.uncertainty_s:.2g} ms"
-        self._session.event(self._last_s, f"camera: {self._camera.dropped} frames lost, {told}")
+        timing = f"times to {1e3 * self._camera.uncertainty_s:.2g} ms"
+        self._session.event(self._last_s, f"camera: {self._camera.dropped} frames lost, {timing}")
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._aside is not None:
-            self._aside.close()
+        if self._helper is not None:
+            self._helper.close()
         try:
             for raw in self._raws:
                 transcode(raw)
         except HaselabError:
-            if kind is None:  # what led here is told first; the raw frames stay
+            if kind is None:  # after an error the raw frames stay, and the error is reported first
                 raise

@@ -19,14 +19,14 @@ class LoopSettings:
     """A closed loop: S10 of the reference study.
 
     Args:
-        controller: of any registered kind.
+        controller: a controller of any registered kind.
         saturation: of the corrected strain.
         voltage_map: corrected strain to drive voltage.
         strain_map: capacitance to strain.
-        video_zero_px: length between the rows of fiducials at zero strain, in px: the camera is the
-            sensor instead of the capacitance; None: it is not.
+        video_zero_px: length between the rows of fiducials at zero strain, in px, to use the camera
+            as the sensor; None: use the capacitance.
         printed_chain: capacitance by the reference study's own chain instead of the lock-in.
-        extra_delay_blocks: by which each output is held back beyond the rig's own delay.
+        extra_delay_blocks: blocks by which each output is delayed beyond the rig's own delay.
         carrier_v: peak amplitude of the sensing signal for this loop; None: that of the run.
     """
 
@@ -41,13 +41,13 @@ class LoopSettings:
 
 
 class RunningController:
-    """A controller in a loop: started, limited, and its failures named.
+    """A controller running in a loop, with its drive limited and its failures reported.
 
     Args:
-        loop: with the controller and its saturation.
+        loop: settings with the controller and its saturation.
         period_s: time between two steps, in s.
     Raises:
-        InputError: the controller does not start.
+        InputError: The controller does not start.
     """
 
     def __init__(self, loop: LoopSettings, period_s: float) -> None:
@@ -56,36 +56,36 @@ class RunningController:
         try:
             self._controller = loop.controller.make()
             self._controller.start(ControllerSetting(period_s, limits.low, limits.high))
-        except Exception as error:  # somebody else's code: whatever it raises
+        except Exception as error:  # code of another package may raise anything
             raise InputError(
                 f"Controller {self._name!r} does not start: {type(error).__name__}: {error}. "
-                "Correct the controller or its parameters."
+                "Fix the controller, or change its parameters."
             ) from error
 
     def step(self, reference: float, measurement: Measurement) -> float | None:
-        """The next drive.
+        """Compute the next drive.
 
         Args:
             reference: desired strain.
             measurement: of the block that has just ended.
         Returns:
-            The drive within the saturation, in strain; None: the output holds, because the
+            The drive within the saturation, in strain; None: keep the output, because the
             measurement is not valid.
         Raises:
-            SafetyError: the controller failed, or returned something that is not a number.
+            SafetyError: The controller failed, or returned something that is not a number.
         """
         try:
             drive = float(self._controller.step(reference, measurement))
         except Exception as error:
             raise SafetyError(
-                f"Controller {self._name!r} failed: {type(error).__name__}: {error}. Correct it "
-                "and test it on the twin."
+                f"Controller {self._name!r} failed: {type(error).__name__}: {error}. Fix it and "
+                "test it on the twin."
             ) from error
         if not measurement.valid:
             return None
         if not math.isfinite(drive):
             raise SafetyError(
                 f"Controller {self._name!r} returned {drive} for a strain of "
-                f"{measurement.strain:.6g}. Correct it and test it on the twin."
+                f"{measurement.strain:.6g}. Fix it and test it on the twin."
             )
         return min(max(drive, self._low), self._high)

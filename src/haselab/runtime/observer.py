@@ -1,4 +1,4 @@
-"""Whoever watches the actuator while a runner plays."""
+"""Protocol of an observer, which watches the actuator while a runner plays."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Protocol
 
 __all__ = ["FIDUCIALS", "PARTICLES", "Observer", "Seen"]
 
-PARTICLES = 400  # at most so many particles are followed
+PARTICLES = 400  # most particles that are tracked
 FIDUCIALS = 6  # a row of three on the upper clamp, a row of three on the lower one
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The actuator in the last frame that has come in.
+    """The actuator in the last frame that has arrived.
 
     Args:
         time_s: middle of the exposure.
-        length_px: between the rows of fiducials of both clamps; NaN where one of them is lost.
+        length_px: between the rows of fiducials of both clamps; NaN if one of them is lost.
     """
 
     time_s: float
@@ -25,15 +25,15 @@ class Seen:
 
 
 class Observer(Protocol):
-    """Whoever watches the actuator while a runner plays."""
+    """Watches the actuator while a runner plays."""
 
     def start(
         self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
     ) -> None:
-        """Begin an experiment, or a part of it; `particles` names where particles are recorded."""
+        """Begin an experiment, or a part of it; record particles under the name `particles`."""
 
     def look(self) -> Seen | None:
-        """Take in what has happened since the last look; None where nothing has."""
+        """Process what has arrived since the last call; return None if nothing has."""
 
     def finish(self) -> None:
-        """End the experiment or the part."""
+        """End the experiment, or the part of it."""

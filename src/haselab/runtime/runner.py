@@ -1,4 +1,4 @@
-"""Plays experiments on a rig, records them, and leaves the bench at 0 V whatever happens."""
+"""Play experiments on a rig, record them, and always end at 0 V."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ __all__ = [
 ]
 
 BLANKING_S = 0.5e-3  # after an output update, until amplifier and monitors have settled
-_LOOK_EVERY = 20  # blocks between two looks at the camera
-_STATIC_FRAMES = 40  # of each static load
-_REACH_POINTS = 1001  # over the saturation, where a loop's voltages are checked
-_ASIDE_S = 30.0  # that disk and camera may take at the ends of an experiment
-_EVENT_LETTERS = 90  # that one event of the session holds
-_EVENT_LINES = 5  # for one reason
+_LOOK_EVERY = 20  # blocks between two calls of the camera recorder
+_STATIC_FRAMES = 40  # for each static load
+_REACH_POINTS = 1001  # points of the saturation range where a loop's voltages are checked
+_SETUP_S = 30.0  # longest time for disk and camera between experiments
+_EVENT_LETTERS = 90  # longest event of a session
+_EVENT_LINES = 5  # most events for one reason
 
 
 class Recorder(Protocol):
-    """Where blocks and events go."""
+    """Receives the blocks and events of a session."""
 
     def append_block(
         self, name: str, codes: NDArray[np.int16], start_s: float, drive_v: float, reference: float
@@ -60,16 +60,17 @@ class Recorder(Protocol):
         """Add one block."""
 
     def flush(self, name: str) -> None:
-        """Let go of what is pending."""
+        """Write what is still buffered for an experiment."""
 
     def event(self, time_s: float, what: str) -> None:
-        """Note that something happened."""
+        """Record that something happened."""
 
 
 def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
-    """The lock-in for a rig: blanked from each block's start until its output has settled.
+    """Make the lock-in for a rig, which ignores each block until its output has settled.
 
-    What came before the update would tell of it too, but late: in a loop the delay counts more.
+    The samples before the update contain information too, but late: in a loop the delay matters
+    more.
     """
     settled = rig.switch_in_block + round(BLANKING_S * rig.rate_hz)
     config = LockinConfig(
@@ -92,18 +93,18 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
 
 
 def counted_s(rig: RigDescription, carrier_hz: float) -> float:
-    """How much of a block the lock-in of a rig fits: its end, from the middle twice as far."""
+    """Time that the lock-in of a rig fits: twice from the middle of the fit to the block's end."""
     last_s = (rig.block_samples - 1) / rig.rate_hz
     return 2.0 * (last_s - lockin_of(rig, carrier_hz).middle_s) + 1.0 / rig.rate_hz
 
 
 def printed_chain_of(rig: RigDescription, carrier_hz: float) -> PaperChain:
-    """The reference study's own chain for a rig; nothing of a block is left out."""
+    """Make the reference study's own chain for a rig, which uses all samples of a block."""
     return PaperChain(replace(lockin_of(rig, carrier_hz).config, blank=(0, 0)))
 
 
 def _left(found: str, error: BaseException | None) -> str:
-    """An output that is left, and what had ended the run."""
+    """Describe an output that is not at 0 V, and what had ended the run."""
     why = "" if error is None else str(error)
     if error is None or (why and why in found):
         return found
@@ -121,20 +122,20 @@ def _outside(blocks: int, played: int, loop: LoopSettings) -> str:
 
 
 class Runner:
-    """One session on one rig. Use as a context: every way out of it ends at 0 V, read back.
+    """One session on one rig. Use as a context, which always ends at 0 V, read back.
 
     Args:
-        rig: the bench, guarded and armed by its user (`haselab.safety.armed`). Only one that is
-            simulated in this process may come plain: it is guarded and armed here, with the
-            default limits.
-        session: where blocks go.
-        camera_recorder: the camera's part.
-        carrier_hz: of the sensing signal.
-        carrier_v: peak amplitude of the sensing signal ahead of the amplifier.
-        progress: told in rig seconds.
+        rig: the bench, guarded and armed by its user (`haselab.safety.armed`). A rig that is
+            simulated in this process may be passed unguarded: it is guarded and armed here, with
+            the default limits.
+        session: to which blocks are written.
+        camera_recorder: records the camera.
+        carrier_hz: frequency of the sensing signal.
+        carrier_v: peak amplitude of the sensing signal at the amplifier's input.
+        progress: updated with the time on the rig's clock, in s.
     Raises:
-        SafetyError: a bench that is neither armed nor simulated in this process; or at the end, an
-            output that is not at 0 V, or not known to be.
+        SafetyError: The bench is neither armed nor simulated in this process; or at the end, the
+            output is not confirmed at 0 V.
     """
 
     def __init__(
@@ -149,27 +150,27 @@ class Runner:
         self._arms = not isinstance(rig, GuardedRig)
         self._rig = rig if isinstance(rig, GuardedRig) else guard(rig)
         self._signals = OrderlyEnd(self._end_of_block)
-        self._entered = False  # the start was not broken off
-        self._left = ""  # at the output, where the start was broken off
+        self._entered = False  # whether the start was completed
+        self._left = ""  # what remains at the output, if the start was interrupted
         self._safety = self._rig.safety
         self._session = session
         self._camera_recorder = camera_recorder
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
         self._missed = self._rig.missed_outputs
-        self._missed_row = 0  # blocks in a row with outputs that were left out
-        self._at_zero = False  # read back at the end
+        self._missed_row = 0  # blocks in a row with skipped outputs
+        self._at_zero = False  # whether 0 V was read back at the end
         self._output = ""  # what was read back at the end
 
     @property
     def mass_kg(self) -> float:
-        """The rig's own weight, in kg."""
+        """The rig's own hung mass, in kg."""
         return self._rig.description.mass_kg
 
     @property
-    def standing_v(self) -> float:
-        """The drive that is put out now, in V."""
-        return self._rig.standing_v
+    def present_drive_v(self) -> float:
+        """The present drive, in V."""
+        return self._rig.present_drive_v
 
     def __enter__(self) -> Self:
         self._safety.record_with(self._note)
@@ -180,8 +181,8 @@ class Runner:
         self._signals.__enter__()
         try:
             if not self._arms:
-                self._rig.check_at_rest()
-                self._safety.sign_of_life(_ASIDE_S)  # instruments are set up, at 0 V still
+                self._rig.check_idle()
+                self._safety.heartbeat(_SETUP_S)  # instruments are set up, still at 0 V
             self._rig.generator.sine(*self._carrier)
             self._entered = True
             return self
@@ -205,9 +206,9 @@ class Runner:
         if self._entered:
             try:
                 self._finish(error)
-            except KeyboardInterrupt as stop:  # the reason and the output must not be lost by it
-                told = str(error or ""), self._output or "0 V commanded, not read back."
-                for note in told:
+            except KeyboardInterrupt as stop:  # keep the reason and the output in the message
+                notes = str(error or ""), self._output or "0 V commanded, not read back."
+                for note in notes:
                     if note and note not in getattr(stop, "__notes__", []):
                         stop.add_note(note)
                 raise
@@ -219,8 +220,8 @@ class Runner:
             self._safety.end_run()
 
     def _finish(self, error: BaseException | None) -> None:
-        """0 V, read back, and the reason recorded."""
-        stopped, found, before = error, "", self._safety.reason
+        """Go to 0 V, read it back, and record the reason."""
+        stopped, found, before = error, "", self._safety.trips
         others = self._safety.revoked_by_others
         try:
             self._rig.command_zero()
@@ -234,31 +235,31 @@ class Runner:
                 self._safety.end_run()
                 if stopped is not None:
                     self._ended_by(stopped, found)
-        reason = self._safety.reason
-        if found:  # whatever ended the run: this matters more
+        if found:  # more important than what ended the run
             raise SafetyError(_left(found, error)) from error
-        if others and isinstance(error, DeviceError):  # what the driver met then is no cause
+        if others and isinstance(error, DeviceError):  # the driver's error is only a consequence
             raise SafetyError(others) from error
-        if error is None and reason != before:
-            raise SafetyError(reason)
+        if error is None and self._safety.trips != before:
+            raise SafetyError(self._safety.reason)
 
     def _read_back(self) -> str:
-        """Whether the output is at 0 V, recorded unless it is; the fault, empty without one."""
+        """Read the output back, record it unless it is at 0 V, and return the fault or ''."""
         try:
-            told, fault = self._rig.read_back(), ""
+            found, self._at_zero = self._rig.read_back()
+            fault = ""
         except SafetyError as error:
-            told = fault = str(error)
-        self._output = f"{told[:1].upper()}{told[1:].rstrip('.')}."
-        self._at_zero = told.startswith("output at 0 V")
+            found = fault = str(error)
+            self._at_zero = False
+        self._output = f"{found[:1].upper()}{found[1:].rstrip('.')}."
         if not self._at_zero:
             with contextlib.suppress(HaselabError):
-                self._note(told)
+                self._note(found)
         return fault
 
     def _ended_by(self, error: BaseException, found: str) -> None:
-        """Record why, and end the camera's part.
+        """Record why the run ended, and stop the camera recorder.
 
-        What goes wrong from here on, a full disk, must not hide the error that led here.
+        A further error, such as a full disk, must not hide the one that ended the run.
         """
         if isinstance(error, KeyboardInterrupt):
             error.add_note(self._output)
@@ -278,12 +279,12 @@ class Runner:
         self._session.event(self._rig.acquisition.time_s, what)
 
     def _note(self, what: str) -> None:
-        """An event of any length."""
+        """Record an event of any length."""
         for line in textwrap.wrap(what, _EVENT_LETTERS)[:_EVENT_LINES]:
             self._event(line)
 
     def _begin(self, name: str) -> None:
-        self._safety.sign_of_life(_ASIDE_S)
+        self._safety.heartbeat(_SETUP_S)
         self._event(f"start {name}")
         self._rig.begin()
 
@@ -295,18 +296,18 @@ class Runner:
         mass_kg: float,
         particles: str = "",
     ) -> None:
-        """Open loop: put out one drive value a block and record.
+        """Play a drive in open loop, one value per block, and record.
 
         Args:
             name: of the experiment in the session.
             drive_v: in V, shape `(blocks,)`; all are checked before the first is put out.
             frame_rate_hz: of the camera.
-            mass_kg: that hangs, for the record.
-            particles: name under which the sheet's particles are recorded; none without one.
+            mass_kg: hung mass, for the record.
+            particles: name of the record of the sheet's particles; empty: they are not recorded.
         Raises:
-            LimitError: a value outside the drive limits.
-            SafetyError: the bench protected itself.
-            DeviceError: disk or instrument failed.
+            LimitError: A value is outside the drive limits.
+            SafetyError: The bench tripped.
+            DeviceError: The disk or an instrument failed.
         """
         self._rig.check_drive(drive_v)
         self._begin(name)
@@ -324,21 +325,21 @@ class Runner:
         frame_rate_hz: float,
         mass_kg: float,
     ) -> None:
-        """Closed loop by self-sensing: monitors, capacitance, strain, controller, voltage, output.
+        """Run a closed loop by self-sensing: monitors, capacitance, strain, controller, drive.
 
-        With `LoopSettings.video_zero_px` the strain is that of the last frame that has come in.
-        A block whose reference is NaN is driven open loop at the voltage of zero strain, before
-        the loop closes without a bump.
+        With `LoopSettings.video_zero_px` the strain is that of the last frame that has arrived.
+        Blocks whose reference is NaN are driven in open loop at the voltage of zero strain; then
+        the loop closes without a step.
 
         Args:
             name: of the experiment in the session.
             reference: desired strain, shape `(blocks,)`.
             loop: controller and maps.
             frame_rate_hz: of the camera.
-            mass_kg: that hangs, for the record.
+            mass_kg: hung mass, for the record.
         Raises:
-            SafetyError: the sensor was lost, or the bench protected itself.
-            DeviceError: disk or instrument failed.
+            SafetyError: The sensor was lost, or the bench tripped.
+            DeviceError: The disk or an instrument failed.
         """
         controller = RunningController(loop, self._rig.description.block_s)
         sensor, watchdog = self._sensor(loop), self._watchdog(loop)
@@ -374,25 +375,25 @@ class Runner:
     def follow(
         self, name: str, reference: NDArray[np.float64], frame_rate_hz: float, mass_kg: float
     ) -> None:
-        """Closed loop by the rig's own controller, which is told the desired strain alone.
+        """Run a closed loop by the rig's built-in controller, which gets only the desired strain.
 
         Args:
             name: of the experiment in the session.
-            reference: desired strain, shape `(blocks,)`; all are checked before the first is told.
-                NaN ahead of the first: the rig stays at rest, for the camera's first frames.
+            reference: desired strain, shape `(blocks,)`; all are checked before the first is sent.
+                During leading NaN values the output stays at 0 V, for the camera's first frames.
             frame_rate_hz: of the camera.
-            mass_kg: that hangs, for the record.
+            mass_kg: hung mass, for the record.
         Raises:
-            InputError: the rig has no controller.
-            LimitError: a strain that the controller does not take.
-            SafetyError: the controller, or the bench, protected itself.
-            DeviceError: disk or instrument failed.
+            InputError: The rig has no built-in controller.
+            LimitError: A strain is outside the controller's limits.
+            SafetyError: The controller or the bench tripped.
+            DeviceError: The disk or an instrument failed.
         """
         controller = self._rig.controller
         if controller is None:
             raise InputError(
-                "This rig has no controller of its own, needed is one, as kind = 'mega'. Close the "
-                "loop by the program instead, or name another rig."
+                "This rig has no built-in controller. Use a rig with kind = 'mega', or close the "
+                "loop in the program."
             )
         controller.strain_limits.check(reference[~np.isnan(reference)])
         watchdog = OutputWatchdog(
@@ -404,10 +405,10 @@ class Runner:
             if desired == desired:
                 controller.follow(float(desired))
             codes = self._take(name, k, float(desired))
-            drive_v = self._rig.standing_v
+            drive_v = self._rig.present_drive_v
             if desired == desired and (fault := watchdog.fault(codes, drive_v, float(desired))):
                 raise self._safety.trip(fault)
-        self.rest()  # what comes takes longer than a controller waits for a sign of life
+        self.rest()  # the next steps take longer than a controller waits for a keep-alive
         self._end(name)
 
     def _sensor(self, loop: LoopSettings) -> StrainSensor:
@@ -429,24 +430,24 @@ class Runner:
             settings.settle_s,
             None if by_video else loop.strain_map.coefficients,
         )
-        return LoopWatchdog(model, settings.loop, settings.rating, self._rig.standing_v)
+        return LoopWatchdog(model, settings.loop, settings.rating, self._rig.present_drive_v)
 
     def _sample(self, sensor: StrainSensor, strain: float, desired: float) -> LoopSample:
-        """What the watchdog compares, of the block just read."""
+        """Collect what the watchdog checks of the block just read."""
         age_s = None
         if sensor.frame_time_s is not None:
             age_s = self._rig.acquisition.time_s - sensor.frame_time_s
         return LoopSample(
-            strain, sensor.capacitance_f, self._rig.standing_v, desired, sensor.fresh, age_s
+            strain, sensor.capacitance_f, self._rig.present_drive_v, desired, sensor.fresh, age_s
         )
 
     def _measured(self, sensor: StrainSensor, strain: float) -> Measurement:
-        """What a controller gets, of the block just read."""
+        """Collect what a controller gets of the block just read."""
         farad = sensor.capacitance_f
         return Measurement(
             strain=strain,
             capacitance_f=math.nan if farad is None else farad,
-            voltage_v=self._rig.standing_v,
+            voltage_v=self._rig.present_drive_v,
             time_s=self._rig.acquisition.time_s,
             valid=not math.isnan(strain),
             in_range=sensor.in_range,
@@ -455,14 +456,14 @@ class Runner:
     def _step(
         self, controller: RunningController, desired: float, measured: Measurement
     ) -> float | None:
-        """The next drive; a controller that fails trips the bench."""
+        """Compute the next drive; a controller that fails trips the bench."""
         try:
             return controller.step(desired, measured)
         except SafetyError as error:
             raise self._safety.trip(str(error)) from error
 
     def _check_reach(self, loop: LoopSettings) -> None:
-        """Refuse a loop that could ask for too much, by the arithmetic that will run in it."""
+        """Refuse a loop whose voltage map exceeds the drive limits within the saturation."""
         strains = np.linspace(loop.saturation.low, loop.saturation.high, _REACH_POINTS)
         voltages = [self._voltage(loop, float(strain)) for strain in (*strains, 0.0)]
         self._rig.description.drive_limits.check(voltages)
@@ -475,12 +476,12 @@ class Runner:
     def hang(
         self, name: str, masses_kg: list[float], settle_s: float, frame_rate_hz: float
     ) -> None:
-        """Static loads: hang each mass at 0 V, wait, take a few frames.
+        """Record static loads: hang each mass at 0 V, wait, take a few frames.
 
         Args:
             name: of the experiment in the session.
             masses_kg: in the order of hanging.
-            settle_s: wait before the frames, in s.
+            settle_s: time to wait before the frames, in s.
             frame_rate_hz: of the camera.
         """
         self._begin(name)
@@ -498,15 +499,15 @@ class Runner:
 
     def release(self, name: str, drive_v: float, settle_s: float, record_s: float,
                 frame_rate_hz: float, mass_kg: float) -> None:  # fmt: skip
-        """Free response: lift the mass, wait, let go, record.
+        """Record a free response: lift the mass, wait, release it.
 
         Args:
             name: of the experiment in the session.
             drive_v: held all the time, in V.
             settle_s: how long the mass is held up, in s.
-            record_s: from the moment of letting go, in s.
+            record_s: duration of the record after the release, in s.
             frame_rate_hz: of the camera.
-            mass_kg: that hangs, for the record.
+            mass_kg: hung mass, for the record.
         """
         self._rig.description.drive_limits.check(drive_v)
         self._begin(name)
@@ -525,23 +526,23 @@ class Runner:
         self._end(name)
 
     def settle(self, drive_v: float, duration_s: float) -> None:
-        """Hold one output with nothing recorded, so that creep fades before what comes.
+        """Hold one output without recording, so that creep fades before the next experiment.
 
         Args:
             drive_v: held, in V.
             duration_s: for how long, in s.
         Raises:
-            LimitError: outside the drive limits.
+            LimitError: The drive is outside its limits.
         """
         self._rig.source.write(drive_v)
         self._rig.stand.wait(duration_s)
 
     def rest(self) -> None:
-        """The drive to 0 V, at once; the sensing signal stays."""
+        """Set the drive to 0 V at once; the sensing signal stays on."""
         self._rig.source.zero()
 
     def load(self, mass_kg: float) -> None:
-        """Hang a mass at 0 V without the sensing signal, leave it there, restore the signal."""
+        """Hang a mass at 0 V with the sensing signal off, then restore the signal."""
         self._rig.stand.hang(mass_kg)  # switches everything off first
         self._rig.generator.sine(*self._carrier)
 
@@ -554,19 +555,19 @@ class Runner:
     def _take(
         self, name: str, index: int, desired: float, *, look: bool = True
     ) -> NDArray[np.int16]:
-        """Read a block, keep it, and look at the camera now and then."""
+        """Read and record a block, and call the camera recorder at intervals."""
         codes = self._rig.acquisition.read()
         start_s = self._rig.acquisition.time_s - self._rig.description.block_s
-        self._session.append_block(name, codes, start_s, self._rig.standing_v, desired)
+        self._session.append_block(name, codes, start_s, self._rig.present_drive_v, desired)
         missed, self._missed = self._rig.missed_outputs - self._missed, self._rig.missed_outputs
         self._missed_row = self._missed_row + 1 if missed else 0
         if missed:
-            self._note(f"{missed} outputs came too late and were left out")
+            self._note(f"{missed} outputs came too late and were skipped")
         limit = self._safety.settings.missed_limit
         if self._missed_row >= limit and self._safety.settings.real_time:
             raise self._safety.trip(
                 f"Lost deadline: outputs of {self._missed_row} blocks in a row came too late and "
-                f"were left out (missed_limit = {limit}). Close other programs."
+                f"were skipped (missed_limit = {limit}). Close other programs."
             )
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:
@@ -575,10 +576,10 @@ class Runner:
         return codes
 
     def _end(self, name: str) -> None:
-        self._safety.sign_of_life(_ASIDE_S)
+        self._safety.heartbeat(_SETUP_S)
         self._session.flush(name)
         self._camera_recorder.finish()
         if self._safety.settings.real_time:
             self._note(f"deadlines of {name}: {self._rig.deadlines.ticks}")
         self._event(f"end {name}")
-        self._safety.sign_of_life(self._safety.settings.idle_s)
+        self._safety.heartbeat(self._safety.settings.idle_s)

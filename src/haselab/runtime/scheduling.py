@@ -1,4 +1,4 @@
-"""A loop in real time comes first: before other programs where that is allowed, and in Python."""
+"""Raise the priority of a real-time loop, in the system if allowed and in Python."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import os
 import sys
 from collections.abc import Iterator
 
-__all__ = ["favoured", "step_back"]
+__all__ = ["lower_priority", "with_priority"]
 
 _NICENESS = -10
-_SWITCH_S = 0.5e-3  # Python's own 5 ms are half a block
+_SWITCH_S = 0.5e-3  # Python's default of 5 ms is half a block
 
 
 @contextlib.contextmanager
-def favoured() -> Iterator[bool]:
-    """This process before others, and a thread that wakes up soon in it.
+def with_priority() -> Iterator[bool]:
+    """Raise the priority of this process, and let its threads switch faster.
 
     Yields:
-        Whether the system allowed the first; on Linux that takes root or CAP_SYS_NICE.
+        Whether the system allowed the higher priority; on Linux this needs root or CAP_SYS_NICE.
     Example:
-        >>> with favoured():
+        >>> with with_priority():
         ...     sys.getswitchinterval()
         0.0005
     """
@@ -33,8 +33,8 @@ def favoured() -> Iterator[bool]:
         _set_niceness(before)
 
 
-def step_back() -> None:
-    """This process after others."""
+def lower_priority() -> None:
+    """Lower the priority of this process below that of others."""
     _set_niceness(max(_niceness(), -_NICENESS))
 
 
@@ -43,7 +43,7 @@ def _niceness() -> int:
 
 
 def _set_niceness(value: int) -> bool:
-    """Of this thread, and of those that it starts."""
+    """Set the niceness of this thread and of those that it starts; return whether it worked."""
     try:
         os.setpriority(os.PRIO_PROCESS, 0, value)
     except (AttributeError, OSError):

@@ -1,4 +1,4 @@
-"""What a closed loop takes its strain from: the capacitance, or the camera."""
+"""Strain sensors of a closed loop: the capacitance, or the camera."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ __all__ = [
     "VideoSensor",
 ]
 
-PATIENCE_BLOCKS = 5  # as many blocks without a strain trip the loop
+PATIENCE_BLOCKS = 5  # blocks in a row without a strain that trip the loop
 
 
 class StrainSensor(Protocol):
-    """A strain a block."""
+    """Gives one strain per block."""
 
-    watches: bool  # whether it looks at the camera itself
-    capacitance_f: float | None  # of the last block, where strain comes from it
-    frame_time_s: float | None  # of the last frame, where strain comes from the camera
-    fresh: bool  # the last strain is a new one, not one that holds
-    in_range: bool  # the strain map was fitted at the capacitance of the last block
+    watches: bool  # whether it reads the camera itself
+    capacitance_f: float | None  # of the last block, if the strain is computed from it
+    frame_time_s: float | None  # of the last frame, if the strain comes from the camera
+    fresh: bool  # whether the last strain is new rather than reused
+    in_range: bool  # whether the strain map was fitted at the capacitance of the last block
 
     def strain(self, codes: NDArray[np.int16]) -> float:
-        """Strain of the block just read, NaN where there is none."""
+        """Strain of the block just read; NaN if there is none."""
 
     def lost(self) -> str:
-        """Why the last block had none, and what to check."""
+        """Why the last block had no strain, and what to check."""
 
 
 def _no_capacitance(reason: int) -> str:
     return (
-        f"No capacitance ({reason_text(reason)}): check the function generator and the monitors' "
+        f"No capacitance ({reason_text(reason)}). Check the function generator and the monitors' "
         "cables."
     )
 
 
 class CapacitanceSensor:
-    """Self-sensing: monitors, capacitance, strain.
+    """Self-sensing: from the monitors to capacitance to strain.
 
     Args:
         lockin: for the rig's blocks.
@@ -95,7 +95,7 @@ class PrintedChainSensor:
     """Self-sensing by the reference study's own chain, block by block.
 
     Args:
-        chain: for the rig's blocks; its low-pass goes on from block to block.
+        chain: for the rig's blocks; its low-pass filter continues from block to block.
         to_strain: capacitance to strain.
     """
 
@@ -123,12 +123,12 @@ class PrintedChainSensor:
 
 
 class VideoSensor:
-    """The camera: length between the fiducials in the last frame that has come in.
+    """Camera: strain from the length between the fiducials in the last frame that has arrived.
 
-    A strain holds until the next frame; after `PATIENCE_BLOCKS` without one it is lost.
+    A strain is reused until the next frame; after `PATIENCE_BLOCKS` without one it is lost.
 
     Args:
-        observer: follows the fiducials.
+        observer: tracks the fiducials.
         zero_px: length at zero strain, in px.
     """
 
@@ -157,7 +157,5 @@ class VideoSensor:
     def lost(self) -> str:
         """See `StrainSensor`."""
         if self._old >= PATIENCE_BLOCKS:
-            return (
-                f"No frame in {self._old} blocks: check the camera, or take more frames a second."
-            )
-        return "A fiducial is not seen: check the light and what stands before the camera."
+            return f"No frame in {self._old} blocks. Check the camera, or raise its frame rate."
+        return "A fiducial is not visible. Check the light, and clear the view of the camera."

@@ -1,4 +1,4 @@
-"""An own bench from the first permission to 0 V, read back: one `with` block."""
+"""Arm a bench in a `with` block that always ends at 0 V, read back."""
 
 from __future__ import annotations
 
@@ -19,24 +19,23 @@ __all__ = ["arm_simulated", "armed", "ends_at_zero"]
 def armed(
     rig: Rig, settings: SafetySettings | None = None, *, acknowledged: str = ""
 ) -> contextlib.AbstractContextManager[GuardedRig]:
-    """Guard and arm a bench; every way out of the `with` block is 0 V, read back.
+    """Guard and arm a bench; the `with` block always ends at 0 V, read back.
 
-    HIGH VOLTAGE MAY BE APPLIED inside the block. Entering it is both steps of arming: whoever
-    writes it has read the limits of the bench.
+    HIGH VOLTAGE MAY BE APPLIED inside the block. Keep clear. Entering the block takes both steps of
+    arming, so read the limits of the bench before you write it.
 
     Args:
         rig: the bench, of drivers shipped with haselab or written by you.
-        settings: limits of the safety chain; None: the default ones.
-        acknowledged: the reason of the last trip, word for word, once its cause is removed.
+        settings: limits of the safety chain; None: the defaults.
+        acknowledged: the reason for the last trip, word for word, once its cause is removed.
     Returns:
         A context with the bench behind its safety chain.
     Raises:
-        InputError: a driver without the methods that take it to 0 V.
-        SafetyError: the reason of the last trip was not acknowledged; or at the end, the output is
-            not at 0 V or not known to be. Then the bench is tripped: switch the high voltage off by
-            hand.
+        InputError: A driver lacks the methods that take it to 0 V.
+        SafetyError: The reason for the last trip was not acknowledged; or at the end, the output is
+            not confirmed at 0 V. Then the bench is tripped: switch the high voltage off by hand.
     Example:
-        >>> from haselab.rig.twin.bench import make_twin
+        >>> from haselab.rig.twin.twin_bench import make_twin
         >>> from haselab.rig.twin.config import twin_of_reading
         >>> with armed(make_twin(twin_of_reading("hz"), 1)) as guarded:
         ...     guarded.source.write(0.5)
@@ -45,16 +44,16 @@ def armed(
 
 
 def ends_at_zero(guarded: GuardedRig) -> contextlib.AbstractContextManager[object]:
-    """Every way out of the `with` block is 0 V, read back; the arming happens inside it.
+    """Return a context that always ends at 0 V, read back; arm the bench inside it.
 
-    The end of the program is a way out too, also for a block in a thread that is still running.
+    The end of the program ends it too, also for a block in a thread that is still running.
 
     Args:
         guarded: the bench behind its safety chain.
     Returns:
         A context.
     Raises:
-        SafetyError: the output is not at 0 V at the end, or not known to be.
+        SafetyError: The output is not confirmed at 0 V at the end.
     """
 
     return OrderlyEnd(_way_to_zero(guarded))
@@ -78,7 +77,8 @@ def _was_armed(guarded: GuardedRig) -> bool:
     return guarded.safety.stage not in (Stage.OFF, Stage.REQUESTED)
 
 
-_live: dict[int, tuple[GuardedRig, int]] = {}  # in a block that ends at 0 V, with the process
+# benches in a block that ends at 0 V, with their process
+_live: dict[int, tuple[GuardedRig, int]] = {}
 
 
 @atexit.register
@@ -90,7 +90,7 @@ def _at_exit() -> None:
 
 
 class _Armed(OrderlyEnd):
-    """What `armed` returns. No generator: a signal could end one before its own end runs."""
+    """What `armed` returns. Not a generator: a signal could end one before its cleanup runs."""
 
     def __init__(self, rig: Rig, settings: SafetySettings | None, acknowledged: str) -> None:
         super().__init__(lambda error: self._to_zero(error))
@@ -109,10 +109,10 @@ class _Armed(OrderlyEnd):
 
 
 def arm_simulated(guarded: GuardedRig) -> None:
-    """Arm a bench that can put out no voltage, without anybody's word.
+    """Arm a simulated bench, which cannot put out a voltage, without confirmation.
 
     Raises:
-        SafetyError: it is not simulated in this process, or has a reason to be acknowledged.
+        SafetyError: The bench is not simulated in this process, or a trip is not acknowledged.
     """
     if not guarded.simulated:
         raise SafetyError(

@@ -1,4 +1,4 @@
-"""What the person who arms a bench reads: the highest voltage and the limits that are in force."""
+"""The text shown to the person who arms a bench: the highest voltage and the limits in force."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ __all__ = ["arming_limits"]
 def arming_limits(
     rig: RigDescription, current_limit_a: float, rate_limit_v_per_s: float, *, own_controller: bool
 ) -> str:
-    """The limits of a bench in words, the voltage first.
+    """Describe the limits of a bench in words, the voltage first.
 
     Args:
         rig: nominal values of the bench.
         current_limit_a: mean current that trips.
-        rate_limit_v_per_s: fastest rise of the drive, ahead of the amplifier.
+        rate_limit_v_per_s: fastest rise of the drive at the amplifier's input.
         own_controller: a microcontroller closes the loop; the limits of this program do not apply.
     Returns:
         Complete sentences, beginning with the name of the bench.

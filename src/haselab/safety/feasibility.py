@@ -1,4 +1,4 @@
-"""Whether a bench can do what it will be asked, before it is energised."""
+"""Check whether a bench can play a study before it is energised."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Check", "Drive", "Feasibility", "Rating", "judge"]
 
 @dataclass(frozen=True)
 class Rating:
-    """What amplifier and actuator stand.
+    """What amplifier and actuator withstand.
 
     Args:
         current_limit_a: of the amplifier.
@@ -25,13 +25,13 @@ class Rating:
         bandwidth_hz: small-signal, -3 dB.
         capacitance_f: of actuator and cable at the largest strain of the study.
         thickness_m: of the dielectric there.
-        breakdown_v_per_m: field that it must not reach.
-        field_margin: part of that field that may be used.
-        stretch_high: longest length over the free one that the actuator stands.
-        stretch: largest that the study is expected to reach; NaN: not known.
-        settle_s: what an update may take to get there, of its block.
+        breakdown_v_per_m: breakdown field of the dielectric.
+        field_margin: fraction of that field that may be used.
+        stretch_high: largest stretch (length over free length) that the actuator withstands.
+        stretch: largest stretch that the study is expected to reach; NaN: unknown.
+        settle_s: longest time that an update may take to settle, within its block.
     Raises:
-        InputError: a number that cannot be.
+        InputError: A number is not above 0.
     """
 
     current_limit_a: float
@@ -49,18 +49,19 @@ class Rating:
         for name, value in vars(self).items():
             if not value > 0.0 and name != "stretch":
                 raise InputError(
-                    f"rating.{name} = {value:g}, allowed are numbers above 0. Correct the rig file."
+                    f"rating.{name} is {value:g}, but it must be above 0. Change it in the rig "
+                    "file."
                 )
 
 
 @dataclass(frozen=True)
 class Drive:
-    """One experiment's output, ahead of the amplifier.
+    """One experiment's drive voltage, at the amplifier's input.
 
     Args:
         name: of the experiment.
-        values_v: one a block, in V. Shape `(N,)`.
-        highest_hz: of the signal in it; 0 for steps and holds.
+        values_v: one value per block, in V. Shape `(N,)`.
+        highest_hz: highest frequency in it; 0 for steps and holds.
         carrier_v: peak of the sensing signal during it, in V; None: that of the study.
     """
 
@@ -72,36 +73,37 @@ class Drive:
 
 @dataclass(frozen=True)
 class Check:
-    """One number held against its limit.
+    """One number compared with its limit.
 
     Args:
-        name: what.
-        where: in which experiment it is largest.
-        asked: the number.
-        allowed: its limit; asked must not be above.
+        name: of the quantity.
+        where: experiment in which it is largest.
+        requested: the number.
+        allowed: its limit; `requested` must not exceed it.
         unit: of both.
-        advice: what to do where it is.
+        advice: what to do if it does.
     """
 
     name: str
     where: str
-    asked: float
+    requested: float
     allowed: float
     unit: str
     advice: str
 
     @property
     def ok(self) -> bool:
-        """Whether the bench can do it; a number that is not known is not judged."""
-        return not self.asked > self.allowed
+        """Whether the number is within its limit; an unknown number (NaN) passes."""
+        return not self.requested > self.allowed
 
     @property
     def fault(self) -> str:
-        """The number beside its limit, for a number that is too high."""
-        limit = f"allowed {self.allowed:.4g} {self.unit}".strip()
-        if math.isinf(self.asked):
-            return f"{self.name}: no end in {self.where}, {limit}"
-        return f"{self.name} of {self.asked:.4g} {self.unit}".strip() + f" in {self.where}, {limit}"
+        """The number and its limit, for a number that is too high."""
+        limit = f"limit {self.allowed:.4g} {self.unit}".strip()
+        if math.isinf(self.requested):
+            return f"{self.name} is infinite in {self.where} ({limit})"
+        value = f"{self.name} is {self.requested:.4g} {self.unit}".strip()
+        return f"{value} in {self.where} ({limit})"
 
 
 @dataclass(frozen=True)
@@ -116,14 +118,14 @@ class Feasibility:
 
     @property
     def ok(self) -> bool:
-        """Whether all of it can be done."""
+        """Whether the bench can do all of it."""
         return all(check.ok for check in self.checks)
 
     def require(self) -> None:
-        """Refuse what the bench cannot do.
+        """Refuse a study that the bench cannot do.
 
         Raises:
-            LimitError: with each number that is too high, and what to do about it.
+            LimitError: A number is too high; the message lists each one and what to do about it.
         """
         bad = [check for check in self.checks if not check.ok]
         if bad:
@@ -144,7 +146,7 @@ def judge(
     carrier_hz: float,
     carrier_v: float,
 ) -> Feasibility:
-    r"""Hold a study's outputs against a bench.
+    r"""Compare a study's drives with what a bench can do.
 
     Peak current $2\pi f C V + C\,\Delta V/\Delta t$: the carrier's, and the charge of the largest
     update spread over its block. An update itself is a step; the amplifier makes it as fast as its
@@ -154,16 +156,16 @@ def judge(
 
     Args:
         rig: nominal values of the bench.
-        rating: what amplifier and actuator stand.
-        drives: every experiment; each begins at 0 V.
-        carrier_hz: of the sensing signal.
-        carrier_v: its peak ahead of the amplifier, in V.
+        rating: what amplifier and actuator withstand.
+        drives: one per experiment; each begins at 0 V.
+        carrier_hz: frequency of the sensing signal.
+        carrier_v: its peak at the amplifier's input, in V.
     Returns:
-        All checks; `require` refuses.
+        All checks; `Feasibility.require` raises if one of them fails.
     Raises:
-        InputError: no drive.
+        InputError: There is no drive.
     Example:
-        >>> from haselab.rig.twin.bench import describe
+        >>> from haselab.rig.twin.twin_bench import describe
         >>> from haselab.rig.twin.config import TwinConfig
         >>> rig = describe(TwinConfig())
         >>> rating = Rating(12e-3, 350e6, 6e3, 3.3e-9, 314e-6, 40e6)
@@ -175,7 +177,7 @@ def judge(
         ['peak current', 'time of an update']
     """
     if not drives:
-        raise InputError("No drive to judge; name at least one experiment.")
+        raise InputError("There is no drive to check. Name at least one experiment.")
     gain, farad = rig.amplifier_gain, rating.capacitance_f
     jumps = [float(np.abs(np.diff(d.values_v, prepend=0.0)).max()) * gain for d in drives]
     peaks = [float(np.abs(d.values_v).max()) * gain for d in drives]
@@ -197,17 +199,17 @@ def judge(
     field_v_m = (peak_v + ripple_v) / rating.thickness_m
     field_limit = rating.field_margin * rating.breakdown_v_per_m / 1e6
     lower = "Lower the voltage"
-    endless = "" if left_a > 0.0 else "The carrier alone takes the amplifier's whole current. "
+    endless = "" if left_a > 0.0 else "The carrier alone needs all of the amplifier's current. "
     return Feasibility((
         Check("output beyond the drive limits", peaks_in, beyond_v, 0.0, "V", f"{lower}."),
         Check("peak current", jumps_in, 1e3 * current_a, 1e3 * rating.current_limit_a, "mA",
-              "Lower carrier or steps, or take a stronger amplifier."),
+              "Lower the carrier or the steps, or use a stronger amplifier."),
         Check("time of an update", jumps_in, 1e3 * rise_s, 1e3 * rating.settle_s, "ms",
               f"{endless}Lower the carrier or the steps, or ramp them."),
         Check("slew of the carrier", "every experiment", slew_v_s / 1e6,
               rating.slew_v_per_s / 1e6, "V/us", "Lower the carrier's frequency or amplitude."),
         Check("carrier frequency", "every experiment", carrier_hz, rating.bandwidth_hz, "Hz",
-              "Lower the carrier's frequency, or take a faster amplifier."),
+              "Lower the carrier's frequency, or use a faster amplifier."),
         Check("signal frequency", signal_in, signal_hz, 0.5 / rig.block_s, "Hz",
               "Lower the signal's frequency, or shorten the block."),
         Check("field", peaks_in, field_v_m / 1e6, field_limit, "MV/m",

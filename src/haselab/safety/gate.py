@@ -1,10 +1,10 @@
-"""The last line before every driver: no call energises anything without a valid permission.
+"""The last check before every driver: no call energises anything without a valid permission.
 
 `Gate.instrument` wraps a driver in an object with the same attributes. Whoever holds a reference
 to an instrument of a bench (the runner, the camera that keeps the clock running, the stand that
-lets time pass) holds the wrapped one, so nothing reaches a driver past this module. Drivers written
-by others are wrapped in the same way and need no line of their own: methods and settings of
-attributes are checked. Reading an attribute is not: it must not change the output.
+lets time pass) holds the wrapped one, so nothing can bypass this module. Drivers of other packages
+are wrapped in the same way and need no code for it: method calls and assignments to attributes
+are checked. Reading an attribute is not checked: it must not change the output.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ __all__ = ["Gate"]
 
 _T = TypeVar("_T")
 
-# Calls that only take the output down, or ask an instrument: never delayed, never refused.
+# Calls that only lower the output or query an instrument: never delayed, never refused.
 _SAFE = frozenset(
     {"zero", "off", "stop", "close", "is_off", "read_voltage", "check_power", "acquired"}
 )
 _FORGETS = ("zero", "off")  # after these a driver has no earlier request left
-# Calls that request nothing themselves, but in which a driver may put out what was requested
-# before: reading a block starts a stream, pausing one writes its last value.
+# Calls that request nothing themselves, but in which a driver may put out an earlier request:
+# reading a block starts a stream, pausing one writes its last value.
 _PASSIVE = frozenset({"read", "keep", "pause", "catch_up", "pass_time", "read_back"})
-# Calls that request an output: their arguments, the last of which says how much.
+# Calls that request an output, with their arguments; the last one is the amount.
 _REQUESTS = {
     "write": ("voltage_v",),
     "preload": ("voltages_v",),
@@ -46,7 +46,7 @@ _REQUESTS = {
 }
 
 _NONE = -2  # no permission; `interlock.DAMAGED` is another number below zero
-_CALL_S = 5.0  # that another holder of the output lock is waited for: one that makes safe
+_CALL_S = 5.0  # longest wait for a program that makes the bench safe and holds the output lock
 
 
 def _requests_output(name: str, arguments: tuple[Any, ...], named: dict[str, Any]) -> bool:
@@ -56,13 +56,13 @@ def _requests_output(name: str, arguments: tuple[Any, ...], named: dict[str, Any
     known = _REQUESTS[name]
     given = dict(zip(known, arguments, strict=False)) | named
     if len(arguments) > len(known) or set(given) != set(known):
-        return True  # arguments of the driver's own: nobody here knows what they do
+        return True  # the driver's own arguments: their effect is unknown here
     return not _is_zero(given[known[-1]])
 
 
 def _is_zero(amount: Any) -> bool:
-    """Whether this is nothing but 0: a number or a sequence of them. A mask, an empty array or an
-    object of somebody's own could be another number to a driver."""
+    """Whether this is 0 or a sequence of zeros. A masked or empty array, or an object of another
+    type, could be a different number to a driver."""
     if type(amount) in (int, float):
         return bool(amount == 0)
     if isinstance(amount, (list, tuple)):
@@ -72,7 +72,7 @@ def _is_zero(amount: Any) -> bool:
 
 
 def _never() -> str:
-    """Of a permission that does not expire."""
+    """The expiry check of a permission that does not expire."""
     return ""
 
 
@@ -80,7 +80,7 @@ class Gate:
     """Lets calls through to the drivers of one bench while its permission is valid.
 
     Args:
-        interlock: of the bench; None: a bench that lives in this process alone.
+        interlock: of the bench; None: a bench that exists only in this process.
     """
 
     def __init__(self, interlock: Interlock | None = None) -> None:
@@ -94,21 +94,21 @@ class Gate:
 
     @staticmethod
     def of(*drivers: object) -> Gate:
-        """The gate that one of these drivers is behind already, in another rig; else a new one."""
+        """Return the gate that already wraps one of these drivers, or a new one."""
         known = (_gates.get(id(driver)) for driver in drivers if driver is not None)
         return next((gate for gate in known if gate is not None), None) or Gate()
 
     def claim(self, key: str, call_s: float, shared: Collection[str] = ()) -> bool:
-        """Use the interlock of this output device, and be the only program that does.
+        """Take the interlock of this output device for this program alone.
 
         Args:
             key: product and serial number of the device.
             call_s: longest time that one call of its driver may take, in s.
-            shared: addresses of further instruments that another bench could name as well.
+            shared: addresses of instruments that another bench could also use.
         Returns:
-            Whether the last program that used it has vanished, perhaps with the device reserved.
+            Whether the last program that used it crashed, perhaps with the device still reserved.
         Raises:
-            DeviceError: another program uses it, or the interlock's folder cannot be used.
+            DeviceError: Another program uses it, or the interlock's folder cannot be used.
         """
         try:
             interlock = Interlock(key)
@@ -120,18 +120,18 @@ class Gate:
             return vanished
         except InterlockBusyError as error:
             raise DeviceError(
-                f"The bench with {key} is in use by {error}. Wait until it has ended, or stop it "
-                "with 'haselab rig safe RIG.toml'; one with own drivers with 'haselab rig safe "
-                f'--bench "{key}"\'.'
+                f"The bench with {key} is in use by {error}. Wait until that program ends, or stop "
+                "it with 'haselab rig safe RIG.toml'; if the bench uses your own drivers, with "
+                f"'haselab rig safe --bench \"{key}\"'."
             ) from None
         except OSError as error:
             raise DeviceError(
-                f"The interlock of {key} cannot be used ({error}). Its folder must be writable and "
-                f"have room: {interlock_folder()}"
+                f"The interlock of {key} cannot be used ({error}). Make its folder writable and "
+                f"free disk space there: {interlock_folder()}"
             ) from None
 
     def release(self) -> None:
-        """Leave the bench to others. Safe to call twice."""
+        """Release the bench for other programs. Safe to call twice."""
         self.end()
         self.interlock.close()
 
@@ -139,57 +139,56 @@ class Gate:
 
     @property
     def permitted(self) -> bool:
-        """A permission was given, nobody has revoked it since, and it has not expired."""
+        """Whether a permission was given and has neither been revoked nor expired."""
         mine = os.getpid() == self._pid  # a fork has no permission
         given = mine and self._revision >= 0 and self._revision == self.interlock.revision
         return given and not self._expired()
 
     def permit(self, revision: int, expired: Callable[[], str] = _never) -> None:
-        """Energising is permitted from now on, for as long as the interlock has this revision.
+        """Permit energising for as long as the interlock keeps this revision.
 
         Args:
             revision: of the interlock.
-            expired: why the permission is no longer valid; empty while it is.
+            expired: returns why the permission is no longer valid, or an empty text.
         """
         self._revision, self._expired = revision, expired
         self.interlock.set_live(True)
 
     def end_permission(self) -> None:
-        """No call is let through any more; the bench may still be live."""
+        """Refuse all further calls; the bench may still be live."""
         self._revision = _NONE
 
     def end(self) -> None:
-        """The permission is returned and the bench is at 0 V; nothing is latched."""
+        """Return the permission of a bench that is at 0 V; no reason is latched."""
         self.end_permission()
         self.interlock.set_live(False)
 
     @property
     def requests(self) -> int:
-        """Calls let through so far that requested an output: what was read back before one of them
-        is out of date."""
+        """Number of calls so far that requested an output; each one outdates earlier read-backs."""
         return self._requests
 
     @property
     def has_requests(self) -> bool:
-        """A driver was given a request and has not been taken to 0 V since."""
+        """Whether a driver was given a request and has not been taken to 0 V since."""
         return any(instrument._gate_pending for instrument in self._wrapped.values())
 
     @property
     def revoked(self) -> str:
-        """Why a permission that was given is no longer valid; empty without one, or if it is."""
+        """Why the permission was revoked; empty while it is valid or if there was none."""
         if self._revision < 0 or self.permitted or self.expired:
             return ""
         return self.interlock.reason or "the permission was revoked"
 
     @property
     def expired(self) -> str:
-        """Why a permission that nobody revoked is no longer valid; empty without one."""
+        """Why the permission expired; empty while it is valid or if there was none."""
         return self._expired() if self._revision == self.interlock.revision else ""
 
     # ---- drivers -----------------------------------------------------------------------------
 
     def instrument(self, driver: _T) -> _T:
-        """The driver behind the gate; the same object for the same driver.
+        """Wrap a driver; the same driver always gives the same object.
 
         Args:
             driver: any instrument of `haselab.rig`.
@@ -204,17 +203,17 @@ class Gate:
         return self._wrapped[id(driver)]  # type: ignore[return-value]
 
     def companion(self, driver: _T) -> _T:
-        """A camera or a stand behind the gate: its calls are let through, and watched.
+        """Wrap a camera or a stand: its calls are let through, and watched.
 
-        It puts out nothing itself, and a call may take as long as a person needs. But it may use
-        a driver of the bench directly. Without a valid permission every driver is therefore taken
-        to 0 V after each of its calls; a voltage is not prevented for the time of the call.
+        It has no output of its own, and a call may wait for a person. But it may use a driver of
+        the bench directly. Without a valid permission, every driver is therefore taken to 0 V
+        after each of its calls; during the call itself a voltage is not prevented.
 
         Args:
             driver: camera or stand.
         Returns:
-            An object with the driver's attributes. What is behind the gate already is returned
-            as it is.
+            An object with the driver's attributes. An object that is already wrapped is returned
+            unchanged.
         """
         if isinstance(driver, _Instrument):
             return driver
@@ -225,12 +224,12 @@ class Gate:
 
     @staticmethod
     def has_wrapped(driver: object) -> bool:
-        """Whether this is a driver behind a gate."""
+        """Whether this driver is wrapped by a gate."""
         return isinstance(driver, _Instrument)
 
     @staticmethod
     def behind(driver: _T) -> _T:
-        """The camera or stand that `companion` has wrapped, for who takes all to 0 V afterwards."""
+        """Unwrap a camera or stand, for a caller that takes everything to 0 V afterwards."""
         return driver._driver if isinstance(driver, _Companion) else driver  # type: ignore[return-value]
 
     def call(
@@ -241,12 +240,12 @@ class Gate:
         arguments: tuple[Any, ...],
         named: dict[str, Any],
     ) -> Any:
-        """One call of a driver's method, checked and then made under the output lock."""
+        """Check one call of a driver's method, then make it under the output lock."""
         if isinstance(instrument, _Companion):
             try:
                 return method(*arguments, **named)
             finally:
-                if self.permitted:  # it may have put out something
+                if self.permitted:  # the call may have applied a voltage
                     self._requests += 1
                     for driver in self._wrapped.values():
                         driver._gate_pending = set(driver._gate_clearing)
@@ -260,12 +259,12 @@ class Gate:
         def checked(acquired: bool) -> Any:
             if not acquired:
                 raise SafetyError(
-                    f"{name}: the bench is being made safe by another program, which has not "
-                    f"finished for {_CALL_S:g} s. Check that program; the output was not changed."
+                    f"{name} was refused: another program is making the bench safe and has not "
+                    f"finished after {_CALL_S:g} s. The output was not changed. Check that program."
                 )
             if not self.permitted:
                 failed = self._forget()
-                if failed is not None:  # it may remember a request, and put it out in this call
+                if failed is not None:  # this call could still put out an earlier request
                     raise failed
                 if _requests_output(name, arguments, named):
                     raise self._refusal()
@@ -276,22 +275,22 @@ class Gate:
                 return method(*arguments, **named)
             finally:  # whatever other threads did meanwhile
                 instrument._gate_pending = set(instrument._gate_clearing)
-                if not self.permitted:  # ended during the call, by one who could not wait for it
+                if not self.permitted:  # revoked during the call, without waiting for it
                     self._forget()
 
         answer = self.interlock.holding_output(checked, _CALL_S)
         if inspect.isgenerator(answer) or inspect.isawaitable(answer):
             raise SafetyError(
                 f"{name} of the driver returned a generator or a coroutine, which could act after "
-                "the bench was made safe. Let it act before it returns."
+                "the bench was made safe. Make it act before it returns."
             )
         return answer
 
     def _forget(self) -> Exception | None:
-        """Take back what was requested of any driver under a permission that has ended.
+        """Cancel what was requested of any driver under a permission that has ended.
 
         Returns:
-            The first error of a driver; the others were taken down all the same.
+            The first error of a driver; the other drivers were cancelled as well.
         """
         first = None
         for instrument in self._wrapped.values():
@@ -300,7 +299,7 @@ class Gate:
         return first
 
     def _to_zero(self) -> None:
-        """Take all drivers down, whatever is known of their requests."""
+        """Take all drivers to 0 V, whether or not they have a request."""
         for instrument in self._wrapped.values():
             for name in sorted(instrument._gate_clearing):
                 quietly(getattr(instrument, name))
@@ -315,15 +314,15 @@ class Gate:
         return SafetyError("The bench is not armed. Arm it before applying a voltage.")
 
     def settle(self, wait_s: float) -> None:
-        """After `zero` and `off`: calls that were under way in other threads have ended as well.
+        """Wait, after `zero` and `off`, until calls in other threads have ended as well.
 
         Args:
-            wait_s: for such a call.
+            wait_s: longest wait for such a call.
         """
         self.interlock.holding_output(lambda acquired: self._forget(), wait_s)
 
 
-# By the identity of a driver behind it, which lives as long as its gate.
+# By the id of a wrapped driver, which exists as long as its gate.
 _gates: weakref.WeakValueDictionary[int, Gate] = weakref.WeakValueDictionary()
 
 
@@ -333,11 +332,11 @@ class _Instrument:
     def __init__(self, gate: Gate, driver: object) -> None:
         self._gate, self._driver = gate, driver
         self._gate_clearing = frozenset(name for name in _FORGETS if hasattr(driver, name))
-        # Of these, to be called before the driver is known to hold no request.
+        # Those still to be called before the driver is known to have no request.
         self._gate_pending = set(self._gate_clearing)
 
     def __getattr__(self, name: str) -> Any:
-        """What the driver makes up when it is asked, as a remote instrument does."""
+        """Forward attributes that the driver creates on access, as remote proxies do."""
         found = getattr(self._driver, name)
         if name.startswith("_") or not callable(found):
             return found
@@ -351,7 +350,7 @@ class _Companion(_Instrument):
 def _wrapper_of(
     kind: type, driver: object, base: type[_Instrument] = _Instrument
 ) -> type[_Instrument]:
-    """A class whose methods pass the gate: real attributes, so that protocols are recognised."""
+    """Make a class whose methods pass the gate; real attributes, so that protocols match."""
     members: dict[str, Any] = {}
     for name in dir(driver):
         if name.startswith("_"):
@@ -370,7 +369,7 @@ def _checked(name: str) -> Callable[..., Any]:
 
 
 def _forwarded(name: str) -> property:
-    """An attribute: reading it must not change the output; setting it counts as a request."""
+    """A property: reading it must not change the output; setting it counts as a request."""
 
     def put(self: _Instrument, value: Any) -> None:
         self._gate.call(self, f"set {name}", lambda: setattr(self._driver, name, value), (), {})

@@ -1,4 +1,4 @@
-"""A rig behind its safety chain: nothing reaches a driver past it."""
+"""A rig behind its safety chain, which no call to a driver can bypass."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from haselab.safety.guarded_parts import (
     GuardedSupply,
 )
 from haselab.safety.instrument_state import instrument_states, output_state
-from haselab.safety.shutdown import Shutdown
+from haselab.safety.shutdown import ReadBack, Shutdown
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.deadlines import Deadlines
 
@@ -32,7 +32,7 @@ __all__ = ["GuardedRig", "guard"]
 
 @dataclasses.dataclass
 class GuardedRig(Rig):
-    """A rig whose parts answer to a safety chain.
+    """A rig whose instruments are all behind one safety chain.
 
     Args:
         plain: the rig behind it.
@@ -44,50 +44,50 @@ class GuardedRig(Rig):
 
     @property
     def safety(self) -> Safety:
-        """The chain."""
+        """The safety chain."""
         return self.bench.safety
 
     @property
     def deadlines(self) -> Deadlines:
-        """Of the present experiment."""
+        """Deadlines of the current experiment."""
         return self.bench.deadlines
 
     def begin(self) -> None:
-        """An experiment begins: its blocks follow one another, its ticks are counted.
+        """Begin an experiment: from here on blocks must follow without a gap.
 
         Raises:
-            DeviceError: an instrument that no block shows, generator or supply, is gone.
+            DeviceError: The generator or the supply does not respond.
         """
         for found in instrument_states(self.plain, self.safety.settings.residual_v):
-            if found.silent:
+            if found.unreachable:
                 with self.bench.calling():
-                    raise DeviceError(f"A link is lost: {found.silent}")
+                    raise DeviceError(f"A link is lost: {found.unreachable}")
         self.bench.passed()
         self.deadlines.start()
 
     def check_drive(self, drive_v: NDArray[np.float64]) -> None:
-        """Refuse a whole drive before its first value goes out.
+        """Refuse a whole drive before its first value is put out.
 
         Args:
-            drive_v: one value a block, in V.
+            drive_v: one value per block, in V.
         Raises:
-            LimitError: a value outside the limits, or a rise above the rate.
+            LimitError: A value is outside the limits, or a rise is above the rate limit.
         """
         self.description.drive_limits.check(drive_v)
-        before_v = self.bench.standing_v
+        before_v = self.bench.present_drive_v
         if np.isfinite(self.safety.settings.rate_limit_v_per_s):
             for value in drive_v:
                 self.bench.check(float(value), before_v)
                 before_v = float(value)
 
     def preload(self, drive_v: NDArray[np.float64]) -> None:
-        """Tell a source that can wait of the coming outputs: a late computer is then no fault.
+        """Queue the coming outputs in a source that can, so that a late computer is no fault.
 
         Args:
-            drive_v: one value a block, in V.
+            drive_v: one value per block, in V.
         Raises:
-            LimitError: see `check_drive`.
-            SafetyError: not armed, and not all of it is 0 V.
+            LimitError: See `check_drive`.
+            SafetyError: The bench is not armed, and a value is not 0 V.
         """
         source = self.bench.preloads
         if source is None:
@@ -99,44 +99,48 @@ class GuardedRig(Rig):
 
     @property
     def missed_outputs(self) -> int:
-        """Outputs since the bench was opened that came too late and were left out."""
+        """Number of outputs since opening that were skipped because they came too late."""
         return self.bench.left_out
 
     @property
-    def standing_v(self) -> float:
-        """The output of the last block: what was asked for, or what stood where that was late."""
-        return self.bench.standing_v if self.controller is None else self.controller.output_v
+    def present_drive_v(self) -> float:
+        """Drive during the last block; if the requested one was late, the one still in force."""
+        return self.bench.present_drive_v if self.controller is None else self.controller.output_v
 
-    def check_at_rest(self) -> None:
-        """Before anything is energised: the link works, and the monitor shows 0 V.
+    def check_idle(self) -> None:
+        """Check before energising that the link works and the monitor shows 0 V.
 
         Raises:
-            DeviceError: no block, or none of this rig.
-            SafetyError: there is an output already.
+            DeviceError: No block arrived, or one that does not fit this rig.
+            SafetyError: There is an output already.
         """
         if not self.safety.settings.read_back:
             return
         codes = self.acquisition.read()
-        left_v = self.bench.watch.residual_v(codes) if self.controller is None else self._told_v()
+        monitored = self.controller is None
+        left_v = self.bench.watch.residual_v(codes) if monitored else self._metered_v()
         if not left_v < self.safety.settings.residual_v:
             raise self.safety.trip(
                 f"Output of {left_v:.4g} V before anything was requested (limit "
-                f"{self.safety.settings.residual_v:g} V). Check amplifier and monitor cables."
+                f"{self.safety.settings.residual_v:g} V). Check the amplifier and the monitor "
+                "cables."
             )
 
-    def _told_v(self) -> float:
-        """The output by the source's own meter, in V: the monitors of a chip show no level."""
+    def _metered_v(self) -> float:
+        """Output by the source's own meter, in V; a microcontroller's monitors show no DC level."""
         found = output_state(self.plain, self.safety.settings.residual_v)
-        if found is None or found.silent:
-            raise DeviceError(f"The output cannot be read: {found.silent if found else 'no meter'}")
+        if found is None or found.unreachable:
+            raise DeviceError(
+                f"The output cannot be read: {found.unreachable if found else 'no meter'}"
+            )
         return abs(found.voltage_v)
 
     def safe(self) -> None:
-        """0 V, no sensing signal, camera off, and 0 V read back.
+        """Take the output to 0 V, stop sensing signal and camera, and read 0 V back.
 
         Raises:
-            SafetyError: the output is not at 0 V, or not known to be. The bench is tripped: switch
-                the high voltage off by hand.
+            SafetyError: The output is not confirmed at 0 V. The bench is tripped: switch the high
+                voltage off by hand.
         """
         try:
             self.command_zero()
@@ -144,26 +148,26 @@ class GuardedRig(Rig):
             self.read_back()
 
     def command_zero(self) -> None:
-        """The first half of `safe`: everything is taken to rest, the rest is not judged."""
+        """Take the bench to 0 V without reading it back: the first half of `safe`."""
         Shutdown(self).run()
 
     def confirm_zero(self) -> None:
-        """`read_back`, unless it was done since anything was energised.
+        """Read back, unless this was done since anything was last energised.
 
         Raises:
-            SafetyError: see `read_back`.
+            SafetyError: See `read_back`.
         """
         self.bench.outdate()
         if "output" not in self.bench.found:
             self.read_back()
 
-    def read_back(self) -> str:
-        """Whether the bench is at 0 V; see `Shutdown.read_back`.
+    def read_back(self) -> ReadBack:
+        """Check that the bench is at 0 V; see `Shutdown.read_back`.
 
         Returns:
             What was read back, for the record.
         Raises:
-            SafetyError: the output is not at 0 V, or not known to be.
+            SafetyError: The output is not confirmed at 0 V.
         """
         return Shutdown(self).read_back()
 
@@ -177,16 +181,16 @@ def guard(
     """Put a safety chain in front of a rig.
 
     Args:
-        rig: the bench. Its drivers are put behind a gate where they are not yet, in `rig` itself:
-            from here on nothing energises it without a permission.
+        rig: the bench. Its drivers are wrapped by a gate, in `rig` itself, unless they already
+            are: from here on nothing energises it without a permission.
         safety: its chain; None makes one with the default limits.
         clock: monotonic, in s.
     Returns:
         The same bench, guarded: nothing is put out until the chain is armed.
     Raises:
-        InputError: a driver without the methods that take it to 0 V.
+        InputError: A driver lacks the methods that take it to 0 V.
     Example:
-        >>> from haselab.rig.twin.bench import make_twin
+        >>> from haselab.rig.twin.twin_bench import make_twin
         >>> from haselab.rig.twin.config import twin_of_reading
         >>> rig = guard(make_twin(twin_of_reading("hz"), 1))
         >>> rig.safety.arm(rig.safety.request())
@@ -214,16 +218,16 @@ def guard(
         rig.description, s.current_limit_a, s.rate_limit_v_per_s, own_controller=own
     )
     if s.rating is None and s.real_time and not own:
-        limits += " The field is not checked against ratings: add [rating] to the rig file."
+        limits += " The electric field is not monitored: add [rating] to the rig file."
     chain.attach(gate, guarded.command_zero, limits, guarded.confirm_zero)
     return guarded
 
 
 def _put_gate(rig: Rig) -> Gate:
-    """The gate of a rig, with all drivers behind it.
+    """Wrap all drivers of a rig and return their gate.
 
     Raises:
-        InputError: a driver that cannot be taken to 0 V.
+        InputError: A driver lacks the methods that take it to 0 V.
     """
     for name, driver, needed in (
         ("source", rig.source, ("write", "zero")),
@@ -237,7 +241,7 @@ def _put_gate(rig: Rig) -> Gate:
                 f"driver every method of its protocol in haselab.rig."
             )
     gate = rig.gate
-    opened_behind = Gate.has_wrapped(rig.source)  # then camera and stand hold its gated drivers
+    opened_behind = Gate.has_wrapped(rig.source)  # then camera and stand hold wrapped drivers
     if not isinstance(gate, Gate):
         gate = rig.gate = Gate.of(rig.source, rig.generator, rig.supply)
     rig.source = gate.instrument(rig.source)

@@ -38,12 +38,12 @@ __all__ = [
 ]
 
 _ROUNDING = 1.0 + 1e-9  # of a difference of two outputs
-_ASIDE_S = 30.0  # that an instrument on a line of its own may take to be set
-_HANDS_S = 3600.0  # a person may take so long to hang a weight
+_SETUP_S = 30.0  # longest time to set an instrument that has its own connection
+_MANUAL_S = 3600.0  # longest time for a person to hang a mass
 
 
 class GuardedBench:
-    """What the guarded parts of one rig share."""
+    """State that the guarded parts of one rig share."""
 
     def __init__(self, rig: Rig, safety: Safety, clock: Callable[[], float]) -> None:
         s = safety.settings
@@ -53,17 +53,17 @@ class GuardedBench:
         queued = rig.description.switch_sample // rig.description.block_samples
         deadline_s = (1 + queued) * rig.description.block_s
         self.deadlines = Deadlines(deadline_s, s.missed_limit, s.late_limit, clock)
-        self.asked_v = 0.0  # last accepted
-        self.standing_v = 0.0  # asked for before the last block
+        self.requested_v = 0.0  # last accepted
+        self.present_drive_v = 0.0  # in force during the last block
         self.time_s = 0.0
-        self.unbroken = False  # the next block has to follow the last one without a gap
+        self.unbroken = False  # whether the next block has to follow without a gap
         self.found: dict[str, OutputState] = {}  # by instrument, since anything was energised
-        self.asked_guardian = False  # since then
-        self._requests = -1  # that the gate had let through then
-        self.turn = threading.Lock()  # instruments report from threads of their own
+        self.asked_guardian = False  # since anything was energised
+        self._requests = -1  # number that the gate had let through then
+        self.turn = threading.Lock()  # several threads report instruments
 
     def outdate(self) -> None:
-        """What was found at rest is out of date once a request was let through to any driver."""
+        """Discard what was found off if any driver was given a request since."""
         requests = self.safety.gate.requests
         if requests != self._requests:
             self._requests = requests
@@ -71,11 +71,11 @@ class GuardedBench:
 
     @property
     def left_out(self) -> int:
-        """Outputs since the bench was opened that came too late and were left out."""
+        """Number of outputs since opening that were skipped because they came too late."""
         return 0 if self.preloads is None else self.preloads.missed_outputs
 
     def check(self, voltage_v: float, before_v: float) -> None:
-        """Check one value against the drive limits, then against the limit of its rise."""
+        """Check one value against the drive limits, then its rise against the rate limit."""
         self.rig.description.drive_limits.check(voltage_v)
         towards_zero = min(before_v, 0.0) <= voltage_v <= max(before_v, 0.0)
         if not towards_zero:
@@ -86,7 +86,7 @@ class GuardedBench:
 
     @contextlib.contextmanager
     def calling(self) -> Iterator[None]:
-        """A call of a driver: where others have made the bench safe, that is why it fails."""
+        """Make a driver call; if it fails because the bench was made safe, say so."""
         try:
             yield
         except InputError:  # refused: nothing was changed
@@ -99,24 +99,24 @@ class GuardedBench:
             raise
 
     def answered(self) -> None:
-        """The output for the last block is on its way: was it in time?"""
+        """Trip if the output that was just given missed its deadline."""
         if self.has_deadlines and (fault := self.deadlines.answered()):
             raise self.safety.trip(fault)
 
     @property
     def has_deadlines(self) -> bool:
-        """The program has to be in time: not where a controller of the rig's own is."""
+        """Whether this program has deadlines; not if the rig has its own controller."""
         return self.safety.settings.real_time and self.rig.controller is None
 
     def passed(self) -> None:
-        """Time has gone by with the present output; blocks may have been passed over."""
+        """Note that time passed with the present output, and that blocks may be missing."""
         self.unbroken = False
-        self.standing_v = self.asked_v
-        self.watch.rest(self.asked_v)
+        self.present_drive_v = self.requested_v
+        self.watch.rest(self.requested_v)
 
 
 class _Part:
-    """Base of the guarded instruments: they take the calls of their protocol and nothing else."""
+    """Base of the guarded instruments, which offer the calls of their protocol and no others."""
 
     _name = "instrument"
 
@@ -130,9 +130,8 @@ class _Part:
 
     def _unknown(self, name: str) -> str:
         return (
-            f"The guarded {self._name} takes only the calls of its protocol in haselab.rig, and "
-            f"{name!r} is none that can be called or set here. Nothing was changed. Set up your "
-            "driver before you guard the rig."
+            f"The guarded {self._name} has no {name!r}: it offers only the calls of its protocol "
+            "in haselab.rig. Nothing was changed. Set up your driver before you guard the rig."
         )
 
 
@@ -145,17 +144,17 @@ class GuardedSource(_Part):
         self._bench, self._plain = bench, plain
 
     def write(self, voltage_v: float) -> None:
-        """Checked here, whoever asks; other than 0 V only while the chain is armed."""
+        """Request a drive voltage; other than 0 V only while the bench is armed."""
         b = self._bench
         voltage_v = as_number("drive voltage", voltage_v)
-        b.check(voltage_v, b.standing_v)
+        b.check(voltage_v, b.present_drive_v)
         if voltage_v != 0.0:
             if not b.safety.live:
                 raise b.safety.refusal()
-            b.safety.sign_of_life(0.0)
+            b.safety.heartbeat(0.0)
         with b.calling():
             self._plain.write(voltage_v)
-        b.asked_v = voltage_v
+        b.requested_v = voltage_v
         b.answered()
 
     def zero(self) -> None:
@@ -163,7 +162,7 @@ class GuardedSource(_Part):
         try:
             self._plain.zero()
         finally:
-            self._bench.asked_v = 0.0
+            self._bench.requested_v = 0.0
             self._bench.passed()
 
 
@@ -177,9 +176,9 @@ class GuardedAcquisition(_Part):
         self._left_out = bench.left_out
 
     def read(self) -> NDArray[np.int16]:
-        """The next block, looked through."""
+        """Read the next block and check it."""
         b = self._bench
-        b.safety.sign_of_life(b.rig.description.block_s)
+        b.safety.heartbeat(b.rig.description.block_s)
         with b.calling():
             before_s = self._plain.time_s
             codes = self._plain.read()
@@ -188,9 +187,9 @@ class GuardedAcquisition(_Part):
             b.watch.check_form(codes, b.time_s - before_s if follows else None)
         before, self._left_out = self._left_out, b.left_out
         if self._left_out == before:
-            b.standing_v = b.asked_v
-        own = b.rig.controller is not None  # which watches over itself
-        fault = "" if own else b.watch.fault(codes, b.standing_v, follows=follows)
+            b.present_drive_v = b.requested_v
+        own = b.rig.controller is not None  # which has its own checks
+        fault = "" if own else b.watch.fault(codes, b.present_drive_v, follows=follows)
         if fault and b.safety.stage in LIVE:
             raise b.safety.trip(b.safety.revoked_by_others or fault)
         if b.has_deadlines:
@@ -199,7 +198,7 @@ class GuardedAcquisition(_Part):
 
     @property
     def time_s(self) -> float:
-        """Clock at the end of the last block; the last known one where the device is gone."""
+        """Time at the end of the last block; the last known time if the device is gone."""
         with contextlib.suppress(HaselabError):
             self._bench.time_s = self._plain.time_s
         return self._bench.time_s
@@ -214,11 +213,10 @@ class GuardedGenerator(_Part):
         self._bench, self._plain = bench, plain
 
     def sine(self, frequency_hz: float, amplitude_v: float) -> None:
-        """Energises the actuator too: only while the chain is armed.
+        """Set the sensing signal, which energises the actuator; only while the bench is armed.
 
         Raises:
-            LimitError: a frequency that the monitors cannot show, or an amplitude above the limit;
-                the carrier stays as it was.
+            LimitError: Frequency or amplitude is outside the limits; the carrier is unchanged.
         """
         b = self._bench
         frequency_hz = as_number("carrier frequency", frequency_hz)
@@ -226,7 +224,7 @@ class GuardedGenerator(_Part):
         check_carrier(b.rig.description, b.safety.settings, frequency_hz, amplitude_v)
         if not b.safety.live:
             raise b.safety.refusal()
-        b.safety.sign_of_life(_ASIDE_S)
+        b.safety.heartbeat(_SETUP_S)
         b.watch.add_carrier(frequency_hz, amplitude_v)
         with self._bench.calling():
             self._plain.sine(frequency_hz, amplitude_v)
@@ -245,17 +243,17 @@ class GuardedSupply(_Part):
         self._bench, self._plain = bench, plain
 
     def set_voltage(self, voltage_v: float) -> None:
-        """Other than 0 V only while the chain is armed.
+        """Set the supply; other than 0 V only while the bench is armed.
 
         Raises:
-            LimitError: outside the limits of the supply; it stays as it was.
+            LimitError: The voltage is outside the limits of the supply, which is unchanged.
         """
         voltage_v = as_number("supply voltage", voltage_v)
         supply_limits(self._bench.rig.description, self._bench.safety.settings).check(voltage_v)
         if voltage_v != 0.0:
             if not self._bench.safety.live:
                 raise self._bench.safety.refusal()
-            self._bench.safety.sign_of_life(_ASIDE_S)
+            self._bench.safety.heartbeat(_SETUP_S)
         with self._bench.calling():
             self._plain.set_voltage(voltage_v)
 
@@ -279,11 +277,11 @@ class GuardedController(_Part):
         vars(self)["strain_limits"] = plain.strain_limits
 
     def follow(self, strain: float) -> None:
-        """Energises the actuator: only while the chain is armed."""
+        """Send a desired strain, which energises the actuator; only while the bench is armed."""
         b = self._bench
         if not b.safety.live:
             raise b.safety.refusal()
-        b.safety.sign_of_life(0.0)
+        b.safety.heartbeat(0.0)
         with b.calling():
             self._plain.follow(strain)
 
@@ -304,25 +302,25 @@ class GuardedStand(_Part):
         self._bench, self._plain, self._acquisition = bench, plain, acquisition
 
     def hang(self, mass_kg: float) -> None:
-        """Everything off first: a person comes to the clamp. The drive and the generator
-        stay off until they are set again.
+        """Switch everything off, then let a person change the mass at the clamp. The drive and
+        the generator stay off until they are set again.
 
         Raises:
-            SafetyError: the bench is not confirmed at 0 V; nobody was asked to touch anything.
+            SafetyError: The bench is not confirmed at 0 V, so the person was not asked to touch it.
         """
-        self._bench.safety.sign_of_life(_ASIDE_S)
+        self._bench.safety.heartbeat(_SETUP_S)
         self._switch_off()
-        self._bench.safety.sign_of_life(_HANDS_S)
+        self._bench.safety.heartbeat(_MANUAL_S)
         with self._bench.calling():
             self._plain.hang(mass_kg)
         self._bench.passed()
 
     def _switch_off(self) -> None:
-        """Drive, generator and supply off, and read back where the rig can be."""
+        """Switch drive, generator and supply off, and read back if the rig allows it."""
         b, rig = self._bench, self._bench.rig
-        if b.asked_v != 0.0 or b.preloads is not None:  # a queue may hold other values
+        if b.requested_v != 0.0 or b.preloads is not None:  # a queue may hold other values
             rig.source.zero()
-            b.asked_v = 0.0
+            b.requested_v = 0.0
             b.passed()
         rig.generator.off()
         if rig.supply is not None:
@@ -334,33 +332,33 @@ class GuardedStand(_Part):
         faults = [each.fault for each in found if each is not None and not each.confirmed]
         if fault := next(iter(faults), "") or discharged(rig, limit_v):
             raise b.safety.trip(
-                f"Not confirmed at 0 V before the weight is moved: {fault.rstrip('.')}. Do not "
-                "touch anything. Switch the high voltage off by hand, and short it."
+                "Do not touch anything. Switch the high voltage off by hand, and short it. 0 V is "
+                f"not confirmed before the mass is changed: {fault.rstrip('.')}."
             )
 
     def lift(self) -> None:
         """See `haselab.rig.LoadStand`: the output keeps its voltage."""
-        self._bench.safety.sign_of_life(_HANDS_S)
+        self._bench.safety.heartbeat(_MANUAL_S)
         with self._bench.calling():
             self._plain.lift()
         self._bench.passed()
 
     def drop(self) -> None:
         """See `haselab.rig.LoadStand`."""
-        self._bench.safety.sign_of_life(_HANDS_S)
+        self._bench.safety.heartbeat(_MANUAL_S)
         with self._bench.calling():
             self._plain.drop()
 
     def wait(self, duration_s: float) -> None:
-        """On a rig of the wall clock the blocks are read and looked through meanwhile."""
+        """Wait; on a real-time rig, read and check the blocks meanwhile."""
         b = self._bench
         if b.safety.settings.real_time:
             for _ in range(round(duration_s / b.rig.description.block_s)):
-                b.unbroken = False  # nothing is recorded: a late computer may pass over blocks
+                b.unbroken = False  # nothing is recorded: a late computer may skip blocks
                 self._acquisition.read()
             b.deadlines.start()
             return
-        b.safety.sign_of_life(duration_s)
+        b.safety.heartbeat(duration_s)
         with b.calling():
             self._plain.wait(duration_s)
         b.passed()

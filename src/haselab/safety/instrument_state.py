@@ -1,4 +1,4 @@
-"""Whether the instruments of a bench are at rest, asked of themselves."""
+"""Query the instruments of a bench: are they off?"""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ __all__ = [
     "output_state",
 ]
 
-_DISCHARGE_S = 3.0  # of a supply's own capacitor
+_DISCHARGE_S = 3.0  # longest discharge of a supply's output capacitor
 _LOOK_S = 0.05
-_TRIALS = 2  # a measurement that failed once may have met a busy computer
+_TRIALS = 2  # one failure may be due to a busy computer
 
 
 @dataclass(frozen=True)
 class OutputState:
-    """What an instrument was found at.
+    """What was found out about the output of an instrument.
 
     Args:
-        left: what is energised; empty if nothing is known to be.
-        silent: why it could not be asked; empty if it could.
-        voltage_v: measured after the amplifier; 0 V where that is not what was asked.
+        energised: what is energised; empty if nothing is known to be.
+        unreachable: why the instrument could not be queried; empty if it could.
+        voltage_v: measured at the amplifier's output; 0 V if it was not measured.
     """
 
-    left: str = ""
-    silent: str = ""
+    energised: str = ""
+    unreachable: str = ""
     voltage_v: float = 0.0
 
     @property
     def confirmed(self) -> bool:
-        """It was asked, and is at rest."""
-        return not (self.left or self.silent)
+        """Whether the instrument was queried and is off."""
+        return not (self.energised or self.unreachable)
 
     @property
     def fault(self) -> str:
-        """What is wrong; empty where rest is confirmed."""
-        return self.left or self.silent
+        """What is wrong; empty if the instrument is confirmed off."""
+        return self.energised or self.unreachable
 
 
 def has_own_connection(instrument: object) -> bool:
-    """Whether an instrument has a connection of its own, so that it can be called at any time."""
+    """Whether an instrument has its own connection, so that it can be called at any time."""
     return isinstance(instrument, ReportsOutputState)
 
 
@@ -60,9 +60,9 @@ def output_state(rig: Rig, residual_v: float) -> OutputState | None:
 
     Args:
         rig: not guarded.
-        residual_v: after the amplifier, at which it counts as safe.
+        residual_v: voltage at the amplifier's output below which it counts as safe.
     Returns:
-        What was found; None where the source cannot be asked.
+        What was found; None if the source cannot report its output.
     """
     source = rig.source
     if not isinstance(source, ReportsOutput):
@@ -76,30 +76,30 @@ def output_state(rig: Rig, residual_v: float) -> OutputState | None:
             continue
         if abs(left_v) < residual_v:
             return OutputState(voltage_v=left_v)
-        return OutputState(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
-    return OutputState(silent=silent)
+        return OutputState(energised=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
+    return OutputState(unreachable=silent)
 
 
 def instrument_states(rig: Rig, residual_v: float) -> list[OutputState]:
-    """Whether generator and supply are off, by their own words.
+    """Whether generator and supply report that they are off.
 
     Args:
         rig: not guarded.
-        residual_v: of the supply, in V, where it has no switch to ask for.
+        residual_v: voltage below which a supply without an output switch counts as off, in V.
     """
     reported = (instrument_state(rig, line, residual_v) for line in (rig.generator, rig.supply))
     return [found for found in reported if found is not None]
 
 
 def instrument_state(rig: Rig, instrument: object, residual_v: float) -> OutputState | None:
-    """Whether one of them is off.
+    """Whether generator or supply reports that it is off.
 
     Args:
         rig: not guarded.
         instrument: its generator or its supply.
-        residual_v: of the supply, in V, where it has no switch to ask for.
+        residual_v: voltage below which a supply without an output switch counts as off, in V.
     Returns:
-        What was found; None where it cannot be asked.
+        What was found; None if it cannot report its output.
     """
     supply = rig.supply
     if supply is not None and instrument is supply:
@@ -116,13 +116,13 @@ def _supply_off(supply: HighVoltageSupply, residual_v: float) -> bool:
 
 
 def discharged(rig: Rig, residual_v: float) -> str:
-    """Wait for a supply that was switched off to run down.
+    """Wait until a supply that was switched off has discharged.
 
     Args:
         rig: not guarded.
-        residual_v: at which it has, where the supply has no `tolerance_v` of its own meter.
+        residual_v: voltage at which it has, if the supply states no `tolerance_v` of its meter.
     Returns:
-        What is wrong after `_DISCHARGE_S`; empty where it has run down, or there is no supply.
+        The fault after `_DISCHARGE_S`; empty if it has discharged, or there is no supply.
     """
     if rig.supply is None:
         return ""
@@ -132,29 +132,29 @@ def discharged(rig: Rig, residual_v: float) -> str:
         try:
             left_v = rig.supply.read_voltage()
         except Exception as error:
-            return f"The supply cannot be asked for what is left ({type(error).__name__}: {error})."
+            return f"The supply's voltage cannot be read ({type(error).__name__}: {error})."
         if abs(left_v) <= limit_v:
             return ""
         if time.monotonic() >= end_s:
             return (
-                f"The supply shows {left_v:.4g} V {_DISCHARGE_S:g} s after it was switched off "
-                f"(limit {limit_v:g} V)."
+                f"The supply still shows {left_v:.4g} V, {_DISCHARGE_S:g} s after it was switched "
+                f"off (limit {limit_v:g} V)."
             )
         time.sleep(_LOOK_S)
 
 
 def _asked(name: str, is_off: Callable[[], bool]) -> OutputState:
     try:
-        return OutputState() if is_off() else OutputState(left=f"{name} is on")
+        return OutputState() if is_off() else OutputState(energised=f"{name} is on")
     except Exception as error:
-        return OutputState(silent=f"{name} cannot be asked ({type(error).__name__}: {error})")
+        return OutputState(unreachable=f"{name} does not respond ({type(error).__name__}: {error})")
 
 
 class BackgroundCall:
-    """An act in a thread of its own, tried twice: an instrument that hangs keeps no other one.
+    """A call in its own thread, tried twice, so that one that hangs does not delay the others.
 
     Args:
-        act: a call to an instrument that has a connection of its own.
+        act: a call to an instrument that has its own connection.
     """
 
     def __init__(self, act: Callable[[], None]) -> None:
@@ -163,7 +163,7 @@ class BackgroundCall:
         self._thread = threading.Thread(target=self._run, name="to rest", daemon=True)
         try:
             self._thread.start()
-        except RuntimeError:  # no thread can be had: then here and now
+        except RuntimeError:  # no thread available: call it directly
             self._run()
 
     def _run(self) -> None:
@@ -173,16 +173,16 @@ class BackgroundCall:
                 return
 
     def done(self, within_s: float) -> bool:
-        """Whether it is done within this time."""
+        """Whether the call ends within this time."""
         if self._thread.ident is not None:
             self._thread.join(within_s)
         return not self._thread.is_alive()
 
     def wait(self) -> None:
-        """Until it is done.
+        """Wait until the call has ended.
 
         Raises:
-            Exception: what the driver raised, against its contract.
+            Exception: The driver raised it, against its contract.
         """
         if self._thread.ident is not None:
             self._thread.join()

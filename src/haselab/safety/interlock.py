@@ -1,19 +1,20 @@
-"""The interlock of one bench: a latch and two locks that every process on this computer sees.
+"""The interlock of one bench: a latch and two locks shared by all processes on this computer.
 
-One small file in shared memory and two lock files belong to each output device, named after its
-serial number. Standard library only: the guardian processes use it too.
+Each output device has one small file in shared memory and two lock files, named after its serial
+number. This module uses only the standard library, because the guardian processes import it too.
 
 - The *owner lock* is held by the one program that uses the bench.
-- The *latch* is a revision, a number drawn anew by every revocation. A permission to energise is
-  valid for one revision: whoever draws a new one ends it, and nobody can give it back. A new
-  permission needs an acknowledgement of the reason that the latch holds.
-- The *output lock* is held during every call that may energise something, and by whoever makes the
-  bench safe, so that no call that began with a valid permission ends after the bench was made safe.
+- The *latch* is a revision: a random number that every revocation replaces. A permission to
+  energise is valid for one revision, so a revocation ends it for good. A new permission requires
+  that the reason in the latch is acknowledged.
+- The *output lock* is held during every call that may energise something, and by a process that
+  makes the bench safe. So no call that began with a valid permission ends after the bench was made
+  safe.
 
-A file that was damaged, emptied or removed means that no permission is valid: what is written anew
-begins with a revision of its own. Instruments that two benches could share (a supply, a generator)
-are named in the file, so that one program uses them, and whoever makes one bench safe reaches the
-program that uses the other.
+If a file was damaged, emptied or removed, no permission is valid: a new file starts with a new
+revision. The file also names instruments that two benches could share (a supply, a generator), so
+that only one program uses them, and a process that makes one bench safe reaches the program that
+uses the other.
 """
 
 from __future__ import annotations
@@ -40,15 +41,15 @@ else:
 __all__ = ["HEARTBEATS", "Interlock", "InterlockBusyError", "interlock_folder"]
 
 HEARTBEATS = 2  # of the two guardians
-DAMAGED = -1  # the revision of a file that cannot be trusted: no permission has it
+DAMAGED = -1  # revision of a damaged file: no permission has it
 _MAGIC = b"HASELAB4"
 _BYTES = 2048
 _REVISION, _ACKNOWLEDGED, _LIVE, _OWNER, _SAFE, _HOLDER, _BEAT = range(8, 64, 8)
 _LEASE, _TIME, _CALL = (_BEAT + 8 * (HEARTBEATS + k) for k in range(3))
-_REASON, _USER, _SHARED = (128, 640), (640, 1024), (1024, 2048)  # texts, from byte to byte
-_POLL_S = 0.002  # between two trials of a lock
-_CALL_S = 2.0  # that a call of a driver may take, unless the owner says longer
-_FOLDER = "HASELAB_INTERLOCKS"  # environment variable that names another folder
+_REASON, _USER, _SHARED = (128, 640), (640, 1024), (1024, 2048)  # byte ranges of the texts
+_POLL_S = 0.002  # between two attempts to lock
+_CALL_S = 2.0  # longest call of a driver, unless the owner allows more
+_FOLDER = "HASELAB_INTERLOCKS"  # environment variable that sets another folder
 _T = TypeVar("_T")
 
 
@@ -57,7 +58,7 @@ class InterlockBusyError(OSError):
 
 
 def interlock_folder() -> Path:
-    """Folder that all users of this computer share; on Linux in memory, so a restart clears it."""
+    """Folder shared by all users of this computer; on Linux in memory, so a restart clears it."""
     given = os.environ.get(_FOLDER)
     if given:
         if not Path(given).is_absolute():
@@ -68,11 +69,11 @@ def interlock_folder() -> Path:
 
 
 def _open_shared(path: Path, content: bytes = b"") -> int:
-    """A file that every user may open, not followed if it is a link; whole from its first moment.
+    """Open or atomically create a file that every user may open; links are not followed.
 
     Args:
         path: of the file.
-        content: of a new one.
+        content: written to a new file.
     """
     flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
     for _ in range(3):
@@ -84,7 +85,7 @@ def _open_shared(path: Path, content: bytes = b"") -> int:
             if hasattr(os, "fchmod"):
                 os.fchmod(handle, 0o666)  # whatever the umask is
             os.write(handle, content)
-            with contextlib.suppress(FileExistsError):  # another program was first
+            with contextlib.suppress(FileExistsError):  # another program created it first
                 os.link(new, path)
         finally:
             os.close(handle)
@@ -93,7 +94,7 @@ def _open_shared(path: Path, content: bytes = b"") -> int:
 
 
 def _content(revision: int) -> bytes:
-    """A file in which nothing is to be acknowledged: no permission has this revision."""
+    """Content of a new file: no reason to acknowledge, and a revision that no permission has."""
     return struct.pack("8sqq", _MAGIC, revision, revision).ljust(_BYTES, b"\0")
 
 
@@ -102,25 +103,25 @@ def _new_revision() -> int:
 
 
 class _FileLock:
-    """A lock that the system releases when the process ends; exclusive among threads as well.
+    """A lock that the system releases when the process ends; it also excludes other threads.
 
-    Whoever acquires it calls `release` with the same token, also where `acquire` did not return,
-    and again where `release` did not: an interrupt at any place then leaves no lock behind.
+    Call `release` with the same token even if `acquire` was interrupted, and again if `release`
+    was: then an interrupt at any place leaves no lock behind.
 
     Args:
-        path: of the lock file; None: threads of this process only.
+        path: of the lock file; None: only for threads of this process.
     """
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
         self._handle = -1 if path is None else _open_shared(path)
-        self._guard = threading.Lock()  # of the next two
-        self._tokens: set[object] = set()  # all of one thread
+        self._guard = threading.Lock()  # protects the next two
+        self._tokens: set[object] = set()  # all from one thread
         self._thread = 0
         self._pid = os.getpid()
 
     def acquire(self, token: object, wait_s: float) -> bool:
-        """Whether it was acquired within this time; the holding thread may acquire it again."""
+        """Whether the lock was acquired in time; the thread that holds it may acquire it again."""
         end_s = time.monotonic() + wait_s
         while True:
             with self._guard:
@@ -165,12 +166,12 @@ class _FileLock:
 
     @property
     def intact(self) -> bool:
-        """The file is the one that others open."""
+        """Whether this is still the file that other processes open."""
         return self._path is None or _same(self._path, self._handle)
 
     @property
     def holder(self) -> int | None:
-        """Process that has the lock, as the system says; None: none, or it does not say."""
+        """Process that holds the lock, according to the system; None: none, or unknown."""
         try:
             lines = Path("/proc/locks").read_text(encoding="ascii").splitlines()
             status = os.fstat(self._handle)
@@ -196,14 +197,14 @@ def _same(path: Path, handle: int) -> bool:
 
 
 class Interlock:
-    """One bench's latch and locks.
+    """The latch and the locks of one bench.
 
     Args:
-        key: what identifies the output device, as `NI 01A2B3C4`; empty: a bench that lives
-            in this process alone, such as the simulated one.
-        folder: None: `interlock_folder()`.
+        key: identifies the output device, such as `NI 01A2B3C4`; empty: a bench that exists only
+            in this process, such as the simulated one.
+        folder: of the files; None: `interlock_folder()`.
     Raises:
-        OSError: the folder cannot be used.
+        OSError: The folder cannot be used.
     """
 
     def __init__(self, key: str = "", folder: Path | None = None) -> None:
@@ -219,7 +220,7 @@ class Interlock:
         place = folder or interlock_folder()
         if not place.is_dir():
             place.mkdir(mode=0o777, parents=True, exist_ok=True)
-            with contextlib.suppress(OSError):  # another user was first
+            with contextlib.suppress(OSError):  # another user created it first
                 place.chmod(0o1777)
         name = re.sub(r"[^A-Za-z0-9._-]+", "_", key)
         with contextlib.ExitStack() as undo:
@@ -233,19 +234,19 @@ class Interlock:
             content = os.pread(self._file, _BYTES, 0)
             if len(content) < _BYTES or content[:8] != _MAGIC:
                 os.pwrite(self._file, _content(_new_revision()), 0)
-                self.revoke("The interlock's file was damaged and had to be written anew")
+                self.revoke("The interlock's file was damaged and was replaced")
             undo.pop_all()
 
     # ---- fields ------------------------------------------------------------------------------
 
     def _bytes(self, at: int, count: int) -> bytes:
-        """So many bytes; zeros where the file is too short."""
+        """Read bytes; zeros beyond the end of the file."""
         if self._file < 0:
             return bytes(self._private[at : at + count])
         return os.pread(self._file, count, at).ljust(count, b"\0")
 
     def _store(self, at: int, data: bytes) -> None:
-        """Written in one call, so that no reader sees a part of a number."""
+        """Write in one call, so that no reader sees half of a number."""
         if self._file < 0:
             self._private[at : at + len(data)] = data
         else:
@@ -271,7 +272,7 @@ class Interlock:
 
     @property
     def intact(self) -> bool:
-        """All files are those that others open, and what is in them is an interlock's."""
+        """Whether all files are those that other processes open, with valid content."""
         if not self.key:
             return True
         if self._path is None or self._file < 0:  # closed
@@ -284,12 +285,12 @@ class Interlock:
 
     @property
     def revision(self) -> int:
-        """Drawn anew by every revocation; `DAMAGED` where the file cannot be trusted."""
+        """Random number, replaced by every revocation; `DAMAGED` if the file is not valid."""
         return self._get(_REVISION) if self.intact else DAMAGED
 
     @property
     def reason(self) -> str:
-        """Why the bench was made safe, with the time; empty where nothing is to be acknowledged."""
+        """Why the bench was made safe, and when; empty if there is nothing to acknowledge."""
         if self.key and self._file >= 0 and not self.intact:
             return "The interlock's file was damaged or removed"
         if self._get(_ACKNOWLEDGED) == self._get(_REVISION):
@@ -302,7 +303,7 @@ class Interlock:
         return f"{text.rstrip('.')} ({when})"
 
     def revoke(self, reason: str) -> int:
-        """End every permission; the first reason stays until it is acknowledged. Never waits.
+        """End every permission; the first reason is kept until acknowledged. Never waits.
 
         Args:
             reason: one sentence.
@@ -317,23 +318,23 @@ class Interlock:
         return revision
 
     def acknowledge(self, revision: int) -> None:
-        """The reason was read, as of this revision; one that came later stays latched."""
+        """Acknowledge the reason as of this revision; a later one stays latched."""
         self._put(_ACKNOWLEDGED, revision)
 
     @property
     def live(self) -> bool:
-        """The bench was permitted to be energised, and has not been found off since."""
+        """Whether the bench was permitted to be energised and has not been found off since."""
         return self._get(_LIVE) != 0 or not self.intact
 
     def set_live(self, live: bool) -> None:
-        """Record that the owner was given a permission, or that it has taken the bench to 0 V."""
-        if os.getpid() == self._pid:  # a fork has no part in this
+        """Record that the owner got a permission, or that it has taken the bench to 0 V."""
+        if os.getpid() == self._pid:  # a fork must not change it
             self._put(_LIVE, self._get(_REVISION) + 1 if live else 0)
 
     def confirm_safe(self, revision: int) -> None:
         """Record that all instruments were found off after this revision.
 
-        A permission that was given since, for this very revision, stays live.
+        A permission that was given since, for this same revision, stays live.
         """
         self._put(_SAFE, revision)
         if self._get(_LIVE) != revision + 1:
@@ -341,26 +342,26 @@ class Interlock:
 
     @property
     def confirmed_safe(self) -> bool:
-        """All instruments were found off since the last revocation."""
+        """Whether all instruments were found off since the last revocation."""
         revision = self.revision
         return revision > 0 and self._get(_SAFE) == revision and self._get(_LIVE) == 0
 
     # ---- owner -------------------------------------------------------------------------------
 
     def own(self, user: str, call_s: float = _CALL_S, shared: Collection[str] = ()) -> bool:
-        """Become the one program that uses the bench, until `close`.
+        """Take the bench for this program alone, until `close`.
 
-        A program that ended while the bench was armed leaves its reason in the latch.
+        If the last program ended while the bench was armed, this reason is latched.
 
         Args:
-            user: what the program is, for others.
+            user: name of the program, for the messages of others.
             call_s: longest time that one call of a driver may take, in s.
-            shared: addresses of instruments that another bench could name as well.
+            shared: addresses of instruments that another bench could also use.
         Returns:
-            Whether the last owner has vanished.
+            Whether the last owner crashed.
         Raises:
-            InterlockBusyError: another program uses it, or one of the shared instruments.
-            OSError: its files were removed meanwhile.
+            InterlockBusyError: Another program uses the bench or one of the shared instruments.
+            OSError: The interlock's files were removed meanwhile.
         """
         if self._owns:
             return False
@@ -384,8 +385,9 @@ class Interlock:
 
     def _check_shared(self, shared: Collection[str]) -> None:
         if not self.intact:
-            raise OSError("its files were removed meanwhile; try again")
-        self._put_text(_SHARED, "\n".join(shared))  # before the look at others: one of two sees it
+            raise OSError("its files were removed meanwhile; run the command again")
+        # before looking at others, so that one of two programs sees the other
+        self._put_text(_SHARED, "\n".join(shared))
         others = self.sharing(shared)
         for other in others:
             other.close()
@@ -407,7 +409,7 @@ class Interlock:
 
     @property
     def in_use(self) -> bool:
-        """A program that lives owns it."""
+        """Whether a running program owns the bench."""
         if self._owner.holder is not None:
             return True
         if self._owner.acquire(self, 0.0):
@@ -421,7 +423,7 @@ class Interlock:
         return self._get(_OWNER)
 
     def close(self) -> None:
-        """Leave the bench to others. Safe to call twice."""
+        """Release the bench for other programs. Safe to call twice."""
         if self._owns:
             if os.getpid() == self._pid:
                 self._put(_OWNER, 0)
@@ -429,7 +431,7 @@ class Interlock:
             self._owns = False
         self._owner.close()
         self._output.close()
-        if self._file >= 0:  # what was read last stays to be asked for
+        if self._file >= 0:  # the last content stays readable
             self._private[:] = self._bytes(0, _BYTES)
             os.close(self._file)
             self._file, self._path = -1, None
@@ -437,23 +439,22 @@ class Interlock:
     # ---- output lock -------------------------------------------------------------------------
 
     def holding_output(self, act: Callable[[bool], _T], wait_s: float) -> _T:
-        """Run an act under the output lock.
+        """Call a function under the output lock.
 
-        The lock is released whatever happens. A `with` statement could not promise that: an
-        interrupt between the lock and its first line, or in the first line of `__exit__`, would
-        leave it behind.
+        The lock is always released. A `with` statement cannot guarantee that: an interrupt between
+        the lock and its first line, or in the first line of `__exit__`, would leave it locked.
 
         Args:
-            act: gets whether the lock was acquired within `wait_s`.
-            wait_s: for others that hold it.
+            act: function; its argument says whether the lock was acquired within `wait_s`.
+            wait_s: longest wait for another holder of the lock.
         Returns:
-            What the act returned.
+            What the function returned.
         """
         token = object()
         try:
             acquired = self._output.acquire(token, wait_s)
             if acquired:
-                with contextlib.suppress(OSError):  # then nobody is killed for holding it
+                with contextlib.suppress(OSError):  # then no holder is killed
                     self._put(_HOLDER, os.getpid())
             return act(acquired)
         finally:
@@ -464,17 +465,17 @@ class Interlock:
                 raise
 
     def make_safe(self, act: Callable[[], bool], wait_s: float) -> bool:
-        """Run an act that takes the bench to 0 V, so that no other call can undo it.
+        """Call a function that takes the bench to 0 V, so that no other call can undo it.
 
-        `revoke` comes first. A call of the owner that is under way is waited for; where it takes
-        longer than `wait_s` the act runs at once, and again when that call has ended. A process
-        whose call does not end within the time that `own` stated is killed.
+        Call `revoke` first. A running call of the owner is waited for; if it takes longer than
+        `wait_s`, the function is called at once, and again when that call has ended. A process
+        whose call does not end within the time given to `own` is killed.
 
         Args:
-            act: takes all instruments to 0 V; whether they confirmed it.
-            wait_s: for a call that is under way.
+            act: takes all instruments to 0 V; returns whether they confirmed it.
+            wait_s: longest wait for a running call.
         Returns:
-            Whether the last act confirmed 0 V.
+            Whether the last call of the function confirmed 0 V.
         """
 
         def after(acquired: bool) -> bool:
@@ -489,10 +490,11 @@ class Interlock:
         return self.holding_output(after, call_s if 0.0 < call_s < 60.0 else _CALL_S)
 
     def _kill_holder(self) -> None:
-        """Kill the process that has the output lock, and thus lives: a program, or a guardian.
+        """Kill the process that holds the output lock: a program, or a guardian.
 
-        The system says which one that is. Where it does not, the file does, which any user could
-        have changed: then only processes of the own user are killed, and none by root.
+        The system tells which process it is. If it does not, the process number in the file is
+        used; any user could have changed that, so then only processes of the same user are killed,
+        and none by root.
         """
         root = getattr(os, "geteuid", lambda: 1)() == 0
         pid = self._output.holder or (0 if root else self._get(_HOLDER))
@@ -500,27 +502,27 @@ class Interlock:
             with contextlib.suppress(OSError):  # it has ended, or belongs to another user
                 os.kill(pid, getattr(signal, "SIGKILL", signal.SIGTERM))
 
-    # ---- signs of life -----------------------------------------------------------------------
+    # ---- heartbeats ---------------------------------------------------------------------------
 
     def count_heartbeat(self, slot: int) -> None:
-        """A guardian is alive: its counter goes on."""
+        """Advance the counter of a guardian, which shows that it runs."""
         self._put(_BEAT + 8 * slot, abs(self._get(_BEAT + 8 * slot)) + 1)
 
     def stop_heartbeat(self, slot: int) -> None:
-        """A guardian ends as it should; nobody is to miss it."""
+        """Mark a guardian as ended in order, so that it is not reported as lost."""
         self._put(_BEAT + 8 * slot, -1)
 
     def heartbeat_count(self, slot: int) -> int:
-        """Counter of a guardian; below zero: it does not watch."""
+        """Counter of a guardian; negative if it does not watch."""
         return self._get(_BEAT + 8 * slot)
 
     def lease(self, for_s: float) -> None:
-        """The owner gives a sign of life and says when the next one comes at the latest."""
+        """Give the owner's heartbeat and the latest time of the next one."""
         self._store(_LEASE, struct.pack("d", time.monotonic() + for_s))
 
     @property
     def lease_end_s(self) -> float:
-        """Monotonic clock at which the owner's last lease ends, in s."""
+        """Time on the monotonic clock at which the owner's lease ends, in s."""
         return self._number(_LEASE)
 
 

@@ -1,4 +1,4 @@
-"""What may be requested of generator and supply, whatever the driver behind them accepts."""
+"""Limits of what may be requested from generator and supply, whatever their drivers accept."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _HIGHEST_HZ = 1e6
 
 
 def as_number(name: str, value: object) -> float:
-    """One number of a request, so that limits and driver get the same.
+    """Convert one number of a request, so that limits and driver get the same value.
 
     Args:
         name: of the quantity, for the message.
-        value: as it was requested; NaN passes and is refused by the limits.
+        value: as it was requested; NaN is returned and then refused by the limits.
     Raises:
-        InputError: a text, a truth value, an array, or nothing.
+        InputError: The value is a text, a truth value, an array, or None.
     """
     kind = type(value).__name__
     if isinstance(value, (bool, np.bool_, str, bytes)) or np.ndim(value) != 0:  # type: ignore[arg-type]
@@ -32,10 +32,10 @@ def as_number(name: str, value: object) -> float:
 
 
 def carrier_limit_v(rig: RigDescription, settings: SafetySettings) -> float:
-    """Highest peak of the sensing signal, in V ahead of the amplifier.
+    """Highest peak of the sensing signal, in V at the amplifier's input.
 
-    Without `SafetySettings.carrier_limit_v` half of the largest drive: the carrier adds to the
-    drive and must not be the larger of the two.
+    Half of the largest drive unless `SafetySettings.carrier_limit_v` is set: the carrier adds to
+    the drive and must not be the larger of the two.
     """
     if settings.carrier_limit_v is not None:
         return settings.carrier_limit_v
@@ -50,22 +50,22 @@ def check_carrier(
     Args:
         rig: nominal values of the bench.
         settings: limits of the safety chain.
-        frequency_hz: from one period a block; also beyond half of the sampling rate, since a
-            microcontroller samples its carrier at less than that.
-        amplitude_v: peak, ahead of the amplifier, from 0 V to `carrier_limit_v`.
+        frequency_hz: at least one period per block; may be above half of the sampling rate, since
+            a microcontroller undersamples its carrier.
+        amplitude_v: peak at the amplifier's input, from 0 V to `carrier_limit_v`.
     Raises:
-        LimitError: outside of these, or not a number.
+        LimitError: A value is outside these limits, or not a number.
     """
-    low_hz = 1.0 / rig.block_s  # one period a block: a slower carrier looks like a drive
+    low_hz = 1.0 / rig.block_s  # one period per block: a slower carrier looks like a drive
     Limits("carrier frequency", low_hz, _HIGHEST_HZ, "Hz").check(frequency_hz)
     Limits("carrier amplitude", 0.0, carrier_limit_v(rig, settings), "V").check(amplitude_v)
 
 
 def supply_limits(rig: RigDescription, settings: SafetySettings) -> Limits:
-    """What a supply with a rail of its own may be set to, in V.
+    """Limits of the set voltage of a separate supply, in V.
 
-    Without `SafetySettings.supply_limit_v` the highest output of the bench: its largest drive
-    times the gain of the amplifier.
+    At most `SafetySettings.supply_limit_v`; unless that is set, the highest output of the bench:
+    its largest drive times the gain of the amplifier.
     """
     high_v = settings.supply_limit_v
     if high_v is None:

@@ -1,4 +1,4 @@
-"""[rating] and [safety] of RIG.toml: what a bench withstands, and the limits of its protection."""
+"""[rating] and [safety] of RIG.toml: what a bench withstands, and its safety limits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import Field
 
 from haselab.base import InputError
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile
+from haselab.rig.chip import ChipFile
 from haselab.rig.rig_file import RigFile
 from haselab.safety.state_machine import SafetySettings
 from haselab.safety.watchdog.settings import FieldRating, WatchdogSettings
@@ -21,7 +21,7 @@ from haselab.store.toml import Section, validated
 __all__ = ["RatingSection", "SafetySection", "rating_section", "runs_by_wall_clock", "safety_of"]
 
 _LOCK_STEP_LEASE_S = 10.0
-_HOST_CHECKS = frozenset(  # of blocks and deadlines, which a microcontroller rig does not have
+_HOST_CHECKS = frozenset(  # checks of blocks and deadlines, which a microcontroller rig lacks
     {"rate_limit_v_per_s", "current_limit_a", "follow", "settle_s", "missed_limit", "late_limit"}
 )
 
@@ -60,17 +60,17 @@ class SafetySection(Section):
 
 
 def runs_by_wall_clock(file: RigFile) -> bool:
-    """Whether the program can be late: not on a twin whose time passes as it is asked for."""
-    if isinstance(file, MegaFile):
+    """Whether the rig runs in real time, so that the program can be late; not on most twins."""
+    if isinstance(file, ChipFile):
         return file.port is not None
     return isinstance(file, BenchConfig) and not file.stand.lock_step
 
 
 def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySettings:
-    """The limits of a rig file for the kind of rig it describes.
+    """Build the safety limits of a rig file for the kind of rig that it describes.
 
-    A bench runs by the wall clock. A recorded session has no output to read back, and no current
-    to limit that would not have been limited when it was recorded.
+    A bench runs in real time. A recorded session has no output to read back, and its current was
+    limited when it was recorded.
 
     Args:
         file: from `load_rig`.
@@ -78,14 +78,14 @@ def safety_of(file: RigFile, given: Mapping[str, Any], path: Path) -> SafetySett
         path: of the rig file, for errors.
     """
     section = validated(SafetySection, dict(given), path, "safety")
-    if isinstance(file, MegaFile) and (unused := sorted(_HOST_CHECKS & set(given))):
+    if isinstance(file, ChipFile) and (unused := sorted(_HOST_CHECKS & set(given))):
         raise InputError(
             f"safety.{unused[0]} has no effect on a microcontroller rig: its limits are compiled "
             f"into the firmware. Remove it. {path}"
         )
     recorded = file.kind == "replay"
     given_s = section.model_dump(exclude={"loop"})
-    if isinstance(file, BenchConfig) and file.stand.lock_step:  # its physics takes computing time
+    if isinstance(file, BenchConfig) and file.stand.lock_step:  # computing its physics takes time
         given_s["lease_s"] = max(section.lease_s, _LOCK_STEP_LEASE_S)
     return SafetySettings(
         **given_s,

@@ -1,4 +1,4 @@
-"""The way to 0 V, and the proof that it was reached."""
+"""Take a bench to 0 V and confirm it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from haselab.base import SafetyError
 from haselab.rig import FunctionGenerator, HighVoltageSupply, ReportsOutput
@@ -22,11 +22,23 @@ from haselab.safety.instrument_state import (
 if TYPE_CHECKING:
     from haselab.safety.guarded import GuardedRig
 
-__all__ = ["Shutdown"]
+__all__ = ["ReadBack", "Shutdown"]
 
-_READ_BACK_BLOCKS = 3  # 30 ms: the output has gone down, and what was queued has passed
-_LONGEST_S = 15.0  # a driver that has not returned by then is left behind
-_PATIENCE_S = 0.25  # with an instrument that does not say that it is off, where there is a guardian
+_READ_BACK_BLOCKS = 3  # 30 ms: the output has settled at 0 V, and queued values have passed
+_LONGEST_S = 15.0  # a driver that has not returned by then is abandoned
+_PATIENCE_S = 0.25  # wait for an instrument to confirm before a guardian is called
+
+
+class ReadBack(NamedTuple):
+    """What is known of the output at the end.
+
+    Args:
+        text: what was read back, for the record; or why that was not possible.
+        at_zero: whether the bench was read back at 0 V.
+    """
+
+    text: str
+    at_zero: bool
 
 
 class Shutdown:
@@ -42,18 +54,18 @@ class Shutdown:
         self._limit_v = rig.safety.settings.residual_v
 
     def run(self) -> None:
-        """0 V, no sensing signal, camera off; each act is tried whatever the others did.
+        """Go to 0 V, stop sensing signal and camera; a step that fails does not stop the others.
 
-        Instruments with a connection of their own are switched off at the same time, so that one
-        that hangs does not delay the others. A driver that raises here is called once more. Where
-        0 V is not confirmed, the guardians are asked; they have connections of their own.
+        Instruments with their own connection are switched off in parallel, so that one that hangs
+        does not delay the others. A driver that raises is called once more. If 0 V is not
+        confirmed, the guardians are called; they have separate connections.
         """
-        with contextlib.suppress(OSError):  # an interlock that fails must not come before 0 V
-            if self._safety.gate.interlock.live:  # from here on guardians need not wait for long
+        with contextlib.suppress(OSError):  # a failing interlock must not prevent 0 V
+            if self._safety.gate.interlock.live:  # shorten the time until the guardians act
                 self._safety.gate.interlock.lease(self._safety.settings.lease_s)
-        self._hear_guardian()
+        self._wait_for_guardian()
         stopped: BaseException | None = None
-        for act in self._to_rest():
+        for act in self._shutdown_steps():
             for _ in range(2):
                 try:
                     act()
@@ -64,13 +76,13 @@ class Shutdown:
                     stopped = error
             else:
                 self._ask_guardian(
-                    f"a driver failed on the way to 0 V: {failed if stopped is None else stopped}"
+                    f"a driver failed during shutdown: {failed if stopped is None else stopped}"
                 )
         if stopped is not None:
             raise stopped
 
-    def _to_rest(self) -> list[Callable[[], None]]:
-        """What has to be done, the output first; the rest is under way by itself."""
+    def _shutdown_steps(self) -> list[Callable[[], None]]:
+        """The steps in order, the output first; instruments with a connection run in threads."""
         self._bench.outdate()
         looks = not self._bench.found and self._safety.settings.read_back
         background, others = [], []
@@ -90,45 +102,46 @@ class Shutdown:
             *others,
             *confirm,
             self._safety.gate.behind(self._rig.camera).stop,
-            self._rig.source.zero,  # again: a camera may have used the board
+            self._rig.source.zero,  # again: a camera may have used the board meanwhile
             *others,
             *confirm,
             *waits,
-            self._hear_guardian,
+            self._wait_for_guardian,
         ]
 
     def _switch_off(
         self, name: str, guarded: FunctionGenerator | HighVoltageSupply, plain: object, looks: bool
     ) -> None:
-        """One instrument by its own line; where it does not confirm, the guardian knows at once."""
+        """Switch one instrument off; if it does not confirm, call the guardian at once."""
         guarded.off()
         if looks:
             self._confirm(name, instrument_state(self._plain, plain, self._limit_v))
 
     def _confirm_output(self) -> None:
-        """By the source's own meter; one that was not found at rest is not asked again."""
+        """Read the source's own meter, unless it was found energised or unreachable before."""
         before = self._bench.found.get("output")
         if before is None or before.confirmed:
             self._confirm("output", output_state(self._plain, self._limit_v))
 
-    def _wait_for(self, aside: BackgroundCall, name: str) -> None:
-        """The guardians do not wait for an instrument that takes its time, and nobody for ever."""
-        if not aside.done(_PATIENCE_S):
-            self._ask_guardian(f"no answer within {_PATIENCE_S:g} s on the way to 0 V")
-        if aside.done(_LONGEST_S):
-            aside.wait()
+    def _wait_for(self, call: BackgroundCall, name: str) -> None:
+        """Wait for one instrument; call the guardians early, and give up after `_LONGEST_S`."""
+        if not call.done(_PATIENCE_S):
+            self._ask_guardian(f"no reply within {_PATIENCE_S:g} s during shutdown")
+        if call.done(_LONGEST_S):
+            call.wait()
         else:
             self._confirm(
-                name, OutputState(silent=f"{name}: off() has not returned within {_LONGEST_S:g} s")
+                name,
+                OutputState(unreachable=f"{name}: off() has not returned within {_LONGEST_S:g} s"),
             )
 
-    def _hear_guardian(self) -> None:
-        """Wait until it has acted: two on one serial line would take each other's words."""
+    def _wait_for_guardian(self) -> None:
+        """Wait until the guardian has acted: two readers on a serial port would mix up replies."""
         if self._bench.asked_guardian and self._safety.guardians is not None:
             self._safety.guardians.outcome()
 
     def _confirm(self, name: str, found: OutputState | None) -> None:
-        """Keep the first that is wrong, and ask the guardian where rest is not confirmed."""
+        """Keep the first fault of an instrument; call the guardian if it is not confirmed off."""
         if found is None:
             return
         with self._bench.turn:
@@ -145,17 +158,17 @@ class Shutdown:
             self._bench.asked_guardian = True
             self._safety.guardians.make_safe(reason)
 
-    def read_back(self) -> str:
-        """Whether the bench is at 0 V, by its own monitors and words; for the record.
+    def read_back(self) -> ReadBack:
+        """Check by meters, monitors and instrument states that the bench is at 0 V.
 
         Returns:
-            What was read back; or why nothing could be, and who made the bench safe then.
+            What was read back; or why that was not possible, and what made the bench safe then.
         Raises:
-            SafetyError: an output above `residual_v`, or an instrument that is on; or instruments
-                that cannot be asked, and no guardian that made them safe.
+            SafetyError: An output is above `residual_v`, or an instrument is on; or an instrument
+                does not respond, and no guardian made it safe.
         """
         if not self._safety.settings.read_back:
-            return "0 V commanded; not read back"
+            return ReadBack("0 V commanded; not read back", at_zero=False)
         self._bench.outdate()
         known = self._bench.found
         if "output" not in known:
@@ -167,39 +180,39 @@ class Shutdown:
                 self._confirm(name, instrument_state(self._plain, line, self._limit_v))
         found = next((each for each in known.values() if not each.confirmed), known["output"])
         if not found.confirmed:
-            return self._unconfirmed(found)
+            return ReadBack(self._unconfirmed(found), at_zero=False)
         if fault := discharged(self._plain, self._limit_v):
-            reported = f"{fault} Switch the high voltage off by hand, and short it."
+            reported = f"Switch the high voltage off by hand, and short it. {fault}"
             self._safety.trip(reported)
             raise SafetyError(reported)
-        return f"output at 0 V; {found.voltage_v:.2g} V read back"
+        return ReadBack(f"output at 0 V; {found.voltage_v:.2g} V read back", at_zero=True)
 
     def _unconfirmed(self, found: OutputState) -> str:
-        """What became of a bench that is not known to be at rest."""
+        """Trip a bench that is not confirmed at 0 V; return what the guardians did, or raise."""
         fault = "this rig has no guardians"
         if self._safety.guardians is not None:
             fault = self._safety.guardians.outcome()
-        if not fault and not found.left:
-            self._safety.trip(f"Not confirmed at 0 V, made safe by the guardian: {found.silent}")
-            return f"0 V by the guardian; not read back ({found.silent})"
-        told_by_blocks = not isinstance(self._plain.source, ReportsOutput)
-        if self._plain.simulated and told_by_blocks and not found.left:  # no voltage is possible
-            return f"0 V commanded; not read back ({found.silent})"
-        allowed = f" (limit {self._limit_v:g} V)" if found.left else ""
+        if not fault and not found.energised:
+            self._safety.trip(f"Not confirmed at 0 V; a guardian made it safe: {found.unreachable}")
+            return f"0 V by the guardian; not read back ({found.unreachable})"
+        from_blocks = not isinstance(self._plain.source, ReportsOutput)
+        if self._plain.simulated and from_blocks and not found.energised:  # no voltage is possible
+            return f"0 V commanded; not read back ({found.unreachable})"
+        allowed = f" (limit {self._limit_v:g} V)" if found.energised else ""
         by = (
             f"; the guardians could not confirm 0 V either: {fault}"
             if fault
             else "; the guardian has acted"
         )
         reported = (
-            f"Output {'not' if found.left else 'not confirmed'} at 0 V: {found.fault}{allowed}"
+            f"Output {'not' if found.energised else 'not confirmed'} at 0 V: {found.fault}{allowed}"
             f"{by}. Switch the high voltage off by hand."
         )
         self._safety.trip(reported)
         raise SafetyError(reported)
 
     def _by_blocks(self) -> OutputState:
-        """The output by the voltage monitor, where the source cannot be asked."""
+        """The output by the voltage monitor, for a source without a meter."""
         blocks = (
             _READ_BACK_BLOCKS
             + self._rig.description.switch_sample // self._rig.description.block_samples
@@ -212,6 +225,6 @@ class Shutdown:
                 left_v = self._bench.watch.residual_v(codes)
                 if left_v < self._limit_v:
                     return OutputState(voltage_v=left_v)
-        except Exception as error:  # whatever the device does now: it is not known to be safe
-            return OutputState(silent=f"{type(error).__name__}: {error}")
-        return OutputState(left=f"{left_v:.4g} V remain at the output", voltage_v=left_v)
+        except Exception as error:  # any failure: 0 V is not confirmed
+            return OutputState(unreachable=f"{type(error).__name__}: {error}")
+        return OutputState(energised=f"{left_v:.4g} V remain at the output", voltage_v=left_v)

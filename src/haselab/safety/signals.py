@@ -1,4 +1,4 @@
-"""SIGTERM, SIGHUP and Ctrl-C end an armed bench in order: at 0 V, and read back."""
+"""End an armed bench at 0 V, read back, after SIGTERM, SIGHUP or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _waiting: list[int] = []  # signals that arrived while the end of a block ran
 
 
 class OrderlyEnd:
-    """While it is entered, a signal that would kill the program ends the `with` block instead.
+    """A context in which a signal that would kill the program ends the `with` block instead.
 
-    SIGTERM and SIGHUP raise `SystemExit` with 128 plus their number where the program stands,
-    Ctrl-C raises `KeyboardInterrupt` as usual. A signal that arrives once `__exit__` has been
-    called is raised at its end, so that nothing interrupts or leaves out the way to 0 V. Only
-    signals whose action is the default one are taken, and the former action is restored: a program
-    with handlers of its own keeps them, one that ignores a signal (nohup) goes on ignoring it. In a
-    thread other than the main one nothing is taken, since signals do not arrive there.
+    SIGTERM and SIGHUP raise `SystemExit` with 128 plus their number in the running code, Ctrl-C
+    raises `KeyboardInterrupt` as usual. A signal that arrives after `__exit__` was called is raised
+    at its end, so that nothing interrupts or skips the shutdown to 0 V. Only signals with their
+    default action are handled, and that action is restored: a program with its own handlers keeps
+    them, and one that ignores a signal (nohup) continues to ignore it. In a thread other than the
+    main one nothing is handled, since signals do not arrive there.
 
     Args:
-        end: called once at the end of the block with its error, None without one.
+        end: called once at the end of the block with its error, or None.
     """
 
     def __init__(self, end: Callable[[BaseException | None], None]) -> None:
@@ -65,7 +65,7 @@ class OrderlyEnd:
     def _take(self, number: int) -> None:
         former = signal.getsignal(number)
         left = getattr(former, "__self__", None)
-        if isinstance(left, OrderlyEnd) and left._over:  # it was interrupted while it restored
+        if isinstance(left, OrderlyEnd) and left._over:  # interrupted while restoring the handlers
             former = left._former[number]
         if former in _DEFAULT:
             self._former[number] = former
@@ -86,8 +86,8 @@ class OrderlyEnd:
 def _is_ending(frame: FrameType | None) -> bool:
     """Whether the end of a block runs in this frame or one of its callers.
 
-    The frames say it from the first instruction of `__exit__` on. A flag would be set too late for
-    a signal that arrives just then: the way to 0 V would be left out.
+    The frames show it from the first instruction of `__exit__` on. A flag would be set too late for
+    a signal that arrives at that moment, and the shutdown to 0 V would be skipped.
     """
     while frame is not None:
         if frame.f_code is OrderlyEnd.__exit__.__code__:

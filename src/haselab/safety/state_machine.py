@@ -6,7 +6,7 @@
 | requested | arm | armed | the same person, in a second step; acknowledges the reason of a trip |
 | armed | run | running | the program |
 | requested, armed, running | end | off | the program, at the end of a run |
-| any | trip | tripped | watchdogs, guardians, `haselab rig safe`, a program that has vanished |
+| any | trip | tripped | watchdogs, guardians, `haselab rig safe`, a program that crashed |
 
 `TRANSITIONS` is this table; the tests derive their fault matrix from it.
 """
@@ -33,7 +33,7 @@ __all__ = ["LIVE", "TRANSITIONS", "ArmingRequest", "Event", "Safety", "SafetySet
 
 
 class Stage(Enum):
-    """Where the chain is."""
+    """A stage of the safety chain."""
 
     OFF = "off"
     REQUESTED = "requested"
@@ -43,7 +43,7 @@ class Stage(Enum):
 
 
 class Event(Enum):
-    """What takes the chain from one stage to another."""
+    """An event that takes the safety chain from one stage to another."""
 
     REQUEST = "request"
     ARM = "arm"
@@ -65,40 +65,40 @@ TRANSITIONS: dict[tuple[Stage, Event], Stage] = {
     (Stage.TRIPPED, Event.END): Stage.TRIPPED,
     **{(stage, Event.TRIP): Stage.TRIPPED for stage in Stage},
 }
-_ARM_S = 5.0  # that another program may take to make the bench safe
-_CALL_S = 0.5  # that a call in another thread is waited for
-LIVE = frozenset({Stage.ARMED, Stage.RUNNING})  # in these an output other than 0 V is permitted
+_ARM_S = 5.0  # longest wait for another program that makes the bench safe
+_CALL_S = 0.5  # longest wait for a call in another thread
+LIVE = frozenset({Stage.ARMED, Stage.RUNNING})  # stages that permit an output other than 0 V
 
 
 @dataclass(frozen=True)
 class SafetySettings:
-    """Limits while the bench is energised.
+    """Limits that apply while the bench is energised.
 
     Args:
-        rate_limit_v_per_s: fastest rise of the drive from one update to the next, ahead of the
-            amplifier; towards 0 V there is no limit.
-        current_limit_a: of the mean current once the output has settled.
-        follow: how far the voltage monitor may be from the requested output, as a part of the
-            drive's range.
-        carrier_limit_v: highest peak of the sensing signal ahead of the amplifier; None: half of
+        rate_limit_v_per_s: fastest rise of the drive from one update to the next, at the
+            amplifier's input; towards 0 V there is no limit.
+        current_limit_a: largest mean current once the output has settled.
+        follow: largest difference between voltage monitor and requested output, as a fraction of
+            the drive's range.
+        carrier_limit_v: highest peak of the sensing signal at the amplifier's input; None: half of
             the largest drive.
-        supply_limit_v: highest voltage of a supply with a rail of its own; None: the largest drive
-            times the amplifier's gain.
-        settle_s: what the output may take to get there: amplifier, charging of the actuator.
-        residual_v: output at which the bench counts as safe, after the amplifier.
-        read_back: read the monitor at the end, to see that the output is at 0 V.
-        real_time: the rig runs by the wall clock; deadlines count.
-        missed_limit: as many missed ticks in a row trip.
-        late_limit: as many late ticks in a hundred trip.
-        lease_s: longest silence of the program before the guardians act.
+        supply_limit_v: highest voltage of a separate supply; None: the largest drive times the
+            amplifier's gain.
+        settle_s: settling time of the output: amplifier, charging of the actuator.
+        residual_v: voltage at the amplifier's output below which the bench counts as safe.
+        read_back: read the monitor at the end, to confirm that the output is at 0 V.
+        real_time: the rig runs in real time, so deadlines count.
+        missed_limit: number of missed ticks in a row that trips.
+        late_limit: number of late ticks in a hundred that trips.
+        lease_s: longest time without a heartbeat of the program before the guardians act.
         idle_s: the same between experiments, where fits are made.
         permit_age_s: longest time for which one arming is valid.
         compare_output: compare the voltage monitor with the drive; False for a recorded session,
             which has no output.
         loop: limits of closed loops.
-        rating: of the dielectric; None where it is not known, then the field is not watched.
+        rating: of the dielectric; None: unknown, so the electric field is not monitored.
     Raises:
-        InputError: a limit that is not finite and above zero.
+        InputError: A limit is not finite and above zero.
     """
 
     rate_limit_v_per_s: float = 2000.0
@@ -125,12 +125,12 @@ class SafetySettings:
 
 @dataclass(frozen=True)
 class ArmingRequest:
-    """First step of arming: what the second one will energise.
+    """First step of arming, which states what the second step will energise.
 
     Args:
-        number: of this request; only the last one can be armed, and once.
-        limits: that will apply, for the person who arms.
-        reason: why the bench was made safe before; it has to be acknowledged. Empty without one.
+        number: of this request; only the last one can be armed, and only once.
+        limits: limits that will apply, for the person who arms.
+        reason: why the bench was made safe before, which must be acknowledged; or empty.
         revision: of the interlock when this was requested.
     """
 
@@ -145,7 +145,7 @@ class Safety:
 
     Args:
         settings: limits.
-        guardians: the independent processes, started; None where the bench has none.
+        guardians: the independent processes, already started; None if the bench has none.
         clock: monotonic, in s.
     """
 
@@ -162,6 +162,7 @@ class Safety:
         self._clock = clock
         self._stage = Stage.OFF
         self._reason = ""
+        self._trips = 0
         self._number = 0
         self._open: ArmingRequest | None = None
         self._armed_s = 0.0
@@ -174,13 +175,18 @@ class Safety:
 
     @property
     def stage(self) -> Stage:
-        """Where the chain is."""
+        """Current stage of the safety chain."""
         return self._stage
 
     @property
     def reason(self) -> str:
-        """Of the last trip; empty before one and after a new arming."""
+        """Reason for the last trip; empty before one and after a new arming."""
         return self._reason
+
+    @property
+    def trips(self) -> int:
+        """Number of trips so far."""
+        return self._trips
 
     def attach(
         self,
@@ -192,10 +198,10 @@ class Safety:
         """Attach the drivers that this chain protects.
 
         Args:
-            gate: in front of all of them.
-            make_safe: takes them to 0 V; a trip does this first.
-            limits: in force, for the person who arms; see `arming_limits`.
-            confirm: raises `SafetyError` unless they are at 0 V, and trips.
+            gate: the one that wraps all of them.
+            make_safe: takes them to 0 V; a trip calls it first.
+            limits: limits in force, for the person who arms; see `arming_limits`.
+            confirm: trips and raises `SafetyError` unless they are at 0 V.
         """
         self.gate, self._make_safe, self._limits = gate, make_safe, limits
         self._confirm = confirm
@@ -207,27 +213,28 @@ class Safety:
     # ---- arming ------------------------------------------------------------------------------
 
     def request(self) -> ArmingRequest:
-        """First step of arming: say what would be energised.
+        """First step of arming: state what would be energised.
 
-        Returns:
-            The request that `arm` takes.
-        Raises:
-            SafetyError: armed already, a guardian does not answer, or the interlock is gone.
+                Returns:
+                    The request that `arm` takes.
+                Raises:
+        SafetyError: The bench is already armed, a guardian does not respond, or the interlock's
+                    files were removed.
         """
         if (self._stage, Event.REQUEST) not in TRANSITIONS:
             raise SafetyError(f"The bench is already {self._stage.value}. Stop it first.")
         if self.guardians is not None and (lost := self.guardians.lost()):
-            raise SafetyError(f"{lost} Nothing was armed. Start the command again.")
+            raise SafetyError(f"{lost} Nothing was armed. Run the command again.")
         watched = "Two guardians watch." if self.guardians is not None else "No guardian watches."
         limits = f"{self._limits} {watched}"
         interlock = self.gate.interlock
         if not interlock.intact:
             raise SafetyError(
                 "The interlock's files were removed, or the rig was closed. Open the rig again, or "
-                "start the command again."
+                "run the command again."
             )
         self._number += 1
-        revision = interlock.revision  # first: what is revoked from here on makes `arm` refuse
+        revision = interlock.revision  # read first: `arm` refuses after any later revocation
         self._open = ArmingRequest(self._number, limits, interlock.reason or self._reason, revision)
         self._to(Event.REQUEST)
         return self._open
@@ -237,15 +244,15 @@ class Safety:
 
         Args:
             request: the one that the last `request` returned.
-            acknowledged: its `reason`, from whoever has read it.
+            acknowledged: its `reason`, once a person has read it.
         Raises:
-            SafetyError: another request, one that was used, a reason that was not acknowledged,
-                or a bench that was made safe meanwhile.
+            SafetyError: The request is not the last one or was used, its reason was not
+                acknowledged, or the bench was made safe meanwhile.
         """
         if request is not self._open or self._stage is not Stage.REQUESTED:
             raise SafetyError(
-                f"Arming request {request.number} is not open (the last one is {self._number}). "
-                "Request arming again."
+                f"Arming request {request.number} is no longer valid (the last one is "
+                f"{self._number}). Request arming again."
             )
         if request.reason and acknowledged != request.reason:
             raise SafetyError(
@@ -256,7 +263,7 @@ class Safety:
         self._open = None
         if self.guardians is not None and (lost := self.guardians.lost()):
             raise self.trip(f"{lost} Nothing was armed.")
-        # An act that makes safe is waited for.
+        # Wait for a program that makes the bench safe.
         interlock.holding_output(lambda acquired: self._grant(request, acquired), _ARM_S)
 
     def _grant(self, request: ArmingRequest, acquired: bool) -> None:
@@ -283,26 +290,26 @@ class Safety:
         return permit_expired(self._clock() - self._armed_s, self.settings.permit_age_s)
 
     def run(self) -> None:
-        """From armed to running.
+        """Go from armed to running.
 
         Raises:
-            SafetyError: not armed.
+            SafetyError: The bench is not armed.
         """
         if self._stage is not Stage.ARMED or not self.gate.permitted:
             raise self.refusal()
         self._to(Event.RUN)
 
     def end_run(self) -> None:
-        """The run is over; the next one needs a new arming. A trip stays.
+        """End the run; the next one needs a new arming. A trip remains.
 
         Raises:
-            SafetyError: the output is not at 0 V, or not known to be; the bench is tripped.
+            SafetyError: The output is not confirmed at 0 V; the bench is tripped.
         """
         try:
-            if why := self.revoked_by_others:  # in the last moment
+            if why := self.revoked_by_others:  # revoked at the last moment
                 self._trip_once(why)
                 self._record(why)
-            elif self._stage in LIVE and self.gate.has_requests:  # nobody has taken it down
+            elif self._stage in LIVE and self.gate.has_requests:  # not yet taken to 0 V
                 self._make_safe()
             if self._stage in LIVE or self._stage is Stage.TRIPPED:
                 self._confirm()
@@ -313,7 +320,7 @@ class Safety:
             self.gate.interlock.lease(UNARMED_S)
 
     def refusal(self) -> SafetyError:
-        """Why nothing may be energised now."""
+        """Return the error that says why nothing may be energised now."""
         reason = (
             self._reason or self.gate.revoked or self.gate.expired or self.gate.interlock.reason
         )
@@ -337,7 +344,7 @@ class Safety:
         """Make the bench safe, keep the first reason, and record it.
 
         Args:
-            reason: what happened, the limit, what to do.
+            reason: what happened, the limit, and what to do.
         Returns:
             The error to raise.
         """
@@ -358,30 +365,31 @@ class Safety:
 
     @property
     def revoked_by_others(self) -> str:
-        """Who made the bench safe while this program had a permission; empty if nobody did."""
+        """What made the bench safe while this program had a permission; empty if nothing did."""
         if self._stage not in LIVE or not self.gate.revoked:
             return ""
-        return f"Made safe from outside this program: {self.gate.revoked.rstrip('.')}."
+        return f"Another program made the bench safe: {self.gate.revoked.rstrip('.')}."
 
     def _trip_once(self, reason: str) -> bool:
-        """Revoke the permission before anything else; whether this was the first reason."""
+        """Revoke the permission before anything else; return whether this is the first reason."""
         first = self._stage is not Stage.TRIPPED
         self.gate.end_permission()
-        with contextlib.suppress(OSError):  # an interlock that fails must not come before 0 V
+        with contextlib.suppress(OSError):  # a failing interlock must not prevent 0 V
             self.gate.interlock.revoke(reason)
         self._to(Event.TRIP)
         if first:
             self._reason = reason
+            self._trips += 1
         return first
 
-    def sign_of_life(self, for_s: float) -> None:
-        """Give the guardians a sign of life, and look for what others have found.
+    def heartbeat(self, for_s: float) -> None:
+        """Send the guardians a heartbeat, and check whether the bench was made safe by others.
 
         Args:
-            for_s: how long the program may now be silent, in s, beyond the lease.
+            for_s: time until the next heartbeat, in s, beyond the lease.
         Raises:
-            SafetyError: the bench was made safe by others, a guardian is lost, or the arming is
-                too old.
+            SafetyError: The bench was made safe by others, a guardian is lost, or the arming has
+                expired.
         """
         if self._stage not in LIVE:
             return

@@ -4,7 +4,7 @@ from haselab.sensing.charge.estimate import Charge, ChargeConfig
 from haselab.sensing.latency import latency, step_latencies
 from haselab.sensing.lockin import Lockin
 from haselab.sensing.paper import PaperChain
-from haselab.sensing.quadrature import sense_quarters
+from haselab.sensing.quadrature import sense_quadrature
 from haselab.sensing.relative import relative_capacitance
 from haselab.sensing.sensed import REASONS, LockinConfig, Sensed, reason_text
 from haselab.sensing.sinefit import SineFit
@@ -21,6 +21,6 @@ __all__ = [
     "latency",
     "reason_text",
     "relative_capacitance",
-    "sense_quarters",
+    "sense_quadrature",
     "step_latencies",
 ]

@@ -27,7 +27,7 @@ from haselab.sensing.sensed import (
 
 __all__ = ["Lockin", "as_readings"]
 
-_COLUMNS = _sense.COLUMNS
+_RESULT = _sense.RESULT  # of a block, by name: native/sensing/sense.h
 _GLANCE, _VALUES = 256, 64  # readings; so few different values show a coarse converter
 _BLOCKS = 16  # in which its step is looked for
 _LOST = 4 | 8 | 32  # clipped, current limit, not finite: no model helps
@@ -114,7 +114,7 @@ class Lockin:
             InputError: the shape does not fit the configuration.
         """
         check_blocks(readings, self.config)
-        rows = np.empty((len(readings), _COLUMNS))
+        rows = np.empty(len(readings), _RESULT)
         _sense.blocks(self._native, as_readings(readings), rows)
         return self._sensed(rows, lambda blocks: readings[blocks])
 
@@ -130,7 +130,7 @@ class Lockin:
             InputError: unequal lengths, or no whole number of blocks.
         """
         check_channels(v, i, self.config)
-        rows = np.empty((v.size // self.config.block_samples, _COLUMNS))
+        rows = np.empty(v.size // self.config.block_samples, _RESULT)
         one, other = as_readings(v), as_readings(i)
         if one.dtype != other.dtype:
             one, other = one.astype(np.float64), other.astype(np.float64)
@@ -141,7 +141,7 @@ class Lockin:
             rows, lambda blocks: np.stack([channel[blocks] for channel in pair], axis=2)
         )
 
-    def _sensed(self, rows: NDArray[np.float64], taken: _Taken) -> Sensed:
+    def _sensed(self, rows: NDArray[np.void], taken: _Taken) -> Sensed:
         phasors = self._phasors(rows)
         suspects = self._suspects(rows)
         if self._models and suspects.size:
@@ -155,38 +155,38 @@ class Lockin:
             return sensed_from_phasors(phasors, self.config)
         return audited(sensed_from_phasors(_without_coarse(phasors, rows, taken), self.config))
 
-    def _suspects(self, rows: NDArray[np.float64]) -> NDArray[np.intp]:
+    def _suspects(self, rows: NDArray[np.void]) -> NDArray[np.intp]:
         """Blocks that the plain model does not explain and that are not lost for another reason."""
-        reason = rows[:, 13].astype(np.uint8)
-        suspect = (rows[:, 14] > 0.0) | (reason & ~np.uint8(_LOST) > 0)
+        reason = rows["reason"].astype(np.uint8)
+        suspect = (rows["suspicion"] > 0) | (reason & ~np.uint8(_LOST) > 0)
         return np.flatnonzero(suspect & (reason & _LOST == 0))
 
-    def _phasors(self, rows: NDArray[np.float64]) -> Phasors:
-        choice, weights = rows[:, 12].astype(np.intp), self._weights
+    def _phasors(self, rows: NDArray[np.void]) -> Phasors:
+        choice, weights = rows["choice"].astype(np.intp), self._weights
         # The carrier's band may scatter more than the noise beside it: then it is believed.
-        quadrature = weights.quadrature[choice] * rows[:, 10]
+        quadrature = weights.quadrature[choice] * rows["excess"]
         level, slope = weights.level[choice], weights.slope[choice]
-        v_noise, i_noise = rows[:, 4], rows[:, 5]
+        v_noise, i_noise = rows["v_noise"], rows["i_noise"]
         return Phasors(
-            voltage=rows[:, 0] + 1j * rows[:, 1],
-            current=rows[:, 2] + 1j * rows[:, 3],
+            voltage=rows["v_re"] + 1j * rows["v_im"],
+            current=rows["i_re"] + 1j * rows["i_im"],
             voltage_std=np.sqrt(quadrature * v_noise),
             current_std=np.sqrt(quadrature * i_noise),
-            omega_rad_s=self.config.omega_rad_s + rows[:, 11],
+            omega_rad_s=self.config.omega_rad_s + rows["offset_rad_s"],
             time_s=middles_s(self.config, weights.middle_s[choice]),
-            reason=rows[:, 13].astype(np.uint8),
+            reason=rows["reason"].astype(np.uint8),
             levels=Levels(
-                rows[:, 6],
-                rows[:, 7],
+                rows["v_level"],
+                rows["i_level"],
                 np.sqrt(level * v_noise),
                 np.sqrt(level * i_noise),
-                rows[:, 8],
+                rows["v_slope"],
                 np.sqrt(slope * v_noise),
             ),
         )
 
 
-def _without_coarse(phasors: Phasors, rows: NDArray[np.float64], taken: _Taken) -> Phasors:
+def _without_coarse(phasors: Phasors, rows: NDArray[np.void], taken: _Taken) -> Phasors:
     """Plain blocks with what the converter's rounding may err, refused where that is most of it."""
     count = len(rows)
     few = taken(np.unique([0, count // 2, max(count - 1, 0)]))[:, :_GLANCE] if count else rows
@@ -196,7 +196,7 @@ def _without_coarse(phasors: Phasors, rows: NDArray[np.float64], taken: _Taken) 
     plain = (phasors.reason == 0) & ~np.isin(np.arange(count), list(phasors.seen))
     plain &= (np.abs(phasors.voltage) > 0.0) & (np.abs(phasors.current) > 0.0)
     sizes = np.abs(np.stack([phasors.voltage, phasors.current])[:, plain])
-    noise = rows[plain, 4:6].T
+    noise = np.stack([rows["v_noise"], rows["i_noise"]])[:, plain]
     stds = np.stack([phasors.voltage_std, phasors.current_std])[:, plain]
     error = rounding_error(sizes, np.sqrt(noise), step) * sizes
     coarse = np.hypot(*(error / sizes)) > np.hypot(*(stds / sizes))

@@ -24,7 +24,7 @@ __all__ = ["PaperChain"]
 
 _CUTOFF_HZ = 2001.0
 _ORDER = 4
-_COLUMNS = 5  # of native/sensing/paper.h, a channel
+_RESULT = _sense.PAPER_RESULT  # of a channel, by name: native/sensing/paper.h
 
 
 class PaperChain:
@@ -94,20 +94,22 @@ class PaperChain:
         """
         check_blocks(readings, self.config)
         blocks = np.ascontiguousarray(readings, dtype=np.float64)
-        rows = np.empty((len(blocks), 2 * _COLUMNS))
+        rows = np.empty((len(blocks), 2), _RESULT)
         self._native.step(blocks, rows)
-        angle = np.arctan2(rows[:, 2::_COLUMNS], rows[:, 1::_COLUMNS])
-        phasors = np.asarray(0.5 * rows[:, 0::_COLUMNS] * np.exp(1j * angle), dtype=np.complex128)
+        angle = np.arctan2(rows["im"], rows["re"])
+        phasors = np.asarray(0.5 * rows["peak_to_peak"] * np.exp(1j * angle), dtype=np.complex128)
+        voltage, current = phasors.T
+        voltage_std, current_std = np.sqrt(rows["scatter"]).T
         middle_s = 0.5 * (self.config.block_samples - 1) / self.config.rate_hz
         return sensed_from_phasors(
             Phasors(
-                voltage=phasors[:, 0],
-                current=phasors[:, 1],
-                voltage_std=np.sqrt(rows[:, 3]),
-                current_std=np.sqrt(rows[:, _COLUMNS + 3]),
+                voltage=voltage,
+                current=current,
+                voltage_std=voltage_std,
+                current_std=current_std,
                 omega_rad_s=np.full(len(rows), self.config.omega_rad_s),
                 time_s=middles_s(self.config, np.full(len(rows), middle_s)),
-                reason=range_reasons(rows[:, 4::_COLUMNS], self.config),
+                reason=range_reasons(rows["most"], self.config),
             ),
             self.config,
         )

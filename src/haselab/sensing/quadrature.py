@@ -9,12 +9,12 @@ from haselab import _core
 from haselab.base import InputError
 from haselab.firmware import ChipSettings
 
-__all__ = ["sense_quarters"]
+__all__ = ["sense_quadrature"]
 
 _HALF = 4  # readings of a channel in an update: half of the window that it looks at
 
 
-def sense_quarters(codes: NDArray[np.int16], settings: ChipSettings) -> NDArray[np.float64]:
+def sense_quadrature(codes: NDArray[np.int16], settings: ChipSettings) -> NDArray[np.float64]:
     """What the chip made of what it latched, bit for bit.
 
     An update looks at its own readings and at those before it; the first of a recording has none
@@ -33,8 +33,8 @@ def sense_quarters(codes: NDArray[np.int16], settings: ChipSettings) -> NDArray[
     Example:
         >>> from haselab.firmware import FrontEnd
         >>> settings = ChipSettings(1, 1, 0, 0.01, -0.04, 0.1, (1.0, 5.0, -0.5, -9.0),
-        ...                         (5e8, -0.3, 0.0), FrontEnd())
-        >>> sense_quarters(np.zeros((8, 2), np.int16), settings)
+        ...                         (5e8, -0.3, 0.0, 0.0), FrontEnd())
+        >>> sense_quadrature(np.zeros((8, 2), np.int16), settings)
         array([nan, nan])
     """
     if codes.ndim != 2 or codes.shape[1] != 2 or len(codes) % _HALF or not len(codes):
@@ -44,7 +44,7 @@ def sense_quarters(codes: NDArray[np.int16], settings: ChipSettings) -> NDArray[
     updates = len(codes) // _HALF
     farad, reason = np.zeros(updates, np.float32), np.ones(updates, np.uint8)
     rows = np.ascontiguousarray(codes, dtype=np.int16)
-    _core.capacitances_of_quarters(*settings.sensing, rows, farad[1:], reason[1:])
+    _core.capacitances_from_quadrature(*settings.sensing, rows, farad[1:], reason[1:])
     low, high = (np.float32(limit) for limit in settings.capacitance_range_f)
     good = (reason == 0) & (farad >= low) & (farad <= high)
     return np.where(good, farad, np.nan).astype(np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +26,11 @@ __all__ = ["SineFit"]
 _MAX_ITERATIONS = 12
 _TOLERANCE_RAD = 1e-9  # change of the phase at a block's end: far below any converter's noise
 _CARRIER_OFF = 64
+_FIT = np.dtype([
+    ("voltage", complex), ("current", complex), ("voltage_std", float), ("current_std", float),
+    ("omega_rad_s", float), ("levels", float, len(fields(Levels))),
+])  # fmt: skip
+_NOT_SETTLED = np.array([(np.nan,) * len(_FIT.names or ())], _FIT)
 
 
 @dataclass(frozen=True)
@@ -119,28 +124,28 @@ class SineFit:
 
     def _fit(self, readings: NDArray[Any]) -> Phasors:
         check_blocks(readings, self.config)
-        rows = np.full((len(readings), 12), np.nan, dtype=np.complex128)
+        rows = np.repeat(_NOT_SETTLED, len(readings))
         most = np.empty((len(readings), 2))
         for k, block in enumerate(readings.astype(np.float64, copy=False)):
             most[k] = np.abs(block).max(axis=0)
             if np.isfinite(most[k]).all():
-                rows[k] = self._fit_block(block[self._kept])
+                rows[k] = self._fit_block(block[self._kept]) or _NOT_SETTLED[0]
         reason = range_reasons(most, self.config)
-        unsettled = np.isnan(rows[:, 0].real) & np.isfinite(most).all(axis=1)
-        real = rows[:, 2:].real
+        unsettled = np.isnan(rows["voltage"].real) & np.isfinite(most).all(axis=1)
         return Phasors(
             # Not settled is not the same as no number: the reason tells it, the phasor is 0.
-            voltage=np.where(unsettled, 0.0, rows[:, 0]),
-            current=np.where(unsettled, 0.0, rows[:, 1]),
-            voltage_std=real[:, 0],
-            current_std=real[:, 1],
-            omega_rad_s=real[:, 2],
+            voltage=np.where(unsettled, 0.0, rows["voltage"]),
+            current=np.where(unsettled, 0.0, rows["current"]),
+            voltage_std=rows["voltage_std"],
+            current_std=rows["current_std"],
+            omega_rad_s=rows["omega_rad_s"],
             time_s=middles_s(self.config, np.full(len(readings), self._middle_s)),
             reason=reason | np.where(unsettled, _CARRIER_OFF, 0).astype(np.uint8),
-            levels=Levels(*(real[:, k] for k in range(3, 9))),
+            levels=Levels(*rows["levels"].T),
         )
 
-    def _fit_block(self, block: NDArray[np.float64]) -> tuple[complex | float, ...]:
+    def _fit_block(self, block: NDArray[np.float64]) -> tuple[Any, ...] | None:
+        """A row of `_FIT`; None where the frequency does not settle."""
         nominal_rad_s = omega_rad_s = self.config.omega_rad_s
         reach_rad_s = 2.0 * np.pi / self._used_s
         for _ in range(_MAX_ITERATIONS):
@@ -154,18 +159,19 @@ class SineFit:
                     (quadrature * voltage.noise) ** 0.5,
                     (quadrature * current.noise) ** 0.5,
                     omega_rad_s,
-                    voltage.level,
-                    current.level,
-                    (inverse[2, 2] * voltage.noise) ** 0.5,
-                    (inverse[2, 2] * current.noise) ** 0.5,
-                    voltage.slope,
-                    (inverse[3, 3] * voltage.noise) ** 0.5 / self._used_s,
-                    0.0,
+                    (
+                        voltage.level,
+                        current.level,
+                        (inverse[2, 2] * voltage.noise) ** 0.5,
+                        (inverse[2, 2] * current.noise) ** 0.5,
+                        voltage.slope,
+                        (inverse[3, 3] * voltage.noise) ** 0.5 / self._used_s,
+                    ),
                 )
             omega_rad_s += step_rad_s
             if not abs(omega_rad_s - nominal_rad_s) < reach_rad_s:
                 break
-        return (np.nan,) * 12
+        return None
 
     def _channels(
         self, block: NDArray[np.float64], omega_rad_s: float

@@ -1,4 +1,4 @@
-"""actuator.toml: read and written section by section; comments, order and other keys survive."""
+"""Read and write actuator.toml by section, keeping comments, order and other keys."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ _WIDEST = 100  # characters of a list on one line
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the numbers of a section come from.
+    """Provenance of the values of a section.
 
     Args:
         command: as it was typed.
         inputs: names and hashes of the files that were read, see `hashed`.
         date: of the command.
         version: of haselab.
-        status: of the result, "ok" or what is wrong with it.
+        status: of the result, "ok" or what is wrong.
     """
 
     command: str
@@ -64,12 +64,12 @@ class Provenance:
 
 
 def hashed(paths: Sequence[Path]) -> Mapping[str, str]:
-    """Name and SHA-256 of each file; what is no file is left out."""
+    """Name and SHA-256 of each file; paths that are not files are left out."""
     return {path.name: sha256_of(path) for path in paths if path.is_file()}
 
 
 def read_actuator(path: Path) -> dict[str, Any]:
-    """The sections of an actuator file, unchecked.
+    """Read the sections of an actuator file, unchecked.
 
     Args:
         path: of the file.
@@ -80,13 +80,14 @@ def read_actuator(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise InputError(
-            f"No such actuator file. Make one with: haselab init NAME --out {path.name}  {path}"
+            f"There is no such actuator file. Create it with: haselab init NAME --out {path.name}  "
+            f"{path}"
         )
     return read_toml(path, "actuator file")
 
 
 def read_run(path: Path) -> dict[str, Any]:
-    """The sections of an actuator file, or of the folder of a run.
+    """Read the sections of an actuator file, or of the folder of a run.
 
     Args:
         path: an actuator.toml, a folder with one, or a folder of an older run with model.json and
@@ -103,7 +104,7 @@ def read_run(path: Path) -> dict[str, Any]:
         return read_actuator(path / ACTUATOR)
     model = read_json(model_file)
     if not isinstance(model, dict):
-        raise InputError(f"model.json must hold an object. Run the study again. {model_file}")
+        raise InputError(f"model.json is not a JSON object. Run the study again. {model_file}")
     return _of_older_run(model, read_toml(path / "controller.toml", "controller file"))
 
 
@@ -141,18 +142,18 @@ def write_section(
     provenance: Provenance | None,
     owned: Collection[str] = (),
 ) -> None:
-    """Write one section of an actuator file; everything else in it stays as it is.
+    """Write one section of an actuator file, and keep everything else.
 
     Args:
-        path: of the file, which exists.
+        path: of an existing file.
         section: name of the section: "model", "sensing.strain_map".
-        values: its keys; tables in it are written as tables; a value of None is left out.
+        values: its keys; nested mappings become tables; a value of None is left out.
         provenance: written to `[provenance.SECTION]`; None: not written.
-        owned: keys that this writer may remove from the section where `values` lacks them. Other
-            keys and all comments survive.
+        owned: keys that are removed from the section if `values` lacks them. Other keys and all
+            comments are kept.
     Raises:
-        InputError: the file cannot be read, or has something else in the place of a table.
-        DeviceError: the disk refuses.
+        InputError: the file cannot be read, or a section is not a table.
+        DeviceError: the file cannot be written.
     """
     read_actuator(path)  # TOML of a bounded depth
     changes: dict[str, tuple[Mapping[str, object], Collection[str]]] = {section: (values, owned)}
@@ -165,15 +166,15 @@ def write_section(
 def write_sections(
     path: Path, sections: Mapping[str, Mapping[str, object]], start: str = ""
 ) -> None:
-    """Write several sections at once; a file that is not there yet is made.
+    """Write several sections at once; create the file if it does not exist.
 
     Args:
         path: of the file.
-        sections: keys of each section; one of None is removed.
+        sections: keys of each section; None removes a section.
         start: text of a new file.
     Raises:
-        InputError: the file cannot be read, or has something else in the place of a table.
-        DeviceError: the disk refuses.
+        InputError: the file cannot be read, or a section is not a table.
+        DeviceError: the file cannot be written.
     """
     if path.exists():
         read_actuator(path)
@@ -185,7 +186,7 @@ def write_sections(
 def _changed(
     text: str, changes: Mapping[str, tuple[Mapping[str, object], Collection[str]]], path: Path
 ) -> str:
-    """The text of a file with sections changed: their keys, and those that may be removed."""
+    """Change sections in the text of a file; for each, its keys and those that may be removed."""
     document = tomlkit.parse(text)
     for section, (values, owned) in changes.items():
         try:
@@ -195,14 +196,14 @@ def _changed(
                 table.add(tomlkit.nl())  # before the next header
         except (TOMLKitError, TypeError, AttributeError) as error:
             raise InputError(
-                f"[{section}] cannot be written: {error}. Write it as a table under a header of "
-                f"its own. {path}"
+                f"[{section}] cannot be written: {error}. Change it to a table under its own "
+                f"header. {path}"
             ) from None
     return document.as_string()
 
 
 def _table_at(document: tomlkit.TOMLDocument, names: Sequence[str]) -> tuple[Any, bool]:
-    """The table of a dotted name, and whether it was missing and has been made."""
+    """Return the table of a dotted name, and whether it was created."""
     place: Any = document
     is_new = False
     for k, name in enumerate(names):
@@ -220,7 +221,7 @@ def _table_at(document: tomlkit.TOMLDocument, names: Sequence[str]) -> tuple[Any
 
 
 def _merge(table: Any, values: Mapping[str, object], owned: Collection[str]) -> None:
-    """Change the keys of a table in their places, add new ones, remove owned ones."""
+    """Change the keys of a table in place, add new ones, remove owned ones."""
     plain = {name: value for name, value in to_plain(values).items() if value is not None}
     for name in [name for name in table if name in owned and name not in plain]:
         table.remove(name)
@@ -233,12 +234,12 @@ def _merge(table: Any, values: Mapping[str, object], owned: Collection[str]) -> 
 
 
 def _unwrapped(item: Any) -> Any:
-    """The plain value; tomlkit gives truth values as such already."""
+    """Return the plain value; tomlkit returns booleans as such."""
     return item.unwrap() if isinstance(item, Item) else item
 
 
 def _item(value: Any, *, last: bool = True) -> Item:
-    """A value as TOML; long lists a line an entry, lists of tables as `[[name]]`."""
+    """Convert a value to TOML; long lists with one entry per line, tables as `[[name]]`."""
     if isinstance(value, Mapping):
         table = tomlkit.table()
         for name, part in value.items():

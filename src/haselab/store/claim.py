@@ -1,4 +1,4 @@
-"""Who may write where: nothing that exists is overwritten, one program at a time has a folder."""
+"""Claims on output paths: nothing is overwritten, and one program at a time uses a folder."""
 
 from __future__ import annotations
 
@@ -23,26 +23,28 @@ __all__ = [
 ]
 
 _MOST_PREVIOUS = 10_000
-_LOG = "guardian.log"  # grows at its end, whoever writes to it
+_LOG = "guardian.log"  # only appended to, by any program
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def _unwritable(path: Path, error: OSError) -> HaselabError:
-    """The error of a path that cannot be made: bad input where its name is at fault."""
+    """Make the error for a path that cannot be created: bad input if its name is the cause."""
     why = error.strerror or str(error)
     if error.errno in _BAD_PATH:
         return InputError(
-            f"Cannot create this path ({why}): a part of it is a file, a link that leads nowhere, "
-            f"or too long. Name another one. {path}"
+            f"Cannot create this path ({why}): part of it is a file, a broken link, or too long. "
+            f"Name another one. {path}"
         )
     if error.errno in _FULL:
         return DeviceError(f"Cannot write ({why}). Free disk space. {path}")
-    return DeviceError(f"Cannot write ({why}). Choose another place, or allow it. {path}")
+    return DeviceError(
+        f"Cannot write ({why}). Choose another folder, or change its permissions. {path}"
+    )
 
 
 def _make_parents(folder: Path) -> list[Path]:
-    """Make a folder and those above it; which ones are new, the lowest first."""
+    """Create a folder with its parents; return the new ones, the lowest first."""
     missing = [each for each in (folder, *folder.parents) if not each.is_dir()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -53,7 +55,7 @@ def _make_parents(folder: Path) -> list[Path]:
 
 
 def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders that this process has made, as far as nothing lies in them."""
+    """Remove folders that this process has created, if they are empty."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
@@ -61,16 +63,16 @@ def _remove_empty(folders: list[Path]) -> None:
 
 @contextlib.contextmanager
 def claimed_file(path: Path) -> Iterator[None]:
-    """Have the name of a new file for this process alone until the context ends.
+    """Reserve the name of a new file for this process until the context ends.
 
-    The file is made at once, empty, so that no other program takes its name, and locked where the
-    system has such locks. One that is still empty at the end goes again, and so do the folders
-    that were made for it.
+    The file is created empty at once, so that no other program takes its name, and locked if the
+    system supports it. If it is still empty at the end, it is removed with the folders that were
+    created for it.
 
     Args:
-        path: of a file that does not exist; a pipe or a device is left as it is.
+        path: of a file that does not exist; a pipe or a device is not touched.
     Raises:
-        InputError: there is something already, or another program has just made it.
+        InputError: the path exists, or another program has just created it.
         DeviceError: the disk refuses.
     """
     if path.exists() and not is_occupied(path):
@@ -95,7 +97,7 @@ def claimed_file(path: Path) -> Iterator[None]:
 
 
 def _is_file(path: Path, status: os.stat_result) -> bool:
-    """Whether the path leads to this very file."""
+    """Whether the path still refers to this file."""
     try:
         return os.path.samestat(path.lstat(), status)
     except OSError:
@@ -103,24 +105,24 @@ def _is_file(path: Path, status: os.stat_result) -> bool:
 
 
 def refuse_linked_folders(folder: Path, *names: str) -> None:
-    """Refuse to write into a folder of others through a link in the place of a subfolder.
+    """Refuse subfolders that are links, through which other folders would be written to.
 
     Args:
         folder: of a run.
-        names: of its subfolders, which may be missing.
+        names: of its subfolders; they need not exist.
     Raises:
         InputError: one of them is a link.
     """
     for name in names:
         if (folder / name).is_symlink():
             raise InputError(
-                f"This is a link to {(folder / name).readlink()}, and files would be written "
-                f"there. Put a folder in its place, or remove it. {folder / name}"
+                f"This path is a link to {(folder / name).readlink()}, where the files would be "
+                f"written. Remove the link, or replace it by a folder. {folder / name}"
             )
 
 
 def create_exclusively(path: Path) -> None:
-    """Make an empty file that did not exist before; a pipe or a device is left as it is.
+    """Create an empty file that does not exist; a pipe or a device is not touched.
 
     Raises:
         InputError: it exists.
@@ -136,7 +138,7 @@ def create_exclusively(path: Path) -> None:
         path.open("xb").close()
     except FileExistsError:
         raise InputError(
-            "This file exists; nothing in it was changed. Name a new path, or add --force to move "
+            "This file exists already; it was not changed. Name a new path, or add --force to move "
             f"the existing result aside. {path}"
         ) from None
     except OSError as error:
@@ -144,9 +146,9 @@ def create_exclusively(path: Path) -> None:
 
 
 def is_occupied(path: Path) -> bool:
-    """Whether something lies here that must not be overwritten: a file, or a folder with content.
+    """Whether the path must not be overwritten: a file, a broken link, or a non-empty folder.
 
-    A pipe or a device is not, nor is a link to one; a link that leads nowhere is.
+    Pipes and devices, and links to them, may be written to.
     """
     if path.is_dir():
         return any(path.iterdir())
@@ -154,16 +156,16 @@ def is_occupied(path: Path) -> bool:
 
 
 def move_aside(path: Path, *, is_claimed: bool = False) -> Path:
-    """Rename a file or a folder to `NAME.previous-1`, or the next number that is free.
+    """Rename a file or a folder to `NAME.previous-1`, or the next free number.
 
     Args:
-        path: of what must make room.
+        path: of the existing result.
         is_claimed: this process has the lock of the folder.
     Returns:
         Its new path. Nothing is deleted.
     Raises:
-        InputError: it cannot be renamed, another program writes to it or below it, or it holds the
-            working directory.
+        InputError: it cannot be renamed, another program writes to it, or it contains the working
+            directory.
     """
     path = path.absolute() if path.is_symlink() else path.resolve()
     if Path.cwd().is_relative_to(path):
@@ -179,7 +181,7 @@ def move_aside(path: Path, *, is_claimed: bool = False) -> Path:
         if aside.exists() or aside.is_symlink():
             continue
         try:
-            # A rename replaces an empty folder or file without a word: this one is made for it.
+            # A rename silently replaces an empty folder or file, so a placeholder is created first.
             if sys.platform != "win32":
                 aside.mkdir() if path.is_dir() and not path.is_symlink() else aside.touch(
                     exist_ok=False
@@ -190,14 +192,16 @@ def move_aside(path: Path, *, is_claimed: bool = False) -> Path:
             raise _immovable(path, error) from None
         try:
             path.rename(aside)
-        except OSError as error:  # a mount point, above all
+        except OSError as error:  # typically a mount point
             _remove_placeholder(aside)
             raise _immovable(path, error) from None
-        if is_held(aside):  # made by another program after the look above
+        if is_held(aside):  # created by another program in the meantime
             aside.rename(path)
             raise _in_use(path)
         return aside
-    raise InputError(f"There are {_MOST_PREVIOUS} previous results. Delete some. {path}")
+    raise InputError(
+        f"There are {_MOST_PREVIOUS} previous results already. Delete some of them. {path}"
+    )
 
 
 def _immovable(path: Path, error: OSError) -> InputError:
@@ -208,13 +212,13 @@ def _immovable(path: Path, error: OSError) -> InputError:
 
 
 def _remove_placeholder(aside: Path) -> None:
-    """Take away what was made in the place of a result that then could not be moved."""
+    """Remove the placeholder for a result that could not be moved."""
     with contextlib.suppress(OSError):
         aside.rmdir() if aside.is_dir() else aside.unlink()
 
 
 def _refuse_in_use(path: Path, is_claimed: bool) -> None:
-    """Refuse a folder that another program writes to, or that holds one."""
+    """Refuse a folder that another program writes to, or that contains such a folder."""
     for folder in (path, *(found for found in path.rglob("*") if found.is_dir())):
         if folder != path or not is_claimed:
             with _locked(folder):
@@ -225,22 +229,22 @@ def _refuse_in_use(path: Path, is_claimed: bool) -> None:
 
 @contextlib.contextmanager
 def claimed_folder(folder: Path, *, force: bool = False) -> Iterator[Path | None]:
-    """Have a new folder for this process alone until the context ends.
+    """Reserve a new folder for this process until the context ends.
 
-    The lock lies on the folder itself and goes with the process, however it ends. Everything of a
-    run is written while it is held: the guardian's log, manifest, session, video, results.
+    The lock is on the folder itself; the system releases it when the process ends. All files of a
+    run are written under the lock: the guardian's log, manifest, session, video, results.
 
     Args:
         folder: new, or empty.
-        force: move an existing one aside instead of refusing it.
+        force: move an existing folder aside instead of refusing it.
     Returns:
-        Where the existing one is now; None: there was none.
+        The new path of the existing folder; None: there was none.
     Raises:
-        InputError: the folder has content, or another program writes to it.
+        InputError: the folder is not empty, or another program writes to it.
         DeviceError: the disk refuses.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out names a file, not a folder. Name another one. {folder}")
+        raise InputError(f"--out names a file, not a folder. Name a new folder. {folder}")
     aside, locked, made = None, False, list[Path]()
     with contextlib.ExitStack() as held:
         if folder.is_symlink() and not folder.exists():
@@ -256,7 +260,7 @@ def claimed_folder(folder: Path, *, force: bool = False) -> Iterator[Path | None
             if not locked:
                 if not force:
                     raise InputError(
-                        "--out names a folder that is not empty; nothing in it was changed. Name a "
+                        "--out names a folder that is not empty; it was not changed. Name a "
                         f"new folder, or add --force to move this one aside. {folder}"
                     )
                 aside = move_aside(folder, is_claimed=True)
@@ -274,12 +278,12 @@ def claimed_folder(folder: Path, *, force: bool = False) -> Iterator[Path | None
 
 
 def _has_results(folder: Path) -> bool:
-    """Whether a folder holds more than the log of a bench that was never armed."""
+    """Whether a folder contains more than the log of a bench that was never armed."""
     return any(path.name != _LOG for path in folder.iterdir())
 
 
 def _put_back(folder: Path, aside: Path | None, made: list[Path]) -> None:
-    """Leave things as they were where nothing has been written; what was there before stays."""
+    """Undo the claim if nothing was written: restore what was moved, remove what was created."""
     if any(folder.iterdir()):
         return
     _remove_empty(made)
@@ -290,17 +294,17 @@ def _put_back(folder: Path, aside: Path | None, made: list[Path]) -> None:
 
 def _in_use(folder: Path) -> InputError:
     kind = "folder" if folder.is_dir() else "file"
-    return InputError(f"Another program writes to this {kind}. Name another one. {folder}")
+    return InputError(f"Another program is writing to this {kind}. Name another one. {folder}")
 
 
 @contextlib.contextmanager
 def shared_folder(folder: Path) -> Iterator[None]:
-    """Have a folder whose files are made anew each time, while the context lasts.
+    """Reserve a folder whose files are rewritten each time, while the context lasts.
 
     Args:
-        folder: new or not.
+        folder: new or existing.
     Raises:
-        InputError: a file lies there, or another program has the folder.
+        InputError: the path is a file, or another program uses the folder.
         DeviceError: the disk refuses.
     """
     made = _make_parents(folder)
@@ -313,7 +317,7 @@ def shared_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[contextlib.ExitStack]:
-    """A lock on the folder, where the system has one; what is given can end it early."""
+    """Lock the folder, if the system supports it; the yielded stack can release it early."""
     with contextlib.ExitStack() as held:
         if sys.platform != "win32":
             import fcntl

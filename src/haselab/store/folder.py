@@ -1,4 +1,4 @@
-"""Small files of a run's folder, each whole or not there at all."""
+"""Write and read small files of a run's folder atomically."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 
 @contextlib.contextmanager
 def drafted(path: Path) -> Iterator[Path]:
-    """Write a file under another name, which it changes for its own when it is whole.
+    """Write a file under a temporary name, and rename it when it is complete.
 
     Args:
         path: of the file; an older one is replaced at the end, in one step. A link is replaced,
@@ -31,7 +31,7 @@ def drafted(path: Path) -> Iterator[Path]:
         An empty file of a random name in the same folder, made by this process, with the same
         ending. It is removed where the context ends by an error.
     Raises:
-        OSError: the disk refuses.
+        OSError: the file cannot be written.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         yield path
@@ -47,13 +47,13 @@ def drafted(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file; an older one is replaced at the end, in one step.
+    """Write a text file; replace an older one atomically.
 
     Nothing else in the folder is touched. A link in the place of the file is replaced; a pipe or a
     device is written to.
 
     Raises:
-        DeviceError: the disk refuses.
+        DeviceError: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,7 +61,7 @@ def write_text(path: Path, text: str) -> None:
             draft.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
         raise DeviceError(
-            f"Cannot write ({error.strerror}); free disk space or choose another folder. {path}"
+            f"Cannot write ({error.strerror}). Free disk space, or choose another folder. {path}"
         ) from None
 
 
@@ -69,8 +69,8 @@ def write_new(path: Path, text: str) -> None:
     """Write a text file that did not exist before.
 
     Raises:
-        InputError: it exists; nothing in it was changed.
-        DeviceError: the disk refuses.
+        InputError: the file exists already; it is not changed.
+        DeviceError: the file cannot be written.
     """
     create_exclusively(path)
     write_text(path, text)

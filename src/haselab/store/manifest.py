@@ -1,4 +1,4 @@
-"""manifest.json of a recording: where it comes from, its state, and the hash of each file."""
+"""manifest.json of a recording: provenance, state, and the hash of each file."""
 
 from __future__ import annotations
 
@@ -147,8 +147,8 @@ def check_recorded(path: Path, *, unverified: bool = False) -> str:
     if unverified:
         return doubt
     raise InputError(
-        f"Not the video that was recorded: {doubt}. Copy it again from where it was recorded; "
-        f"--unverified reads it and marks the result. {path}"
+        f"The video was changed after the recording: {doubt}. Copy the original again, or add "
+        f"--unverified to read it and mark the result. {path}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Names of experiments: each becomes the name of a file somewhere."""
+"""Check the names of experiments, which become names of files, and convert them."""
 
 from __future__ import annotations
 

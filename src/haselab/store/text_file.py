@@ -46,7 +46,7 @@ def check_regular(path: Path, what: str = "file") -> int:
         raise InputError(f"The file cannot be read ({reason}). Check the name: {path}") from None
     kind = _KINDS.get(stat.S_IFMT(status.st_mode))
     if kind is not None:
-        raise InputError(f"This is {kind}. Give a regular file: {path}")
+        raise InputError(f"The path is {kind}. Name a regular file: {path}")
     return status.st_size
 
 
@@ -62,8 +62,8 @@ def read_text(path: Path, what: str = "file") -> str:
     size = check_regular(path, what)
     if size > _MOST_BYTES:
         raise InputError(
-            f"The file has {size} bytes, but a text file may have {_MOST_BYTES}. Check the name: "
-            f"{path}"
+            f"The file has {size} bytes, more than the {_MOST_BYTES} of a text file. Check the "
+            f"name: {path}"
         )
     try:
         return path.read_text(encoding="utf-8-sig")

@@ -1,4 +1,4 @@
-"""TOML files checked by a pydantic model: all faults at once, each with its path in the file."""
+"""Check TOML files with a pydantic model; report all errors at once, with their paths."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
         for fault in shown
     )
     more = f"; and {count - len(shown)} more" if count > len(shown) else ""
-    raise InputError(f"{count} fault(s): {faults}{more}. Correct them. {source}")
+    raise InputError(f"{count} error(s): {faults}{more}. Change these values. {source}")
 
 
 def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
@@ -151,10 +151,10 @@ def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
     if kind == "missing":
         field = None if table is None else table.model_fields.get(fault["loc"][-1])
         words = () if field is None else _words(field.annotation)
-        return f"{fault['msg']}; allowed are {', '.join(words)}" if words else str(fault["msg"])
+        return f"{fault['msg']}; use one of {', '.join(words)}" if words else str(fault["msg"])
     keys = [] if table is None else sorted(table.model_fields)
     if 0 < len(keys) <= _MOST_KEYS:
-        return f"no such key; allowed are {', '.join(keys)}"
+        return f"no such key; the keys are {', '.join(keys)}"
     close = difflib.get_close_matches(str(fault["loc"][-1]), keys, 1)
     return f"no such key; did you mean {close[0]}" if close else "no such key"
 

@@ -1,4 +1,4 @@
-"""Studies: experiments as objects, played and fitted; what a package with its own one needs."""
+"""Studies: experiments as objects, played and fitted, and what packages need to add their own."""
 
 from haselab.study.analysis import Analysis
 from haselab.study.experiment import Chart, Curve, Experiment, NotPlayedError, Outcome

@@ -1,4 +1,4 @@
-"""What a study has found so far: each fit is made once, when its result is first needed."""
+"""The findings of a study so far: each fit is made once, when its result is first needed."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ Value = TypeVar("Value")
 
 
 class _NotRecordedError(InputError):
-    """The session lacks a recording: bad input, not a fit without a result."""
+    """The session lacks a recording, which is bad input, not a failed fit."""
 
 
 def experiments_of(study: Study) -> tuple[AnyExperiment, ...]:
-    """The experiments that a study holds, in the order of playing."""
+    """The experiments of a study, in the order of playing."""
     found = [cast("type[AnyExperiment]", kind).of(study) for kind in experiment_classes()]
     return tuple(experiment for experiment in found if experiment is not None)
 
 
 class Analysis:
-    """The findings of one study while they are made.
+    """The findings of a study while its fits are made.
 
     Args:
         study: what is played and fitted.
         rig: nominal values of the bench.
-        source: observations by name; the fits know nothing else of the session.
-        told: is called with the title of each fit as it begins.
-        fitted: is called with each outcome, as soon as it is known.
-        repeated: values of another run, by type, that are played again instead of those found here.
-        known: values of an actuator file, by type, for what no experiment of the study gives.
+        source: returns observations by name; the fits have no other access to the session.
+        on_fit: called with the title of each fit as it begins.
+        fitted: called with each outcome, as soon as it is known.
+        repeated: values of another run, by type, to play instead of those found here.
+        known: values of an actuator file, by type, that no experiment of the study finds.
     """
 
     def __init__(
@@ -47,24 +47,24 @@ class Analysis:
         study: Study,
         rig: RigDescription,
         source: Source,
-        told: Callable[[str], None] = lambda what: None,
+        on_fit: Callable[[str], None] = lambda what: None,
         fitted: Callable[[Outcome], None] = lambda outcome: None,
         repeated: Mapping[type, object] | None = None,
         known: Mapping[type, object] | None = None,
     ) -> None:
         self.study, self.rig = study, rig
         self.experiments = experiments_of(study)
-        self._source, self._told, self._fitted = source, told, fitted
+        self._source, self._on_fit, self._fitted = source, on_fit, fitted
         self._repeated, self._known = repeated or {}, known or {}
         self._seen: dict[str, Observation] = {}
         self._outcomes: dict[str, Outcome | NotPlayedError] = {}
         self._under_way: list[str] = []
 
     def observe(self, name: str) -> Observation:
-        """What was recorded under a name, in physical units.
+        """Return what was recorded under a name, in physical units.
 
         Raises:
-            InputError: the session does not hold it.
+            InputError: the session has no such recording.
         """
         if name not in self._seen:
             try:
@@ -74,51 +74,53 @@ class Analysis:
         return self._seen[name]
 
     def need(self, kind: type[Value]) -> Value:
-        """A value that an experiment gives, or the actuator file, such as `Maps`.
+        """Return a value that an experiment finds, or that of the actuator file, such as `Maps`.
 
         Args:
             kind: its type.
         Raises:
-            NotPlayedError: no experiment of this study gives it.
-            ResultError: the fit that gives it has no result.
+            NotPlayedError: no experiment of this study finds it.
+            ResultError: the fit has no result.
         """
         for experiment in self.experiments:
             if kind in experiment.gives:
                 for value in self.outcome(experiment).values:
                     if isinstance(value, kind):
                         return value
-                raise NotPlayedError(f"[{experiment.table}] of this study gives no {kind.__name__}")
+                raise NotPlayedError(
+                    f"[{experiment.table}] of this study did not find a {kind.__name__}"
+                )
         if kind in self._known:
             return cast("Value", self._known[kind])
         tables = [c.table for c in experiment_classes() if kind in c.gives]
-        wanted = f"[{tables[0]}]" if tables else f"an experiment that gives a {kind.__name__}"
+        wanted = f"[{tables[0]}]" if tables else f"an experiment that finds a {kind.__name__}"
         raise NotPlayedError(f"needs {wanted}, which is not in this study")
 
     def find(self, kind: type[Value]) -> Value | None:
-        """The same; None where no experiment of this study gives it."""
+        """Return a value like `need`; None if no experiment of this study finds it."""
         with contextlib.suppress(NotPlayedError):
             return self.need(kind)
         return None
 
     def repeated(self, kind: type[Value]) -> Value | None:
-        """The value of the run that is repeated; None where none is."""
+        """Return the value of the run that is repeated; None if there is none."""
         return cast("Value | None", self._repeated.get(kind))
 
     def to_play(self, kind: type[Value]) -> Value:
-        """The value that is played: that of the run that is repeated, else the one found here.
+        """Return the value to play: that of a run that is repeated, else the one found here.
 
         Raises:
-            NotPlayedError: as of `need`.
+            NotPlayedError: see `need`.
         """
         repeated = self.repeated(kind)
         return self.need(kind) if repeated is None else repeated
 
     def outcome(self, experiment: AnyExperiment) -> Outcome:
-        """What the fit of an experiment gives; made at the first call.
+        """Return the outcome of an experiment's fit, which is made at the first call.
 
         Raises:
-            NotPlayedError: it needs an experiment that is not in the study.
-            ResultError: no result, or the recorded data are refused by the fit.
+            NotPlayedError: the fit needs an experiment that is not in the study.
+            ResultError: no result, or the fit refuses the recorded data.
         """
         known = self._outcomes.get(experiment.table)
         if isinstance(known, NotPlayedError):
@@ -127,9 +129,12 @@ class Analysis:
             return known
         if experiment.table in self._under_way:
             circle = " -> ".join([*self._under_way, experiment.table])
-            raise InputError(f"Experiments need each other's results in a circle: {circle}.")
+            raise InputError(
+                f"The experiments depend on each other in a circle: {circle}. Remove one "
+                "dependency."
+            )
         self._under_way.append(experiment.table)
-        self._told(experiment.title)
+        self._on_fit(experiment.title)
         try:
             with fitting(experiment.title), foreign(experiment, "fit"):
                 found = experiment.fit(self)
@@ -145,28 +150,28 @@ class Analysis:
 
 
 def _check_rows(experiment: AnyExperiment, found: Outcome) -> None:
-    """Refuse results that the report would have no row for.
+    """Refuse results for which the report has no row.
 
     Raises:
-        ResultError: naming them.
+        ResultError: the message names them.
     """
     unnamed = sorted({*found.quantities, *found.missing} - set(experiment.rows()))
     if unnamed:
         raise ResultError(
-            f"The experiment [{experiment.table}] gives {', '.join(unnamed)}, but its method "
-            "'rows' does not name them. Add a Quantity for each there."
+            f"The experiment [{experiment.table}] returns {', '.join(unnamed)}, but its method "
+            "'rows' does not list them. Add a Quantity for each."
         )
 
 
 @contextlib.contextmanager
 def foreign(experiment: AnyExperiment, doing: str) -> Iterator[None]:
-    """The code of another package, which may fail in any way: named, not a defect of haselab.
+    """Run code of another package; report any failure as that package's, not as a bug of haselab.
 
     Args:
         experiment: whose code runs.
         doing: "play" or "fit".
     Raises:
-        ResultError: in place of an error that is none of haselab's.
+        ResultError: replaces an error that is not one of haselab's.
     """
     try:
         yield
@@ -178,19 +183,19 @@ def foreign(experiment: AnyExperiment, doing: str) -> Iterator[None]:
             raise
         raise ResultError(
             f"The method '{doing}' of the experiment [{experiment.table}], package {package!r}, "
-            f"fails: {type(error).__name__}: {error}. What was recorded is kept. Add --debug for "
-            "the place in its code."
+            f"failed: {type(error).__name__}: {error}. The recorded data are kept. Run again with "
+            "--debug for the traceback."
         ) from error
 
 
 @contextlib.contextmanager
 def fitting(what: str) -> Iterator[None]:
-    """A fit that refuses recorded data has no result: the user gave it nothing wrong.
+    """Turn a fit's refusal of recorded data into a missing result: it is not the user's input.
 
     Args:
-        what: is fitted.
+        what: title of the fit.
     Raises:
-        ResultError: in place of an `InputError`.
+        ResultError: replaces an `InputError`.
     """
     try:
         yield
@@ -198,5 +203,5 @@ def fitting(what: str) -> Iterator[None]:
         raise
     except InputError as error:
         raise ResultError(
-            f"{what}: the recorded data give no result. {error} What was recorded is kept."
+            f"{what}: no result from the recorded data. {error} The recorded data are kept."
         ) from error

@@ -1,4 +1,4 @@
-"""A study as data: STUDY.toml, its tables checked all at once."""
+"""Studies as data: read STUDY.toml and check all its tables at once."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ __all__ = [
     "step_study_of",
 ]
 
-REFERENCE_STUDY = "hasel-iros2018"  # whose results are compared with the paper
+REFERENCE_STUDY = "hasel-iros2018"  # only its results are compared with the paper
 _STUDIES = Path(__file__).parent / "studies"
 
 Table = TypeVar("Table", bound=Section)
 
 
 class _Head(Section):
-    """What every study has, whatever it plays."""
+    """The tables that every study has, whatever it plays."""
 
     name: str
     sensing: Sensing = Sensing()
@@ -52,10 +52,10 @@ class _Head(Section):
 
 
 class Study(_Head):
-    """What a run needs to know besides the rig: what is played, one table an experiment.
+    """The experiments of a study, one table each.
 
-    Which tables there may be is the business of the experiments, see `haselab.study.registry`; one
-    that is not there is not played. The file may hold them in any order.
+    The possible tables are those of the registered experiments (`haselab.study.registry`); an
+    experiment without a table is not played. The file may have the tables in any order.
 
     Example:
         >>> triangle = dict(low_v=0, high_v=2, frequency_hz=0.25, cycles=5, left_out_cycles=1,
@@ -70,7 +70,7 @@ class Study(_Head):
     @model_validator(mode="before")
     @classmethod
     def _tables_are_known(cls, data: Any) -> Any:
-        """Check every table by its own class, all of them at once."""
+        """Check every table with its own class, all of them at once."""
         if not isinstance(data, Mapping):
             return data
         checked = file_model(data).model_validate(data)
@@ -87,17 +87,17 @@ class Study(_Head):
         return self.name == REFERENCE_STUDY
 
     def has(self, table: str) -> bool:
-        """Whether the study holds a table."""
+        """Whether the study has a table."""
         return table in self.tables
 
     def table(self, name: str, kind: type[Table]) -> Table:
-        """One table.
+        """Return one table.
 
         Args:
             name: in the file.
-            kind: class that has checked it.
+            kind: the class that checks it.
         Raises:
-            InputError: the study does not hold it.
+            InputError: the study has no such table.
         """
         found = self.tables.get(name)
         if not isinstance(found, kind):
@@ -136,18 +136,18 @@ class Study(_Head):
 
     @property
     def nominal_baseline_v(self) -> float:
-        """The baseline that is given, or the middle of the triangle, about which one is found.
+        """The given baseline, or the middle of the triangle, around which the baseline is found.
 
         Raises:
-            InputError: none is given and there is no triangle.
+            InputError: no baseline is given, and there is no triangle.
         """
         given = self.operating_point.baseline_v
         if given is not None:
             return given
         if not self.has("triangle"):
             raise InputError(
-                f"The study {self.name!r} has no [triangle] whose middle could be the voltage of "
-                "zero strain. Give operating_point.baseline_v, in V at the DAQ output."
+                f"The study {self.name!r} has no [triangle], whose middle would be the voltage of "
+                "zero strain. Add operating_point.baseline_v, in V at the DAQ output."
             )
         return 0.5 * (self.triangle.low_v + self.triangle.high_v)
 
@@ -160,10 +160,10 @@ class StepStudy(Section):
 
 
 def file_model(data: Mapping[str, Any]) -> type[_Head]:
-    """The model of a study file that holds these tables.
+    """Return the model of a study file with these tables.
 
     Args:
-        data: of the file; what it holds besides tables of experiments is not allowed there.
+        data: of the file; keys that are not tables of experiments are refused.
     """
     known = {name: kind for name, kind in table_types().items() if name in data}
     fields: dict[str, Any] = {name: (kind, ...) for name, kind in known.items()}
@@ -180,27 +180,27 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_study(path: Path, *, quick: bool = False) -> Study:
-    """Read STUDY.toml; every fault is told at once, with its path in the file.
+    """Read STUDY.toml; report all errors at once, with their paths in the file.
 
     Args:
-        path: of the TOML file; its table `quick` holds the changes of a quick run.
+        path: of the TOML file; its table `quick` has the changes of a quick run.
         quick: apply those changes.
     Returns:
         The checked study.
     Raises:
-        InputError: no such file, no TOML, an unknown key or a value out of range.
+        InputError: no such file, invalid TOML, an unknown key or a value out of range.
     """
     data = _read(path, quick)
     if "step_trials" in data:
         raise InputError(
-            'The study holds a table [step_trials], which only a rig with kind = "mega" plays. '
-            f"Name such a rig, or use the table [steps]. {path}"
+            'The study has a table [step_trials], which needs a rig with kind = "mega". '
+            f"Use such a rig, or the table [steps]. {path}"
         )
     return _with_all_parameters(checked_study(data, path), path)
 
 
 def _with_all_parameters(study: Study, path: Path) -> Study:
-    """The study with the default of each parameter that its own controller leaves out.
+    """Add the default of each parameter that the study leaves out for its own controller.
 
     Raises:
         InputError: the kind is not registered, or does not accept the parameters.
@@ -213,13 +213,13 @@ def _with_all_parameters(study: Study, path: Path) -> Study:
 
 
 def checked_study(data: Mapping[str, Any], source: object) -> Study:
-    """The study that some tables are, from a file or from a recording.
+    """Make a study from its tables, read from a file or from a recording.
 
     Args:
         data: the tables.
-        source: where they come from, for the message.
+        source: where they come from, for error messages.
     Raises:
-        InputError: a table that no installed experiment reads, no experiment at all, or a value
+        InputError: an unknown table, no experiment at all, or a value
             out of range.
     """
     kinds = table_types()
@@ -228,20 +228,20 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
         close = difflib.get_close_matches(unknown[0], fields, 1)
         meant = f" Did you mean [{close[0]}]?" if close else ""
         raise InputError(
-            f"The study holds a table [{unknown[0]}] that no installed experiment reads.{meant} "
-            f"Tables are {', '.join(sorted(fields - {'name'}))}; install the package of the "
-            f"experiment, or correct the name. {source}"
+            f"The study has a table [{unknown[0]}], but no installed experiment has that "
+            f"name.{meant} The known tables are {', '.join(sorted(fields - {'name'}))}. Change the "
+            f"name, or install the package of the experiment. {source}"
         )
     if not set(data) & set(kinds):
         raise InputError(
-            "The study holds no experiment. Add at least one of the tables "
+            "The study has no experiment. Add at least one of the tables "
             f"{', '.join(f'[{name}]' for name in kinds)}. {source}"
         )
     return validated(Study, data, source)
 
 
 def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
-    """The same for a study of step trials alone.
+    """Read a STUDY.toml of step trials only, for a chip.
 
     Args:
         path: of the TOML file.
@@ -249,19 +249,19 @@ def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
     Returns:
         The checked study.
     Raises:
-        InputError: as of `load_study`.
+        InputError: see `load_study`.
     """
     data = _read(path, quick)
     if "step_trials" not in data:
         raise InputError(
-            "The study holds no table [step_trials], which is all that a chip plays (step, zero_s, "
-            f"step_s, rest_s, frame_rate_hz, trials). Give one, or name another rig. {path}"
+            "The study has no table [step_trials] (step, zero_s, step_s, rest_s, frame_rate_hz, "
+            f"trials), the only one that a chip can play. Add it, or use another rig. {path}"
         )
     return validated(StepStudy, data, path)
 
 
 def step_study_of(study: Study, *, quick: bool = False) -> StepStudy:
-    """The study's step as step trials for a chip, row S26.
+    """Convert the steps of a study to step trials for a chip, row S26.
 
     Args:
         study: whose step it is.

@@ -1,4 +1,4 @@
-"""What an experiment is: it declares its drives, plays, observes, fits, and names its results."""
+"""The interface of an experiment: it declares its drives, plays, fits and names its results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Settings = TypeVar("Settings", bound=Section)
 
 
 class NotPlayedError(ResultError):
-    """A result needs something that this study does not play; the message is the reason."""
+    """A result needs an experiment that this study does not play; the message says which."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Curve:
         name: in the legend.
         x: shape `(N,)`.
         y: shape `(N,)`; NaN leaves a gap.
-        points: drawn as separate points; else as a line.
+        points: draw separate points instead of a line.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure of the report as data, so that the report is drawn without the experiment's code.
+    """A figure of the report as data, so that the report needs no code of the experiment.
 
     Args:
         name: of the file in `figures/`: letters, digits and hyphens.
@@ -70,7 +70,7 @@ class Chart:
     curves: tuple[Curve, ...]
 
     def to_dict(self) -> dict[str, object]:
-        """As analysis.json holds it."""
+        """Convert to JSON types, for analysis.json."""
         curves = [
             {"name": c.name, "x": np.asarray(c.x), "y": np.asarray(c.y), "points": c.points}
             for c in self.curves
@@ -83,15 +83,15 @@ class Chart:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the fit of an experiment gives.
+    """The result of an experiment's fit.
 
     Args:
         quantities: estimates by id, each with a row of `Experiment.rows`.
-        notes: by id, what the reader should know.
-        charts: figures of the report.
-        figures: sections of analysis.json, for figures that the report draws by itself.
-        values: objects that other experiments may ask for by their type, see `Experiment.gives`.
-        missing: why a result could not be found, by id.
+        notes: by id, remarks for the reader.
+        charts: further figures of the report.
+        figures: sections of analysis.json, for the report's built-in figures.
+        values: objects for other experiments, which request them by type; see `Experiment.gives`.
+        missing: why a result was not found, by id.
     """
 
     quantities: Mapping[str, Estimate] = field(default_factory=dict)
@@ -105,14 +105,14 @@ class Outcome:
 class Experiment(ABC, Generic[Settings]):
     """One experiment of a study.
 
-    A subclass names its table in STUDY.toml and implements `drives`, `play`, `fit` and `rows`. What
-    it plays is compared with the drives that it has declared: an experiment whose drives are not
-    declared cannot be played, so that none escapes the feasibility check.
+    A subclass names its table in STUDY.toml and implements `drives`, `play`, `fit` and `rows`. An
+    experiment can only play the drives that it has declared, so that the feasibility check covers
+    all of them.
 
     Args:
-        study: that holds it.
+        study: the study of the experiment.
         settings: its table, checked.
-    Example: `docs/add-an-experiment.md` and `examples/plugins/haselab-myexperiment`.
+    Example: `docs/extend/add-an-experiment.md` and `examples/plugins/haselab-myexperiment`.
     """
 
     table: ClassVar[str]
@@ -127,59 +127,60 @@ class Experiment(ABC, Generic[Settings]):
 
     @classmethod
     def of(cls, study: Study) -> Self | None:
-        """The experiment as a study holds it; None where the study does not."""
+        """Make the experiment of a study; None if the study does not have it."""
         settings = study.tables.get(cls.table)
         return None if settings is None else cls(study, settings)  # type: ignore[arg-type]
 
     def recordings(self) -> dict[str, str]:
-        """Names under which it records, and the kind of each; the default is one recording."""
+        """Names of its recordings, and the kind of each; the default is one recording."""
         return {self.table: self.title}
 
     def plans(self) -> list[ExperimentPlan]:
-        """The same for the session file."""
+        """The recordings as plans for the session file."""
         return [ExperimentPlan(name, kind, FIDUCIALS, {}) for name, kind in
                 self.recordings().items()]  # fmt: skip
 
     @abstractmethod
     def drives(self, rig: RigDescription) -> Sequence[Drive]:
-        """Every output that the experiment makes, in V ahead of the amplifier.
+        """Declare every output of the experiment, in V before the amplifier.
 
-        The feasibility check judges them before anything moves, and `play` may not leave their
-        range. Where a voltage depends on an earlier fit, declare the largest that it may have.
+        The feasibility check compares them with the limits before anything moves, and `play` may
+        not leave their range. If a voltage depends on an earlier fit, declare the largest possible
+        one.
 
         Args:
             rig: nominal values of the bench.
         """
 
     def masses_kg(self) -> tuple[float, ...]:
-        """Masses that it hangs besides the rig's own."""
+        """Masses that the experiment hangs, besides the rig's own."""
         return ()
 
     def seconds(self, rig: RigDescription) -> float:
-        """How long the recorded part takes, in s, for the progress bar."""
+        """Duration of the recorded part in s, for the progress bar."""
         return rig.block_s * sum(len(drive.values_v) for drive in self.drives(rig))
 
     @abstractmethod
     def play(self, player: Player) -> None:
-        """Play and record it.
+        """Play and record the experiment.
 
         Args:
-            player: puts out, records, and gives what earlier experiments have found.
+            player: plays, records, and returns the findings of earlier experiments.
         Raises:
-            NotPlayedError: it needs the result of an experiment that the study does not hold.
+            NotPlayedError: it needs the result of an experiment that is not in the study.
         """
 
     @abstractmethod
     def fit(self, analysis: Analysis) -> Outcome:
-        """Results from what was recorded; reads nothing else, so that it can be repeated.
+        """Compute the results from the recording only, so that the fit can be repeated.
 
         Args:
-            analysis: gives the observations, and what other experiments have found.
+            analysis: returns the observations, and the findings of other experiments.
         Raises:
-            NotPlayedError: it needs the result of an experiment that the study does not hold.
-            ResultError: the data give no result.
+            NotPlayedError: it needs the result of an experiment that is not in the study.
+            ResultError: no result from these data.
         """
 
     @abstractmethod
     def rows(self) -> Mapping[str, Quantity]:
-        """All results that it may have, by id, in the order of the report."""
+        """All possible results by id, in the order of the report."""

@@ -1,4 +1,4 @@
-"""Whether a bench can play a study: its outputs, as its experiments declare them, judged."""
+"""Check whether a bench can play a study, from the drives that its experiments declare."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from haselab.base import InputError
 from haselab.rig import RigDescription
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile, TwinFile
-from haselab.rig.twin.bench import GRAVITY_M_S2, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, describe, native_bench
 from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of
@@ -32,11 +32,11 @@ __all__ = [
 ]
 
 _NEVER_V_PER_M = 1e15
-_STEPS = 200_000  # of the twin's mechanics, 20 s: the sheet hangs still, up to creep
+_STEPS = 200_000  # of the twin's mechanics, 20 s, after which only creep remains
 
 
 def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
-    """What a study will put out, as its experiments declare it.
+    """All drives of a study, as its experiments declare them.
 
     Args:
         study: what will be played.
@@ -46,35 +46,34 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
 
 
 def study_masses_kg(study: Study) -> list[float]:
-    """All masses that a study hangs besides the rig's own."""
+    """All masses that a study hangs, besides the rig's own."""
     return [mass for experiment in experiments_of(study) for mass in experiment.masses_kg()]
 
 
 def check_drives(study: Study, rig: RigDescription) -> None:
-    """Refuse a study that this rig would refuse later, when hours of it have been played.
+    """Refuse a study now that this rig would refuse hours later.
 
     Args:
         study: what will be played.
         rig: nominal values of the bench.
     Raises:
-        LimitError: a drive beyond the rig's limits.
-        InputError: a mass that cannot be hung.
+        LimitError: a drive is beyond the rig's limits.
+        InputError: a mass is negative.
     """
     for drive in study_drives(study, rig):
         rig.drive_limits.check(drive.values_v)
     for mass_kg in study_masses_kg(study):
         if not 0.0 <= mass_kg < math.inf:
             raise InputError(
-                f"The study hangs a mass of {mass_kg:g} kg (static_load.masses_kg). Give masses of "
-                "0 kg and more."
+                f"static_load.masses_kg of the study has a mass of {mass_kg:g} kg. Use masses of "
+                "at least 0 kg."
             )
 
 
 def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
-    """What a twin withstands in a study, by its own physics at the extremes of the study.
+    """Rating of a twin, from its own physics at the extremes of the study.
 
-    The dielectric does not break here: after a breakdown the field would be the one of the
-    breakdown, not that of the study.
+    Breakdown is switched off for this calculation, because it would limit the field.
     """
     bench = native_bench(config, 0, noise=False, breakdown_v_per_m=_NEVER_V_PER_M)
     law = config.law
@@ -100,21 +99,21 @@ def rating_of_twin(config: TwinConfig, study: Study) -> Rating:
 
 
 def _smallest_gap_m(law: ActuatorLaw) -> float:
-    """For an actuator that leaves the lengths of its law, where the output is taken away."""
+    """Smallest gap of a law: an actuator that leaves its range of lengths loses its output."""
     limits = law.length_limits_m
     return float(law.gap_m(np.array([limits.low, limits.high])).min())
 
 
 def _largest_f(bench: Bench, lengths_m: NDArray[np.float64], output_v: float) -> float:
-    """Capacitance at the end of the motion where it is larger; some actuators contract."""
+    """Largest capacitance at either end of the motion; some actuators contract."""
     ends_m = (float(lengths_m.min()), float(lengths_m.max()))
     return max(bench.capacitance(length_m, output_v) for length_m in ends_m)
 
 
 def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:
-    """All checks of a study on a bench; `require` refuses it with the numbers.
+    """Check a study against a bench; `require` of the answer raises if a check fails.
 
-    Drives with a carrier of their own are judged with it, and each check is the worst of all.
+    A drive with its own carrier is checked with it; each check reports the worst case.
 
     Args:
         study: what will be played.
@@ -131,11 +130,11 @@ def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibilit
         for carrier_v, some in by_carrier.items()
     ]
     together = zip(*(one.checks for one in found), strict=True)
-    return Feasibility(tuple(max(same, key=lambda check: check.asked) for same in together))
+    return Feasibility(tuple(max(same, key=lambda check: check.requested) for same in together))
 
 
 def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating] | None:
-    """What a rig is and what it withstands; None where that is not known.
+    """Description and rating of a rig; None if the rating is unknown.
 
     Args:
         file: from `load_rig`.
@@ -152,16 +151,16 @@ def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, 
 
 
 def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibility | None:
-    """All checks of a study on the rig of a file.
+    """Check a study against the rig of a file.
 
     Args:
         file: from `load_rig`.
         study: what will be played.
         path: of the rig file.
     Returns:
-        The checks; None where it is not known what the rig withstands.
+        The checks; None if the rating of the rig is unknown.
     """
-    if isinstance(study, StepStudy):  # on a chip, whose limits are compiled in
+    if isinstance(study, StepStudy):  # for a chip, whose limits are in its firmware
         return None
     rated = rated_rig(file, study, path)
     return None if rated is None else judge_study(study, *rated)

@@ -21,20 +21,20 @@ from haselab.study.paper.paper_check import recompute_paper, recompute_steps
 from haselab.study.paper.row_table import CITATION, study_rows
 from haselab.study.paper.scope import changes_text, not_played
 from haselab.study.pipeline import Findings
-from haselab.study.results import VERDICT_RULE, quantity_rows, reading_verdict
+from haselab.study.results import VERDICT_RULE, axis_interpretation, quantity_rows
 from haselab.study.simulated.truth import is_simulated
 from haselab.study.tables import Control
 
 __all__ = ["marked_unverified", "results_of", "sections_found", "write_design", "write_findings"]
 
-_FOUND: Mapping[type, tuple[str, ...]] = {  # sections by what is written to them
+_FOUND: Mapping[type, tuple[str, ...]] = {  # sections by the type of the finding in them
     Maps: ("sensing.strain_map", "drive.voltage_map"),
     Dynamics: ("model",),
     Loops: ("controller",),
 }
 _START = """\
-# What a study found out about its actuator. SI units. Works with haselab design, compare, firmware
-# and run; comments and keys of your own stay as they are.
+# Findings of a study about its actuator, in SI units. Use it with haselab design, compare, firmware
+# and run. Your own comments and keys are kept.
 
 [actuator]
 
@@ -57,7 +57,7 @@ def results_of(
     noise_free: Mapping[str, float] | None,
     doubt: str = "",
 ) -> dict[str, Any]:
-    """results.json: one row an id, where it all comes from, and whether that could be verified."""
+    """Content of results.json: one row per id, provenance, and whether it could be verified."""
     trials = found.find(Comparison)
     results = {
         "quantities": quantity_rows(
@@ -77,11 +77,11 @@ def results_of(
 
 
 def marked_unverified(results: dict[str, Any], doubt: str) -> dict[str, Any]:
-    """The same results; where their session could not be verified, with a mark and the reason.
+    """Mark results whose session could not be verified, and add the reason.
 
     Args:
         results: content of results.json.
-        doubt: why the session is not verified; empty where it is.
+        doubt: why the session could not be verified; empty if it was.
     """
     if not doubt:
         return results
@@ -104,13 +104,13 @@ def write_findings(
         found: all findings.
         study: saturation and names.
         header: of the session, for the provenance.
-        noise_free: of the same experiment on the twin without noise, by id.
-        doubt: why the session could not be verified; empty where it could.
+        noise_free: results of the same experiments on the twin without noise, by id.
+        doubt: why the session could not be verified; empty if it was.
     Returns:
-        What results.json holds.
+        The content of results.json.
     Raises:
         InputError: `firmware` or `figures` is a link; nothing was written.
-        DeviceError: the disk refuses.
+        DeviceError: a file cannot be written.
     """  # fmt: skip
     refuse_linked_folders(folder, "firmware", "figures")
     results = results_of(found, study, header, noise_free, doubt)
@@ -124,7 +124,7 @@ def write_findings(
 
 
 def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[str, Any]:
-    """analysis.json: data of the figures, and for the reference study what concerns the paper."""
+    """Content of analysis.json: data of the figures; for the reference study also the paper."""
     charts = [chart.to_dict() for chart in found.charts]
     sections: dict[str, Any] = {**found.figures, **({"charts": charts} if charts else {})}
     if not study.is_reference:
@@ -143,7 +143,7 @@ def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[
     ]  # fmt: skip
     return {
         **sections,
-        "reading": reading_verdict(found.quantities, header["rig_config"]),
+        "reading": axis_interpretation(found.quantities, header["rig_config"]),
         "d_rows": rows,
         "reconciling": reconciling,
         "rows": [asdict(row) for row in study_rows()],
@@ -174,7 +174,7 @@ def write_design(
     study: Study,
     drive_limits: tuple[float, float] | None = None,
 ) -> None:
-    """Write actuator.toml: maps, model and controllers, which is all that firmware is built from.
+    """Write actuator.toml: maps, model and controllers, from which firmware is built.
 
     Args:
         folder: of the run.
@@ -184,7 +184,7 @@ def write_design(
         study: its name, sensing and controllers.
         drive_limits: of the rig, in V; None: not written.
     Raises:
-        DeviceError: the disk refuses.
+        DeviceError: a file cannot be written.
     """
     path = folder / ACTUATOR
     sections: dict[str, Mapping[str, object]] = {
@@ -208,7 +208,7 @@ def write_design(
 
 
 def sections_found(found: Findings) -> list[str]:
-    """Sections of actuator.toml that a study's findings are written to."""
+    """Names of the sections of actuator.toml for a study's findings."""
     return [name for kind, names in _FOUND.items() if found.find(kind) for name in names]
 
 
@@ -226,10 +226,10 @@ def _model(dynamics: Dynamics, loops: Loops | None) -> Mapping[str, object]:
 
 
 def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:
-    """The PID that was designed; as alternatives the paper's PI, and the study's own controller.
+    """The designed PID, and as alternatives the paper's PI and the study's own controller.
 
-    What was designed has margins, so an own controller never takes its place: one of a kind that
-    is there already has the name "own".
+    The designed one has margins, so an own controller never replaces it: one of the same kind gets
+    the name "own".
     """
     tables: list[dict[str, object]] = []
     for kind, gains, key in (("pid", loops.pid, "S25"), ("pi", loops.pi, "S21")):

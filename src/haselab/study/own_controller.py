@@ -1,4 +1,4 @@
-"""Steps by a controller of any registered kind: what a study file adds beside the paper's PI."""
+"""Step trials with the controller that a study adds to the paper's PI, of any kind."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ OWN = "own"  # group of trials
 
 
 def own_controller(study: Study) -> ChosenController | None:
-    """The controller of `[control] kind = "..."`.
+    """Return the controller of `[control] kind = "..."`.
 
     Args:
         study: with or without such a table.
     Returns:
-        The controller with checked values; None where the study names no kind.
+        The controller with checked parameters; None if the study names no kind.
     Raises:
-        InputError: a kind that is not registered, or values that it does not accept.
+        InputError: the kind is not registered, or does not accept the parameters.
     """
     if not study.has("control") or study.control.kind is None:
         return None
@@ -29,7 +29,7 @@ def own_controller(study: Study) -> ChosenController | None:
 
 
 def own_names(study: Study) -> list[str]:
-    """Step trials by the study's own controller."""
+    """Names of the step trials with the study's own controller."""
     has_own = study.has("control") and study.control.kind is not None
     trials = study.steps.own_trials if has_own else 0
     return [f"{OWN}-{k + 1}" for k in range(trials)]
@@ -41,7 +41,7 @@ def own_quantities(rise: Estimate, overshoot: Estimate, error: Estimate) -> dict
 
 
 def own_note(control: Control) -> str:
-    """Which controller it was, and what the study cannot say of it."""
+    """Note about the controller, and about what the study does not compute for it."""
     values = ", ".join(f"{name} = {value:.6g}" for name, value in control.parameters.items())
     return (
         f"controller {control.kind!r}{f' ({values})' if values else ''}; its margins, if its "

@@ -1,4 +1,4 @@
-"""A study in its order: each experiment played and fitted; or the fits alone from a recording."""
+"""Play and fit the experiments of a study in order, or repeat only the fits from a recording."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class Findings:
-    """All that a study has found.
+    """All findings of a study.
 
     Args:
         quantities: estimates by id.
-        notes: by id, what the reader should know.
+        notes: by id, remarks for the reader.
         figures: sections of analysis.json.
-        values: what the experiments give each other, by type: maps, plant, controllers.
+        values: maps, plant, controllers and others, by type.
         charts: further figures of the report.
         missing: why a result was not found, by id.
     """
@@ -41,7 +41,7 @@ class Findings:
     missing: Mapping[str, str] = field(default_factory=dict)
 
     def find(self, kind: type[Value]) -> Value | None:
-        """A value by its type; None where this study gives none."""
+        """Return a value by its type; None if this study has not found one."""
         return cast("Value | None", self.values.get(kind))
 
 
@@ -50,25 +50,25 @@ def investigate(
     study: Study,
     rig: RigDescription,
     runner: Runner | None = None,
-    told: Callable[[str], None] = lambda what: None,
+    on_fit: Callable[[str], None] = lambda what: None,
     repeated: Mapping[type, object] | None = None,
     fitted: Callable[[Outcome], None] = lambda outcome: None,
     known: Mapping[type, object] | None = None,
 ) -> Findings:
     """Play and fit all experiments of a study.
 
-    With a runner each experiment is played before it is looked at; without one the source holds
-    them all already. The fits do not know the difference.
+    With a runner each experiment is played before it is fitted; without one, the source already has
+    all of them. The fits are the same in both cases.
 
     Args:
         source: observations by the experiment's name.
         study: what is played and fitted.
         rig: nominal values of the bench.
-        runner: plays the experiments; None when they are recorded already.
-        told: is called with the title of each fit as it begins.
-        repeated: baseline, maps and controllers of another run, to be played exactly again.
-        fitted: is called with each outcome, as soon as it is known.
-        known: values of an actuator file, for what no experiment of the study gives.
+        runner: plays the experiments; None if they are already recorded.
+        on_fit: called with the title of each fit as it begins.
+        repeated: baseline, maps and controllers of another run, to play again exactly.
+        fitted: called with each outcome, as soon as it is known.
+        known: values of an actuator file that no experiment of the study finds.
     Returns:
         All results.
     Raises:
@@ -77,9 +77,9 @@ def investigate(
     """
 
     def begin(what: str) -> None:
-        if runner is not None and runner.standing_v != 0.0:
+        if runner is not None and runner.present_drive_v != 0.0:
             runner.rest()  # while the fit is made
-        told(what)
+        on_fit(what)
 
     analysis = Analysis(study, rig, source, begin, fitted, repeated, known)
     left_out: dict[str, str] = {}
@@ -111,7 +111,7 @@ def investigate(
 
 
 def _joined_notes(parts: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """All notes by id, those of one id in the order of the parts."""
+    """Join notes by id; those of one id in the order of the parts."""
     found: dict[str, str] = {}
     for key, note in (item for part in parts for item in part.items()):
         found[key] = f"{found[key]}; {note}" if key in found else note
@@ -119,7 +119,7 @@ def _joined_notes(parts: Sequence[Mapping[str, str]]) -> dict[str, str]:
 
 
 def _joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """All entries; a section that several parts have holds what each puts into it."""
+    """Join sections; one that occurs in several parts gets the entries of all of them."""
     found: dict[str, Any] = {}
     for key, value in (item for part in parts for item in part.items()):
         old = found.get(key)

@@ -1,4 +1,4 @@
-"""Plays one experiment on a bench, within the drives that it has declared."""
+"""Play one experiment on a bench, within the drives that it has declared."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Floats = NDArray[np.float64]
 
 
 class Player:
-    """What an experiment plays with: the runner, and what was found so far.
+    """Plays the drives of one experiment, and gives access to earlier findings.
 
     Args:
         runner: of the session.
-        experiment: that plays.
+        experiment: the experiment to play.
         analysis: of the study.
     """
 
@@ -44,15 +44,15 @@ class Player:
     def play(
         self, name: str, drive_v: Floats, frame_rate_hz: float, *, particles: str = ""
     ) -> None:
-        """Open loop: put out one drive value a block and record.
+        """Play one drive value per block in open loop, and record.
 
         Args:
             name: one of `Experiment.recordings`.
             drive_v: in V, shape `(blocks,)`.
             frame_rate_hz: of the camera.
-            particles: name under which the sheet's particles are recorded; empty: they are not.
+            particles: name of the recording of the sheet's particles; empty: not recorded.
         Raises:
-            LimitError: a drive that was not declared, or beyond the drive limits.
+            LimitError: a drive was not declared, or is beyond the drive limits.
             SafetyError: the bench protected itself.
             DeviceError: disk or instrument failed.
         """
@@ -60,7 +60,7 @@ class Player:
         self._runner.play(name, drive_v, frame_rate_hz, self.mass_kg, particles=particles)
 
     def settle(self, drive_v: float, duration_s: float) -> None:
-        """Hold one output without recording, so that creep fades before what comes.
+        """Hold one output without recording, until creep has faded.
 
         Args:
             drive_v: in V.
@@ -72,7 +72,7 @@ class Player:
     def release(
         self, name: str, drive_v: float, settle_s: float, record_s: float, frame_rate_hz: float
     ) -> None:
-        """Lift the mass, wait, let go, record; see `Runner.release`."""
+        """Lift the mass, wait, drop it and record; see `Runner.release`."""
         self._check(np.array([drive_v]))
         self._runner.release(name, drive_v, settle_s, record_s, frame_rate_hz, self.mass_kg)
 
@@ -86,22 +86,22 @@ class Player:
     def close_loop(
         self, name: str, reference: Floats, loop: LoopSettings, frame_rate_hz: float
     ) -> None:
-        """Closed loop, one desired strain a block; see `Runner.close_loop`."""
+        """Close the loop, with one desired strain per block; see `Runner.close_loop`."""
         self._runner.close_loop(name, reference, loop, frame_rate_hz, self.mass_kg)
 
     def rest(self) -> None:
-        """The drive to 0 V, at once; the sensing signal stays."""
+        """Set the drive to 0 V at once; the sensing signal stays on."""
         self._runner.rest()
 
     def _check(self, drive_v: Floats) -> None:
-        """Refuse what the feasibility check has not seen."""
+        """Refuse drives that were not declared to the feasibility check."""
         low_v, high_v = float(np.min(drive_v)), float(np.max(drive_v))
         declared = f"declares drives of {self._low_v:g} to {self._high_v:g} V"
         if low_v < self._low_v - _SAME_V or high_v > self._high_v + _SAME_V:
             worst_v = low_v if low_v < self._low_v - _SAME_V else high_v
             raise LimitError(
                 f"The experiment [{self._name}] {declared}, but plays {worst_v:g} V. Return every "
-                "drive from its method 'drives', so that the feasibility check can judge it."
+                "drive from its method 'drives', so that the feasibility check covers it."
             )
         jump_v = float(np.abs(np.diff(drive_v)).max()) if drive_v.size > 1 else 0.0
         if jump_v > self._jump_v + _SAME_V:

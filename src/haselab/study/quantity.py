@@ -1,4 +1,4 @@
-"""A result's row: its name, its unit, and what a publication printed for it."""
+"""Row of a result: its name, its unit, and the value in a publication."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 __all__ = ["TOLERANCE", "Quantity"]
 
-TOLERANCE = 0.10  # a printed number of two digits is met within this part of it
+TOLERANCE = 0.10  # relative distance within which a printed number of two digits agrees
 
 
 @dataclass(frozen=True)
@@ -16,15 +16,15 @@ class Quantity:
     Args:
         name: for people.
         unit: SI.
-        paper: printed value, or range; None where the paper gives none.
-        recomputed: what the paper's own numbers give; None where nothing was recomputed.
-        paper_note: what the reader should know of the comparison.
+        paper: printed value or range; None: the paper has none.
+        recomputed: value computed from the paper's own numbers; None: not recomputed.
+        paper_note: remark about the comparison.
         within: distance from the printed value that still agrees; None: a tenth of it.
-        setting: what of the study was set to the value; "" for what is measured.
+        setting: what in the study was set to the value; "": the value is measured.
         same_as: id of the row with the same printed quantity; the two count as one comparison.
-        note: what the reader of any study should know.
-        plain_name: for people who do not have the publication; "" where `name` is one.
-        reference_only: it is about the publication, and no result of another study.
+        note: remark for any study.
+        plain_name: name for readers without the publication; "": use `name`.
+        reference_only: the row is about the publication and not part of other studies.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Quantity:
 
     @property
     def agreed(self) -> tuple[float, float] | None:
-        """Values that agree with the paper; None where it gives none."""
+        """Range of values that agree with the paper; None if the paper has no value."""
         if self.paper is None or isinstance(self.paper, tuple):
             return self.paper
         margin = TOLERANCE * abs(self.paper) if self.within is None else self.within

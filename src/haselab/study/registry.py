@@ -1,4 +1,4 @@
-"""Which experiments there are: those of haselab, and those of installed packages."""
+"""The registry of experiments: those of haselab and those of installed packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from haselab.store.toml import Section
 __all__ = ["GROUP", "ExperimentClass", "experiment_classes", "table_types"]
 
 GROUP = "haselab.experiments"  # of entry points
-# In the order of playing; those of other packages follow.
+# In the order of playing; experiments of other packages follow.
 _BUILT_IN = {
     "triangle": "haselab.study.experiments.triangle:TriangleTest",
     "static_load": "haselab.study.experiments.static_load:StaticLoadTest",
@@ -26,7 +26,7 @@ _BUILT_IN = {
 
 
 class ExperimentClass(Protocol):
-    """What the registry has to know of a class of experiments."""
+    """What the registry needs of a class of experiments."""
 
     table: ClassVar[str]
     settings_type: ClassVar[type[Section]]
@@ -40,7 +40,7 @@ def experiment_classes() -> tuple[type[ExperimentClass], ...]:
     Returns:
         Those of haselab, then those of installed packages in the order of their names.
     Raises:
-        InputError: a package's experiment cannot be loaded, or its table has a name that is taken.
+        InputError: a package's experiment cannot be loaded, or its table has a name in use.
     """
     built_in = [EntryPoint(name, value, GROUP) for name, value in _BUILT_IN.items()]
     return _loaded([*built_in, *sorted(entry_points(group=GROUP), key=lambda point: point.name)])
@@ -59,8 +59,8 @@ def _loaded(points: Iterable[EntryPoint]) -> tuple[type[ExperimentClass], ...]:
             ) from error
         if table in found:
             raise InputError(
-                f"The experiment {point.name!r} ({point.value}) reads the table [{table}], which "
-                f"{found[table].__module__} reads already. Rename its table, or uninstall its "
+                f"The experiment {point.name!r} ({point.value}) has the table [{table}], which "
+                f"{found[table].__module__} already uses. Rename its table, or uninstall its "
                 "package."
             )
         found[table] = loaded
@@ -68,7 +68,7 @@ def _loaded(points: Iterable[EntryPoint]) -> tuple[type[ExperimentClass], ...]:
 
 
 def table_types() -> dict[str, type[Section]]:
-    """Classes that check the tables of a study, by name, in the order of playing."""
+    """The classes that check the tables of a study, by name, in the order of playing."""
     return {
         kind.table: kind.settings_type
         for kind in experiment_classes()

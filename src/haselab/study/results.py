@@ -1,4 +1,4 @@
-"""results.json: paper, recomputed, measured here; and which reading the data support."""
+"""Rows of results.json, their agreement with the paper, and the frequency axis that fits."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from haselab.study.simulated.truth import (
 __all__ = [
     "VERDICT_RULE",
     "Quantity",
+    "axis_interpretation",
     "quantities",
     "quantity_rows",
-    "reading_verdict",
     "rows_of",
     "verdict",
 ]
 
 VERDICT_RULE = (
-    "Agrees: the whole 95 % interval lies within 10 % of the printed number (within 0.1 where that "
-    "number is 0), or within the printed range. Disagrees: the whole interval lies outside. "
+    "Agrees: the whole 95 % interval is within 10 % of the printed number (within 0.1 if that "
+    "number is 0), or within the printed range. Disagrees: the whole interval is outside. "
     "Inconclusive: the interval is partly inside."
 )
 _PRINTED_ZETA = 0.09  # eq. 10
 
 
 def verdict(quantity: Quantity, measured: Estimate) -> str:
-    """What a result says of the paper's number, by `VERDICT_RULE`.
+    """Compare a result with the paper's number, by `VERDICT_RULE`.
 
     Args:
         quantity: with the paper's value.
-        measured: with its 95 % interval; one without counts as a point.
+        measured: with its 95 % interval; without one it counts as a point.
     Returns:
         "agrees", "disagrees", "inconclusive" or "not in paper".
     Example:
@@ -74,12 +74,12 @@ def quantity_rows(
 
     Args:
         measured: estimates by id.
-        notes: by id, in front of the table's own.
+        notes: by id, placed before those of the table.
         rig_config: of the session's header, for what was set in a twin.
-        noise_free: of the same experiment without noise, by id; None off the twin.
+        noise_free: results of the same experiments without noise, by id; None: not on a twin.
         study: that was played, whose experiments name the rows; None: the reference study.
     Returns:
-        One row an id, in the table's order.
+        One row per id, in the table's order.
     """
     twin = twin_of(rig_config)
     fixed = {} if study is None else _fixed_by(study)
@@ -125,7 +125,7 @@ def rows_of(study: Study) -> dict[str, Quantity]:
     """All results that a study may have, by id, in the order of the report.
 
     Args:
-        study: the reference study has those of the chip too, which run beside it.
+        study: the reference study also has the rows of the chip's experiments.
     """
     found: dict[str, Quantity] = dict(quantities()) if study.is_reference else {}
     for experiment in experiments_of(study):
@@ -136,10 +136,10 @@ def rows_of(study: Study) -> dict[str, Quantity]:
 
 
 def _fixed_by(study: Study) -> dict[str, str]:
-    """What the settings of a study fix that the built-in one leaves to the data, by id.
+    """Results that the settings of a study fix, but the built-in study finds from data, by id.
 
-    The default twin's numbers were chosen for the operating point that the data give; where another
-    one is fixed, nothing was set in the twin, and results still follow from its parameters.
+    The default twin's parameters were chosen for the operating point found from the data. With
+    another, fixed one nothing was set in the twin, but results still follow from its parameters.
     """
     fixed = {}
     if study.operating_point.baseline_v is not None:
@@ -153,14 +153,14 @@ def _fixed_by(study: Study) -> dict[str, str]:
     return fixed
 
 
-def reading_verdict(
+def axis_interpretation(
     measured: Mapping[str, Estimate], rig_config: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Which reading of the paper's frequency axis the data support.
+    """Decide which interpretation of the paper's frequency axis, rad/s or Hz, the data support.
 
-    Both readings put the same printed number on the axis. The relative distance of a measured
-    frequency from each, with the interval of the printed digits, decides; a frequency that is
-    near neither supports neither. A twin was set to a reading, so that its data decide nothing.
+    The criterion is the relative distance of a measured frequency from the printed number in either
+    unit, with the interval of the printed digits; a frequency near neither supports neither. A twin
+    was set to one interpretation, so its data are no evidence.
 
     Args:
         measured: estimates by id.
@@ -193,8 +193,8 @@ def reading_verdict(
     decays = (measured["S19.decay_1"].value, measured["S19.decay_2"].value)
     evidence.append(
         {
-            "what": "decay of the free response (1/s), printed 3.6 and 4.2; under each reading the "
-            "printed damping ratio 0.09 times 5.11",
+            "what": "decay of the free response (1/s), printed 3.6 and 4.2; expected with each "
+            "interpretation: the printed damping ratio 0.09 times 5.11",
             "rad": _PRINTED_ZETA * 5.11,
             "hz": _PRINTED_ZETA * 2.0 * math.pi * 5.11,
             "data": f"{decays[0]:.2f} and {decays[1]:.2f}",
@@ -202,16 +202,16 @@ def reading_verdict(
     )
     agreed = votes[0] if len(set(votes)) == 1 else "cannot tell"
     words = {
-        "rad": "The data support the reading rad/s, as printed.",
-        "hz": "The data support the reading Hz: the printed number times 2 pi.",
-        "neither": "The data support neither reading: the frequency is near neither number.",
-        "cannot tell": "Chirp and free response point to different readings: cannot tell.",
+        "rad": "The data support rad/s, as printed.",
+        "hz": "The data support Hz: the printed number times 2 pi.",
+        "neither": "The data support neither interpretation: the frequency is near neither number.",
+        "cannot tell": "Inconclusive: chirp and free response support different interpretations.",
     }
     said = words[agreed]
     if is_simulated(rig_config):
         said = (
-            "No verdict: this bench is simulated and was set to one reading, so that its data "
-            "cannot say which one the paper means. As a test of the method: "
+            "No conclusion: this bench is simulated and was set to one interpretation, so its data "
+            "cannot show which one the paper means. As a test of the method: "
             f"{said[0].lower()}{said[1:]}"
         )
     return {"verdict": said, "evidence": evidence}

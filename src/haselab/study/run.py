@@ -1,4 +1,4 @@
-"""A whole run: rig, session, findings, and the folder that a user gets."""
+"""Run or analyse a whole study: rig, session, findings, and the folder of the run."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.camera_recorder import CameraRecorder, KeepVideo
 from haselab.runtime.observer import Observer
 from haselab.runtime.runner import Runner, lockin_of
-from haselab.runtime.scheduling import favoured
-from haselab.runtime.side_observer import SideObserver
+from haselab.runtime.scheduling import with_priority
+from haselab.runtime.threaded_observer import ThreadedObserver
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
@@ -40,7 +40,7 @@ from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
 from haselab.study.known import known_values
 from haselab.study.pipeline import Findings, investigate
-from haselab.study.simulated.noise_free import QuietBench
+from haselab.study.simulated.noise_free import NoiseFreeBench
 
 __all__ = [
     "RunOptions",
@@ -61,10 +61,10 @@ class RunOptions:
     """How a run is recorded.
 
     Args:
-        folder: where everything goes.
+        folder: for all files of the run.
         seed: of the rig's random numbers, for the record.
         keep_video: which frames are kept.
-        rig_config: configuration of the rig as JSON holds it, for the record.
+        rig_config: configuration of the rig as JSON, for the record.
         known: the actuator file that the study starts from; None: there is none.
     """
 
@@ -78,7 +78,7 @@ class RunOptions:
 def session_header(
     study: Study | StepStudy, rig: RigDescription, options: RunOptions
 ) -> dict[str, Any]:
-    """Where the data come from: study, rig, seed, versions, hashes."""
+    """Provenance of the data: study, rig, seed, versions, hashes."""
     study_json = study.model_dump(mode="json")
     known = {} if options.known is None else {"actuator": _recorded(options.known)}
     digest = hashlib.sha256(json.dumps(study_json, sort_keys=True).encode()).hexdigest()
@@ -109,22 +109,22 @@ def _recorded(tables: ActuatorTables) -> dict[str, Any]:
 def recording(
     rig: Rig, options: RunOptions, header: dict[str, Any], planned: Sequence[ExperimentPlan]
 ) -> Iterator[tuple[SessionWriter, Observer]]:
-    """The folder of a run, open: manifest, session and the camera's part.
+    """Open the folder of a run: manifest, session and camera recorder.
 
     Args:
-        rig: the bench; it goes to 0 V where the folder cannot be opened.
+        rig: the bench; it goes to 0 V if the folder cannot be opened.
         options: folder, video.
         header: of the session.
         planned: what will be recorded.
     Raises:
-        DeviceError: the disk refuses.
+        DeviceError: a file cannot be written.
     """
     in_real_time = isinstance(rig, GuardedRig) and rig.safety.settings.real_time
     with ExitStack() as opened:
         try:
             opened.enter_context(Manifest(options.folder, header))
             if in_real_time:
-                opened.enter_context(favoured())
+                opened.enter_context(with_priority())
             queue = QueueRule(patience_s=0.0) if in_real_time else None
             session = opened.enter_context(
                 SessionWriter(
@@ -141,7 +141,7 @@ def recording(
         except BaseException:
             rig.safe()
             raise
-        yield session, SideObserver(camera_recorder) if in_real_time else camera_recorder
+        yield session, ThreadedObserver(camera_recorder) if in_real_time else camera_recorder
 
 
 def run_study(
@@ -155,16 +155,16 @@ def run_study(
 
     Args:
         study: what is played.
-        rig: the bench; it ends at 0 V whatever happens.
+        rig: the bench; it always ends at 0 V.
         options: folder, seed, video.
-        progress: told in rig seconds.
+        progress: in seconds of the rig.
         fitted: see `investigate`.
     Returns:
         All findings.
     Raises:
-        DeviceError: disk or instrument failed; what was recorded is kept.
+        DeviceError: disk or instrument failed; the recorded data are kept.
         SafetyError: the bench protected itself.
-        ResultError: a fit without a result; the recording up to there is kept.
+        ResultError: a fit has no result; the recorded data are kept.
     """
     sensing = study.sensing
     lockin = lockin_of(rig.description, sensing.carrier_hz)
@@ -194,7 +194,7 @@ def run_study(
 def _with_sheet(
     findings: Findings, session: SessionWriter | SessionReader, rig: RigDescription
 ) -> Findings:
-    """The findings with figure 2, of the particles that were tracked in the triangle."""
+    """Add figure 2, of the particles tracked in the triangle test, to the findings."""
     drawn = sheet_figure(
         session.experiment("particles"), session.experiment("triangle"), rig, "video/triangle.png"
     )
@@ -216,23 +216,23 @@ def described(data: Mapping[str, Any]) -> RigDescription:
 def analyse_session(
     path: Path, *, unverified: bool = False
 ) -> tuple[Findings, Study, dict[str, Any]]:
-    """All fits again, from the recorded session alone.
+    """Repeat all fits from the recorded session.
 
     Args:
-        path: session.h5, or the folder that holds it.
-        unverified: read on where a checksum does not match.
+        path: session.h5, or its folder.
+        unverified: continue if a checksum does not match.
     Returns:
         Findings, the study, and the session's header.
     Raises:
-        InputError: no session, a damaged one, or one without some experiment.
+        InputError: no session, a damaged one, or one that lacks an experiment.
         ResultError: a fit without a result.
     """
     path = session_file(path)
     with SessionReader(path, unverified=unverified) as session:
         if "study" not in session.header:
             raise InputError(
-                "The recording holds no study, whose analysis could be repeated. Read it with"
-                f" 'haselab sense' or 'haselab session export'. {path}"
+                "The recording does not contain a study, so there is no analysis to repeat. Read "
+                f"it with 'haselab sense' or 'haselab session export'. {path}"
             )
         try:
             study = checked_study(session.header["study"], path)
@@ -257,10 +257,10 @@ def analyse_session(
 def noise_free_results(
     config: TwinConfig, study: Study, known: ActuatorTables | None, played: Findings
 ) -> dict[str, float]:
-    """What the same experiments and fits give on the same twin with all noise off, by id."""
-    quiet = QuietBench(config, study)
+    """Results of the same experiments and fits on the same twin without noise, by id."""
+    quiet = NoiseFreeBench(config, study)
     sensing = study.sensing
-    # Without noise a sensor at rest repeats itself, which is no fault here.
+    # Without noise a sensor at rest repeats the same value, which is not a fault here.
     patient = SafetySettings(loop=WatchdogSettings(repeat_s=_HOUR_S))
     bench = guard(quiet.rig, Safety(patient))
     arm_simulated(bench)

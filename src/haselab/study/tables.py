@@ -1,4 +1,4 @@
-"""Tables of STUDY.toml: the settings of what haselab itself plays, each checked by itself."""
+"""Tables of STUDY.toml: the settings of haselab's own experiments."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ __all__ = [
     "Triangle",
 ]
 
-LEAST_LOADS = 7  # of the static test: the fit needs six beside the lightest, its reference
+LEAST_LOADS = 7  # of the static test: the fit needs six besides the lightest, its reference
 _DAY_S = 86400.0
 _volt = Field(ge=-100, le=100)
 _frames = Field(gt=0, le=1e5)
 
 
 class Sensing(Section):
-    """The sensing signal, and the calibration data of eqs. 2 and 3 (row D11b)."""
+    """The sensing signal, and the scales of eqs. 2 and 3 (row D11b)."""
 
     carrier_hz: float = Field(2000.0, gt=0, le=1e6)
     carrier_v: float = Field(0.02, gt=0, le=1)
@@ -37,14 +37,14 @@ class Sensing(Section):
 
 
 class OperatingPoint(Section):
-    """Row S18; the weight is the rig's."""
+    """Row S18; the hung mass is the rig's."""
 
     baseline_v: float | None = Field(
         None,
         ge=-100,
         le=100,
-        description="drive voltage of zero strain, DAQ volts; left out: the one that centres the "
-        "strain in the longest linear region",
+        description="drive voltage of zero strain, in V at the DAQ output; default: the one that "
+        "centres the strain in the longest linear region",
     )
 
 
@@ -75,14 +75,14 @@ class StaticLoad(Section):
         None,
         ge=1,
         le=6,
-        description="straight segments of the load curve; left out: as many as BIC prefers",
+        description="straight segments of the load curve; default: chosen by BIC",
     )
 
     @field_validator("masses_kg", mode="after")
     @classmethod
     def _suffice(cls, masses_kg: tuple[float, ...]) -> tuple[float, ...]:
         if (different := len(set(masses_kg))) < LEAST_LOADS:
-            raise ValueError(f"{different} different masses; allowed are {LEAST_LOADS} or more")
+            raise ValueError(f"has {different} different masses, but needs at least {LEAST_LOADS}")
         return masses_kg
 
 
@@ -118,16 +118,16 @@ class Steps(Section):
     pi_trials: int = Field(ge=1, le=1000)
     pid_trials: int = Field(ge=0, le=1000)
     printed_chain_trials: int = Field(
-        0, ge=0, le=100, description="with the PI, closed by the paper's sensing chain"
+        0, ge=0, le=100, description="with the PI and the paper's sensing chain"
     )
     printed_chain_carrier_v: float = Field(
-        0.1, gt=0, le=1, description="of these trials, whose outputs' steps leak into the carrier"
+        0.1, gt=0, le=1, description="of these trials; steps of the output leak into the carrier"
     )
     extra_delay_trials: int = Field(
         0,
         ge=0,
         le=100,
-        description="with a PI for outputs that are held back by extra_delay_blocks",
+        description="with a PI for outputs delayed by extra_delay_blocks",
     )
     extra_delay_blocks: int = Field(1, ge=1, le=10)
     saturating_trials: int = Field(
@@ -135,10 +135,10 @@ class Steps(Section):
     )
     saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain")
     own_trials: int = Field(
-        2, ge=1, le=1000, description="with the controller of [control] kind, where there is one"
+        2, ge=1, le=1000, description="with the controller of [control] kind, if there is one"
     )
     feedback: Literal["capacitance", "video"] = Field(
-        "capacitance", description="what the closed loops take their strain from"
+        "capacitance", description="source of the strain for the closed loops"
     )
 
 
@@ -146,15 +146,18 @@ _LOOP_KEYS = {"kind", "parameters", "saturation_low", "saturation_high"}
 
 
 class Control(Section):
-    """Rows S21, S22, S25; with `kind`, a controller of any registered kind beside the paper's.
+    """Rows S21, S22, S25; `kind` adds a controller of any registered kind to the paper's.
 
     With `kind`, the other keys of the table are the parameters of that kind.
     """
 
     kind: str | None = Field(
-        None, min_length=1, max_length=64, description="registered kind that plays own_trials"
+        None,
+        min_length=1,
+        max_length=64,
+        description="registered kind of the controller for own_trials",
     )
-    parameters: dict[str, float] = Field({}, description="of that kind")
+    parameters: dict[str, float] = Field({}, description="of that controller")
     kp: float = Field(0.85, ge=0, description="printed, for the printed plant gain")
     ki: float = Field(1.5, ge=0)
     plant_gain: float = Field(0.5, gt=0, description="printed static gain, eq. 8")
@@ -172,7 +175,7 @@ class Control(Section):
 
 
 class StepTrials(Section):
-    """Steps by a controller that is ready: row S24, on the chip."""
+    """Step trials with a controller that is already designed: row S24, on the chip."""
 
     step: float = Field(ge=-0.5, le=0.5, description="desired strain, not 0")
     zero_s: float = Field(gt=1, le=3600)

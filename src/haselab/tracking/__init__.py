@@ -21,17 +21,17 @@ from haselab.tracking.strain import (
     homogeneity,
     strain_field,
 )
-from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
+from haselab.tracking.tracks import FrameTracks, LossReason, Tracks, TrackState
 
 __all__ = [
     "DotProfile",
     "FrameTracks",
     "GaugeStrain",
     "Homogeneity",
+    "LossReason",
     "NoiseLaw",
     "Particles",
     "PointTracker",
-    "Reason",
     "StrainField",
     "TrackOptions",
     "TrackState",

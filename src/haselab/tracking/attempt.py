@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab._track import Summary
-from haselab.tracking.options import Floats
+from haselab.tracking.options import Floats, Poses
 from haselab.tracking.reference import Reference
-from haselab.tracking.tracks import FrameTracks, Reason, TrackState
+from haselab.tracking.tracks import FrameTracks, LossReason, TrackState
 
 __all__ = ["FEWER", "Attempt", "better", "distance_px", "joint_affine", "surprise_px"]
 
@@ -23,18 +23,19 @@ class Attempt:
 
     Args:
         poses, velocity_px, reason, gain: of the next state.
-        found: x, y, std x, std y, in px. Shape `(4, P)`.
+        position_px, std_px: along x and y; NaN where not valid. Shape `(2, P)`.
         quality: correlations. Shape `(P,)`.
         summary: what must be looked into.
         believed: number of points that were found.
         surprise_px: median distance from where the velocities put the points.
     """
 
-    poses: Floats
+    poses: Poses
     velocity_px: Floats
     reason: NDArray[np.uint8]
     gain: Floats
-    found: Floats
+    position_px: Floats
+    std_px: Floats
     quality: Floats
     summary: Summary
     believed: int
@@ -43,21 +44,21 @@ class Attempt:
     @property
     def missed(self) -> int:
         """Points that the frame should show and does not."""
-        return int(np.count_nonzero((self.reason != 0) & (self.reason & Reason.LEFT == 0)))
+        return int(np.count_nonzero((self.reason != 0) & (self.reason & LossReason.LEFT == 0)))
 
-    def after(self, reference: Reference, poses: Floats, scatter: float) -> TrackState:
+    def after(self, reference: Reference, poses: Poses, scatter: float) -> TrackState:
         """The state before the next frame."""
         return TrackState(reference, poses, self.velocity_px, self.reason, self.gain, scatter)
 
     def tracks(self) -> FrameTracks:
         """The points in this frame."""
-        x, y, std_x, std_y = self.found
+        (x, y), (std_x, std_y) = self.position_px, self.std_px
         return FrameTracks(x, y, std_x, std_y, self.quality, self.reason == 0, self.reason)
 
 
 def surprise_px(state: TrackState, made: Attempt) -> float:
     """Median distance of the points from where their velocities put them."""
-    away = made.poses[:, :2] - state.poses[:, :2] - state.velocity_px
+    away = made.poses["centre_px"] - state.poses["centre_px"] - state.velocity_px
     known = made.reason == 0
     return float(np.median(np.abs(away[known]).max(axis=1))) if known.any() else np.inf
 
@@ -69,18 +70,19 @@ def better(one: Attempt, other: Attempt) -> Attempt:
     return max(one, other, key=lambda made: made.believed)
 
 
-def joint_affine(state: TrackState, made: Attempt) -> Floats:
+def joint_affine(state: TrackState, made: Attempt) -> Poses:
     """Poses of all points after the affine motion of those that were found."""
     known = made.reason == 0
-    design = np.hstack([state.poses[:, :2], np.ones((len(known), 1))])
-    motion = np.linalg.lstsq(design[known], made.poses[known, :2], rcond=None)[0]
-    matrix = motion[:2].T
-    turned = (matrix @ state.poses[:, 2:].reshape(-1, 2, 2)).reshape(-1, 4)
-    return np.hstack([design @ motion, turned])
+    design = np.hstack([state.poses["centre_px"], np.ones((len(known), 1))])
+    motion = np.linalg.lstsq(design[known], made.poses["centre_px"][known], rcond=None)[0]
+    moved = np.empty_like(state.poses)
+    moved["centre_px"] = design @ motion
+    moved["deformation"] = motion[:2].T @ state.poses["deformation"]
+    return moved
 
 
 def distance_px(one: Attempt, other: Attempt) -> float:
     """Median distance between two attempts of the points that both found."""
     both = (one.reason == 0) & (other.reason == 0)
-    away = one.poses[both, :2] - other.poses[both, :2]
+    away = one.poses["centre_px"][both] - other.poses["centre_px"][both]
     return float(np.median(np.abs(away).max(axis=1))) if both.any() else np.inf

@@ -34,7 +34,7 @@ def may_be_uncertain(attempt: Attempt, scatter: float, options: TrackOptions) ->
 
 def uncertain_points(attempt: Attempt, options: TrackOptions) -> NDArray[np.bool_]:
     """The least certain of the points, without which no more are expected wrong than may be."""
-    std = attempt.found[2:]
+    std = attempt.std_px
     valid = attempt.reason == 0
     out = np.zeros(len(valid), bool)
     if not valid.any():

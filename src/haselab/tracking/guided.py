@@ -97,8 +97,8 @@ class GuidedTracker:
         if moved.any():
             poses, velocity = alone.poses.copy(), alone.velocity_px.copy()
             reason = alone.reason.copy()
-            shift = body.poses[:n, :2] - body.reference.centres_px[:n]
-            poses[moved, :2] = (alone.reference.centres_px + shift)[moved]
+            shift = body.poses["centre_px"][:n] - body.reference.centres_px[:n]
+            poses["centre_px"][moved] = (alone.reference.centres_px + shift)[moved]
             velocity[moved], reason[moved] = body.velocity_px[:n][moved], 0
             alone = replace(alone, poses=poses, velocity_px=velocity, reason=reason)
         names = ("x_px", "y_px", "std_x_px", "std_y_px", "quality", "valid", "reason")

@@ -17,7 +17,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter, uniform_filter
 from scipy.signal import fftconvolve
 
-from haselab.tracking.options import Floats, Frame
+from haselab.tracking.options import Floats, Frame, Poses
 from haselab.tracking.subsets import Subsets
 
 __all__ = ["Hypothesis", "JointSearch", "lookalikes", "repeats"]
@@ -49,11 +49,12 @@ class Hypothesis:
     shift_px: Floats
     height: float
 
-    def moved(self, poses: Floats, middle: Floats) -> Floats:
+    def moved(self, poses: Poses, middle: Floats) -> Poses:
         """Poses after this motion. Shape `(P, 6)`."""
         after = np.empty_like(poses)
-        after[:, :2] = middle + (poses[:, :2] - middle) @ self.matrix.T + self.shift_px
-        after[:, 2:] = (self.matrix @ poses[:, 2:].reshape(-1, 2, 2)).reshape(-1, 4)
+        away = poses["centre_px"] - middle
+        after["centre_px"] = middle + away @ self.matrix.T + self.shift_px
+        after["deformation"] = self.matrix @ poses["deformation"]
         return after
 
 
@@ -95,15 +96,15 @@ class JointSearch:
         side = max(self._side // self._bin, 3)
         return np.asarray(rfft2(_normalised(grey, side, self._floor * self._bin**2), self._size))
 
-    def _pattern(self, poses: Floats, matrix: Floats) -> Singles:
+    def _pattern(self, poses: Poses, matrix: Floats) -> Singles:
         """All templates at their places, turned by the matrix."""
         half = self._side // 2
         offsets = np.mgrid[-half : half + 1, -half : half + 1][::-1].reshape(2, -1)
         source = np.rint(np.linalg.inv(matrix) @ offsets).astype(int)
         inside = (np.abs(source) <= half).all(axis=0)
         values = self._templates[:, source[1, inside] + half, source[0, inside] + half]
-        x = np.rint(poses[:, :1]).astype(int) + offsets[0, inside]
-        y = np.rint(poses[:, 1:2]).astype(int) + offsets[1, inside]
+        middle_x, middle_y = np.rint(poses["centre_px"]).astype(int).T[:, :, np.newaxis]
+        x, y = middle_x + offsets[0, inside], middle_y + offsets[1, inside]
         height, width = self._shape
         seen = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         flat = np.bincount((y * width + x)[seen], values[seen], minlength=height * width)
@@ -127,7 +128,7 @@ class JointSearch:
         ]
 
     def shifts(
-        self, spectrum: NDArray[np.complex64], poses: Floats, count: int = _PEAKS
+        self, spectrum: NDArray[np.complex64], poses: Poses, count: int = _PEAKS
     ) -> list[Hypothesis]:
         """The likeliest shifts of all points together, the likeliest first."""
         pattern = self._pattern(poses, np.eye(2))
@@ -136,9 +137,9 @@ class JointSearch:
             for height, shift in self._peaks(spectrum, pattern, count)
         ]
 
-    def turns(self, spectrum: NDArray[np.complex64], poses: Floats) -> list[Hypothesis]:
+    def turns(self, spectrum: NDArray[np.complex64], poses: Poses) -> list[Hypothesis]:
         """The likeliest turns and changes of size with a shift, the likeliest first."""
-        middle = poses[:, :2].mean(axis=0)
+        middle = poses["centre_px"].mean(axis=0)
         found = []
         for matrix in _matrices():
             moved = Hypothesis(matrix, np.zeros(2), 0.0).moved(poses, middle)
@@ -187,13 +188,13 @@ def lookalikes(picture: Frame | Floats, subsets: Subsets, reach_px: int, least: 
     return out
 
 
-def repeats(search: JointSearch, picture: Frame | Floats, poses: Floats) -> Floats:
+def repeats(search: JointSearch, picture: Frame | Floats, poses: Poses) -> Floats:
     """Shifts that carry the pattern of the points onto something that looks the same.
 
     Args:
         search: of the points.
         picture: the reference. Shape `(H, W)`.
-        poses: of the points in it. Shape `(P, 6)`.
+        poses: of the points in it. Shape `(P,)`.
 
     Returns:
         The shifts, in px, the shortest first. Shape `(R, 2)`; none for scattered dots.

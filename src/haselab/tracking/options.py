@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["Floats", "Frame", "Model", "TrackOptions"]
+__all__ = ["Floats", "Frame", "Model", "Poses", "TrackOptions"]
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
+Poses = NDArray[np.void]  # centre_px and deformation of each subset; native/tracking/track.h
 Model = Literal["translation", "neighbours", "affine"]
 
 _LARGEST_SUBSET_PX = 101

@@ -15,9 +15,15 @@ from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_
 from haselab.tracking.audit import may_be_uncertain, uncertain_points
 from haselab.tracking.camera.fixed_pattern import FixedPattern, find_pattern, stays_with_pixels
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.options import Floats, Frame, Model, TrackOptions
-from haselab.tracking.reference import JUMP_PX, Reference, first_reference, renewed_reference
-from haselab.tracking.tracks import FrameTracks, Reason, Tracks, TrackState
+from haselab.tracking.options import Floats, Frame, Model, Poses, TrackOptions
+from haselab.tracking.reference import (
+    JUMP_PX,
+    Reference,
+    first_reference,
+    poses_at,
+    renewed_reference,
+)
+from haselab.tracking.tracks import FrameTracks, LossReason, Tracks, TrackState
 
 __all__ = ["PointTracker", "track_frames"]
 
@@ -123,7 +129,7 @@ class PointTracker:
         count = len(centres_px)
         return TrackState(
             reference,
-            poses=np.hstack([centres_px, reference.base.reshape(-1, 4)]),
+            poses=poses_at(centres_px, reference.base),
             velocity_px=np.zeros((count, 2)),
             reason=np.zeros(count, np.uint8),
             gain=np.zeros(1),
@@ -181,21 +187,21 @@ class PointTracker:
         # of points that move each for itself, others that come near would pass for uneven light
         if self._together and summary.unevenness > _EVEN_LIGHT and attempt.believed:
             self._take_light_out(state.reference, frame, attempt)
-            audit = _track.audit(state.reference.native, attempt.found)
+            audit = _track.audit(state.reference.native, attempt.position_px, attempt.std_px)
         if state.pattern is not None and not self._together:
-            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + _left_variance(state, attempt))
+            attempt.std_px = np.sqrt(attempt.std_px**2 + _left_variance(state, attempt))
         scatter = self._audited(state, attempt, audit)
         reference, poses = state.reference, attempt.poses
         if summary.due > _DUE * len(self._points) and self._together:
             reference, poses = renewed_reference(
-                reference, frame, poses, attempt.reason == 0, attempt.found[:2].T, self._options
+                reference, frame, poses, attempt.reason == 0, attempt.position_px.T, self._options
             )
         after = replace(attempt.after(reference, poses, scatter), pattern=state.pattern)
         return replace(after, textured=state.textured), attempt.tracks()
 
     def _decided(self, state: TrackState, frame: Frame) -> TrackState:
         """Whether the pattern is the sensor's or the scene's, once enough points have moved."""
-        rest, now = state.reference.centres_px, state.poses[:, :2]
+        rest, now = state.reference.centres_px, state.poses["centre_px"]
         moved = (state.reason == 0) & (np.abs(now - rest).max(axis=1) > _MOVED_PX)
         if state.pattern is None or state.textured is None or 4 * moved.sum() < len(moved):
             return state
@@ -218,12 +224,12 @@ class PointTracker:
         strayed = attempt.summary.strayed / len(self._points)
         if strayed > _MANY_STRAYED and attempt.believed and (attempt.reason == 0).any():
             # so many are no accidents: they are the tails of errors that all points have
-            spread = JUMP_PX / float(np.nanmedian(attempt.found[2:]))
+            spread = JUMP_PX / float(np.nanmedian(attempt.std_px))
             scatter = max(scatter, strayed * spread**2)
         if scatter > 1.0 and attempt.believed:
             # all points of a frame share what shakes them, whatever their own noise
-            common = (scatter - 1.0) * np.nanmean(attempt.found[2:] ** 2)
-            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + common)
+            common = (scatter - 1.0) * np.nanmean(attempt.std_px**2)
+            attempt.std_px = np.sqrt(attempt.std_px**2 + common)
         if state.pattern is not None or may_be_uncertain(attempt, scatter, self._options):
             self._drop(attempt)
         return scatter
@@ -234,8 +240,8 @@ class PointTracker:
         if coarse.any():
             if 3 * np.count_nonzero((attempt.reason == 0) & ~coarse) < len(coarse):
                 coarse = attempt.reason == 0
-            attempt.reason[coarse] = Reason.UNLIKE
-            attempt.found[:, coarse] = np.nan
+            attempt.reason[coarse] = LossReason.UNLIKE
+            attempt.position_px[:, coarse] = attempt.std_px[:, coarse] = np.nan
 
     def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:
         """Corrects the positions for slopes of the light, and their deviations for the cost."""
@@ -244,19 +250,20 @@ class PointTracker:
         used = attempt.reason == 0
         samples[~used] = 0.0
         law = reference.noise
-        matrices = attempt.poses[:, 2:].reshape(-1, 2, 2)
+        matrices = attempt.poses["deformation"]
         level = samples[:, : reference.subsets.side**2].mean(axis=1) + 2.0 ** (reference.bits - 1)
         noise = None if law is None else law.variance(level)
         found = reference.slopes.unevenness(samples, matrices, noise, used)
         if found is not None:
-            attempt.found[:2] += found.shift_px.T
-            attempt.found[2:] = np.sqrt(attempt.found[2:] ** 2 + found.variance_px2.T)
+            attempt.position_px += found.shift_px.T
+            attempt.std_px = np.sqrt(attempt.std_px**2 + found.variance_px2.T)
 
-    def _attempt(self, state: TrackState, frame: Frame, poses: Floats | None = None) -> Attempt:
+    def _attempt(self, state: TrackState, frame: Frame, poses: Poses | None = None) -> Attempt:
         """One frame from where the state, or `poses`, expects the points."""
         reference, count = state.reference, len(self._points)
-        after = np.empty((count, 6)), np.empty((count, 2)), np.empty(count, np.uint8), np.empty(1)
-        found, quality = np.empty((4, count)), np.empty(count)
+        after_poses, gain = np.empty_like(state.poses), np.empty(1)
+        velocity_px, reason = np.empty((count, 2)), np.empty(count, np.uint8)
+        position_px, std_px, quality = np.empty((2, count)), np.empty((2, count)), np.empty(count)
         summary = _track.step(
             reference.native,
             reference.rules,
@@ -266,13 +273,28 @@ class PointTracker:
             state.velocity_px if poses is None else np.zeros((count, 2)),
             state.reason,
             state.gain,
-            *after,
-            found,
+            after_poses,
+            velocity_px,
+            reason,
+            gain,
+            position_px,
+            std_px,
             quality,
         )
-        made = Attempt(*after, found, quality, summary, summary.believed, summary.surprise_px)
+        made = Attempt(
+            poses=after_poses,
+            velocity_px=velocity_px,
+            reason=reason,
+            gain=gain,
+            position_px=position_px,
+            std_px=std_px,
+            quality=quality,
+            summary=summary,
+            believed=summary.believed,
+            surprise_px=summary.surprise_px,
+        )
         if poses is not None:
-            made.velocity_px[:] += poses[:, :2] - state.poses[:, :2]
+            made.velocity_px[:] += poses["centre_px"] - state.poses["centre_px"]
         return made
 
     def _stay_certain(self, state: TrackState, attempt: Attempt) -> None:
@@ -283,8 +305,9 @@ class PointTracker:
         """
         if not attempt.summary.ambiguous and attempt.summary.most_surprise_px <= _SURPRISE_PX:
             return
-        away = np.abs(attempt.poses[:, :2] - state.poses[:, :2] - state.velocity_px).max(axis=1)
-        lost = (state.reason & Reason.AMBIGUOUS) != 0
+        step = attempt.poses["centre_px"] - state.poses["centre_px"]
+        away = np.abs(step - state.velocity_px).max(axis=1)
+        lost = (state.reason & LossReason.AMBIGUOUS) != 0
         jumped = (attempt.reason == 0) & (away > _SURPRISE_PX)
         if jumped.any():
             reach = 4 * max(self._options.search_px, self._options.subset_px)
@@ -292,8 +315,8 @@ class PointTracker:
             jumped &= away > 0.25 * state.reference.lookalikes_px(reach, least)
         lost |= jumped
         if lost.any():
-            attempt.reason[lost] |= np.uint8(Reason.AMBIGUOUS)
-            attempt.found[:, lost] = np.nan
+            attempt.reason[lost] |= np.uint8(LossReason.AMBIGUOUS)
+            attempt.position_px[:, lost] = attempt.std_px[:, lost] = np.nan
 
     def _identified(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
         """The attempt that explains most points, and whether another does so as well."""
@@ -311,7 +334,7 @@ class PointTracker:
         """The joint motion that explains most points; of equals the least surprising."""
         search, count = state.reference.search, len(self._points)
         spectrum = search.spectrum(frame)
-        middle = state.poses[:, :2].mean(axis=0)
+        middle = state.poses["centre_px"].mean(axis=0)
         best = plain
         for proposals in (search.shifts, search.turns):
             for guess in proposals(spectrum, state.poses):
@@ -323,7 +346,7 @@ class PointTracker:
                 break
         return best
 
-    def _tried(self, state: TrackState, frame: Frame, poses: Floats) -> Attempt:
+    def _tried(self, state: TrackState, frame: Frame, poses: Poses) -> Attempt:
         made = self._attempt(state, frame, poses)
         made.surprise_px = surprise_px(state, made)
         return made
@@ -343,7 +366,7 @@ class PointTracker:
         every = [best]
         for shift in around:
             poses = best.poses.copy()
-            poses[:, :2] += shift
+            poses["centre_px"] += shift
             made = self._tried(state, frame, poses)
             if 3 * made.believed > len(self._points) and all(
                 distance_px(made, other) > 0.5 * nearest for other in every
@@ -354,9 +377,14 @@ class PointTracker:
         first = min(near, key=lambda made: made.surprise_px)
         if len(near) == 1 or (moves_on and first.surprise_px <= 0.25 * nearest):
             return first
-        reason = np.where(first.reason == 0, np.uint8(Reason.AMBIGUOUS), first.reason)
-        found = np.where(first.reason == 0, np.nan, first.found)
-        return replace(first, reason=reason, found=found, velocity_px=0.0 * first.velocity_px)
+        found = first.reason == 0
+        return replace(
+            first,
+            reason=np.where(found, np.uint8(LossReason.AMBIGUOUS), first.reason),
+            position_px=np.where(found, np.nan, first.position_px),
+            std_px=np.where(found, np.nan, first.std_px),
+            velocity_px=0.0 * first.velocity_px,
+        )
 
 
 def _left_variance(state: TrackState, attempt: Attempt) -> Floats:
@@ -368,7 +396,7 @@ def _left_variance(state: TrackState, attempt: Attempt) -> Floats:
         return np.zeros((2, len(attempt.reason)))
     subsets = state.reference.subsets
     level = state.pattern.variance / (subsets.norm / state.pattern.scale) ** 2
-    moved = np.abs(attempt.poses[:, :2] - state.reference.centres_px).max(axis=1)
+    moved = np.abs(attempt.poses["centre_px"] - state.reference.centres_px).max(axis=1)
     away = np.minimum(moved * _DOTS_IN_SUBSET / subsets.side, 1.0) ** 2
     return np.asarray((away * level) * np.diagonal(subsets.even, axis1=1, axis2=2).T)
 

@@ -15,10 +15,10 @@ from haselab.tracking.camera.light import LightSlopes, build_slopes
 from haselab.tracking.camera.noise import NoiseLaw, measure_noise
 from haselab.tracking.identity import JointSearch, lookalikes, repeats
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.options import Floats, Frame, TrackOptions
+from haselab.tracking.options import Floats, Frame, Poses, TrackOptions
 from haselab.tracking.subsets import Subsets, build_subsets
 
-__all__ = ["JUMP_PX", "Reference", "first_reference", "renewed_reference"]
+__all__ = ["JUMP_PX", "Reference", "first_reference", "poses_at", "renewed_reference"]
 
 JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
 _MOST_RESIDUAL = 8.0  # mean square residual over the noise's, against the median point
@@ -73,8 +73,7 @@ class Reference:
     @cached_property
     def repeats_px(self) -> Floats:
         """Shifts that carry the points onto look-alikes. Shape `(R, 2)`, the shortest first."""
-        at_rest = np.hstack([self.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (len(self.base), 1))])
-        return repeats(self.search, self.picture, at_rest)
+        return repeats(self.search, self.picture, poses_at(self.centres_px))
 
     def lookalikes_px(self, reach_px: int, least: float) -> Floats:
         """Distance from each point to its nearest look-alike; see `identity.lookalikes`. `(P,)`."""
@@ -96,6 +95,22 @@ class Reference:
 
 def _centres_at_rest(points_px: Floats, base: Floats, subsets: Subsets) -> Floats:
     return np.asarray(points_px - np.einsum("pij,pj->pi", base, subsets.offsets_px))
+
+
+def poses_at(centres_px: Floats, deformation: Floats | None = None) -> Poses:
+    """Poses of subsets with these centres, deformed by the identity when nothing else is given.
+
+    Args:
+        centres_px: centres `[x, y]`, in px. Shape `(P, 2)`.
+        deformation: gradients. Shape `(P, 2, 2)`.
+
+    Returns:
+        The poses. Shape `(P,)`.
+    """
+    poses = np.empty(len(centres_px), _track.POSE)
+    poses["centre_px"] = centres_px
+    poses["deformation"] = np.eye(2) if deformation is None else deformation
+    return poses
 
 
 def first_reference(
@@ -145,11 +160,11 @@ def first_reference(
 def renewed_reference(
     old: Reference,
     frame: Frame,
-    poses: Floats,
+    poses: Poses,
     valid: NDArray[np.bool_],
     where: Floats,
     options: TrackOptions,
-) -> tuple[Reference, Floats]:
+) -> tuple[Reference, Poses]:
     """Templates taken anew from one frame, where its points allow it.
 
     A point's error in that frame has two parts. The one from the frame's noise is in the new
@@ -159,7 +174,7 @@ def renewed_reference(
     Args:
         old: the reference so far.
         frame: the frame, `(H, W)`.
-        poses: centre and deformation gradient of each subset in it. Shape `(P, 6)`.
+        poses: centre and deformation gradient of each subset in it. Shape `(P,)`.
         valid: points that were found in it. Shape `(P,)`.
         where: the points in it, `[x, y]`, in px. Shape `(P, 2)`.
         options: how to track.
@@ -178,13 +193,13 @@ def renewed_reference(
     except InputError:  # no texture in a subset
         return old, poses
     subsets = _merged(old.subsets, fresh, new)
-    stretch = poses[new, 2:].reshape(-1, 2, 2)  # of the old templates
+    stretch = poses["deformation"][new]  # of the old templates
     base, covariance, frames = old.base.copy(), old.covariance.copy(), old.frames.copy()
     base[new] = old.base[new] @ np.linalg.inv(stretch)
     covariance[new] = stretch @ covariance[new] @ stretch.transpose(0, 2, 1)
     frames[new] = 1
     after = poses.copy()
-    after[new] = np.hstack([fresh.centres_px, np.tile([1.0, 0.0, 0.0, 1.0], (int(new.sum()), 1))])
+    after[new] = poses_at(fresh.centres_px)
     centres = _centres_at_rest(old.points_px, base, subsets)
     around = build_neighbourhood(centres, old.points_px)
     native = _native_points(subsets, old.points_px, base, covariance, frames, around)
@@ -252,10 +267,12 @@ def _native_points(
     around: Neighbourhood,
 ) -> _track.Points:
     """The reference in the kernel's layout."""
-    parts = [m[:, [0, 0, 1], [0, 1, 1]] for m in (subsets.even, subsets.shaped, covariance)]
-    parts.append(
-        np.stack([subsets.norm, subsets.level, subsets.residual_share, 1.0 / frames], axis=1)
-    )
+    noise = np.empty(len(frames), _track.NOISE)
+    upper = (slice(None), [0, 0, 1], [0, 1, 1])
+    noise["even"], noise["shaped"] = subsets.even[upper], subsets.shaped[upper]
+    noise["reference"], noise["averaged"] = covariance[upper], 1.0 / frames
+    noise["norm"], noise["level"] = subsets.norm, subsets.level
+    noise["residual_share"] = subsets.residual_share
     return _track.Points(
         shape=subsets.shape,
         gradient=subsets.gradient,
@@ -264,7 +281,7 @@ def _native_points(
         centre=_centres_at_rest(points_px, base, subsets),
         offset=subsets.offsets_px,
         base=np.ascontiguousarray(base.reshape(-1, 4)),
-        noise=np.hstack(parts).astype(np.float32),
+        noise=noise,
         white=_WHITE,
         near=around.index,
         lever=around.lever_px,

@@ -280,15 +280,15 @@ def homogeneity(
         )
     mean_strain, _ = _line(place[:, 1], moved[:, 1], std[:, 1])
     parts = np.array_split(np.argsort(place[:, 1], kind="stable"), bands)
-    slopes = np.array([_line(place[p, 1], moved[p, 1], std[p, 1]) for p in parts])
-    excess = float(np.var(slopes[:, 0]) - np.mean(slopes[:, 1] ** 2))
+    slope, slope_std = np.array([_line(place[p, 1], moved[p, 1], std[p, 1]) for p in parts]).T
+    excess = float(np.var(slope) - np.mean(slope_std**2))
     distance = place[:, 0] - 0.5 * (place[:, 0].min() + place[:, 0].max())
     outward = np.sign(distance) * (moved[:, 0] - np.median(moved[:, 0]))
     sides = np.array_split(np.argsort(np.abs(distance), kind="stable"), bands)
     return Homogeneity(
         height_px=np.array([place[p, 1].mean() for p in parts]),
-        strain=slopes[:, 0],
-        strain_std=slopes[:, 1],
+        strain=slope,
+        strain_std=slope_std,
         mean_strain=mean_strain,
         unevenness=float(np.sqrt(max(excess, 0.0)) / max(abs(mean_strain), 1e-12)),
         offset_px=np.array([np.abs(distance[p]).mean() for p in sides]),

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from haselab.tracking.camera.fixed_pattern import FixedPattern
 from haselab.tracking.camera.noise import NoiseLaw
-from haselab.tracking.options import Floats, Frame
+from haselab.tracking.options import Floats, Frame, Poses
 from haselab.tracking.reference import Reference
 
-__all__ = ["FrameTracks", "Reason", "TrackState", "Tracks"]
+__all__ = ["FrameTracks", "LossReason", "TrackState", "Tracks"]
 
 
-class Reason(IntFlag):
+class LossReason(IntFlag):
     """Why a point is not valid in a frame; several may hold.
 
     UNLIKE: the correlation is below the least quality, the contrast is not above what noise alone
@@ -49,8 +49,8 @@ class FrameTracks:
         quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
             subset shows an even grey.
         valid: whether the point was found.
-        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
-            come from elsewhere.
+        reason: bits of `LossReason` for points that are not valid, else 0; `None` where the
+            positions come from elsewhere.
     """
 
     x_px: Floats
@@ -72,8 +72,8 @@ class Tracks:
         quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
             subset shows an even grey.
         valid: whether the point was found.
-        reason: bits of `Reason` for points that are not valid, else 0; `None` where the positions
-            come from elsewhere.
+        reason: bits of `LossReason` for points that are not valid, else 0; `None` where the
+            positions come from elsewhere.
     """
 
     x_px: Floats
@@ -105,9 +105,9 @@ class TrackState:
 
     Args:
         reference: what the frames are compared with.
-        poses: centre of each subset `x, y` in px and its deformation gradient. Shape `(P, 6)`.
+        poses: `centre_px` of each subset and its `deformation` gradient. Shape `(P,)`.
         velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
-        reason: `Reason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
+        reason: `LossReason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
         gain: median over the points of the contrast over the reference's; 0 before the first
             frame. Shape `(1,)`.
         scatter: mean square of the points' scatter about a smooth field over what their deviations
@@ -118,7 +118,7 @@ class TrackState:
     """
 
     reference: Reference
-    poses: Floats
+    poses: Poses
     velocity_px: Floats
     reason: NDArray[np.uint8]
     gain: Floats

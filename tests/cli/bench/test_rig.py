@@ -18,9 +18,9 @@ import pytest
 
 from haselab.cli.bench import rig as rig_commands
 from haselab.cli.main import main
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.checks import CheckResult, LivePlan
+from haselab.rig.real_bench import RealBench
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.safety.interlock import Interlock

@@ -32,7 +32,7 @@ def test_the_examples_are_listed(capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("chrip", "--out", "x"), "There is no example 'chrip'. Name one of monitors, cycles"),
+        (("chrip", "--out", "x"), "There is no example 'chrip'. Use one of monitors, cycles"),
         (("chirp",), "Missing option '--out'"),
         (("--out", "x"), "--out needs the NAME of a data set"),
     ],

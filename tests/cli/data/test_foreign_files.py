@@ -354,14 +354,14 @@ def test_a_conversion_is_reported(tmp_path, capsys):
     time_s, u, y = sweep()
     file = german(tmp_path / "a.csv", "Zeit [ms];U;x [mm]", 1e3 * time_s, u, 1e3 * y)
     assert code_of("identify", "arx", file, "--input", "U", "--output", "x") == 0
-    assert "column x is converted from mm to m" in capsys.readouterr().err
+    assert "column x was converted from mm to m" in capsys.readouterr().err
 
 
 # ---- what cannot be decided ---------------------------------------------------------------------
 
 REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
     "comma twice": ("u,y\n1,5,2,5\n1,6,2,6\n1,7,2,7\n", (), "commas separate the columns and the"),
-    "name twice": ("u;y;y\n1;2;3\n1;2;4\n", (), "Column y is there 2 times, as columns 2, 3"),
+    "name twice": ("u;y;y\n1;2;3\n1;2;4\n", (), "The file has 2 columns y: columns 2, 3"),
     "unknown unit": ("u [lbf];y\n1;2\n2;3\n", (), "Column 'u [lbf]' states the unit 'lbf'"),
     "case decides": (
         "u (mpa);y\n1;2\n2;3\n",
@@ -369,7 +369,7 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
         "states the unit 'mpa', which is not known",
     ),
     "two marks": ("u;y\n0,5;1.234\n0,6;1.235\n", (), "Column y has decimal points, but other col"),
-    "thousands": ("u;y\n0,5;1.234,5\n0,6;0,1\n", (), "Column y holds '1.234,5' in line 2"),
+    "thousands": ("u;y\n0,5;1.234,5\n0,6;0,1\n", (), "Column y has '1.234,5' in line 2"),
     "empty cell": ("u;y\n0,5;1,5\n0,6;\n0,7;1,7\n", (), "Column y has no value in line 3"),
     "no header": (
         "0,5;1,5\n0,6;1,6\n",
@@ -377,7 +377,7 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
         "no header row with u, y. Add one, or name",
     ),
     "no such column": ("a;b\n0,5;1,5\n0,6;1,6\n", (), "Name the columns with --input and --output"),
-    "no unit": ("u;y\n1;2\n2;3\n", ("--unit", "u"), "--unit u has no COLUMN=UNIT"),
+    "no unit": ("u;y\n1;2\n2;3\n", ("--unit", "u"), "--unit u is not COLUMN=UNIT"),
     "bad unit": (
         "u;y\n1;2\n2;3\n",
         ("--unit", "u=parsec"),
@@ -392,9 +392,9 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
     "clock times": (
         "z;u;y\n10:00:01;2;3\n10:00:02;3;4\n",
         ("--time", "z"),
-        "Column z holds no times",
+        "Column z has no times",
     ),
-    "units in cells": ("u;y\n1 V;2 mm\n2 V;3 mm\n3 V;4 mm\n", (), "Column u holds '1 V' in line 2"),
+    "units in cells": ("u;y\n1 V;2 mm\n2 V;3 mm\n3 V;4 mm\n", (), "Column u has '1 V' in line 2"),
     "workbook": ("PK", (), "Export the data as CSV"),
 }
 
@@ -417,7 +417,7 @@ def test_a_quantity_refuses_the_unit_of_another_one(tmp_path, capsys):
     assert "Column U is in mA, but --voltage needs the voltage in V" in capsys.readouterr().err
     path.write_text("v_monitor_v [s],i_monitor_v\n" + rows(V, I))
     assert code_of("sense", path, "--carrier-hz", 2000, "--rate-hz", 5e4, "--v", "1") == 2
-    assert "The column of --v is in s, but it needs V" in capsys.readouterr().err
+    assert "The column of --v is in s, but must be in V" in capsys.readouterr().err
 
 
 def test_a_column_t_that_does_not_rise_is_no_time(tmp_path, capsys):
@@ -438,7 +438,7 @@ def test_a_rate_that_contradicts_a_foreign_time_column_is_refused(tmp_path, caps
     for words in (("sense", path, "--carrier-hz", 2000), ("identify", "arx", path)):
         named = foreign.arguments() if words[0] == "sense" else ("--input", "2", "--output", "3")
         assert code_of(*words, *named, "--rate-hz", 49e3) == 2
-        assert "contradicts column Zeit [ms], which has 50000 rows" in capsys.readouterr().err
+        assert "but column Zeit [ms] has 50000 rows" in capsys.readouterr().err
 
 
 def test_units_need_no_header_of_their_own_kind(tmp_path):

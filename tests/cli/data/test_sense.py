@@ -208,10 +208,10 @@ def test_readings_of_the_actuator_itself_are_told_from_those_of_monitors(tmp_pat
     assert "--volt-per-monitor-volt 1 --ampere-per-monitor-volt 1" in message
     options = ["--carrier-hz", 2000, "--rate-hz", 2e5, "--full-scale-v", 5000]
     assert run("sense", source, *options) == 0
-    assert "more than a monitor has" in capsys.readouterr().err
+    assert "more than any monitor output" in capsys.readouterr().err
     options += ["--volt-per-monitor-volt", 1, "--ampere-per-monitor-volt", 1]
     assert run("sense", source, *options) == 0
-    assert "more than a monitor has" not in capsys.readouterr().err
+    assert "more than any monitor output" not in capsys.readouterr().err
 
 
 def test_a_warning_keeps_the_causes_of_all_blocks(tmp_path, record, capsys):
@@ -234,11 +234,13 @@ def test_the_recording_itself_is_never_the_answers_place(tmp_path, record, capsy
     link.symlink_to(file)
     for out in (file, link):
         assert run("sense", file, "--carrier-hz", 2000, "--rate-hz", 200000, "--out", out) == 2
-        assert "names what is read" in capsys.readouterr().err
+        assert "names a file that is read" in capsys.readouterr().err
     assert file.read_bytes() == before
 
 
-@pytest.mark.parametrize(("good", "code", "words"), [(1, 3, "Hardly any"), (8, 0, "warning: only")])
+@pytest.mark.parametrize(
+    ("good", "code", "words"), [(1, 3, "Too few blocks"), (8, 0, "warning: only")]
+)
 def test_few_valid_blocks_are_no_quiet_result(
     record: np.ndarray, tmp_path: Path, capfd: pytest.CaptureFixture[str], good: int, code: int,
     words: str,

@@ -19,8 +19,8 @@ from haselab.pipelines.calibration_file import save_calibration
 from haselab.pipelines.prefetch import ahead, in_order
 from haselab.pipelines.sensing import source as sense_source
 from haselab.pipelines.sensing.table import Summary
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.calibration import Calibration, Reference, ReferenceReading
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
@@ -109,7 +109,7 @@ def lockin(**changes: object) -> Lockin:
 
 
 def test_each_kind_of_file_gives_the_same_rows_as_the_lockin_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PIECE_ROWS", 5 * BLOCK)  # 12 blocks in 5, 5 and 2
+    monkeypatch.setattr(sense_source, "_PART_ROWS", 5 * BLOCK)  # 12 blocks in 5, 5 and 2
     sensed = lockin().sense(RECORD.reshape(-1, BLOCK, 2))
     rows = {}
     for kind in KINDS:
@@ -132,7 +132,7 @@ def test_the_length_of_the_pieces_leaves_no_trace(tmp_path, monkeypatch, method)
     source = save(tmp_path / "pairs.npy", RECORD)
     told = []
     for blocks in (1, 3, 100):
-        monkeypatch.setattr(sense_source, "_PIECE_ROWS", blocks * BLOCK)
+        monkeypatch.setattr(sense_source, "_PART_ROWS", blocks * BLOCK)
         out = tmp_path / f"{blocks}.csv"
         assert run(source, *ASK, "--method", method, "--out", out) == 0
         told.append(out.read_text())
@@ -194,9 +194,9 @@ def test_one_bad_reading_costs_its_block_alone_and_says_why(
     [
         (lambda r: r[:, ::-1], [], 3, "swapped, or one monitor inverted", "phase out of band"),
         (lambda r: r * [1, -1], [], 3, "swapped, or one monitor inverted", "phase out of band"),
-        (lambda r: r * np.nan, [], 3, "not finite", "not a finite number"),
+        (lambda r: r * np.nan, [], 3, "NaN or infinite", "not a finite number"),
         (lambda r: np.clip(60 * r, -10, 10), [], 3, "clipped", "clipped"),
-        (lambda r: r * [1, 0], [], 3, "No block of 12 shows a carrier", "amplitude lost"),
+        (lambda r: r * [1, 0], [], 3, "None of 12 blocks shows a carrier", "amplitude lost"),
         (lambda r: r, ["--rate-hz", "100000"], 3, "Check --carrier-hz, --rate-hz", None),
         (lambda r: r, ["--rate-hz", "250000"], 3, "Check --carrier-hz, --rate-hz", None),
     ],
@@ -208,7 +208,7 @@ def test_a_record_without_one_valid_block_is_one_line_and_rows_with_the_reason(
     assert run(source, *ASK, *options, "--out", out) == code
     told = capsys.readouterr()
     assert told.out == ""
-    lines = [line for line in told.err.splitlines() if "fill no block" not in line]
+    lines = [line for line in told.err.splitlines() if "do not fill a block" not in line]
     assert len(lines) == 1
     assert words in lines[0]
     columns = read(out)
@@ -220,8 +220,8 @@ def test_a_record_without_one_valid_block_is_one_line_and_rows_with_the_reason(
 @pytest.mark.parametrize(
     ("kind", "record", "words"),
     [
-        ("pairs.npy", RECORD[: BLOCK - 1], "has 1999 samples, a block 2000"),
-        ("a.csv", RECORD[: BLOCK - 1], "has 1999 samples, a block 2000"),
+        ("pairs.npy", RECORD[: BLOCK - 1], "has 1999 samples, but a block has 2000"),
+        ("a.csv", RECORD[: BLOCK - 1], "has 1999 samples, but a block has 2000"),
         ("pairs.npy", RECORD[:0], "is empty"),
         ("stored.npz", RECORD[:0], "is empty"),
         ("a.csv", RECORD[:0], "is empty"),
@@ -251,7 +251,7 @@ def test_a_file_without_a_byte_is_one_line(tmp_path, capsys, suffix):
 def test_a_missing_channel_names_what_is_there(tmp_path, capsys):
     np.savez(tmp_path / "a.npz", v_monitor_v=RECORD[:, 0], current=RECORD[:, 1])
     assert run(tmp_path / "a.npz", *ASK) == 2
-    assert "lacks i_monitor_v; present are v_monitor_v, current" in capsys.readouterr().err
+    assert "lacks i_monitor_v; it has v_monitor_v, current" in capsys.readouterr().err
     np.save(tmp_path / "a.npy", RECORD[:, 0])
     assert run(tmp_path / "a.npy", *ASK) == 2
     assert "or two columns with shape (n, 2)" in capsys.readouterr().err
@@ -261,14 +261,14 @@ def test_samples_beyond_the_last_block_are_told(tmp_path, capsys):
     assert run(save(tmp_path / "pairs.npy", RECORD[: 3 * BLOCK + 17]), *ASK, "--json") == 0
     told = capsys.readouterr()
     assert json.loads(told.out)["blocks"] == 3
-    assert "17 samples at the end fill no block" in told.err
+    assert "the last 17 samples do not fill a block" in told.err
 
 
 def test_a_rate_that_contradicts_the_file_is_refused(tmp_path, capsys):
     source = tmp_path / "a.npz"
     np.savez(source, v_monitor_v=RECORD[:, 0], i_monitor_v=RECORD[:, 1], rate_hz=100e3)
     assert run(source, *ASK) == 2
-    assert "contradicts the file's own rate, which has 100000 rows" in capsys.readouterr().err
+    assert "but the file's own rate has 100000 rows" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("share", "code"), [(2.0, 2), (0.5, 2), (1.01, 2), (1.0, 0)])
@@ -277,7 +277,7 @@ def test_a_rate_that_contradicts_the_times_is_refused(tmp_path, capsys, share, c
     time_s = np.arange(len(RECORD)) / RATE_HZ * share
     np.savez(source, v_monitor_v=RECORD[:, 0], i_monitor_v=RECORD[:, 1], time_s=time_s)
     assert run(source, *ASK) == code
-    assert ("contradicts column time_s" in capsys.readouterr().err) == (code == 2)
+    assert ("but column time_s has" in capsys.readouterr().err) == (code == 2)
 
 
 def test_times_in_ms_are_hinted_at(tmp_path, capsys):
@@ -294,7 +294,7 @@ def test_samples_that_are_missing_in_the_middle_are_one_line(tmp_path, capsys):
     source = tmp_path / "a.npz"
     np.savez(source, v_monitor_v=RECORD[:, 0], i_monitor_v=RECORD[:, 1], time_s=time_s)
     assert run(source, "--carrier-hz", 2000) == 2
-    assert "time_s steps by 0.010005 s to row 9001" in capsys.readouterr().err
+    assert "time_s has a step of 0.010005 s before row 9001" in capsys.readouterr().err
 
 
 # ---- sessions and calibrations --------------------------------------------------------------
@@ -314,7 +314,7 @@ def session(path: Path, blocks: int = 23, **header: object) -> np.ndarray:
 
 
 def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PIECE_ROWS", 7 * BLOCK)  # chunks of 10 blocks
+    monkeypatch.setattr(sense_source, "_PART_ROWS", 7 * BLOCK)  # chunks of 10 blocks
     codes = session(tmp_path / "session.h5")
     out = tmp_path / "out.csv"
     assert run(tmp_path / "session.h5", "--experiment", "play", "--out", out) == 0
@@ -336,7 +336,11 @@ def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
     ("header", "options", "words"),
     [
         ({}, [], "a session with the experiments play. Name one with --experiment"),
-        ({}, ["--experiment", "never"], "No experiment 'never' with blocks; there are play."),
+        (
+            {},
+            ["--experiment", "never"],
+            "The session has no experiment 'never' with blocks, only play.",
+        ),
         ({}, ["--experiment", "play", "--block-s", "0.02"], "blocks have 0.01 s"),
         ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),
         ({"study": {}}, ["--experiment", "play"], "lacks study.sensing"),
@@ -352,7 +356,7 @@ def test_what_a_session_lacks_is_one_line(tmp_path, capsys, header, options, wor
 
 def test_a_file_that_is_no_session_has_no_experiment(tmp_path, capsys):
     assert run(save(tmp_path / "plain.h5", RECORD), "--experiment", "play") == 2
-    assert "Not a whole haselab session" in capsys.readouterr().err
+    assert "The file is not a complete haselab session" in capsys.readouterr().err
 
 
 def calibration(**changes: object) -> Calibration:
@@ -394,7 +398,7 @@ def test_a_calibration_of_something_else_is_refused(tmp_path, capsys):
 
 
 def test_json_holds_every_column_to_the_last_digit(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PIECE_ROWS", 5 * BLOCK)
+    monkeypatch.setattr(sense_source, "_PART_ROWS", 5 * BLOCK)
     record = spoiled(v=np.nan)
     assert run(save(tmp_path / "pairs.npy", record), *ASK, "--json") == 0
     answer = json.loads(capsys.readouterr().out)

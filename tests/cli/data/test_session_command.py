@@ -60,7 +60,9 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
     (folder / "video" / "late.mkv").write_bytes(b"x")
     code, _, line = typed(capsys, "recover", folder)
     assert code == 2
-    assert line.startswith("haselab: 1 files are not those that were sealed: video/late.mkv.")
+    assert line.startswith(
+        "haselab: 1 files were changed after the recording was sealed: video/late.mkv."
+    )
 
 
 @pytest.mark.parametrize(
@@ -74,7 +76,7 @@ def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys)
         ),
         (("session", "export", "{run}/none", "--to", "csv", "--out", "{run}/x"), "No session here"),
         (("recover", "{run}/none"), "No session here"),
-        (("analyse", "{run}"), "holds no study, whose analysis could be repeated"),
+        (("analyse", "{run}"), "does not contain a study"),
     ],
 )
 def test_bad_input_is_one_line(folder, capsys, arguments, words):
@@ -98,7 +100,7 @@ def test_a_copy_of_a_session_is_not_analysed_over_the_results_beside_it(folder, 
     copy.write_bytes((folder / "session.h5").read_bytes())
     for force in ((), ("--force",)):
         code, _, line = typed(capsys, "analyse", copy, *force)
-        assert code == 2 and "Give --out DIR" in line
+        assert code == 2 and "Add --out DIR" in line
     assert "is not empty" in typed(capsys, "analyse", copy, "--out", tmp_path)[2]
     assert results.read_text() == "those of another session"
 
@@ -107,7 +109,7 @@ def test_an_analysis_does_not_write_through_linked_folders(folder, tmp_path, cap
     (tmp_path / "others").mkdir()
     (folder / "firmware").symlink_to(tmp_path / "others")
     code, _, line = typed(capsys, "analyse", folder)
-    assert code == 2 and "This is a link to" in line
+    assert code == 2 and "This path is a link to" in line
 
 
 def test_the_drive_is_imported_block_by_block_and_times_without_a_unit_are_named(

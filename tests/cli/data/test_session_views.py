@@ -147,5 +147,5 @@ def test_an_experiment_that_is_not_there_is_refused_and_nothing_stays(session, t
     out = tmp_path / "csv"
     assert code_of("session", "export", session, "--to", "csv", "--experiment", "never", "--out",
                    out) == 2  # fmt: skip
-    assert "No experiment 'never' in this session; there are bare" in capsys.readouterr().err
+    assert "The session has no experiment 'never', only bare" in capsys.readouterr().err
     assert not out.exists()

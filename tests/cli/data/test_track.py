@@ -156,10 +156,10 @@ def test_wrong_usage_and_missing_files_end_with_code_2(clip, tmp_path, capsys):
         part in line
         for part, line in zip(
             (
-                "--out OUT.csv is needed",
+                "Missing option '--out'",
                 "no such video",
                 "excludes --auto",
-                "only 6 frames can be read",
+                "has only 6 frames",
             ),
             lines,
             strict=True,
@@ -279,8 +279,8 @@ def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, ca
         (("--fixed", "left"), "No point has the name left"),
         (("--lens", "nothing.json"), "No such file"),
         (("--overlay", "a.gif"), "take .mp4"),
-        (("--times", "nothing.csv"), "holds no times"),
-        (("--rest-frames", "9"), "only 6 frames can be read"),
+        (("--times", "nothing.csv"), "has no times"),
+        (("--rest-frames", "9"), "has only 6 frames"),
     ],
 )
 def test_scales_and_options_that_cannot_be_used_end_with_one_line(
@@ -316,7 +316,7 @@ def test_a_truncated_video_keeps_what_was_read_and_ends_with_code_2(tmp_path, ca
     assert len(read(out)) == 6 * kept
     assert len(read(tmp_path / "t-strain.csv")) == kept
     assert "copy it again" in summary["incomplete"]
-    assert f"Only {kept} frames were tracked, their rows are kept" in captured.err
+    assert f"Only {kept} frames were tracked; their rows are kept" in captured.err
     assert captured.err.count("\n") == 1
 
 
@@ -490,7 +490,7 @@ def test_motion_among_the_rest_frames_is_told_and_left_out(tmp_path, capsys):
     assert call(*arguments, "--out", out) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["rest_frames"] == 6
-    warning = "--rest-frames 10, but the points move from frame 6 on"
+    warning = "--rest-frames is 10, but the points move from frame 6 on"
     assert warning in captured.err and warning in page.read_text()
     for number, row in enumerate(read(out)):
         truth = 30 + 0.5 * max(number - 5, 0)

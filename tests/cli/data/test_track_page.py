@@ -14,9 +14,9 @@ import tifffile
 from haselab.cli.data.track import command
 from haselab.cli.main import cli
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
-from haselab.tracking import Reason
+from haselab.tracking import LossReason
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "tracking.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "measure" / "tracking.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 COMMANDS = [
     line
@@ -155,7 +155,7 @@ def test_the_page_names_every_option_and_every_reason():
     options = {name for param in command.params for name in param.opts}
     common = {"--json", "--debug", "--help", "-h", "video"}
     assert options - common - set(re.findall(r"--[a-z-]+", TEXT)) == set()
-    assert {r.name for r in Reason if f"`{str(r.name).lower()}`" not in TEXT} == set()
+    assert {r.name for r in LossReason if f"`{str(r.name).lower()}`" not in TEXT} == set()
 
 
 def test_the_header_of_the_table_is_that_of_the_page(records, monkeypatch):

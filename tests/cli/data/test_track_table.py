@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from haselab.pipelines.tracking.kept import Kept
 from haselab.pipelines.tracking.table import COLUMNS, METRES, Block, TrackRows, reason_name
-from haselab.tracking import Reason, Tracks
+from haselab.tracking import LossReason, Tracks
 
 FEW = st.floats(-9e4, 9e4, allow_nan=False)
 
@@ -50,7 +50,7 @@ def test_lost_points_read_nan_with_their_reason_and_names_are_quoted():
     numbers = np.full((5, 2, 2), 1.5)
     numbers[:4, 1, 0] = np.nan
     reason = np.zeros((2, 2), np.uint8)
-    reason[1, 0] = Reason.UNLIKE | Reason.COVERED
+    reason[1, 0] = LossReason.UNLIKE | LossReason.COVERED
     names = ['left, "top"', "été"]
     rows = lines(TrackRows(names, 1e-4), block_of(numbers, reason, first=41), np.zeros((2, 2)))
     assert rows[0] == [*COLUMNS, *METRES, "reason"]
@@ -63,7 +63,7 @@ def test_lost_points_read_nan_with_their_reason_and_names_are_quoted():
 
 def test_every_reason_has_a_word():
     assert reason_name(0) == ""
-    assert all(reason_name(int(flag)) for flag in Reason)
+    assert all(reason_name(int(flag)) for flag in LossReason)
 
 
 def test_of_a_long_clip_all_of_the_few_points_and_some_frames_of_all_are_kept():

@@ -103,12 +103,12 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
     [
         (
             {"run/udev/data/c166:0": "E:ID_MM_CANDIDATE=1\n"},
-            "ModemManager runs and may send AT commands to /dev/ttyACM0",
+            "ModemManager is running and may send AT commands to /dev/ttyACM0",
             'KERNEL=="ttyACM0", ENV{ID_MM_DEVICE_IGNORE}="1"\' | sudo tee -a /etc/udev/rules.d/',
         ),
         (
             {"proc/sys/net/core/rmem_max": "212992"},
-            "net.core.rmem_max is 212992 bytes, a frame of the camera 262144",
+            "net.core.rmem_max is 212992 bytes, but a frame of the camera has 262144",
             "echo net.core.rmem_max=1048576 | sudo tee /etc/sysctl.d/90-haselab.conf",
         ),
         (
@@ -119,7 +119,7 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
         ({"sys/class/net/eth1/speed": "100"}, "eth1 is a link of 100 Mbit/s", "Use a cable of"),
         (
             {"proc/net/route": ROUTES + OUT},
-            "no port of this computer is in the camera's network (192.168.1.7)",
+            "no network port of this computer is in the camera's network (192.168.1.7)",
             "sudo ip addr add 192.168.1.1/24 dev PORT",
         ),
         (
@@ -147,7 +147,7 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
         ),
         (
             {f"{CAMERA}/speed": "480"},
-            "BFS-U3-13Y3M is connected at 480 Mbit/s, as USB 2",
+            "BFS-U3-13Y3M is connected at only 480 Mbit/s (USB 2)",
             "Use a USB 3 port",
         ),
         (
@@ -191,7 +191,7 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
                 "etc/os-release": 'ID=debian\nPRETTY_NAME="Debian GNU/Linux 12"\n',
             },
             "NI-DAQmx is not installed",
-            "none for Debian GNU/Linux 12: use a Windows computer",
+            "not for Debian GNU/Linux 12: use a Windows computer",
         ),
         *(
             (
@@ -200,10 +200,10 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
                     "etc/os-release": f"ID=other\nID_LIKE={likes}\nPRETTY_NAME='Other 1'\n",
                 },
                 "NI-DAQmx is not installed",
-                "none for Other 1: use a Windows"
+                "not for Other 1: use a Windows"
                 if like is None
-                else f"no packages for Other 1, but for {like}, which it is derived from or "
-                f"close to: try NI Linux Device Drivers for {like} from ni.com, or use a Windows",
+                else f"no packages for Other 1, but has some for the related {like}: try NI Linux "
+                f"Device Drivers for {like} from ni.com, or use a Windows",
             )
             for likes, like in [
                 ('"ubuntu debian"', "Ubuntu"),
@@ -224,7 +224,7 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
         ),
         (
             {"dev/ttyACM0": None},
-            "/dev/ttyACM0 is not there",
+            "/dev/ttyACM0 does not exist",
             "ls /dev/ttyACM* /dev/ttyUSB*",
         ),
     ],
@@ -281,7 +281,7 @@ def test_a_camera_by_name_or_none_leaves_the_ports_alone(plant):
 def test_a_local_board_on_macos_is_told_to_use_a_server(tmp_path):
     machine = Machine(tmp_path, "darwin", 1, frozenset())
     (found,) = examine_system(machine, SystemNeeds(local_daq=True))
-    assert found.detail == "NI-DAQmx does not exist for macOS" and "daq.server" in found.advice
+    assert found.detail == "NI-DAQmx is not available for macOS" and "daq.server" in found.advice
 
 
 @pytest.mark.parametrize("junk", ["", "x", "\x00\xff", "CapEff:", "a b c\nd e"])
@@ -292,5 +292,5 @@ def test_files_with_junk_are_no_crash(plant, junk):
 
 def test_a_port_with_a_null_character_is_not_there_and_no_fault_of_the_program(plant):
     told = bad(plant(), SystemNeeds(serial_ports=("/dev/tty\x00x",)))
-    assert "is not there" in told[0].detail
+    assert "does not exist" in told[0].detail
     assert plant().group("dev/tty\x00x") == "dialout"

@@ -132,9 +132,9 @@ def test_modes_of_a_proportional_input(tmp_path):
         (["verdict", "{file}", "--question", "creep", "--risk", "0.9"], r"risk = 0\.9"),
         (
             ["verdict", "{file}", "--question", "creep", "--linear"],
-            "--linear with --question creep",
+            "not supported with --question creep",
         ),
-        (["verdict", "{model}", "--question", "agreement"], "is no estimate here"),
+        (["verdict", "{model}", "--question", "agreement"], "has no estimate"),
     ],
 )
 def test_bad_use_of_a_verdict_is_told_in_one_line(alternation, model, arguments, match):
@@ -146,8 +146,8 @@ def test_bad_use_of_a_verdict_is_told_in_one_line(alternation, model, arguments,
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        (["--goal", "colour"], "--goal = colour; allowed are creep, reading"),
-        (["--goal", "all", "--capacitance-f", "0"], "--capacitance-f = 0 F"),
+        (["--goal", "colour"], "--goal is colour, but must be one of creep, reading"),
+        (["--goal", "all", "--capacitance-f", "0"], "--capacitance-f is 0 F"),
         (["--goal", "all", "--baseline-v", "9"], "baseline_v = 9 V"),
         (["--goal", "all", "--duration-s", "-1"], "duration_s = -1 s"),
         (["--goal", "all", "--noise-std", "0"], "noise_std = 0"),

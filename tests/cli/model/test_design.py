@@ -70,8 +70,8 @@ def test_demands_of_a_file_are_met_or_the_command_exits_with_3(model, tmp_path, 
     ("text", "message"),
     [
         ("{", "model.json is not a JSON document"),
-        ("{}", "the model holds nothing"),
-        ('{"poles": []}', "the model holds poles"),
+        ("{}", "The model has the keys none"),
+        ('{"poles": []}', "The model has the keys poles"),
         ('{"plant": {"gain": 1}}', "natural_frequency_rad_s"),
         ('{"plant": {"natural_frequency_rad_s": 5, "damping_ratio": 0.1}}', "gain"),
         (
@@ -144,7 +144,7 @@ def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, cap
         model.write_text(json.dumps(told | {"loop_delay_s": wrong}))
         code, _, error = run(capsys, "design", model)
         assert code == 2
-        assert error.startswith("haselab: 1 fault(s): loop_delay_s: Input should be ")
+        assert error.startswith("haselab: 1 error(s): loop_delay_s: Input should be ")
 
 
 def test_margins_of_given_gains_are_those_of_the_library(model, capsys):

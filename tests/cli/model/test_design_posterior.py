@@ -96,7 +96,7 @@ def changed(key, value):
     [
         (changed("values", [1.0, 32.1, None, 0.012]), "damping_ratio is not identifiable"),
         (changed("matrix", [[None] * 4] * 4), "gain is not identifiable"),
-        (changed("values", [1.0, 40.0, 0.12, 0.012]), "belongs to other numbers"),
+        (changed("values", [1.0, 40.0, 0.12, 0.012]), "belongs to other parameters"),
         (changed("matrix", [[1.0]]), "needs one value, one row"),
         (changed("matrix", "wide"), "matrix: Input should be a valid list"),
         (changed("names", ["gain"] * 4), "all names different"),

@@ -81,12 +81,12 @@ def test_what_is_no_model_is_refused(model, tmp_path):
         export(model, "--to", "mat")
     path = tmp_path / "x.json"
     path.write_text("{}")
-    with pytest.raises(InputError, match="the model holds nothing"):
+    with pytest.raises(InputError, match="The model has the keys none"):
         export(path, "--to", "json")
     mat = tmp_path / "x.mat"
     savemat(mat, {"model": {"num": [1.0], "den": [1.0, 2.0], "Ts": 0.1}})
     with pytest.raises(InputError, match="discrete time"):
         export(mat, "--to", "json")
     savemat(mat, {"model": {"num": [1.0]}})
-    with pytest.raises(InputError, match="needed are num and den"):
+    with pytest.raises(InputError, match="must have num and den"):
         export(mat, "--to", "json")

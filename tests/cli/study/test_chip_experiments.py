@@ -21,6 +21,10 @@ from haselab.rig.twin.config import twin_of_reading
 from haselab.store.toml import toml_text
 from haselab.study.chip.rows import chip_rows
 from haselab.study.definition import builtin_study, step_study_of
+from haselab.study.experiment import Outcome
+from haselab.study.fits.dynamics import Dynamics
+from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
 
 DATA = Path(__file__).resolve().parents[2] / "firmware" / "data"
 
@@ -58,7 +62,7 @@ def test_tools_that_are_missing_are_one_line_of_the_report(
     (folder / "analysis.json").write_text(json.dumps(rows.figures))
     page = compose_page(read_folder(folder))
     for name in ("chip", "miniature"):
-        assert "is left out: cc is not installed" in page.left_out[name]
+        assert "was left out: cc is not installed" in page.left_out[name]
     assert page.html.count("sudo apt-get install -y") == 2
 
 
@@ -102,8 +106,7 @@ def started(
     monkeypatch.setattr(module, "write_design", lambda *_: None)
     patched = type("Patched", (), {**vars(subprocess), "Popen": staticmethod(popen)})
     monkeypatch.setattr(module, "subprocess", patched)
-    none: Any = None
-    beside.start(none, none, none)
+    beside.start(Outcome(values=tuple(object.__new__(kind) for kind in (Maps, Dynamics, Loops))))
     return beside, process[0]
 
 

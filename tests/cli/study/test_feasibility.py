@@ -16,10 +16,10 @@ from haselab.base import InputError, LimitError, SafetyError
 from haselab.cli.bench.arming import Operator, armed_rig
 from haselab.cli.study.feasibility import command
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile
+from haselab.rig.chip import ChipFile
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.bench import TwinBench, describe, rig_of
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, describe, rig_of
 from haselab.safety.arming_text import arming_limits
 from haselab.safety.guardian.client import guardian_command
 from haselab.safety.rig_limits import safety_of
@@ -41,7 +41,7 @@ def test_the_field_foretold_is_the_field_that_breaks_the_twin() -> None:
     # A ramp to the highest output with the twin's own weight; its breakdown set just around.
     study = builtin_study()
     told = judge_study(study, describe(TwinConfig()), rating_of_twin(TwinConfig(), study))
-    field = next(c.asked for c in told.checks if c.name == "field") * 1e6
+    field = next(c.requested for c in told.checks if c.name == "field") * 1e6
     for factor, breaks in ((0.95, True), (1.05, False)):
         breakdown = factor * field / 1.01  # the carrier's 1 % is not in the twin's slow ramp
         config = TwinConfig.model_validate({"dielectric": {"breakdown_v_per_m": breakdown}})
@@ -59,7 +59,7 @@ def test_the_command_tells_every_number_and_refuses_a_thin_dielectric(tmp_path: 
     assert answer["feasible"] and all(check["ok"] for check in answer["checks"])
     (tmp_path / "twin.toml").write_text("[dielectric]\nbreakdown_v_per_m = 20e6\n")
     (tmp_path / "rig.toml").write_text('kind = "twin"\ntwin = "twin.toml"\n')
-    words = r"field of \d.* MV/m in step trials by the paper's sensing chain, allowed 18 MV/m"
+    words = r"field is \d.* MV/m in step trials by the paper's sensing chain \(limit 18 MV/m"
     with pytest.raises(LimitError, match=words):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 
@@ -146,7 +146,7 @@ def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) ->
         return prompt
 
     monkeypatch.setattr(click.termui, "visible_prompt_func", ended(EOFError()))
-    with pytest.raises(InputError, match=r"nobody answered\. Nothing was energised\..* --yes"):
+    with pytest.raises(InputError, match=r"no answer\. Nothing was energised\..* --yes"):
         Operator().confirm(request)
     monkeypatch.setattr(click.termui, "visible_prompt_func", ended(KeyboardInterrupt()))
     with pytest.raises(click.Abort, match="Nothing was energised") as stop:
@@ -157,7 +157,7 @@ def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) ->
 @pytest.mark.parametrize("name", ["current_limit_a", "rate_limit_v_per_s", "follow"])
 def test_a_limit_without_effect_on_a_microcontroller_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "rig.toml"
-    file = MegaFile.model_construct(kind="mega", port=None)
+    file = ChipFile.model_construct(kind="mega", port=None)
     with pytest.raises(InputError, match=rf"safety\.{name} has no effect on a microcontroller"):
         safety_of(file, {name: 0.05}, path)
     assert "mean current. The microcontroller ramps down" in arming_limits(
@@ -233,18 +233,18 @@ def test_the_field_is_that_of_the_study_also_beyond_the_breakdown() -> None:
     for thickness_m in (0.6e-3, 1.0e-3, 1.2e-3, 2.0e-3):
         config = TwinConfig.model_validate({"shell": {"thickness_m": thickness_m}})
         found = judge_study(study, describe(config), rating_of_twin(config, study))
-        fields.append(next(c.asked for c in found.checks if c.name == "field"))
+        fields.append(next(c.requested for c in found.checks if c.name == "field"))
     assert fields == sorted(fields, reverse=True)
     assert fields[1] > 1.2 * 40.0
 
 
 def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study() -> None:
-    page = Path(__file__).parents[3] / "docs" / "safety.md"
+    page = Path(__file__).parents[3] / "docs" / "bench" / "safety.md"
     if not page.is_file():
         pytest.skip("an installed package has no docs")
     config, study = twin_of_reading("hz"), builtin_study()
     found = judge_study(study, describe(config), rating_of_twin(config, study)).checks
-    asked = {check.name: check.asked for check in found}
+    asked = {check.name: check.requested for check in found}
     assert (
         f"{asked['peak current']:.1f} of 12 mA, {asked['time of an update']:.2f} of 5 ms and "
         f"{asked['field']:.1f} of 36 MV/m"
@@ -252,10 +252,10 @@ def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study()
 
 
 @pytest.mark.long
-def test_the_figure_shows_what_is_asked_over_what_is_allowed(tmp_path: Path) -> None:
+def test_the_figure_shows_the_requested_values_over_their_limits(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text('kind = "twin"\n')
     figure = tmp_path / "feasible.svg"
     arguments = [str(STUDY), "--rig", str(tmp_path / "rig.toml"), "--plot", str(figure)]
     CliRunner().invoke(command, arguments, catch_exceptions=False)
     text = figure.read_text()
-    assert "Asked over allowed" in text and "stretch" in text
+    assert "Requested over limit" in text and "stretch" in text

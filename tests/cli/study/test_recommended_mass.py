@@ -8,8 +8,8 @@ import pytest
 
 from haselab.cli.study import recommended_mass
 from haselab.cli.study.recommended_mass import with_mass_limit
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_bench import describe
 from haselab.study.definition import builtin_study
 from haselab.study.feasibility import judge_study, rating_of_twin
 from haselab.study.pipeline import Findings

@@ -62,7 +62,7 @@ def test_a_missing_folder_is_bad_input_in_one_line(tmp_path, capsys):
     assert run(tmp_path / "none") == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert err.startswith("haselab: no folder of a run there.")
+    assert err.startswith("haselab: The folder does not exist.")
 
 
 def test_corrupt_results_are_bad_input_in_one_line(folder, capsys):
@@ -85,7 +85,7 @@ def test_a_report_does_not_write_into_a_folder_of_others_through_a_link(folder, 
     (others / "fig4.svg").write_text("theirs")
     (folder / "figures").symlink_to(others)
     assert run(folder) == 2
-    assert "This is a link to" in capsys.readouterr().err
+    assert "This path is a link to" in capsys.readouterr().err
     assert [path.read_text() for path in others.iterdir()] == ["theirs"]
     assert not (folder / "report.html").exists()
 

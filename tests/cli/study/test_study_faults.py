@@ -54,7 +54,7 @@ def test_a_study_above_the_voltage_limit_is_refused(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text('kind = "twin"\n')
     command = ["run", str(tmp_path / "study.toml"), "--rig", str(tmp_path / "rig.toml")]
     ended(haselab(*command, "--quick", "--out", str(tmp_path / "out")), 2,
-          "output beyond the drive limits of 0.5 V in triangle")  # fmt: skip
+          "output beyond the drive limits is 0.5 V in triangle")  # fmt: skip
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="file size limits are POSIX's")
@@ -98,5 +98,5 @@ def test_a_session_cut_short_is_one_line_at_any_length(tmp_path: Path) -> None:
     for share in (0.0, 0.001, 0.1, 0.5, 0.9, 0.999):
         cut = tmp_path / "cut.h5"
         cut.write_bytes(data[: int(share * len(data))])
-        with pytest.raises(InputError, match="Not a whole haselab session"):
+        with pytest.raises(InputError, match="The file is not a complete haselab session"):
             SessionReader(cut)

@@ -41,7 +41,7 @@ DRIVER = """
     from haselab.cli.study import run, study_run
     from haselab.cli.interrupt import Interruptible
     from haselab.cli.main import main
-    from haselab.rig.twin.bench import TwinBench
+    from haselab.rig.twin.twin_bench import TwinBench
     from haselab.store.session.writer import SessionWriter
     from haselab.store.video.writer import VideoWriter
     meter, where, number, again = sys.argv[1:5]

@@ -39,7 +39,7 @@ def test_a_reading_beside_a_twin_is_refused(reading: str, twin: Path, tmp_path: 
 def test_a_rig_file_without_a_kind_names_the_kinds(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text('reading = "hz"\n')
-    with pytest.raises(InputError, match='kind: Field required; allowed are "twin", "bench", "me'):
+    with pytest.raises(InputError, match='kind: Field required; use one of "twin", "bench", "me'):
         load_rig(path)
 
 
@@ -55,7 +55,7 @@ def test_a_missing_number_names_no_words() -> None:
 def test_a_twin_that_is_too_heavy_is_refused_with_every_advice(twin: Path, tmp_path: Path) -> None:
     twin.write_text("[load]\nmass_kg = 0.35\n")
     with pytest.raises(
-        LimitError, match=r"1\) peak current of .* 2\) time of an update: no end"
+        LimitError, match=r"1\) peak current is .* 2\) time of an update is infinite"
     ) as (refused):
         CliRunner().invoke(
             reproduce,

@@ -102,7 +102,7 @@ def test_an_input_that_bends_is_not_called_clipped(name, curve):
 
 @pytest.mark.long
 def test_most_inputs_that_were_clipped_unseen_are_named():
-    """Slow drives and shallow limits do not tell a limit from a curve: docs/identification.md."""
+    """A slow drive or a shallow limit looks like a curve: docs/identify/identification.md."""
     named = [
         "input seems to have been clipped" in fitted(np.clip(u, -level, level), u).status
         for u in SMOOTH.values()

@@ -12,7 +12,7 @@ from haselab.identify.noise import autoregression, coloured_covariance
 from haselab.identify.record import Record
 from haselab.identify.transfer.fit import TransferStructure, fit_transfer
 from haselab.identify.transfer.layout import layout_of
-from haselab.identify.transfer.problem import Found, Problem
+from haselab.identify.transfer.problem import Found, TransferProblem
 from haselab.models import Plant, SlowMode
 
 OMEGA, ZETA = float(np.sqrt(26.14)), 0.0909495
@@ -44,7 +44,7 @@ def test_the_model_is_the_plant_for_any_pole_delay_and_clock(
     record = Record(u, 100.0, np.sin(time_s), time_s, before)
     search = np.array([math.log(omega), math.log(zeta), math.log(tau), delay_s])
     found = Found(search, np.array([0.7, 0.3]), [np.zeros(0)], 0.0, True)
-    (output,) = Problem(layout, [record], 0.1).predict(found)
+    (output,) = TransferProblem(layout, [record], 0.1).predict(found)
     expected = plant.simulate(u - before, 100.0, time_s) + before * plant.static_gain
     part = 1e-8 + (2e-6 if abs(zeta**2 - 1.0) < 2e-6 else 0.0)
     assert np.allclose(output, expected, atol=part * np.abs(expected).max())
@@ -63,7 +63,7 @@ def test_factors_leave_orthogonal_residuals_and_the_slopes_are_those_of_the_cost
         Record(random_input(1), 100.0, rng.normal(size=2000), TIME_S),
         Record(np.ones(4), 100.0, rng.normal(size=900), TIME_S[:900] + 0.0013, 0.3),
     ]
-    problem = Problem(layout, records, 0.1)
+    problem = TransferProblem(layout, records, 0.1)
     search = np.array(
         [math.log(v) for k in range(poles // 2) for v in (5.0 * 2**k, 0.2 + 0.1 * k)]
         + [math.log(0.1)] * (poles % 2)

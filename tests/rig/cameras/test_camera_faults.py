@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.pairing import ExposureTrial, starts_with_edge
+from haselab.rig.real_bench import RealBench
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.camera_faults import CameraFaults
 from haselab.rig.twin.serve.faults import BenchFaults

@@ -21,8 +21,8 @@ from haselab.rig.cameras.aravis.library import AravisLibrary
 from haselab.rig.cameras.config import AravisConfig, FolderConfig, V4l2Config
 from haselab.rig.cameras.opening import OpenedCamera, open_camera
 from haselab.rig.instruments.sections import CameraConfig
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench
 from haselab.store.video.writer import VideoWriter, write_png
 
 RATE_HZ = 100.0

@@ -14,11 +14,11 @@ from pydantic import ValidationError
 
 from haselab.base import DeviceError, InputError
 from haselab.cli.main import main
-from haselab.rig.bench import RealBench, identify
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.cameras.aravis import library as aravis_library
 from haselab.rig.cameras.aravis.library import AravisLibrary
 from haselab.rig.cameras.source import ExposureLine
+from haselab.rig.real_bench import RealBench, identify
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.serve.server import ServedTwin
@@ -140,7 +140,7 @@ def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
         ({"kind": "folder"}, r"camera\.path"),
         (
             {"kind": "folder", "path": "x", "address": "y"},
-            r"camera\.address: no such key; allowed are kind, path, repeat",
+            r"camera\.address: no such key; the keys are kind, path, repeat",
         ),
         ({"kind": "aravis", "exposure_s": -1.0}, r"camera\.exposure_s"),
         ({"kind": "v4l2", "width_px": 640}, r"width_px and height_px belong together"),

@@ -409,7 +409,7 @@ def test_a_folder_may_begin_again(tmp_path):
 def test_what_is_no_recording_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no such video file or folder"):
         FolderCamera(FolderConfig(kind="folder", path=str(tmp_path / "none")), clock_of([0.0]))
-    with pytest.raises(InputError, match=r"The folder holds no image"):
+    with pytest.raises(InputError, match=r"The folder contains no image"):
         FolderCamera(FolderConfig(kind="folder", path=str(tmp_path)), clock_of([0.0]))
     tifffile.imwrite(
         tmp_path / "deep.tif", np.zeros((3, 4, 5), np.uint16), photometric="minisblack"

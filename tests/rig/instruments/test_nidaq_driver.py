@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
-from haselab.rig.bench import RealBench
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.checks.output_timing import measure_lag, measure_start, recommended_ahead_blocks
 from haselab.rig.drivers import quietly
@@ -27,6 +26,7 @@ from haselab.rig.instruments.nidaq.routes import verify_routes
 from haselab.rig.instruments.nidaq.section import NidaqConfig
 from haselab.rig.instruments.nidaq.tasks import NidaqTasks, ticks_per_sample
 from haselab.rig.instruments.sections import ExposureConfig
+from haselab.rig.real_bench import RealBench
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.hub import TwinHub

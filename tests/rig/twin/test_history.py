@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.history import precondition
+from haselab.rig.twin.twin_bench import TwinBench
 
 
 def stretched_m(config: TwinConfig, peak_v: float) -> float:

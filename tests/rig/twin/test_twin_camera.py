@@ -14,9 +14,9 @@ from scipy.optimize import curve_fit
 
 from haselab.base import InputError, LimitError
 from haselab.rig.twin import bench as twin_bench
-from haselab.rig.twin.bench import make_twin
-from haselab.rig.twin.camera import CameraConfig, TwinCamera
+from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 
 PATIENCE_S = 60.0  # against a hang
 HALF_WIDTH_M = 0.07
@@ -25,7 +25,9 @@ SILENT = {"shot_gain_grey": 0.0, "read_noise_grey": 0.0}
 
 
 def camera(seed: int = 1, **changes: object) -> TwinCamera:
-    return TwinCamera(CameraConfig.model_validate(changes), HALF_WIDTH_M, FREE_LENGTH_M, seed=seed)
+    return TwinCamera(
+        TwinCameraConfig.model_validate(changes), HALF_WIDTH_M, FREE_LENGTH_M, seed=seed
+    )
 
 
 def direct_image(seen: TwinCamera, blobs: NDArray[np.float64], length_m: float) -> NDArray:
@@ -298,15 +300,15 @@ def test_bad_requests_are_refused() -> None:
     with pytest.raises(LimitError, match=r"neck_coefficient = 0.5 .* would fold"):
         camera(neck_coefficient=0.5)
     with pytest.raises(LimitError, match="sheet half-width"):
-        TwinCamera(CameraConfig(), 0.005, FREE_LENGTH_M, seed=0)
+        TwinCamera(TwinCameraConfig(), 0.005, FREE_LENGTH_M, seed=0)
     with pytest.raises(LimitError, match="leaves no room for a sheet"):
         camera(height_px=100)
     with pytest.raises(ValidationError, match="longer than a frame"):
-        CameraConfig(rate_hz=400, exposure_s=3e-3)
+        TwinCameraConfig(rate_hz=400, exposure_s=3e-3)
     with pytest.raises(ValidationError, match="dots outside"):
-        CameraConfig(width_px=200)
+        TwinCameraConfig(width_px=200)
     with pytest.raises(ValidationError, match="Extra inputs"):
-        CameraConfig.model_validate({"gain": 1})
+        TwinCameraConfig.model_validate({"gain": 1})
 
 
 def test_one_core_renders_300_frames_a_second(capsys: pytest.CaptureFixture[str]) -> None:

@@ -47,7 +47,7 @@ def test_all_faults_are_told_at_once_each_with_its_path(tmp_path: Path) -> None:
     message = str(fault.value)
     for where, what in (
         ("load.mass_kg", "greater than 0 (got -0.25)"),
-        ("shell.lenght_m", "no such key; allowed are"),
+        ("shell.lenght_m", "no such key; the keys are"),
         ("acquisition.bits", "less than or equal to 16 (got 24)"),
         ("amplifier.gain", "'high'"),
     ):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from haselab.base import LimitError
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, describe
 
 OMEGA = 2 * np.pi * 2000.0
 LSB_V = 20.0 / 2**16

@@ -10,8 +10,8 @@ from scipy import optimize, signal, stats
 from scipy.integrate import solve_ivp
 
 from haselab.base import SafetyError
-from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe, native_bench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, TwinBench, describe, native_bench
 from haselab.sensing import Lockin, LockinConfig
 
 STEP_S = 1e-4  # of the mechanics: 20 samples of 200 kHz

@@ -48,21 +48,27 @@ def test_the_cut_is_the_best_of_all(rng):
     columns = tables(rng)
     y = rng.standard_normal((40, 2, 2 * PIECES)) * rng.uniform(1, 4, (40, 1, 1))
     y[::2, :, 6:8] += 30.0
-    parts = np.zeros((40, PIECES, 4), dtype=np.int32)
-    result = np.empty((40, 3))
+    parts, result = np.zeros((40, PIECES), _sense.PART), np.empty(40, _sense.PARTS_RESULT)
     _sense.parts(y, [np.concatenate(columns)], [2, 2, 1, 2], [PRICE, CUT, LEFT_OUT], parts, result)
-    assert result[:, 0] == pytest.approx([exhaustive(one, columns) for one in y], rel=1e-12)
-    assert (parts[:, :, 1].sum(axis=1) < PIECES)[::2].all()  # piece 3 is left out
-    assert result[:, 2] == pytest.approx((parts[:, :, 1] > 0).sum(axis=1))
+    assert result["score"] == pytest.approx([exhaustive(one, columns) for one in y], rel=1e-12)
+    assert (parts["count"].sum(axis=1) < PIECES)[::2].all()  # piece 3 is left out
+    assert (result["parts"] == (parts["count"] > 0).sum(axis=1)).all()
 
 
 def test_tables_that_do_not_fit_are_refused(rng):
-    parts, result = np.zeros((1, PIECES, 4), dtype=np.int32), np.empty((1, 3))
+    parts, result = np.zeros((1, PIECES), _sense.PART), np.empty(1, _sense.PARTS_RESULT)
     with pytest.raises(ValueError, match="a table does not fit the pieces"):
         _sense.parts(
             np.zeros((1, 2, 2 * PIECES)), [np.zeros((5, WIDE))], [2, 2, 1, 2],
             [PRICE, CUT, LEFT_OUT], parts, result,
         )  # fmt: skip
+
+
+def test_rows_of_another_dtype_are_refused(rng):
+    y, columns = np.zeros((1, 2, 2 * PIECES)), [np.concatenate(tables(rng))]
+    parts, plain = np.zeros((1, PIECES), _sense.PART), np.empty((1, 3))
+    with pytest.raises(ValueError, match="the array has the wrong dtype"):
+        _sense.parts(y, columns, [2, 2, 1, 2], [PRICE, CUT, LEFT_OUT], parts, plain)
 
 
 @pytest.mark.parametrize("tau_s", [0.0, 4e-4, 2e-3])

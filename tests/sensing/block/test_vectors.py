@@ -9,9 +9,9 @@ from haselab import _sense
 
 
 def sums(x, cosine, sine, bits):
-    out = np.empty((-(-x.size // cosine.size), 6), dtype=np.float32)
+    out = np.empty(-(-x.size // cosine.size), _sense.SUMS)
     _sense.sum_pieces(x, cosine, sine, bits, out)
-    return out
+    return np.stack([out[name] for name in _sense.SUMS.names])
 
 
 @pytest.mark.parametrize("bits", [128, 256, 512])

@@ -127,7 +127,7 @@ def test_a_second_pass_begins_at_the_first_row(folder, name):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_missing_column_is_one_line_with_those_that_are_there(folder, name):
-    with pytest.raises(InputError, match=r"lacks amps; present are .*v.*i") as caught:
+    with pytest.raises(InputError, match=r"lacks amps; it has .*v.*i") as caught:
         open_columns(folder / name, ["v", "amps"])
     assert str(caught.value).endswith(name)
 
@@ -174,7 +174,7 @@ def test_fields_of_a_structured_array_are_columns(tmp_path):
         pieces = list(stream.pieces(999))
     np.testing.assert_array_equal(np.concatenate([p[0] for p in pieces]), K)
     np.testing.assert_array_equal(np.concatenate([p[1] for p in pieces]), I)
-    with pytest.raises(InputError, match="lacks x; present are t, v, i"):
+    with pytest.raises(InputError, match="lacks x; it has t, v, i"):
         open_columns(tmp_path / "a.npy", ["x"])
 
 
@@ -207,7 +207,7 @@ def test_a_cell_that_is_no_number_is_told_with_its_line_far_down(tmp_path):
     (tmp_path / "a.csv").write_text(f"v,i\n{rows}3,oops\n")
     with (
         open_columns(tmp_path / "a.csv", ["v", "i"]) as stream,
-        pytest.raises(InputError, match="Column i holds 'oops' in line 900002"),
+        pytest.raises(InputError, match="Column i has 'oops' in line 900002"),
     ):
         for _ in stream.pieces(10_000):
             pass
@@ -246,7 +246,7 @@ def test_a_rate_from_times_is_checked_to_the_end(tmp_path):
         with (
             open_columns(tmp_path / "gap.npz", ["v"]) as stream,
             pytest.raises(
-                InputError, match=r"time_s steps by 1.005 s to row 7001, before by 0.005"
+                InputError, match=r"time_s has a step of 1.005 s before row 7001, but 0.005"
             ),
         ):
             list(stream.pieces(rows))

@@ -95,7 +95,7 @@ def test_settings_are_completed_or_refused_but_never_cut(tmp_path):
     with SessionWriter(path, PLANS, SAMPLES, HEADER) as session:
         session.append_frames("a", np.zeros(1), tracks_of(1), 0.0)
         session.complete_settings("a", {"kp": 0.5, "note": "ü" * 100})
-        with pytest.raises(InputError, match=r"Settings of 'a' have \d+ bytes, allowed are 65000"):
+        with pytest.raises(InputError, match=r"Settings of 'a' have \d+ bytes, but at most 65000"):
             session.complete_settings("a", {"note": "x" * 66_000})
     with SessionReader(path) as session:
         assert session.experiment("a").settings == {"kp": 0.5, "note": "ü" * 100}
@@ -140,7 +140,9 @@ def test_no_file_no_experiment_and_no_session_are_told_apart(tmp_path):
         other["numbers"] = np.arange(5)
     (tmp_path / "text.h5").write_text("time_s,v_monitor_v\n0,1\n" * 50)
     for name in ("other.h5", "text.h5"):
-        with pytest.raises(InputError, match=rf"Not a whole haselab session \(.*{name}$"):
+        with pytest.raises(
+            InputError, match=rf"The file is not a complete haselab session \(.*{name}$"
+        ):
             SessionReader(tmp_path / name)
 
 
@@ -153,7 +155,7 @@ def test_a_session_cut_at_any_byte_is_refused_with_one_line(tmp_path):
     for cut in sorted(cuts):
         path.write_bytes(data[:cut])
         with pytest.raises(
-            InputError, match=r"^Not a whole haselab session \(.*cut\.h5$"
+            InputError, match=r"^The file is not a complete haselab session \(.*cut\.h5$"
         ) as caught:
             SessionReader(path)
         assert "\n" not in str(caught.value)
@@ -326,7 +328,7 @@ def test_a_place_that_cannot_hold_a_session_is_a_device_error(tmp_path):
     with pytest.raises(DeviceError, match=r"cannot be written \(.*session\.h5$"):
         SessionWriter(tmp_path / "file" / "session.h5", PLANS, SAMPLES, HEADER)
     (tmp_path / "session.h5").mkdir()
-    with pytest.raises(InputError, match=r"There is a session already.*session\.h5$"):
+    with pytest.raises(InputError, match=r"The folder has a session already.*session\.h5$"):
         SessionWriter(tmp_path / "session.h5", PLANS, SAMPLES, HEADER)
 
 

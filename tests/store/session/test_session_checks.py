@@ -127,10 +127,10 @@ def test_a_damaged_session_is_read_on_request_and_marked(sealed, tmp_path):
 )
 def test_one_bit_of_a_killed_session_is_refused(killed, dataset, row, what):
     flip(killed, place_of(killed, dataset, row) + 6, 4)
-    with pytest.raises(InputError, match="Not a whole haselab session") as caught:
+    with pytest.raises(InputError, match="The file is not a complete haselab session") as caught:
         SessionReader(killed)
     assert what.replace("block of 'chirp', 5", "start of 'chirp', 5") in str(caught.value)
-    with pytest.raises(InputError, match="Not a whole haselab session"):
+    with pytest.raises(InputError, match="The file is not a complete haselab session"):
         recover(killed)
 
 
@@ -176,7 +176,7 @@ def test_a_seal_that_is_cut_or_written_over_is_noticed(sealed):
     data = sealed.read_bytes()
     for changed in (data[:-1], data[:-200], data[:-20] + b"x" * 20, data + b"\0", data[:-120]):
         sealed.write_bytes(changed)
-        with pytest.raises(InputError, match="Not a whole haselab session"):
+        with pytest.raises(InputError, match="The file is not a complete haselab session"):
             SessionReader(sealed)
 
 
@@ -212,7 +212,7 @@ def test_a_session_with_links_is_refused(sealed, kind):
 @pytest.mark.parametrize("name", ["a.h5", "a.mat"])
 def test_columns_that_lie_in_another_file_are_refused(tmp_path, kind, name):
     _linked(tmp_path / name, kind)
-    with pytest.raises(InputError, match=r"^The values of x lie in another file.*\.(h5|mat)$"):
+    with pytest.raises(InputError, match=r"^The values of x are in another file.*\.(h5|mat)$"):
         open_columns(tmp_path / name, ["x"])
 
 

@@ -139,7 +139,7 @@ def test_columns_that_cannot_be_a_session_are_refused(tmp_path):
     path.write_text("v_monitor_v,i_monitor_v\n" + "0.5,0.25\n" * 50)
     with pytest.raises(InputError, match=r"states no sampling rate\. Add --rate-hz.*a\.csv$"):
         import_session(path, tmp_path / "x", ImportPlan())
-    with pytest.raises(InputError, match=r"50 samples are less than a block of 2000.*a\.csv$"):
+    with pytest.raises(InputError, match=r"50 samples, but a block has 2000.*a\.csv$"):
         import_session(path, tmp_path / "x", ImportPlan(rate_hz=1e3))
     np.savez(tmp_path / "c.npz", v=np.zeros(50, np.int16), i=np.zeros(50, np.int16), rate_hz=1e3)
     with pytest.raises(InputError, match=r"hold integers.*Give --volt-per-code\. .*c\.npz$"):
@@ -147,7 +147,7 @@ def test_columns_that_cannot_be_a_session_are_refused(tmp_path):
 
 
 def test_a_session_without_scale_and_an_unknown_form_are_refused(session, tmp_path):
-    with pytest.raises(InputError, match="No form 'xls'; there are csv, mat"):
+    with pytest.raises(InputError, match="Unknown format 'xls'. Use one of csv, mat"):
         export_session(session, "xls", tmp_path / "x")
     SessionWriter(tmp_path / "bare.h5", PLANS, SAMPLES, {}).close()
     with pytest.raises(InputError, match=r"lacks rig\.volt_per_code.*bare\.h5$"):
@@ -162,7 +162,7 @@ def test_a_missing_library_is_one_line(session, tmp_path, monkeypatch, form):
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(InputError, match=r"Install haselab\[formats\], or take --to"):
+    with pytest.raises(InputError, match=r"Install haselab\[formats\], or use --to"):
         export_session(session, form, tmp_path / f"s.{form}")
 
 

@@ -112,7 +112,7 @@ def test_a_second_writer_is_refused_and_the_first_one_keeps_every_block(tmp_path
             if k == 12:
                 session.flush("a")  # its own thread writes nothing more
                 before = path.read_bytes()
-                with pytest.raises(InputError, match=r"There is a session already; nothing in it"):
+                with pytest.raises(InputError, match=r"The folder has a session already; it was"):
                     SessionWriter(path, PLANS, SAMPLES, {})
                 assert path.read_bytes() == before
     with SessionReader(path) as reader:

@@ -219,7 +219,7 @@ def test_a_recording_that_stopped_short_is_refused_after_its_last_frame(tmp_path
 def test_unknown_missing_and_empty_files_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"no such video.*nothing\.avi"):
         open_video(tmp_path / "nothing.avi")
-    with pytest.raises(InputError, match="holds no image"):
+    with pytest.raises(InputError, match="contains no image"):
         open_video(tmp_path)
     (tmp_path / "empty.avi").touch()
     with pytest.raises(InputError, match="is empty"):

@@ -35,7 +35,7 @@ from haselab.runtime.runner import Runner
 from haselab.study.definition import Study, builtin_study
 from haselab.study.fits.maps import Maps as FoundMaps
 from haselab.study.pipeline import investigate
-from haselab.study.simulated.noise_free import QuietBench
+from haselab.study.simulated.noise_free import NoiseFreeBench
 
 Floats = NDArray[np.float64]
 GRAVITY, VACUUM = 9.81, 8.8541878128e-12
@@ -565,7 +565,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
     waits = builtin_study().static_load
     point = study.operating_point.model_copy(update={"baseline_v": 1.0})
     study = study.model_copy(update={"steps": few, "static_load": waits, "operating_point": point})
-    quiet, sensing = QuietBench(config, study), study.sensing
+    quiet, sensing = NoiseFreeBench(config, study), study.sensing
     with Runner(
         quiet.rig, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
     ) as runner:

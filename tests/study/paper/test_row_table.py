@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import describe
 from haselab.runtime.runner import counted_s, lockin_of
 from haselab.study.paper.paper_check import recompute_paper
 from haselab.study.paper.row_table import markdown_table, study_rows
 from haselab.study.results import quantities
 
-DOCS = Path(__file__).parents[3] / "docs" / "study.md"
+DOCS = Path(__file__).parents[3] / "docs" / "study" / "study.md"
 OPEN = {"S27", "S29", "S30"}  # of later issues
 
 

@@ -1,4 +1,4 @@
-"""From a rig file to a rig that is guarded, judged and armed."""
+"""Arm a rig: check the study against its limits, guard it, and ask the operator."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import click
 
 from haselab.base import InputError, SafetyError
+from haselab.cli.options import shared_option
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import ReplayFile, RigFile, opened_rig
@@ -30,11 +31,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def arming_options(function: F) -> F:
     """Add `--yes` and `--acknowledge`, see `Operator`."""
-    yes = click.option(
-        "--yes",
-        is_flag=True,
-        help="Skip the confirmation. High voltage WILL be applied; keep clear.",
-    )
+    yes = shared_option("--yes", is_flag=True, detail="High voltage WILL be applied; keep clear.")
     return yes(acknowledge_option(function))
 
 
@@ -53,18 +50,18 @@ class Operator:
     """Who arms a bench: a person at the terminal, or options of the command line.
 
     Args:
-        yes: the second step needs no answer.
-        acknowledge: the reason of the last trip needs no answer.
+        yes: energise without asking.
+        acknowledge: acknowledge the reason of the last trip without asking.
     """
 
     yes: bool = False
     acknowledge: bool = False
 
     def acknowledged(self, reason: str) -> str:
-        """The reason for which the bench was made safe, once it was acknowledged.
+        """Return the reason of the last trip, once it is acknowledged.
 
         Raises:
-            SafetyError: it was not.
+            SafetyError: the reason was not acknowledged.
         """
         if not reason:
             return ""
@@ -79,10 +76,10 @@ class Operator:
         )
 
     def confirm(self, request: ArmingRequest) -> None:
-        """The second step of arming.
+        """Ask whether to energise, the second step of arming.
 
         Raises:
-            InputError: the answer was no.
+            InputError: the answer is no.
         """
         warning = f"HIGH VOLTAGE WILL BE APPLIED to {request.limits} Keep clear."
         if not self.yes and not _confirmed(f"{warning} Energise?"):
@@ -90,7 +87,7 @@ class Operator:
 
 
 def _confirmed(question: str) -> bool:
-    """The answer of the person at the terminal.
+    """Ask a question at the terminal.
 
     Raises:
         InputError: there is no terminal, or its input has ended.
@@ -100,8 +97,8 @@ def _confirmed(question: str) -> bool:
     except click.Abort as stop:
         if isinstance(stop.__context__, EOFError):
             raise InputError(
-                "Not armed: nobody answered. Nothing was energised. Run in a terminal, or add "
-                "--yes (and --acknowledge after a trip)."
+                "Not armed: no answer. Nothing was energised. Run in a terminal, or add --yes "
+                "(and --acknowledge after a trip)."
             ) from stop
         stop.add_note("Nothing was energised.")
         raise
@@ -109,14 +106,14 @@ def _confirmed(question: str) -> bool:
 
 @contextlib.contextmanager
 def gated_rig(file: RigFile, path: Path) -> Iterator[Rig]:
-    """The rig of a file behind its gate; leaving the context is 0 V and all connections closed.
+    """Open the rig of a file behind its gate; on exit, command 0 V and close all connections.
 
     Args:
         file: from `load_rig`.
         path: of the rig file.
     Raises:
         DeviceError: an instrument or its driver is missing, or another program uses the bench.
-        InputError: another instrument than the file names.
+        InputError: another instrument answers than the file names.
     """
     with opened_rig(file, path, Gate()) as rig:
         yield rig
@@ -131,11 +128,11 @@ def armed_rig(
     folder: Path,
     operator: Operator | None = None,
 ) -> Iterator[GuardedRig]:
-    """Check a study against a rig, put the rig behind its safety chain, arm it in two steps.
+    """Check a study against a rig, guard the rig, and arm it in two steps.
 
-    A real bench gets two guardian processes whose log is `guardian.log` in the folder; a twin in
-    this process ends with it. A bench without a table [rating] is not checked: its limits are not
-    known. A recorded session can energise nothing: nobody is asked.
+    A real bench gets two guardian processes, which log to `guardian.log` in the folder; a twin in
+    this process needs none. A bench without a table [rating] is not checked: its limits are not
+    known. A recorded session cannot energise anything, so no confirmation is needed.
 
     Args:
         rig: opened from the file.
@@ -143,10 +140,12 @@ def armed_rig(
         path: of the rig file.
         study: what will be played.
         folder: of the run.
-        operator: who acknowledges and confirms; None: nobody has to, as on a twin.
+        operator: who acknowledges and confirms; None: no confirmation is needed, as on a twin.
+    Yields:
+        The armed rig.
     Raises:
         LimitError: the study is not feasible on this bench.
-        InputError: the second step was refused.
+        InputError: the operator did not confirm.
         SafetyError: the reason of the last trip was not acknowledged.
         DeviceError: a guardian does not start, or does not reach the bench.
     """
@@ -167,11 +166,11 @@ def armed_rig(
 
 
 def arm(safety: Safety, operator: Operator | None) -> None:
-    """Both steps of arming.
+    """Arm a bench in two steps: request, then acknowledge and confirm.
 
     Args:
         safety: of the bench.
-        operator: who acknowledges and confirms; None: nobody has to.
+        operator: who acknowledges and confirms; None: no confirmation is needed.
     """
     request = safety.request()
     acknowledged = ""

@@ -1,4 +1,4 @@
-"""`haselab calibrate`: reference capacitors in the actuator's place, one after the other."""
+"""`haselab calibrate`: calibrate the monitors with reference capacitors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import POSITIVE, Real, actuator_option, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.cli.study.run import rig_file
 from haselab.pipelines.calibration_file import calibration_section, save_calibration
 from haselab.rig import ReferenceFixture, Rig
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.sensing.calibration import (
     Calibration,
     Reference,
@@ -36,13 +37,13 @@ from haselab.sensing.calibration import (
 __all__ = ["command"]
 
 _SETTLE_S = 0.1  # after the carrier comes on; amplifier and monitors need 2 ms
-_WORST_GAIN = 2.0  # a scale further from the nominal one is a mistake at the fixture
-_WORST_PHASE_RAD = 0.8  # so is a phase beyond two monitors at half their bandwidth
+_WORST_GAIN = 2.0  # a larger ratio to the nominal scale is a wiring or rig file mistake
+_WORST_PHASE_RAD = 0.8  # more than two monitors at half their bandwidth cause
 
 
 @dataclass(frozen=True)
 class _Request:
-    """What the user asked for."""
+    """The options of the command."""
 
     references: tuple[Reference, ...]
     carrier_hz: float
@@ -51,7 +52,7 @@ class _Request:
 
 
 class _OperatorFixture:
-    """A person at the fixture."""
+    """A fixture whose capacitors a person exchanges."""
 
     def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
         """See `haselab.rig.ReferenceFixture`."""
@@ -69,7 +70,7 @@ class _OperatorFixture:
 def _references(
     context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
 ) -> tuple[Reference, ...]:
-    """The references of all options `FARAD[,OHM[,TOLERANCE]]`."""
+    """Parse the references, `FARAD[,OHM[,TOLERANCE]]` each."""
     del context
     found = []
     for value in values:
@@ -79,7 +80,7 @@ def _references(
             numbers = []
         if not 1 <= len(numbers) <= 3:
             raise click.BadParameter(
-                f"{value!r} is not FARAD[,OHM[,TOLERANCE]]; give 1e-9 or 1e-9,5,0.01.",
+                f"{value!r} is not FARAD[,OHM[,TOLERANCE]]. Use for example 1e-9 or 1e-9,5,0.01.",
                 param=parameter,
             )
         found.append(Reference(*numbers))
@@ -94,7 +95,7 @@ def _rig_of(name: str) -> Rig:
 
 
 def _record(rig: Rig, request: _Request) -> NDArray[np.int16]:
-    """Blocks of what is connected: carrier on, drive at 0 V; both off at the end."""
+    """Record what is connected: carrier on, drive at 0 V; both off at the end."""
     d = rig.description
     rig.source.zero()
     rig.generator.sine(request.carrier_hz, request.carrier_v)
@@ -109,7 +110,7 @@ def _record(rig: Rig, request: _Request) -> NDArray[np.int16]:
 def _measure(
     rig: Rig, fixture: ReferenceFixture, request: _Request, progress: Progress
 ) -> list[ReferenceReading]:
-    """Every reference in turn; whatever happens ends at 0 V with the carrier off."""
+    """Measure every reference in turn; always end at 0 V with the carrier off."""
     readings = []
     progress.start(len(request.references))
     try:
@@ -134,7 +135,7 @@ def _measure(
 
 
 def _answer(calibration: Calibration, nominal_s: float) -> dict[str, Any]:
-    """What was found, and what it takes out of the readings."""
+    """The calibration, and each reference before and after it."""
     c = calibration
     rows = []
     for reference, reading in zip(c.references, c.readings, strict=True):
@@ -169,7 +170,7 @@ def _answer(calibration: Calibration, nominal_s: float) -> dict[str, Any]:
 
 
 def _chart(answer: dict[str, Any]) -> Chart:
-    """What is left of each reference after the calibration."""
+    """The residual of each reference after the calibration."""
     columns = {key: np.array([row[key] for row in answer["references"]], dtype=np.float64)
                for key in ("nominal_f", "residual", "std_f")}  # fmt: skip
     order = np.argsort(columns["nominal_f"])
@@ -180,28 +181,32 @@ def _chart(answer: dict[str, Any]) -> Chart:
 
 
 def _page(answer: dict[str, Any]) -> str:
-    """The answer for a reader."""
-    lines = ["nominal nF   as read nF   calibrated nF   residual %   std %"]
+    """The answer as a table to read."""
+    lines = ["nominal nF  uncalibrated nF  calibrated nF  residual %   std %"]
     for row in answer["references"]:
         std = 100.0 * row["std_f"] / row["nominal_f"]
         lines.append(
-            f"{1e9 * row['nominal_f']:10.4g} {1e9 * row['reading_f']:12.5g} "
-            f"{1e9 * row['measured_f']:15.5g} {100.0 * row['residual']:12.2g} {std:7.2g}"
+            f"{1e9 * row['nominal_f']:10.4g} {1e9 * row['reading_f']:16.5g} "
+            f"{1e9 * row['measured_f']:14.5g} {100.0 * row['residual']:11.2g} {std:7.2g}"
         )
     count = len(answer["references"])
-    left = f"{100.0 * answer['residual']:.2g} %" if count > 2 else "none: two references fix both"
+    left = (
+        f"{100.0 * answer['residual']:.2g} %"
+        if count > 2
+        else "none: two references leave nothing to check"
+    )
     exact = all(row["tolerance"] == 0.0 for row in answer["references"])
     turned = math.degrees(answer["phase_rad"])
     lines += [
         "",
         f"gain error of the monitors   {100.0 * answer['gain_error']:+.3f} %",
-        f"phase between them           {turned:+.3f} deg at {answer['carrier_hz']:g} Hz",
+        f"phase between the monitors   {turned:+.3f} deg at {answer['carrier_hz']:g} Hz",
         f"stray capacitance            {1e12 * answer['stray_f']:.2f} pF",
-        f"offsets at rest              {1e3 * answer['offsets_v'][0]:.2f} mV, "
+        f"monitor offsets              {1e3 * answer['offsets_v'][0]:.2f} mV, "
         f"{1e3 * answer['offsets_v'][1]:.2f} mV",
         f"residual                     {left}",
         f"standard deviation of scale  {100.0 * answer['scale_relative_std']:.2g} %, "
-        + ("references taken as exact" if exact else "tolerances of the references included"),
+        + ("references assumed exact" if exact else "tolerances of the references included"),
     ]
     return "\n".join(lines)
 
@@ -210,46 +215,38 @@ def _check_sane(answer: dict[str, Any]) -> None:
     factor = 1.0 + answer["gain_error"]
     if not 1.0 / _WORST_GAIN < factor < _WORST_GAIN:
         raise ResultError(
-            f"The monitors read {factor:.3g} times their nominal gain, allowed are "
+            f"The monitors have {factor:.3g} times their nominal gain, but plausible is only "
             f"{1 / _WORST_GAIN:g} to {_WORST_GAIN:g}. Check that each reference was connected in "
             "turn, and the monitors' scales in the rig file."
         )
     if abs(answer["phase_rad"]) > _WORST_PHASE_RAD:
         raise ResultError(
-            f"The current monitor is turned by {math.degrees(answer['phase_rad']):.0f} deg, "
-            f"allowed are {math.degrees(_WORST_PHASE_RAD):.0f}. Check the order of the "
+            f"The current monitor has a phase error of {math.degrees(answer['phase_rad']):.0f} "
+            f"deg, more than {math.degrees(_WORST_PHASE_RAD):.0f}. Check the order of the "
             "references, the polarity of the monitors, and that their channels are not swapped."
         )
 
 
 @click.command("calibrate")
-@click.option("--rig", required=True, help="RIG.toml, or 'twin'.")
-@click.option(
+@shared_option("--rig", required=True, detail="'twin' uses the simulated bench.")
+@shared_option(
     "--capacitor",
     "references",
     metavar="FARAD[,OHM[,TOL]]",
     callback=_references,
     multiple=True,
     required=True,
-    help="Reference, in F: 1e-9, or with series ohm and relative tolerance: 1e-9,5,0.01. Repeat.",
+    detail="Optionally with series resistance in ohm and relative tolerance: 1e-9,5,0.01. Repeat "
+    "the option for each reference, at least two.",
 )
-@click.option("--carrier-hz", type=Real(min=1.0), default=2000.0, show_default=True)
-@click.option(
-    "--carrier-v",
-    type=POSITIVE,
-    default=0.02,
-    show_default=True,
-    help="Peak amplitude ahead of the amplifier.",
-)
-@click.option(
-    "--duration-s",
-    type=Real(min=0.1, max=600.0),
-    default=1.0,
-    show_default=True,
-    help="Recorded of each reference.",
-)
-@actuator_option("the calibration is written to [sensing].")
-@answer_options(plot=True)
+@shared_option("--carrier-hz", type=Real(min=1.0), default=2000.0, show_default=True)
+@shared_option("--carrier-v", type=POSITIVE, default=0.02, show_default=True)
+@shared_option(
+    "--duration-s", type=Real(min=0.1, max=600.0), default=1.0, show_default=True,
+    detail="Recording time of each reference.",
+)  # fmt: skip
+@actuator_option("Writes the calibration to [sensing].")
+@answer_options(None, "A calibration file (TOML) for `haselab sense`. Default: none.", plot=True)
 def command(
     rig: str,
     actuator: Path | None,
@@ -258,13 +255,13 @@ def command(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """Calibrate the monitors against reference capacitors.
+    """Calibrate the monitors with reference capacitors.
 
     VOLTAGE WILL BE APPLIED: the carrier, 100 V peak at the default --carrier-v and a gain of 5000.
-    Each --capacitor takes the actuator's place in turn: connect it only when asked, with the
-    amplifier off and the electrodes shorted. During a measurement the drive is 0 V and the carrier
-    is on. On the twin the fixture exchanges them. --actuator or --out names the file (TOML) for the
-    calibration that `haselab sense` takes.
+    Each --capacitor takes the actuator's place in turn. Connect it only when the command asks you
+    to, with the amplifier off and the electrodes shorted. During a measurement the drive is 0 V and
+    the carrier is on. On the twin the capacitors are exchanged automatically. --actuator or --out
+    names the file for the calibration, which `haselab sense` reads.
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
@@ -273,8 +270,8 @@ def command(
     request = _Request(**options)
     if len(request.references) < 2:
         raise InputError(
-            "One --capacitor given; scale and stray capacitance need at least 2 that differ. Add "
-            "another one."
+            "Only one --capacitor was given, but scale and stray capacitance need at least 2 that "
+            "differ. Add another one."
         )
     bench = _rig_of(rig)
     readings = _measure(

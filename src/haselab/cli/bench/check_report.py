@@ -1,4 +1,4 @@
-"""The report of `haselab rig check`: what was found on which bench, in one file to mail."""
+"""The report of `haselab rig check`: the results of all checks in one file to send."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ __all__ = ["write_check_report"]
 def write_check_report(
     path: Path, rig: Path, checks: Sequence[CheckResult], *, finished: bool
 ) -> None:
-    """Write the checks with all that a reader far from the bench needs.
+    """Write the results of the checks, with all that a reader elsewhere needs.
 
     Args:
         path: of the JSON file.
         rig: the rig file that was checked.
         checks: in the order in which they were made.
-        finished: they were made to the end.
+        finished: all checks were made.
     Raises:
-        DeviceError: the disk refuses.
+        DeviceError: the file cannot be written.
     """
     text = rig.read_bytes()
     write_json(

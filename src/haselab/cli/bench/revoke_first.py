@@ -1,7 +1,7 @@
-"""`haselab rig safe` revokes the permission before it imports anything large.
+"""Revoke the permission for `haselab rig safe` before anything large is imported.
 
-Standard library and the interlock only: drivers and their libraries take seconds to import on a
-slow computer, and until the permission is revoked a program may go on energising the bench.
+This module imports the standard library and the interlock only. Drivers take seconds to import on
+a slow computer, and a program may energise the bench until its permission is revoked.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ def _bench_key(file: dict[str, Any]) -> str:
 def revoke_first(arguments: list[str]) -> bool:
     """Revoke the permission of the bench that `rig safe RIG.toml` names.
 
-    The command itself does it again, and reports what is wrong.
+    The command itself revokes it again and reports errors.
 
     Args:
         arguments: of the command line.
     Returns:
-        Whether it was revoked: not for another command or a call for help, nor where the rig file
-        cannot be read, has neither `daq.serial_number` nor `port`, or has another kind of board.
+        Whether it was revoked. It is not for another command or --help, or if the rig file cannot
+        be read, has neither `daq.serial_number` nor `port`, or has another kind of board.
     """
     if arguments[:2] != ["rig", "safe"] or {"--help", "-h"} & set(arguments):
         return False
@@ -55,9 +55,9 @@ def revoke_first(arguments: list[str]) -> bool:
                 interlock.revoke(REASON)
             finally:
                 interlock.close()
-        except Exception:  # whatever is in the file: the command that follows says what is wrong
+        except Exception:  # the command that follows reports what is wrong
             continue
         revoked = True
     if revoked:
-        print("Permission revoked. Now taking the instruments to 0 V ...", file=sys.stderr)
+        print("Permission revoked. Commanding 0 V on the instruments ...", file=sys.stderr)
     return revoked

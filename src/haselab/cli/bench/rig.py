@@ -1,4 +1,4 @@
-"""`haselab rig`: check a bench step by step; make one safe from outside."""
+"""`haselab rig`: check a bench in stages, make it safe, and show its state."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from haselab.cli.bench.check_report import write_check_report
 from haselab.cli.bench.revoke_first import REASON
 from haselab.cli.common import Real, answer_options
 from haselab.cli.interrupt import Interruptible
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig, BenchOutputs
@@ -31,11 +32,11 @@ from haselab.rig.checks import (
     live_checks,
     live_step_v,
 )
-from haselab.rig.chip import MegaFile, key_of_port
+from haselab.rig.chip import ChipFile, key_of_port
 from haselab.rig.instruments.registry import daq_of, reported_faults
 from haselab.rig.rig_file import ReplayFile, RigFile, load_rig, load_rig_to_shut_down
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.guardian.client import Guardians, guardian_command
@@ -47,35 +48,35 @@ from haselab.store.folder import write_new, write_text
 
 __all__ = ["check", "command", "safe", "status"]
 
-_RANGE_SHARE = 0.98  # of an input's range that a signal may take
-_SUPPLY_SHARE = 0.1  # of what the rig file lets the supply put out
-_LIVE_S = 10.0  # that one live check may take; the loop-back check and the supply's take longest
-_ROUTES_S = 5.0  # that a call of the board may take
-_PROGRAM_S = 5.0  # that a program may take to stop its bench
+_RANGE_SHARE = 0.98  # share of an input's range that a signal may use
+_SUPPLY_SHARE = 0.1  # share of the supply's limit that the live checks use
+_LIVE_S = 10.0  # limit for one live check; the loop-back and the supply check take longest
+_ROUTES_S = 5.0  # limit for one call of the board
+_PROGRAM_S = 5.0  # limit for a program to stop its bench
 _NOTHING = "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand."
-_HANDS_OFF = "Switch amplifier and supply off and discharge the electrodes first."
+_SWITCH_OFF_FIRST = "First switch the amplifier and the supply off and discharge the electrodes."
 _BY_HAND = "Switch the high voltage off by hand."
-_REPORTED_OFF = "off, by the instrument's own report"
+_REPORTED_OFF = "off, as reported by the instrument"
 _DONE = {
     "daq": "board reset, 0 V set; the output was not measured",
-    "program": "permission revoked, and its program reported 0 V",
+    "program": "permission revoked; its program reported 0 V",
     "chip": "permission revoked; it ramps down by itself, the output was not measured",
 }
 
 
 @click.group("rig")
 def command() -> None:
-    """Check a bench, or make it safe."""
+    """Check a bench in stages, or make it safe."""
 
 
 def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
-    """The file, its drivers, and the steps of this check on a twin: nothing is touched."""
+    """Check the file and its drivers, and run the checks on a twin; no instrument is used."""
     safety_of(file, getattr(file, "safety", {}), path)
-    yield CheckResult("mock", "rig file", f"kind {file.kind}, no fault", True)
+    yield CheckResult("mock", "rig file", f"kind {file.kind}, valid", True)
     if isinstance(file, BenchConfig):
         if not file.rating:
             yield CheckResult(
-                "mock", "rating", "none: 'run' will not check a study against limits", True
+                "mock", "rating", "none: 'run' does not check a study against limits", True
             )
         d = file.describe()
         limits = d.drive_limits
@@ -117,7 +118,7 @@ def _checks(
     with gated_rig(file, path) as rig:
         if isinstance(file, ReplayFile):
             yield CheckResult(
-                "dry", "recording", f"block of {len(_first_block(rig))} readings", True
+                "dry", "recording", f"block of {len(_first_block(rig))} samples", True
             )
             return
         for name, reported in (
@@ -141,7 +142,7 @@ def _checks(
 
 
 def _routes(file: BenchConfig) -> Iterator[CheckResult]:
-    """The board's tasks, tried while no other program can use the bench."""
+    """Try the board's tasks while no other program can use the bench."""
     daq, gate = daq_of(file.daq), Gate()
     link = daq.connect(file.daq)
     with contextlib.ExitStack() as opened:
@@ -156,12 +157,12 @@ def _routes(file: BenchConfig) -> Iterator[CheckResult]:
 def _armed(
     rig: Rig, file: RigFile, path: Path, operator: Operator
 ) -> Iterator[Callable[[], object]]:
-    """Permission, and guardians, for what is energised without a run.
+    """Arm the bench, with guardians, for checks outside of a run.
 
-    What the guardians do is logged beside the rig file.
+    The guardians log to a file beside the rig file.
 
     Yields:
-        What has to be called every few seconds.
+        A function to call every few seconds, as a sign of life.
     """
     guarded = guard(rig, Safety(safety_of(file, getattr(file, "safety", {}), path)))
     safety = guarded.safety
@@ -174,10 +175,10 @@ def _armed(
         arm(safety, operator)
         safety.gate.interlock.lease(_LIVE_S)
         try:
-            yield lambda: safety.sign_of_life(_LIVE_S)
+            yield lambda: safety.heartbeat(_LIVE_S)
         except KeyboardInterrupt as stop:
             guarded.command_zero()
-            reported = guarded.read_back()  # raises where the output is not known to be at 0 V
+            reported = guarded.read_back().text  # raises if 0 V is not confirmed
             stop.add_note(f"{reported[:1].upper()}{reported[1:].rstrip('.')}.")
             raise
         finally:
@@ -209,7 +210,7 @@ def _live_warning(rig: Rig, plan: LivePlan) -> str:
 
 
 def _supply_v(file: RigFile) -> float:
-    """What the live checks ask of the supply: a tenth of what the rig file lets it put out."""
+    """Voltage that the live checks set on the supply: a tenth of its limit in the rig file."""
     if isinstance(file, BenchConfig) and file.supply is not None:
         highest_v = file.supply.highest_v
         return min(highest_v, max(SUPPLY_V, _SUPPLY_SHARE * highest_v))
@@ -217,8 +218,8 @@ def _supply_v(file: RigFile) -> float:
 
 
 def _by_hand(file: RigFile) -> bool:
-    """A bench of real time; a served twin keeps its own time."""
-    if isinstance(file, MegaFile):
+    """Whether a person operates the bench in real time; a served twin has its own clock."""
+    if isinstance(file, ChipFile):
         return file.port is not None
     return isinstance(file, BenchConfig) and file.stand.kind == "operator"
 
@@ -232,40 +233,40 @@ def _first_block(rig: Rig) -> bytes:
 @click.option(
     "--live",
     is_flag=True,
-    help="Also apply HIGH VOLTAGE: the sensing signal, a step to 10 % of the drive range (1 kV at "
+    help="Apply HIGH VOLTAGE too: the sensing signal, a step to 10 % of the drive range (1 kV at "
     "2 V x 5000) and 10 % of the supply's limit; on a microcontroller, closed loop at zero strain "
     "for 0.5 s. Keep clear. Requires --yes.",
 )
-@click.option(
-    "--yes", is_flag=True, help="Confirm that high voltage may be applied. Required with --live."
-)
-@click.option(
-    "--capacitor",
-    type=Real(3e-10, 1e-6),
-    metavar="FARAD",
-    help="A known high-voltage capacitor is in the actuator's place: also check the scale of the "
-    "current monitor. With --live.",
-)
+@shared_option(
+    "--yes", is_flag=True,
+    detail="High voltage WILL be applied; keep clear. Required with --live.",
+)  # fmt: skip
+@shared_option(
+    "--capacitor", type=Real(3e-10, 1e-6), metavar="FARAD",
+    detail="It must withstand high voltage. Also checks the scale of the current monitor. With "
+    "--live. Default: none.",
+)  # fmt: skip
 @click.option(
     "--loop-back",
     is_flag=True,
-    help="The board's output is wired to the voltage monitor's input and the amplifier is "
-    "disconnected: look at 50 starts of the output only. With --live.",
+    help="Check only 50 starts of the output, with the board's output wired to the voltage "
+    "monitor's input and the amplifier disconnected. With --live.",
 )
 @click.option(
     "--frames",
     type=Real(0.01, 1e5),
     metavar="HZ",
-    help="Film ten seconds at this rate; the default is half a second at up to 100 Hz.",
+    help="Record frames for 10 s at this rate, in Hz. Default: 0.5 s at up to 100 Hz.",
 )
 @click.option(
     "--save",
     type=click.Path(path_type=Path),
     metavar="CHECK.json",
-    help="Report to mail: rig file, computer, instruments, all checks.",
+    help="Write a report to send to others: rig file, computer, instruments, all checks. "
+    "Default: none.",
 )
 @acknowledge_option
-@answer_options(OutputRule(options=("save",)), "Also write the JSON result to this file.")
+@answer_options(OutputRule(options=("save",)))
 def check(
     rig: Path,
     live: bool,
@@ -278,10 +279,10 @@ def check(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Check a bench in stages: mock (no instrument), dry (no high voltage) and, with --live, live
-    (high voltage).
+    """Check the bench of RIG in stages.
 
-    Stops at the first check that fails and commands all outputs to 0 V.
+    The stages are mock (no instrument), dry (no high voltage) and, with --live, live (high
+    voltage). The command stops at the first check that fails and commands all outputs to 0 V.
     """
     if live and not yes:
         raise click.UsageError(
@@ -295,11 +296,13 @@ def check(
     }
     if loop_back and capacitor is not None:
         raise click.UsageError(
-            "--loop-back has no amplifier, --capacitor needs one. Leave one out."
+            "--loop-back needs the amplifier disconnected, --capacitor connected. Leave one out."
         )
     if not live and any(given.values()):
         first = next(option for option, used in given.items() if used)
-        raise click.UsageError(f"{first} belongs to --live.")
+        raise click.UsageError(
+            f"{first} has no effect without --live. Add --live, or leave it out."
+        )
     file = load_rig(rig)
     Interruptible(SilentProgress())  # a signal ends the checks, and that ends at 0 V
     checks: list[CheckResult] = []
@@ -309,16 +312,16 @@ def check(
         raise InputError(f"--loop-back needs a rig of kind = 'bench', found {file.kind!r}. {rig}")
     plan = LivePlan(capacitor, _supply_v(file), loop_back, daq)
     try:
-        # Closed at once where a check does not hold: 0 V must not wait for Python's collector.
+        # Closed at once if a check fails: 0 V must not wait for the garbage collector.
         operator = Operator(yes, acknowledge) if live else None
         with contextlib.closing(_checks(file, rig, operator, plan, frames)) as coming:
             for each in coming:
                 checks.append(each)
-                _tell(each, as_json)
+                _print_check(each, as_json)
                 if not each.passed:
                     advice = f"{each.advice}. Then" if each.advice else "Fix this, then"
                     if each.step == "live":
-                        advice = f"{_HANDS_OFF} {advice}"
+                        advice = f"{_SWITCH_OFF_FIRST} {advice}"
                     raise DeviceError(
                         f"{each.step}: {each.what}: {each.found}. {advice} run 'haselab rig "
                         f"check' again. {rig}"
@@ -330,7 +333,7 @@ def check(
             checks.append(CheckResult(step, "bench", str(error), False))
         raise
     except KeyboardInterrupt as stop:
-        if live and not getattr(stop, "__notes__", []):  # it came between two checks
+        if live and not getattr(stop, "__notes__", []):  # the interrupt came between two checks
             stop.add_note("All outputs were commanded to 0 V, not read back.")
         raise
     finally:
@@ -342,7 +345,7 @@ def check(
 
 
 def _recommend(checks: list[CheckResult], file: RigFile) -> None:
-    """Values that were measured, where the rig file has another one."""
+    """Print measured values that differ from those of the rig file."""
     for each in checks:
         for key, value in each.recommended.items():
             section, _, name = key.partition(".")
@@ -351,7 +354,7 @@ def _recommend(checks: list[CheckResult], file: RigFile) -> None:
                 click.echo(f"        recommended for the rig file: {key} = {value:g}")
 
 
-def _tell(each: CheckResult, as_json: bool) -> None:
+def _print_check(each: CheckResult, as_json: bool) -> None:
     if not as_json:
         mark = "ok" if each.passed else "FAILED"
         click.echo(f"{mark:6s}  {each.step:5s} {each.what:32s} {each.found}")
@@ -369,15 +372,18 @@ def _answer(
 
 @command.command("safe")
 @click.argument("rig", type=click.Path(path_type=Path), required=False)
-@click.option("--bench", metavar="KEY", help="Bench of your own drivers: its key in Gate.claim.")
-@answer_options(OutputRule("last"), "Also write the JSON result to this file.")
+@click.option(
+    "--bench", metavar="KEY",
+    help="Name a bench of your own drivers by its key in Gate.claim. Default: the bench of RIG.",
+)  # fmt: skip
+@answer_options(OutputRule("last"))
 def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -> None:
-    """Revoke the permission and command 0 V on every output of a bench, whichever program uses it.
+    """Command 0 V on every output of the bench of RIG.
 
-    Every program that uses THIS bench on this computer stays at 0 V until somebody arms the bench
-    again and acknowledges the reason. Other benches go on. In an emergency, press the emergency
-    stop first. With --bench, this command cannot reach the output: it revokes the permission and
-    waits up to 5 s for the program to command 0 V.
+    IN AN EMERGENCY, PRESS THE EMERGENCY STOP FIRST. The command revokes the permission of whichever
+    program on this computer uses the bench. That program stays at 0 V until you arm the bench again
+    and acknowledge the reason. Other benches are not affected. With --bench, this command cannot
+    reach the outputs: it revokes the permission and waits up to 5 s for the program to command 0 V.
     """
     if (rig is None) == (bench is None):
         raise InputError(f"{_NOTHING} Then give either a rig file or --bench KEY.")
@@ -389,18 +395,18 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         file, broken = load_rig_to_shut_down(rig)
     except (InputError, DeviceError) as error:
         raise type(error)(f"{_NOTHING} {error}") from None
-    if not isinstance(file, BenchOutputs) and (not isinstance(file, MegaFile) or file.port is None):
+    if not isinstance(file, BenchOutputs) and (not isinstance(file, ChipFile) or file.port is None):
         raise InputError(
-            f"The rig has kind {file.kind!r}: it can energise nothing outside the program that "
-            "runs it. Stop that program with Ctrl-C. 'rig safe' needs kind = 'bench', or 'mega' "
-            f"with a port. {rig}"
+            f"The rig has kind {file.kind!r}, which cannot energise anything outside the program "
+            "that runs it. Stop that program with Ctrl-C. 'rig safe' needs kind = 'bench', or "
+            f"'mega' with a port. {rig}"
         )
     click.echo(
-        "Revoking the permission and commanding 0 V. If this does not end, switch the amplifier "
-        "off by hand.",
+        "Revoking the permission and commanding 0 V. If this does not finish, switch the "
+        "amplifier off by hand.",
         err=True,
     )
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         faults = [_safe_by_its_program(key_of_port(file.port or ""), "chip")]
     else:
         faults = revoke_and_make_safe(file, REASON) + broken
@@ -415,7 +421,7 @@ def _report_safe(
         for name, fault in faults
     ]
     for each in rests:
-        _tell(each, as_json)
+        _print_check(each, as_json)
     bad = [each.what for each in rests if not each.passed]
     energised = [name for name in bad if name != "interlock"]
     reported = ["Permission not revoked: stop the program that uses this bench."] * (
@@ -425,13 +431,13 @@ def _report_safe(
         reported.append(f"Not confirmed at 0 V: {', '.join(energised)}. {_BY_HAND}")
     try:
         _answer(rests, as_json, out, write_new)
-    finally:  # this matters more than an answer that could not be written
+    finally:  # more important than an answer that cannot be written
         if bad:
             raise DeviceError(f"{' '.join(reversed(reported))} {bench}")
 
 
 def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
-    """The program of the bench commands 0 V; a microcontroller ramps down without its link too."""
+    """Make the bench's program command 0 V; a microcontroller also ramps down by itself."""
     with contextlib.closing(Interlock(key)) as interlock:
         used = interlock.owner_pid
         interlock.revoke(REASON)
@@ -454,10 +460,10 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
 @command.command("status")
 @answer_options()
 def status(as_json: bool, out: Path | None) -> None:
-    """Show which benches of this computer are armed, and why others were made safe.
+    """Show which benches of this computer are armed.
 
-    It reads what programs have recorded since the computer started, and touches no instrument: it
-    is no measurement of a voltage.
+    For the others it shows why they were made safe. It reads what programs have recorded since the
+    computer started. It does not contact any instrument: this is NOT a measurement of a voltage.
     """
     places = sorted(interlock_folder().glob("*.state"))
     benches = [_state_of(place.stem) for place in places]
@@ -474,15 +480,15 @@ def status(as_json: bool, out: Path | None) -> None:
 
 
 def _state_of(key: str) -> dict[str, object]:
-    """What a bench's interlock holds, in words and for JSON."""
+    """The state of a bench's interlock, as text and for JSON."""
     with contextlib.closing(Interlock(key)) as interlock:
         live, pid, reason = interlock.live, interlock.owner_pid, interlock.reason
     if live and pid:
-        state = f"ARMED by process {pid}: the output may be energised"
+        state = f"ARMED by process {pid}. The output may be energised"
     elif live:
-        state = "NOT CONFIRMED AT 0 V: its last program ended while it was armed"
+        state = "NOT CONFIRMED AT 0 V. Its last program ended while the bench was armed"
     else:
         state = "not armed"
     if reason:
-        state += f"; made safe: {reason}, to be acknowledged before it can be armed"
+        state += f"; made safe: {reason}. Acknowledge this reason to arm the bench again"
     return {"bench": key, "armed": live, "process": pid or None, "reason": reason, "state": state}

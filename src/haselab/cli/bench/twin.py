@@ -1,4 +1,4 @@
-"""`haselab twin`: the simulated bench behind the instruments' own protocols."""
+"""`haselab twin`: describe a simulated bench, or serve it over the instruments' protocols."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import click
 
 from haselab.cli.bench.twin_new import new
 from haselab.cli.common import Real, answer_options
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.run import rig_file
 from haselab.rig.twin.serve.faults import FAULTS
@@ -20,22 +21,22 @@ from haselab.rig.twin.serve.local_user import can_tell_users
 from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.ni.server import PRODUCT
 from haselab.rig.twin.serve.server import Ports, ServedTwin
-from haselab.runtime.scheduling import favoured
+from haselab.runtime.scheduling import with_priority
 from haselab.store.folder import write_new
 
 __all__ = ["command", "serve"]
 
 _CANNOT_TELL = (
-    "this system does not report who owns a connection: every user of this computer can connect "
-    "and set outputs of the twin."
+    "this system does not report which user owns a connection, so every user of this computer can "
+    "connect and set outputs of the twin."
 )
-_PORT = "TCP port; 0 chooses a free one."
-_TICK_S = 0.2  # Python looks at signals between waits
+_PORT = "Set the TCP port of the {}. 0 uses a free one."
+_TICK_S = 0.2  # Python handles signals between waits
 
 
 @click.group("twin")
 def command() -> None:
-    """The simulated bench: its parameters, and its instruments on loopback."""
+    """Describe a simulated bench, or serve it on loopback."""
 
 
 command.add_command(new)
@@ -48,36 +49,52 @@ command.add_command(new)
     type=Real(0.0, 1000.0),
     default=1.0,
     show_default=True,
-    help="Seconds of the bench in a second; 0: time passes only as it is asked for.",
+    help="Set the seconds of simulated time per second of real time. With 0, time passes only when "
+    "a client requests data.",
 )
-@click.option("--daq-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
-@click.option("--generator-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
-@click.option("--client-port", type=click.IntRange(0, 65535), default=0, help=_PORT)
+@click.option(
+    "--daq-port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    show_default=True,
+    help=_PORT.format("data acquisition"),
+)
+@click.option(
+    "--generator-port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    show_default=True,
+    help=_PORT.format("function generator"),
+)
+@click.option(
+    "--client-port", type=click.IntRange(0, 65535), default=0, show_default=True,
+    help=_PORT.format("client interface"),
+)  # fmt: skip
 @click.option(
     "--ahead-blocks",
     type=click.IntRange(0, 10),
     default=2,
     show_default=True,
-    help="Queued output blocks (daq.ahead_blocks) written to the rig file.",
+    help="Set the number of queued output blocks (daq.ahead_blocks) in the rig file.",
 )
-@click.option(
-    "--board",
-    type=click.Choice(list(DEVICES)),
-    default=PRODUCT,
-    show_default=True,
-    help="NI device that the acquisition acts as.",
-)
+@shared_option(
+    "--board", type=click.Choice(list(DEVICES)), default=PRODUCT, show_default=True,
+    metavar="BOARD",
+    detail=f"The acquisition behaves like this NI device: {', '.join(DEVICES)}.",
+)  # fmt: skip
 @click.option(
     "--fault",
     type=click.Choice(list(FAULTS)),
-    help="Simulate one fault of the bench, to practise with 'haselab rig check'.",
+    metavar="FAULT",
+    help="Simulate one fault of the bench, to practise with 'haselab rig check': "
+    f"{', '.join(FAULTS)}. Default: none.",
 )
 @click.option(
     "--allow-other-users",
     is_flag=True,
-    help="Serve every user of this computer. The default is the user who starts the server.",
+    help="Serve every user of this computer instead of only the user who starts the server.",
 )
-@answer_options(OutputRule("late"), "Rig file to write.")
+@answer_options(OutputRule("late"), "A rig file for this bench. Default: print it.")
 def serve(
     rig: Path,
     pace: float,
@@ -91,9 +108,10 @@ def serve(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Serve the twin of RIG (kind "twin") until SIGINT or SIGTERM.
+    """Serve the twin of RIG as instruments on loopback.
 
-    Prints the rig file that leads to it, or writes it to --out, once all instruments answer.
+    RIG is a rig file of kind "twin". The command prints a rig file that connects to the served
+    instruments, or writes it to --out, once they all answer. It ends on SIGINT (Ctrl-C) or SIGTERM.
     """
     config, seed = rig_file(rig)
     ended = threading.Event()
@@ -103,7 +121,7 @@ def serve(
 
     if not (allow_other_users or can_tell_users()):
         click.echo(f"haselab: {_CANNOT_TELL}", err=True)
-    first = favoured() if pace > 0.0 else contextlib.nullcontext()
+    first = with_priority() if pace > 0.0 else contextlib.nullcontext()
     before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         ports = Ports(daq_port, generator_port, client_port)

@@ -1,4 +1,4 @@
-"""`haselab twin new`: a commented TWIN.toml of one kind of actuator."""
+"""`haselab twin new`: write a commented TWIN.toml for one kind of actuator."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from haselab.actuators import PlanarHasel, actuator_kind
 from haselab.base import InputError
 from haselab.cli.common import answer_options
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig
 from haselab.store.folder import write_new
@@ -23,22 +24,25 @@ __all__ = ["new"]
 
 
 @click.command("new")
-@click.option("--kind", default=PLANAR_HASEL, show_default=True, help="Kind of the actuator.")
-@click.option("--name", default="my twin", show_default=True, help="Name of the bench.")
+@shared_option(
+    "--kind", default=PLANAR_HASEL, show_default=True, metavar="KIND",
+    detail="An unknown kind prints the known ones.",
+)  # fmt: skip
+@click.option("--name", default="my twin", show_default=True, help="Set the name of the bench.")
 @click.option(
     "--set",
     "values",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Set one value, for example --set shell.length_m=0.08. May be repeated.",
+    help="Set one value, for example --set shell.length_m=0.08. Repeat the option for "
+    "more. Default: those of the kind.",
 )
-@answer_options(OutputRule("late"), "TWIN.toml to write. The default prints it.")
+@answer_options(OutputRule("late"), "A TWIN.toml. Default: print it.")
 def new(kind: str, name: str, values: tuple[str, ...], as_json: bool, out: Path | None) -> None:
-    """Write the parameters of a simulated bench to a TWIN.toml that you can edit.
+    """Write a TWIN.toml, which describes a simulated bench.
 
-    The file holds every parameter of the actuator with its unit and limits. Sections that it
-    leaves out (amplifier, acquisition, camera) have their defaults. An unknown --kind lists the
-    known kinds.
+    The file holds every parameter of the actuator with its unit and limits. The sections amplifier,
+    acquisition and camera are left out where they have their default values.
     """
     config = validated(TwinConfig, _data(kind, name, values), "--set")
     text = "\n".join(_lines(config)) + "\n"
@@ -65,12 +69,12 @@ def _data(kind: str, name: str, values: Sequence[str]) -> dict[str, Any]:
             parsed = None
         if not (equals and dot and section and entry) or parsed is None:
             raise InputError(
-                f"--set {given} is not KEY=VALUE with a key such as shell.length_m and a number "
-                "or a list of numbers. Correct it."
+                f"--set {given} is not KEY=VALUE. Use a key such as shell.length_m, and a number "
+                "or a list of numbers as the value."
             )
         table = data.setdefault(section, {})
         if not isinstance(table, dict):
-            raise InputError(f"--set {given}: {section} is not a table. Use --{section}.")
+            raise InputError(f"--set {given}: {section} is not a section. Use --{section}.")
         table[entry] = parsed
     return data
 

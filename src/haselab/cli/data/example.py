@@ -16,16 +16,17 @@ __all__ = ["command"]
 
 @click.command("example")
 @click.argument("name", required=False)
-@answer_options(OutputRule("folder"), "New folder for the data set.")
+@answer_options(OutputRule("folder"), "A new folder for the data set. Default: list the names.")
 def command(name: str | None, as_json: bool, out: Path | None) -> None:
-    """List example data sets, or write the one called NAME with the commands that use it.
+    """List the example data sets, or write the one called NAME.
 
-    The data are simulated by the twin, the same each time, in files as other programs write them.
+    The README of a data set shows the commands that use it. The data are simulated by the twin,
+    always the same, and stored in the formats of other programs.
     """
     if name is None:
         if out is not None:
             listed = ", ".join(each.name for each in DATA_SETS)
-            raise InputError(f"--out needs the NAME of a data set. Name one of {listed}.")
+            raise InputError(f"--out needs the NAME of a data set. Use one of {listed}.")
         answer = {each.name: each.title for each in DATA_SETS}
         emit(answer, as_json=as_json, out=None)
         if not as_json:
@@ -40,6 +41,6 @@ def command(name: str | None, as_json: bool, out: Path | None) -> None:
         written = {"files": [str(file) for file in files], "commands": list(data_set.commands)}
         emit(written, as_json=True, out=None)
         return
-    click.echo(f"Wrote {', '.join(file.name for file in files)} to {out}. Try there:\n")
+    click.echo(f"Wrote {', '.join(file.name for file in files)} to {out}. Try in that folder:\n")
     for words in data_set.commands:
         click.echo(f"  haselab {words}")

@@ -1,4 +1,4 @@
-"""`haselab sense FILE`: monitor voltages to capacitance, block by block."""
+"""`haselab sense FILE`: compute capacitance from the monitor voltages, block by block."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from haselab.cli.common import (
     answer_options,
     emit,
     progress_bar,
-    tell_doubt,
     unverified_option,
+    warn_unverified,
 )
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.pipelines.prefetch import ahead, in_order
 from haselab.pipelines.sensing.source import Request, Source, open_source, too_short
@@ -35,7 +36,7 @@ from haselab.pipelines.sensing.table import (
     Judged,
     Summary,
     columns_of,
-    json_pieces,
+    json_parts,
 )
 from haselab.sensing import Charge, ChargeConfig, LockinConfig, Sensed
 from haselab.store.columns.reader import pairs_of
@@ -44,35 +45,35 @@ __all__ = ["command"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_LONGEST_S = 3600.0  # of a block, a blanking, a skew
+_LONGEST_S = 3600.0  # limit for the length of a block, for blanking and for skew
 _METHODS = {"lockin": "Lockin", "sinefit": "SineFit", "paper": "PaperChain", "charge": "Charge"}
-_EACH_FOR_ITSELF = ("lockin",)  # its blocks know nothing of each other, and it is all in C
+_PARALLEL = ("lockin",)  # its blocks are independent of each other, and it is all in C
 _MOST_WORKERS = 4
 _TOO_FEW = 0.1  # share of valid blocks below which there is no result
-_NO_MONITOR_V = 50.0  # peak to peak: converters end at 10 or 20 V
-_AT_THE_ACTUATOR = (
+_NO_MONITOR_V = 50.0  # peak to peak, more than any monitor: converters reach 10 or 20 V
+_ALREADY_SCALED = (
     "If the columns are V and A at the actuator, add --volt-per-monitor-volt 1 "
     "--ampere-per-monitor-volt 1"
 )
-_TONE_ROWS = 1 << 18  # of the record in which tones are looked for
-_FEW = 0.8  # below which a warning says why
+_TONE_ROWS = 1 << 18  # rows in which tones are searched
+_FEW = 0.8  # share of valid blocks below which a warning gives the reason
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _NOT_FINITE, _CARRIER_OFF = 1, 2, 4, 32, 64
 
 
 class _Method(Protocol):
-    """A sensing method, whichever it is."""
+    """Any sensing method."""
 
     config: LockinConfig
 
     def sense(self, readings: NDArray[Any]) -> Sensed:
-        """Blocks of both monitors."""
+        """Sense blocks of both monitors."""
 
     def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
-        """The same from two columns."""
+        """Sense two columns, voltage and current."""
 
 
 class _Sink(Protocol):
-    """Where results go, some blocks at a time."""
+    """Takes results, some blocks at a time."""
 
     def write(self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str]) -> None:
         """Take the columns of some blocks."""
@@ -87,7 +88,7 @@ def _positive(context: click.Context, parameter: click.Parameter, value: float |
 
 
 def _not_negative(context: click.Context, parameter: click.Parameter, value: float | None) -> Any:
-    """Refuse a time that is negative or no number."""
+    """Refuse a time that is negative or not a number."""
     del context
     if value is not None and not 0.0 <= value < _LONGEST_S:
         raise click.BadParameter(
@@ -97,7 +98,7 @@ def _not_negative(context: click.Context, parameter: click.Parameter, value: flo
 
 
 def _finite(context: click.Context, parameter: click.Parameter, value: float | None) -> Any:
-    """Refuse what is no number."""
+    """Refuse a time that is not a finite number."""
     del context
     if value is not None and not abs(value) < _LONGEST_S:
         raise click.BadParameter(
@@ -106,16 +107,20 @@ def _finite(context: click.Context, parameter: click.Parameter, value: float | N
     return value
 
 
-def _option(name: str, text: str, **settings: Any) -> Callable[[F], F]:
-    return click.option(name, type=REAL, callback=_positive, help=text, **settings)
+def _option(name: str, detail: str) -> Callable[[F], F]:
+    """A shared option that takes a positive number."""
+    return shared_option(name, type=REAL, callback=_positive, detail=detail)
 
 
 def _scale(name: str, default: float, text: str) -> Callable[[F], F]:
-    return _option(name, text, default=default, show_default=True)
+    """The scale of an equation of the paper."""
+    return click.option(
+        name, type=REAL, callback=_positive, default=default, show_default=True, help=text
+    )
 
 
-def _sense_piece(method: _Method, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
-    """The whole blocks of one piece; columns of one array go through without a copy."""
+def _sense_part(method: _Method, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
+    """Sense the whole blocks of one part; columns of one array are not copied."""
     length = method.config.block_samples
     used = v.size // length * length
     pairs = pairs_of(v, i)
@@ -125,7 +130,7 @@ def _sense_piece(method: _Method, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
 
 
 def _results(source: Source, method: _Method, request: Request) -> Iterator[tuple[Columns, Judged]]:
-    """Columns and words of the blocks of each piece."""
+    """Columns and reasons of the blocks of each part."""
     length = method.config.block_samples
 
     def numbered() -> Iterator[tuple[int, NDArray[Any], NDArray[Any]]]:
@@ -136,19 +141,19 @@ def _results(source: Source, method: _Method, request: Request) -> Iterator[tupl
             first += v.size // length
 
     def work(
-        piece: tuple[int, NDArray[Any], NDArray[Any]],
+        part: tuple[int, NDArray[Any], NDArray[Any]],
     ) -> tuple[Columns, Judged]:
-        first, v, i = piece
-        return _columns(_sense_piece(method, v, i), source, request, first)
+        first, v, i = part
+        return _columns(_sense_part(method, v, i), source, request, first)
 
-    workers = min(_MOST_WORKERS, os.cpu_count() or 1) if request.method in _EACH_FOR_ITSELF else 1
+    workers = min(_MOST_WORKERS, os.cpu_count() or 1) if request.method in _PARALLEL else 1
     return in_order(work, numbered(), workers)
 
 
 def _columns(
     sensed: Sensed, source: Source, request: Request, first: int
 ) -> tuple[Columns, Judged]:
-    """Columns and words of blocks from one on."""
+    """Columns and reasons of the blocks from number `first` on."""
     config, count = source.config, sensed.valid.size
     inside_s = sensed.time_s - config.block_s * np.arange(count)
     columns = columns_of(
@@ -166,7 +171,7 @@ def _columns(
 def _charge_results(
     source: Source, config: ChargeConfig, request: Request, read: Callable[[], None]
 ) -> Iterator[tuple[Columns, Judged]]:
-    """The same without a carrier: the whole record is read before its first block is known."""
+    """Results without a carrier: the whole record is read before its first block is known."""
     charge, length = Charge(config), config.block_samples
     blocks = 0
     for v, i in ahead(source.pieces()):
@@ -179,7 +184,7 @@ def _charge_results(
 
 
 def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
-    """Sense all of it."""
+    """Sense the whole source, with a progress bar."""
     bar, share = progress_bar(), 0.0
     bar.start(1.0)
 
@@ -206,7 +211,7 @@ def _run(source: Source, request: Request, sinks: list[_Sink]) -> None:
 def _nothing_valid(
     summary: Summary, config: LockinConfig | ChargeConfig, tones_hz: list[float]
 ) -> str:
-    """What is wrong with a record none of whose blocks is valid."""
+    """What is wrong with a record without any valid block."""
     blocks = summary.blocks
     tones = " and ".join(f"{hz:.5g}" for hz in tones_hz)
     seen = f"The voltage has tones at {tones} Hz. " if tones else ""
@@ -219,34 +224,34 @@ def _nothing_valid(
     if 2 * counts[worst] < blocks or by_charge:
         return f"None of {blocks} blocks is valid: {summary.why_not()}. {seen}".rstrip()
     if worst == _NOT_FINITE:
-        return f"All {blocks} blocks hold values that are not finite. Export the record again."
+        return f"All {blocks} blocks contain NaN or infinite values. Export the record again."
     if worst == _CLIPPED:
         if summary.largest_v > _NO_MONITOR_V:
             return (
                 f"All {blocks} blocks are clipped: the voltage spans up to {summary.largest_v:.4g} "
-                f"V, more than a monitor has. {_AT_THE_ACTUATOR} and a --full-scale-v above the "
-                "largest voltage."
+                f"V, more than any monitor output. {_ALREADY_SCALED} and a --full-scale-v above "
+                "the largest voltage."
             )
         return (
-            f"All {blocks} blocks reach the converter's full scale and are clipped. Lower the "
-            "signal, or state the range by --full-scale-v."
+            f"All {blocks} blocks reach the converter's full scale and are clipped. Reduce the "
+            "signal, or state the full scale with --full-scale-v."
         )
     if worst == _PHASE_OUT:
         return (
             f"The current does not lead the voltage in any of {blocks} blocks, as it does in a "
-            "capacitor: the channels seem swapped, or one monitor inverted. Swap the columns, "
-            "turn the sign of one, or check --skew-s."
+            "capacitor: the channels may be swapped, or one monitor inverted. Swap the columns, "
+            "change the sign of one, or check --skew-s."
         )
     assert isinstance(config, LockinConfig)
     return (
-        f"No block of {blocks} shows a carrier at {config.carrier_hz:g} Hz on both monitors. {seen}"
-        f"Check --carrier-hz, --rate-hz ({config.rate_hz:g} Hz) and the sensing signal."
+        f"None of {blocks} blocks shows a carrier at {config.carrier_hz:g} Hz on both monitors. "
+        f"{seen}Check --carrier-hz, --rate-hz ({config.rate_hz:g} Hz) and the sensing signal."
     )
 
 
 def _tones_hz(source: Source) -> list[float]:
-    """The largest tones of the voltage above a few periods a block, at most two, in order."""
-    from haselab.sensing.block.tones import strongest_tones  # scipy: half a second at the start
+    """The largest tones of the voltage with a few periods per block, at most two, in order."""
+    from haselab.sensing.block.tones import strongest_tones  # scipy takes half a second to import
 
     v, _ = next(source.stream.pieces(_TONE_ROWS))
     config = source.config
@@ -273,34 +278,36 @@ def _sense(
     if summary.blocks == 0:
         raise too_short(left_over, source.config.block_samples, source.config.rate_hz, path)
     if left_over:
-        click.echo(f"haselab: {left_over} samples at the end fill no block and are left.", err=True)
+        click.echo(
+            f"haselab: the last {left_over} samples do not fill a block and are left out.", err=True
+        )
     if summary.valid_blocks == 0:
         raise ResultError(f"{_nothing_valid(summary, source.config, tones_hz)} {path}")
     share = summary.valid_blocks / summary.blocks
     doubtful = f"{summary.valid_blocks} of {summary.blocks} blocks valid: {summary.why_not()}."
     if share < _TOO_FEW:
-        raise ResultError(f"Hardly any block can be used, {doubtful} {path}")
+        raise ResultError(f"Too few blocks are valid: {doubtful} {path}")
     if share < _FEW:
         click.echo(f"haselab: warning: only {doubtful}", err=True)
     plain = source.session is None and request.calibration is None and source.in_monitor_volts
     if plain and summary.largest_v > _NO_MONITOR_V:
         click.echo(
-            f"haselab: warning: the voltage spans up to {summary.largest_v:.4g} V, more than a "
-            f"monitor has, and is taken as volts at the monitors. {_AT_THE_ACTUATOR}.",
+            f"haselab: warning: the voltage spans up to {summary.largest_v:.4g} V, more than any "
+            f"monitor output, but is treated as volts at the monitors. {_ALREADY_SCALED}.",
             err=True,
         )
     save_plot(plot, lambda: _chart(collected, path))
     answer = summary.answer(request.method)
     if doubt:
-        tell_doubt(doubt, path)
+        warn_unverified(doubt, path)
         answer["unverified"] = True
     if as_json:
-        for text in json_pieces(answer, collected):
+        for text in json_parts(answer, collected):
             click.echo(text, nl=False)
     else:
         emit(answer, as_json=False, out=None)
         if out is None:
-            click.echo(f"{summary.blocks} rows, one a block: use --json or --out.")
+            click.echo(f"{summary.blocks} rows, one per block: use --json or --out.")
 
 
 def _chart(collected: Collected, path: Path) -> Chart:
@@ -320,7 +327,7 @@ def _chart(collected: Collected, path: Path) -> Chart:
 
 
 class _Out:
-    """The CSV file, made when its first rows come: a refused request leaves nothing behind."""
+    """The CSV file, created with its first rows: a refused request leaves no file behind."""
 
     def __init__(self, path: Path, opened: ExitStack) -> None:
         self._path, self._opened = path, opened
@@ -337,69 +344,46 @@ class _Out:
 
 @click.command("sense")
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
-@_option(
-    "--carrier-hz", "Frequency of the sensing signal; needed but for a session and for charge."
-)
-@_option("--rate-hz", "Samples per second and channel. Default: from the file.")
-@_option(
-    "--block-s",
-    "Length of a block, one result each; default: 0.01 (charge: 0.5), or the session's.",
-)
+@_option("--carrier-hz", "Default: from the session or --actuator. The method charge needs none.")
+@_option("--rate-hz", "Default: the rate in the file.")
+@_option("--block-s", "Default: 0.01 (method charge: 0.5), or the session's.")
+@shared_option(
+    "--method", type=click.Choice(list(_METHODS)), default="lockin", show_default=True,
+    detail="lockin: the most accurate; sinefit: for a carrier that is not exactly known; paper: "
+    "as in the paper; charge: without a carrier, from the charge of a drive that passes 0 V.",
+)  # fmt: skip
+@shared_option(
+    "--skew-s", type=REAL, callback=_finite, detail="Default: 0, or the session's.",
+)  # fmt: skip
+@shared_option(
+    "--blank-s", type=REAL, callback=_not_negative,
+    detail="The step is at the start of each block; 0: there are no steps. Default: search each "
+    "block for a step, or use the times that a session states.",
+)  # fmt: skip
+@_option("--volt-per-monitor-volt", "Default: 5000, or the session's.")
+@_option("--ampere-per-monitor-volt", "Default: 0.002, or the session's.")
 @click.option(
-    "--method",
-    type=click.Choice(list(_METHODS)),
-    default="lockin",
-    show_default=True,
-    help="lockin: best; sinefit: carrier not exactly known; paper: the study's own chain; charge: "
-    "no carrier, the charge of a drive that passes 0 V.",
-)
+    "--calibration", type=click.Path(path_type=Path), metavar="CALIBRATION.toml",
+    help="Use this file of 'haselab calibrate' instead of scales and skew. Default: none.",
+)  # fmt: skip
 @click.option(
-    "--skew-s",
-    type=REAL,
-    callback=_finite,
-    help="Time from a voltage sample to its current sample; default: 0, or the session's.",
-)
+    "--amplifier", metavar="NAME",
+    help="Refuse a calibration of an amplifier with another name. Default: accept any.",
+)  # fmt: skip
 @click.option(
-    "--blank-s",
-    type=REAL,
-    callback=_not_negative,
-    help="Start of each block that does not count, after an output's step; 0: no steps. Default: "
-    "each block is searched for a step at an unknown time; a session states where its steps are.",
-)
-@_option(
-    "--volt-per-monitor-volt", "Scale of the voltage monitor; default: 5000, or the session's."
-)
-@_option(
-    "--ampere-per-monitor-volt", "Scale of the current monitor; default: 0.002, or the session's."
-)
-@click.option(
-    "--calibration",
-    type=click.Path(path_type=Path),
-    help="File of 'haselab calibrate': takes the place of scales and skew.",
-)
-@click.option("--amplifier", help="Refuse a calibration of another one than this.")
-@_option("--full-scale-v", "Range of the converter; beyond it is clipped. Default: 10.")
-@_option("--current-limit-a", "A block whose current reaches it is not valid; default: none.")
-@click.option(
-    "--v",
-    "v_column",
-    default="v_monitor_v",
-    show_default=True,
-    help="Voltage monitor's column.",
-)
-@click.option(
-    "--i",
-    "i_column",
-    default="i_monitor_v",
-    show_default=True,
-    help="Current monitor's column.",
-)
-@click.option("--experiment", metavar="NAME", help="FILE is a session: sense this experiment.")
+    "--full-scale-v", type=REAL, callback=_positive,
+    help="Set the full scale of the converter in V. Samples that reach it count as clipped. "
+    "Default: 10.",
+)  # fmt: skip
+@_option("--current-limit-a", "A block whose current reaches it is not valid. Default: no limit.")
+@shared_option("--v", "v_column", default="v_monitor_v", show_default=True)
+@shared_option("--i", "i_column", default="i_monitor_v", show_default=True)
+@shared_option("--experiment", detail="For a FILE that is a session. Default: its only one.")
 @column_options
-@_scale("--reactance-scale", 2.5e6, "Of eq. 2, for relative_capacitance alone.")
-@_scale("--capacitance-scale", 10.0, "Of eq. 3, for relative_capacitance alone.")
-@actuator_option("carrier and calibration are read from [sensing].")
-@answer_options(plot=True)
+@_scale("--reactance-scale", 2.5e6, "Set the scale of eq. 2, for relative_capacitance only.")
+@_scale("--capacitance-scale", 10.0, "Set the scale of eq. 3, for relative_capacitance only.")
+@actuator_option("Reads carrier and calibration from [sensing].")
+@answer_options(None, "A CSV file with one row per block. Default: none.", plot=True)
 @unverified_option
 def command(
     file: Path,
@@ -409,12 +393,11 @@ def command(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """Capacitance and series resistance from the records of both monitors.
+    """Compute capacitance and series resistance from both monitors.
 
-    FILE has the columns v_monitor_v and i_monitor_v, or those that --v and --i name (CSV, .mat,
-    .npz, .h5 or .tdms), or is a .npy array of two columns, voltage first, or a haselab session; it
-    may be larger than memory. --out names a CSV file with one row a block, written as the blocks
-    are sensed.
+    FILE is a table (CSV, .mat, .npz, .h5 or .tdms) with the columns v_monitor_v and i_monitor_v, or
+    those that --v and --i name; a .npy array of two columns, voltage first; or a haselab session.
+    It may be larger than memory: the rows of --out are written as the blocks are computed.
     """
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
@@ -425,8 +408,8 @@ def command(
 
 
 def _known(actuator: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Carrier and calibration of an actuator file, where the options do not give them."""
-    from haselab.cli.actuator_file import load_actuator  # `haselab sense` must start at once
+    """Carrier and calibration of an actuator file that the options do not give."""
+    from haselab.cli.actuator_file import load_actuator  # `haselab sense` must start fast
 
     sensing = load_actuator(actuator).sensing
     known: dict[str, Any] = {}

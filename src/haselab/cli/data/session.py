@@ -1,4 +1,4 @@
-"""`haselab session`: a recording in the form of other tools, and back."""
+"""`haselab session`: export a recording for other tools, or import one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import click
 
 from haselab.base import InputError
 from haselab.cli.columns import advice_on_columns, column_options, note_seconds
-from haselab.cli.common import Real, answer_options, emit, tell_doubt, unverified_option
+from haselab.cli.common import Real, answer_options, emit, unverified_option, warn_unverified
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.pipelines.sensing.series import derived_series
 from haselab.store.columns.selection import ColumnOptions
@@ -27,21 +28,22 @@ def command() -> None:
 
 @command.command("export")
 @click.argument("session", type=click.Path(path_type=Path))
-@click.option(
+@shared_option(
     "--to", "form", type=click.Choice(sorted(FORMS)), required=True,
-    help="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb.",
+    detail="csv and parquet: a folder of tables; mat: structs of version 5; tdms: LabVIEW; nwb: "
+    "Neurodata Without Borders.",
 )  # fmt: skip
-@click.option(
-    "--experiment", "experiments", multiple=True, metavar="NAME",
-    help="Export this experiment alone; repeat it for more. Default: all.",
+@shared_option(
+    "--experiment", "experiments", multiple=True,
+    detail="Repeat the option for more. Default: all.",
 )  # fmt: skip
 @click.option(
     "--derived/--recorded-only", default=True, show_default=True,
-    help="Export capacitance and strain of each experiment as well, where they follow from it.",
+    help="Export capacitance and strain of each experiment too, where they can be computed.",
 )  # fmt: skip
 @answer_options(
     OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),
-    "File or folder to write.  [required]",
+    "A file, or a folder of tables.  [required]",
 )
 @unverified_option
 def _export(
@@ -53,7 +55,10 @@ def _export(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Export SESSION (a run folder or its session.h5) for another tool."""
+    """Export a recording for another tool.
+
+    SESSION is the folder of a run or its session.h5.
+    """
     if out is None:
         raise InputError("Missing option '--out': the file or folder to write.")
     done = export_session(
@@ -64,7 +69,7 @@ def _export(
         derived=derived_series if derived else nothing_derived,
         unverified=unverified,
     )
-    tell_doubt(done.doubt, session)
+    warn_unverified(done.doubt, session)
     for why in done.unreadable.values():
         click.echo(f"haselab: left out: {why}", err=True)
     answer: dict[str, Any] = {
@@ -80,54 +85,39 @@ def _export(
 
 @command.command("import")
 @click.argument("file", type=click.Path(path_type=Path))
+@shared_option("--v", "v_column", default="v_monitor_v", show_default=True)
+@shared_option("--i", "i_column", default="i_monitor_v", show_default=True)
 @click.option(
-    "--v",
-    "v_column",
-    default="v_monitor_v",
-    show_default=True,
-    help="Column of the voltage monitor, in V.",
-)
-@click.option(
-    "--i",
-    "i_column",
-    default="i_monitor_v",
-    show_default=True,
-    help="Column of the current monitor, in V.",
-)
-@click.option("--drive", metavar="COLUMN", help="Column of the drive voltage ahead of the "
-              "amplifier, in V; the median of each block is kept.  [default: none]")  # fmt: skip
-@click.option("--experiment", default="imported", show_default=True, help="Name in the session.")
-@click.option(
-    "--rate-hz",
-    type=Real(1e-3, 1e8),
-    help="Sampling rate per channel, in Hz. Default: read from the file.",
-)
+    "--drive", metavar="COLUMN",
+    help="Name the column of the drive voltage before the amplifier, in V; the median of each "
+    "block is kept. Default: none.",
+)  # fmt: skip
+@shared_option("--experiment", default="imported", show_default=True)
+@shared_option("--rate-hz", type=Real(1e-3, 1e8), detail="Default: the rate in the file.")
 @click.option(
     "--volt-per-code", type=Real(1e-12, 1e6),
-    help="Converter resolution, in V per code. Default: the smallest that covers every sample.",
+    help="Set the converter resolution in V per code. Default: the smallest that covers every "
+    "sample.",
 )  # fmt: skip
 @click.option(
     "--block-samples", type=click.IntRange(20, 2_000_000), default=2000, show_default=True,
-    help="Samples per channel in one block.",
+    help="Set the number of samples per channel in one block.",
 )  # fmt: skip
-@click.option(
+@shared_option(
     "--volt-per-monitor-volt", type=Real(1e-9, 1e9),
-    help="Scale of the voltage monitor, in V/V. Default: 5000; from the peak for a column in kV.",
+    detail="Default: 5000, or from the peak for a column in kV.",
 )  # fmt: skip
-@click.option(
+@shared_option(
     "--ampere-per-monitor-volt", type=Real(1e-15, 1e3),
-    help="Scale of the current monitor, in A/V. Default: 0.002; from the peak for a column in A.",
+    detail="Default: 0.002, or from the peak for a column in A.",
 )  # fmt: skip
-@click.option(
+@shared_option(
     "--carrier-hz", type=Real(1e-3, 1e8),
-    help="Frequency of the sensing signal, in Hz, kept for `haselab sense`. Default: none.",
+    detail="It is stored for `haselab sense`. Default: none.",
 )  # fmt: skip
-@click.option(
-    "--skew-s", type=Real(-1.0, 1.0), default=0.0, show_default=True,
-    help="Time from a voltage sample to its current sample, in s.",
-)  # fmt: skip
+@shared_option("--skew-s", type=Real(-1.0, 1.0), default=0.0, show_default=True)
 @column_options
-@answer_options(OutputRule("folder"), "New folder for the session.")
+@answer_options(OutputRule("folder"), "A new folder for the session.  [required]")
 def _import(
     file: Path,
     v_column: str,
@@ -142,9 +132,10 @@ def _import(
     out: Path | None,
     **scales: float | None,
 ) -> None:
-    """Import the voltage and current columns of FILE (CSV, MAT, NPZ, HDF5, TDMS) as a session.
+    """Import voltage and current columns as a session.
 
-    The session can be sensed, exported and read like a recorded one.
+    FILE is CSV, MAT, NPZ, HDF5 or TDMS. The session can be sensed, exported and read like a
+    recorded one.
     """
     if out is None:
         raise InputError("Missing option '--out': the new folder of the session.")

@@ -1,4 +1,4 @@
-"""`haselab track`: video to displacements and strain."""
+"""`haselab track`: measure displacements and strain in a video."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from haselab.cli.common import (
     answer_options,
     emit,
     progress_bar,
-    tell_doubt,
     unverified_option,
+    warn_unverified,
 )
 from haselab.cli.data.track_chart import track_chart
 from haselab.cli.data.track_link import link_clip
 from haselab.cli.data.track_pictures import overlay_to
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.plot import save_plot
 from haselab.pipelines.prefetch import in_order
@@ -42,11 +43,11 @@ from haselab.pipelines.tracking.points import (
 )
 from haselab.pipelines.tracking.scale import (
     Correction,
-    ScaleWish,
+    ScaleOptions,
+    describe_scale,
     make_correction,
     read_lens,
     scale_of,
-    told,
     with_fixed,
 )
 from haselab.pipelines.tracking.stream import (
@@ -70,9 +71,9 @@ _MANY_LOST = 0.1
 _TURN_S = 0.5e-3
 
 
-def _beside(wishes: Mapping[str, Any]) -> tuple[str, ...]:
-    """Endings of the files beside the table: a lens only where one is calibrated."""
-    return ("-strain.csv", "-lens.json") if wishes["lens_board"] else ("-strain.csv",)
+def _beside(options: Mapping[str, Any]) -> tuple[str, ...]:
+    """Endings of the files beside the table; a lens only if one is calibrated."""
+    return ("-strain.csv", "-lens.json") if options["lens_board"] else ("-strain.csv",)
 
 
 _OUTPUTS = OutputRule(options=("overlay", "report"), beside=_beside)
@@ -80,12 +81,12 @@ _OUTPUTS = OutputRule(options=("overlay", "report"), beside=_beside)
 
 @dataclass(frozen=True)
 class _Request:
-    """What the user asked for, beyond the video and the answer's place."""
+    """The options, besides those for the output."""
 
     points: Path | None
     count: int
     rest_frames: int
-    scale: ScaleWish
+    scale: ScaleOptions
     lens: Path | None
     lens_board: str | None
     fixed: str | None
@@ -103,7 +104,8 @@ def _rest(opening: Opening, count: int, path: Path) -> list[Frame]:
     frames = opening.frames
     if len(frames) < count:
         raise InputError(
-            f"--rest-frames {count}, but only {len(frames)} frames can be read. Lower it. {path}"
+            f"--rest-frames is {count}, but the video has only {len(frames)} frames. Lower it. "
+            f"{path}"
         )
     return frames[:count]
 
@@ -111,22 +113,22 @@ def _rest(opening: Opening, count: int, path: Path) -> list[Frame]:
 def _before_motion(
     rest: list[Frame], points: Points, options: TrackOptions, path: Path
 ) -> tuple[list[Frame], str]:
-    """The rest frames before anything moves, and a warning where some are left out."""
+    """The rest frames before anything moves, and a warning if some are left out."""
     still = frames_at_rest(rest, points.place_px, options)
     if still == len(rest):
         return rest, ""
     line = (
-        f"--rest-frames {len(rest)}, but the points move from frame {still} on. Only the first "
-        f"{still} frames are the reference. Give at most --rest-frames {still}. {path}"
+        f"--rest-frames is {len(rest)}, but the points move from frame {still} on. Only the first "
+        f"{still} frames were averaged as the reference. Use at most --rest-frames {still}. {path}"
     )
     click.echo(f"haselab: {line}", err=True)
     return rest[:still], line
 
 
-def _watched(
+def _with_progress(
     followed: Iterator[Block], correction: Correction, kept: Kept, frames: int
 ) -> Iterator[Block]:
-    """The blocks, corrected and noted, with a progress bar."""
+    """Correct and record the blocks, with a progress bar."""
     bar = progress_bar()
     bar.start(frames)
     try:
@@ -142,7 +144,7 @@ def _watched(
 def _track(
     video: VideoReader, request: _Request, clock: Clock, out: Path, head: dict[str, Any]
 ) -> tuple[dict[str, Any], HaselabError | None]:
-    """Points followed by subsets; the answer for the user, and what broke the video off."""
+    """Track points by subsets; return the answer, and the error that ended the video early."""
     opening = Opening(read_ahead(video, clock), max(request.rest_frames, PILOT_FRAMES))
     rest = _rest(opening, request.rest_frames, video.path)
     if request.points is None:
@@ -169,14 +171,14 @@ def _track(
     followed = UntilBroken(follow)
     with out.open("wb") as file:
         file.write(rows.header())
-        watched = _watched(iter(followed), correction, kept, video.frames_expected)
+        watched = _with_progress(iter(followed), correction, kept, video.frames_expected)
         for _ in in_order(lambda b: file.write(rows.block(b, correction.rest_px)), watched, 1):
             pass
     overlay.close()
     if not kept.frames:
-        raise followed.error or InputError(f"The video holds no frame. {video.path}")
+        raise followed.error or InputError(f"The video contains no frame. {video.path}")
     answer = head | {"rest_frames": len(rest)} | _answer(points, choice, kept)
-    answer |= told(lens, [points.names[k] for k in fixed], scale)
+    answer |= describe_scale(lens, [points.names[k] for k in fixed], scale)
     gauge = gauge_of(points, correction.rest_px, kept)
     answer["strain"] = strain_answer(gauge, kept, out)
     if request.report is not None:
@@ -198,8 +200,8 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
     held = kept.valid / kept.frames
     if 1.0 - held.mean() > _MANY_LOST:
         click.echo(
-            f"haselab: {100 * (1 - held.mean()):.0f} % of the positions were lost; the column "
-            "reason says why. --link gives the paths of particles that come and go.",
+            f"haselab: {100 * (1 - held.mean()):.0f} % of the positions were lost; see the column "
+            "reason. Use --link for particles that appear and disappear.",
             err=True,
         )
     noise = choice.state.noise
@@ -212,8 +214,9 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
         "valid_fraction": float(held.mean()),
         "expected_wrong_fraction": kept.expected_wrong,
         "expected_wrong_basis": (
-            "share of the valid positions wrong by more than 0.5 px, by their standard deviations; "
-            "at least 1e-4, and 0.005 of the lost share for look-alikes in front of the points"
+            "share of the valid positions that are wrong by more than 0.5 px, from their standard "
+            "deviations; at least 1e-4, plus 0.005 of the lost share for similar points that hide "
+            "the tracked ones"
         ),
         "median_std_px": float(np.median(thin.std_x_px[thin.valid])) if thin.valid.any() else None,
         "noise": None if noise is None else {"floor": noise.floor, "slope": noise.slope},
@@ -221,7 +224,7 @@ def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
 
 
 def _loss_line(video: VideoReader) -> str:
-    """What compression does, in words; nothing where it does nothing."""
+    """A warning about lossy compression; empty if there is none."""
     if video.lossy:
         return (
             f"The video is compressed with loss ({video.codec}). The standard deviations are "
@@ -232,14 +235,14 @@ def _loss_line(video: VideoReader) -> str:
         )
     if video.lossy is None:
         return (
-            f"{video.codec} compresses with loss or without, and the file does not say which. "
+            f"{video.codec} may or may not compress with loss, and the file does not say. "
             f"Record raw, FFV1 or TIFF to be sure. {video.path}"
         )
     return ""
 
 
 def _gap_line(video: VideoReader) -> str:
-    """Which frames are missing, in words; nothing where none is."""
+    """A warning about missing frames; empty if there are none."""
     missing = video.missing
     if not missing:
         return ""
@@ -250,75 +253,93 @@ def _gap_line(video: VideoReader) -> str:
     )
 
 
-def _request(wishes: dict[str, Any]) -> _Request:
-    """The options; those of the scale together."""
+def _request(options: dict[str, Any]) -> _Request:
+    """Collect the options; those of the scale go into one object."""
     names = ("mm_per_px", "points", "ruler", "board", "picture")
-    scale = ScaleWish(**{name: wishes.pop(f"scale_{name}") for name in names})
-    return _Request(**wishes, scale=scale)
+    scale = ScaleOptions(**{name: options.pop(f"scale_{name}") for name in names})
+    return _Request(**options, scale=scale)
 
 
 @click.command()
 @click.argument("video", type=click.Path(path_type=Path))
-@click.option("--points", type=click.Path(path_type=Path), help="CSV: point, x_px, y_px.")
-@click.option("--auto", is_flag=True, help="Find the points (the default without --points).")
+@click.option(
+    "--points", type=click.Path(path_type=Path), metavar="P.csv",
+    help="Read the points in the first frame from this CSV file: point, x_px, y_px. Default: find "
+    "them, as with --auto.",
+)  # fmt: skip
+@click.option("--auto", is_flag=True, help="Find the points automatically.")
 @click.option("--count", type=click.IntRange(1), default=300, show_default=True,
     help="Find at most this many particles.",
 )  # fmt: skip
 @click.option("--rest-frames", type=click.IntRange(1), default=1, show_default=True,
     help="Average this many motionless first frames as the reference.",
 )  # fmt: skip
-@click.option("--scale-mm-per-px", type=REAL, help="Length of a pixel.")
-@click.option("--scale-points", metavar="X1,Y1,X2,Y2,MM", help="Two points, their distance.")
 @click.option(
-    "--scale-ruler", metavar="X1,Y1,X2,Y2,MM", help="A line on a ruler, MM from tick to tick."
-)
-@click.option("--scale-board", metavar="CxR,MM", help="A checkerboard's inner corners, its square.")
-@click.option(
-    "--scale-picture",
-    type=click.Path(path_type=Path),
-    help="Of ruler or board; without it they are in the first frame.",
-)
-@click.option(
-    "--lens",
-    type=click.Path(path_type=Path),
-    help="A folder of checkerboard pictures (with --lens-board), or a lens.json made of one.",
-)
-@click.option("--lens-board", metavar="CxR,MM", help="The checkerboard of --lens.")
-@click.option(
-    "--fixed",
-    metavar="NAMES|P.csv",
-    help="Points that should stand still: rigid motion of camera and stand is taken out.",
-)
-@click.option("--rate-hz", type=POSITIVE, help="Frame rate, in place of the file's.")
-@click.option(
-    "--times",
-    type=click.Path(path_type=Path),
-    help="Times of the frames: CSV frame,time_s, or session.h5 with --experiment.",
-)
-@click.option("--experiment", help="Of the session given by --times.")
-@click.option(
-    "--subset-px",
-    type=INTEGER,
-    help="Side of a subset, odd. Default: 15 with --points, by the dots' size with --auto.",
-)
-@click.option(
-    "--model",
-    type=click.Choice(["auto", "translation", "neighbours", "affine"]),
-    default="auto",
-    show_default=True,
-    help="How a subset may move and deform.",
-)
-@click.option("--link", is_flag=True, help="Find particles in each frame and link them.")
-@click.option("--reach-px", type=POSITIVE, default=5.0, show_default=True,
-    help="With --link: the farthest that a particle moves between frames.",
+    "--scale-mm-per-px", type=REAL,
+    help="Set the scale in mm per pixel. Default: none, lengths stay in pixels.",
 )  # fmt: skip
 @click.option(
-    "--overlay",
-    type=click.Path(path_type=Path),
-    help=".mp4: the points on the frames; .png: a contact sheet.",
-)
-@click.option("--report", type=click.Path(path_type=Path), help="HTML: one page of the tracks.")
-@answer_options(_OUTPUTS, plot=True)
+    "--scale-points", metavar="X1,Y1,X2,Y2,MM",
+    help="Find the scale from two points in px and their distance in mm. Default: none.",
+)  # fmt: skip
+@click.option(
+    "--scale-ruler", metavar="X1,Y1,X2,Y2,MM",
+    help="Find the scale from a line on a ruler in px and the mm between its ticks. Default: none.",
+)  # fmt: skip
+@click.option(
+    "--scale-board", metavar="CxR,MM",
+    help="Find the scale from a checkerboard: inner corners, and side of a square in mm. Default: "
+    "none.",
+)  # fmt: skip
+@click.option(
+    "--scale-picture", type=click.Path(path_type=Path),
+    help="Read the ruler or the board from this picture. Default: the first frame.",
+)  # fmt: skip
+@click.option(
+    "--lens", type=click.Path(path_type=Path),
+    help="Correct the lens with a folder of checkerboard pictures (and --lens-board), or with a "
+    "lens.json made from one. Default: no correction.",
+)  # fmt: skip
+@click.option(
+    "--lens-board", metavar="CxR,MM",
+    help="Describe the checkerboard of --lens: inner corners, and side of a square in mm. Default: "
+    "none.",
+)  # fmt: skip
+@click.option(
+    "--fixed", metavar="NAMES|P.csv",
+    help="Subtract the rigid motion of these fixed points, which moves camera and stand. Default: "
+    "none.",
+)  # fmt: skip
+@shared_option("--rate-hz", type=POSITIVE, detail="Default: the frame rate in the file.")
+@click.option(
+    "--times", type=click.Path(path_type=Path),
+    help="Read the times of the frames from a CSV file (frame, time_s), or from a session.h5 with "
+    "--experiment. Default: from the frame rate.",
+)  # fmt: skip
+@shared_option("--experiment", detail="For a session given with --times. Default: its only one.")
+@click.option(
+    "--subset-px", type=INTEGER,
+    help="Set the side of a subset in px, odd. Default: 15 with --points, from the size of the "
+    "dots with --auto.",
+)  # fmt: skip
+@shared_option(
+    "--model", type=click.Choice(["auto", "translation", "neighbours", "affine"]), default="auto",
+    show_default=True, detail="It describes how a subset moves and deforms.",
+)  # fmt: skip
+@click.option("--link", is_flag=True, help="Find particles in each frame and link them.")
+@click.option("--reach-px", type=POSITIVE, default=5.0, show_default=True,
+    help="Set the largest motion of a particle between frames in px, for --link.",
+)  # fmt: skip
+@click.option(
+    "--overlay", type=click.Path(path_type=Path), metavar="FILE.mp4|png",
+    help="Write the frames with the points as a video (.mp4) or as a contact sheet (.png). "
+    "Default: none.",
+)  # fmt: skip
+@click.option(
+    "--report", type=click.Path(path_type=Path), metavar="FILE.html",
+    help="Write a page about the tracks. Default: none.",
+)  # fmt: skip
+@answer_options(_OUTPUTS, "A CSV file with the tracks.  [required]", plot=True)
 @unverified_option
 def command(
     video: Path,
@@ -328,22 +349,24 @@ def command(
     as_json: bool,
     out: Path | None,
     plot: Path | None,
-    **wishes: Any,
+    **options: Any,
 ) -> None:
-    """Video to displacements and strain.
+    """Measure displacements and strain in a video.
 
-    VIDEO is anything FFmpeg reads, a folder of images, a TIFF stack, .cine or .mraw. Points
-    named upper* and lower* (with --auto: the clamps' two rows of three dots, or three particles
-    near either end) give the strain.
+    VIDEO is any file that FFmpeg reads, a folder of images, a TIFF stack, .cine or .mraw. The
+    strain is computed from the points named upper* and lower*. With --auto these are the two rows
+    of three dots on the clamps, or three particles near each end.
     """
     if out is None:
-        raise click.UsageError("--out OUT.csv is needed: the table of tracks goes there.")
-    request = _request(wishes)
+        raise click.UsageError("Missing option '--out': the CSV file for the tracks.")
+    request = _request(options)
     if request.points is not None and (auto or link):
-        raise click.UsageError("--points excludes --auto and --link; give one of them.")
+        raise click.UsageError("--points excludes --auto and --link. Use only one of them.")
     if link and (request.lens or request.fixed or request.report):
-        raise click.UsageError("--link takes no --lens, --fixed or --report; leave them out.")
-    # Threads that wait to decode or to write get their turn sooner than after Python's 5 ms.
+        raise click.UsageError(
+            "--link does not support --lens, --fixed or --report. Leave them out."
+        )
+    # Switch to the threads that decode and write sooner than after Python's default of 5 ms.
     sys.setswitchinterval(_TURN_S)
     clock = read_clock(request.rate_hz, request.times, request.experiment, unverified=unverified)
     doubt = check_recorded(video, unverified=unverified)
@@ -372,10 +395,10 @@ def command(
             found, broken_off = _track(reader, request, clock, out, head)
     answer = {**head, **found, "table": str(out)}
     if clock.doubt and request.times is not None:
-        tell_doubt(clock.doubt, request.times)
+        warn_unverified(clock.doubt, request.times)
         answer["unverified"] = True
     if doubt:
-        tell_doubt(doubt, video)
+        warn_unverified(doubt, video)
         answer["unverified"] = True
     if broken_off is None:
         answer["frames"] = answer["frames_read"]
@@ -385,5 +408,5 @@ def command(
     save_plot(plot, lambda: track_chart(out))
     if broken_off is not None:
         raise InputError(
-            f"Only {found['frames_read']} frames were tracked, their rows are kept. {broken_off}"
+            f"Only {found['frames_read']} frames were tracked; their rows are kept. {broken_off}"
         )

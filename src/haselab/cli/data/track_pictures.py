@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError
+from haselab.cli.data.grey_range import grey_range
 from haselab.tracking import FrameTracks
 from haselab.tracking.options import Floats, Frame
 
-__all__ = ["Overlay", "grey_range", "overlay_to"]
+__all__ = ["Overlay", "overlay_to"]
 
 _MOST_VIDEO_FRAMES = 1500
 _PLAY_HZ = 30
@@ -53,12 +54,6 @@ def overlay_to(path: Path | None, frame_count: int) -> Overlay:
         f"--overlay ends in {path.suffix!r}; take .mp4, .mkv or .mov for a video, .png for a "
         f"contact sheet. {path}"
     )
-
-
-def grey_range(frame: Frame) -> tuple[float, float]:
-    """Grey levels that become black and white in a picture of this frame."""
-    low, high = np.percentile(frame[::4, ::4], (0.5, 99.5))
-    return float(low), float(max(high, low + 1.0))
 
 
 class _Nothing:

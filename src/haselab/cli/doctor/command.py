@@ -22,12 +22,13 @@ from haselab.cli.common import answer_options
 from haselab.cli.doctor.controllers import controller_findings
 from haselab.cli.doctor.machine import Finding, Machine
 from haselab.cli.doctor.system import examine_system
-from haselab.rig.bench import identify
+from haselab.cli.options import shared_option
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.chip import MegaFile, opened_chip
+from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.chip.build import simavr_header
 from haselab.rig.instruments.instrument import Instrument, SystemNeeds
 from haselab.rig.instruments.registry import Driver, camera_of, installed
+from haselab.rig.real_bench import identify
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
 from haselab.store.folder import write_text
@@ -91,7 +92,7 @@ def _tool(name: str) -> Finding:
 
 
 def _driver(driver: Driver) -> Iterator[Finding]:
-    """What one kind of instrument needs on this computer."""
+    """Check what one kind of instrument needs on this computer."""
     try:
         instrument = driver.load()
     except DeviceError as error:
@@ -109,7 +110,7 @@ def _driver(driver: Driver) -> Iterator[Finding]:
 
 
 def _library(instrument: Instrument[Any], needs: str) -> Finding:
-    """A library that is no Python package."""
+    """Check a library that is not a Python package."""
     try:
         instrument.check_driver()
     except DeviceError as error:
@@ -119,18 +120,18 @@ def _library(instrument: Instrument[Any], needs: str) -> Finding:
 
 
 def _twin() -> Finding:
-    """The default rig, asked for one block."""
+    """Read one block from the default rig."""
     try:
-        bench = importlib.import_module("haselab.rig.twin.bench")
+        bench = importlib.import_module("haselab.rig.twin.twin_bench")
         config = importlib.import_module("haselab.rig.twin.config")
         block = bench.TwinBench(config.TwinConfig(), 0).read()
     except ImportError as error:
         return Finding("rig", "twin", False, str(error), "Build the extensions: make setup")
-    return Finding("rig", "twin", True, f"answers, {len(block)} readings a block")
+    return Finding("rig", "twin", True, f"answers, {len(block)} samples per block")
 
 
-def _chip(file: MegaFile, path: Path) -> Finding:
-    """A chip on its port, or built and run in co-simulation."""
+def _chip(file: ChipFile, path: Path) -> Finding:
+    """Identify a microcontroller on its port, or build it and run it in co-simulation."""
     try:
         with opened_chip(file, path, Gate()) as chip:
             return Finding("instrument", "chip", True, chip.identity)
@@ -140,11 +141,11 @@ def _chip(file: MegaFile, path: Path) -> Finding:
 
 
 def _needs(file: object) -> SystemNeeds:
-    """What a rig file needs of the operating system."""
+    """What the instruments of a rig file need from the operating system."""
     if isinstance(file, BenchConfig):
         needs = (each.instrument.system_needs(each.config) for each in file.instruments())
         return functools.reduce(operator.or_, needs)
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         of_port = SystemNeeds(() if file.port is None else (file.port,))
         camera = file.camera
         return of_port if camera is None else of_port | camera_of(camera).system_needs(camera)
@@ -152,11 +153,11 @@ def _needs(file: object) -> SystemNeeds:
 
 
 def _instruments(file: object, path: Path) -> list[Finding]:
-    """Every instrument of a rig file, each asked by itself."""
-    if isinstance(file, MegaFile):
+    """Identify every instrument of a rig file, each on its own."""
+    if isinstance(file, ChipFile):
         return [_chip(file, path)]
     if not isinstance(file, BenchConfig):
-        return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"no fault in {path}")]
+        return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"{path} is valid")]
     found = []
     for name, reported in identify(file):
         wrong = reported if isinstance(reported, HaselabError) else None
@@ -185,15 +186,17 @@ def _examine() -> list[Finding]:
 
 
 @click.command("doctor")
-@click.option(
-    "--rig", type=click.Path(path_type=Path), help="Also identify the instruments of this RIG.toml."
-)
+@shared_option(
+    "--rig", type=click.Path(path_type=Path),
+    detail="Its instruments are identified, too. Default: none.",
+)  # fmt: skip
 @answer_options()
 def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
-    """Report what is installed, which instruments answer, and how to fix the rest.
+    """Report what is installed and which devices answer.
 
-    Also examines serial ports, cameras, network and priorities of the operating system.
-    With --rig every instrument of that bench is identified; outputs are not changed.
+    For everything else the command says how to fix it. It also examines serial ports, cameras, the
+    network and the process priorities of the operating system. With --rig it identifies every
+    instrument of that bench; outputs are not changed.
     """
     findings = _examine()
     file = None if rig is None else load_rig(rig)

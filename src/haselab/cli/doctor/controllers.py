@@ -1,4 +1,4 @@
-"""Controllers that installed packages bring: whether they load, and what they can do."""
+"""Check the controllers of installed packages: whether they load, and what they need."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["controller_findings"]
 
 
 def controller_findings() -> Iterator[Finding]:
-    """One row for each kind of controller that another package has registered."""
+    """Yield one row for each kind of controller that another package has registered."""
     for name, package in installed_controllers():
         try:
             kind = controller_kind(name)

@@ -1,4 +1,4 @@
-"""The computer that `haselab doctor` looks at: files below a root, which a test may plant."""
+"""The computer that `haselab doctor` examines: files below a root, which a test can replace."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["Finding", "Machine", "bad", "good"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked for.
+    """Result of one check.
 
     Args:
         kind: runtime, extension, package, optional, program, rig, instrument or system.
-        name: of the thing.
-        found: it is there and works.
+        name: what was checked.
+        found: it exists and works.
         detail: its version, or what is wrong.
-        advice: what to do when it is not there.
+        advice: what to do if it does not.
     """
 
     kind: str
@@ -32,7 +32,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Machine:
-    """The computer that is looked at.
+    """The computer that is examined.
 
     Args:
         root: of its files.
@@ -49,33 +49,33 @@ class Machine:
     )
 
     def text(self, path: str) -> str:
-        """A file without the blanks at its ends; empty where it cannot be read."""
+        """Read a file, stripped; empty if it cannot be read."""
         try:
             return (self.root / path).read_text(encoding="utf-8", errors="replace").strip()
         except (OSError, ValueError):  # ValueError: a null character
             return ""
 
     def word(self, path: str) -> str:
-        """A file as one line that can be printed."""
+        """Read a file as one printable line."""
         line = " ".join(self.text(path).split())
         return "".join(letter if letter.isprintable() else "?" for letter in line)
 
     def number(self, path: str) -> int | None:
-        """A file that holds a whole number."""
+        """Read a whole number from a file; None if there is none."""
         try:
             return int(self.text(path).split()[0])
         except (IndexError, ValueError):
             return None
 
     def entries(self, path: str) -> list[Path]:
-        """What a folder holds, in order."""
+        """List a folder, sorted."""
         try:
             return sorted((self.root / path).iterdir())
         except (OSError, ValueError):  # ValueError: a null character
             return []
 
     def runs(self, program: str) -> bool:
-        """A process of this name is running."""
+        """Whether a process of this name is running."""
         return any(
             self.text(f"proc/{entry.name}/comm") == program[:15]
             for entry in self.entries("proc")
@@ -83,7 +83,7 @@ class Machine:
         )
 
     def may_use(self, path: str) -> bool | None:
-        """Whether the user may read and write a device; None: it is not there."""
+        """Whether the user may read and write a device; None if it does not exist."""
         try:
             found = (self.root / path).stat()
         except (OSError, ValueError):  # ValueError: a null character
@@ -108,10 +108,10 @@ class Machine:
 
 
 def good(name: str, detail: str) -> Finding:
-    """Something that is as it should be."""
+    """Make the finding of a check that passed."""
     return Finding("system", name, True, detail)
 
 
 def bad(name: str, detail: str, advice: str) -> Finding:
-    """Something that is wrong, and what to type."""
+    """Make the finding of a check that failed, with what to type."""
     return Finding("system", name, False, detail, advice)

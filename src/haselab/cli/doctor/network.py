@@ -1,4 +1,4 @@
-"""What `haselab doctor` finds of the network to a GigE Vision camera."""
+"""Check the network to a GigE Vision camera, for `haselab doctor`."""
 
 from __future__ import annotations
 
@@ -9,40 +9,41 @@ from haselab.cli.doctor.machine import Finding, Machine, bad, good
 
 __all__ = ["examine_network"]
 
-_FRAME_BYTES = 4 * 2**20  # of a camera whose picture is not known
+_FRAME_BYTES = 4 * 2**20  # of a camera whose frame size is not known
 _JUMBO = 8192  # recommended by Aravis' documentation, "Ethernet Devices"
 
 
 def examine_network(
     machine: Machine, name: str, frame_bytes: int | None = None
 ) -> Iterator[Finding]:
-    """Socket buffers, and the port that leads to a camera.
+    """Check the socket buffers and the network port of a camera.
 
     Args:
         machine: the computer.
-        name: of the camera, or its address; without an address its port is not known.
-        frame_bytes: of its picture; None: not known.
+        name: of the camera, or its address; with a name only, its port is not known.
+        frame_bytes: size of a frame; None: not known.
     Yields:
-        What is wrong; the port, where nothing is.
+        What is wrong; else the port.
     """
     wanted = frame_bytes or _FRAME_BYTES
     most = machine.number("proc/sys/net/core/rmem_max")
     if most is not None and most < wanted:
         size = 1 << (4 * wanted - 1).bit_length()
         yield bad(
-            "network", f"net.core.rmem_max is {most} bytes, a frame of the camera {wanted}",
+            "network", f"net.core.rmem_max is {most} bytes, but a frame of the camera has {wanted}",
             f"Type: echo net.core.rmem_max={size} | sudo tee /etc/sysctl.d/90-haselab.conf && "
             "sudo sysctl --system",
         )  # fmt: skip
     try:
         address = ipaddress.IPv4Address(name)
     except ValueError:
-        return  # a name: which port leads to it is not known
+        return  # a name: its port is not known
     if address.is_loopback:
         return
     ports = _ports_of(machine, address)
     if not ports:
-        yield bad("network", f"no port of this computer is in the camera's network ({address})",
+        yield bad("network", "no network port of this computer is in the camera's network "
+                  f"({address})",
                   f"Type: sudo ip addr add {_neighbour(address)}/24 dev PORT  (ip link lists the "
                   "ports)")  # fmt: skip
         return

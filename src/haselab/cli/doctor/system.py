@@ -1,7 +1,7 @@
-"""What `haselab doctor` finds of the operating system: ports, cameras, network, real time, driver.
+"""Check the operating system for `haselab doctor`: ports, cameras, network, real time, drivers.
 
-Every check reads files below a root (`/proc`, `/sys`, `/etc`, `/dev`), so that a test plants them.
-A file that is missing is no finding: a check says only what it has read.
+Every check reads files below a root (`/proc`, `/sys`, `/etc`, `/dev`), which a test can replace.
+A missing file gives no finding: a check reports only what it has read.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ _NI_SYSTEMS = ("ubuntu", "rhel", "rocky", "almalinux", "opensuse-leap")
 
 
 def examine_system(machine: Machine, needs: SystemNeeds) -> list[Finding]:
-    """Look at what instruments and cameras need of the system.
+    """Check what instruments and cameras need from the operating system.
 
     Args:
         machine: the computer.
-        needs: of the rig; devices that are plugged in are looked at in any case.
+        needs: of the rig; devices that are plugged in are always checked.
     Returns:
-        What is wrong with advice that can be typed, and what was found to be well.
+        Checks that failed, with advice to type, and checks that passed.
     """
     found = [*_ni_driver(machine, needs)]
     if machine.platform == "linux":
@@ -73,7 +73,7 @@ def _ni_boards(machine: Machine) -> list[tuple[str, str]]:
 def _ni_driver(machine: Machine, needs: SystemNeeds) -> Iterator[Finding]:
     if machine.platform == "darwin":
         if needs.local_daq:
-            yield bad("NI driver", "NI-DAQmx does not exist for macOS", f"Use {_SERVER}")
+            yield bad("NI driver", "NI-DAQmx is not available for macOS", f"Use {_SERVER}")
         return
     if machine.platform != "linux":
         return
@@ -93,7 +93,7 @@ def _ni_driver(machine: Machine, needs: SystemNeeds) -> Iterator[Finding]:
                        "Type: sudo dkms autoinstall && sudo reboot")  # fmt: skip
         else:
             # Whether NI-DAQmx for Linux supports a USB board is decided by nilsdev.
-            usb = f"; nilsdev has to list {boards[0][1]}, else use {_SERVER}" if boards else ""
+            usb = f"; nilsdev must list {boards[0][1]}, else use {_SERVER}" if boards else ""
             yield good("NI driver", f"installed{usb}")
         return
     release = _release(machine)
@@ -102,13 +102,13 @@ def _ni_driver(machine: Machine, needs: SystemNeeds) -> Iterator[Finding]:
     like = next((_NI_LIKES[each] for each in likes if each in _NI_LIKES), "")
     if own not in _NI_SYSTEMS and like:
         how = (
-            f"NI has no packages for {name}, but for {like}, which it is derived from or close to: "
+            f"NI has no packages for {name}, but has some for the related {like}: "
             f"try NI Linux Device Drivers for {like} from ni.com, or use {_SERVER}"
         )
     elif own in _NI_SYSTEMS:
         how = f"Install NI Linux Device Drivers for {name} from ni.com, or use {_SERVER}"
     else:
-        how = f"NI has packages for Ubuntu, RHEL and openSUSE, none for {name}: use {_SERVER}"
+        how = f"NI has packages for Ubuntu, RHEL and openSUSE, but not for {name}: use {_SERVER}"
     yield bad("NI driver", "NI-DAQmx is not installed", how)
 
 
@@ -137,22 +137,23 @@ def _serial_ports(machine: Machine, needs: SystemNeeds) -> Iterator[Finding]:
         path = port.lstrip("/")
         allowed = machine.may_use(path)
         if allowed is None:
-            yield bad("serial port", f"{port} is not there",
-                       "Plug it in, or correct the port: ls /dev/ttyACM* /dev/ttyUSB*")  # fmt: skip
+            yield bad("serial port", f"{port} does not exist",
+                       "Plug the device in, or change the port: ls /dev/ttyACM* "
+                       "/dev/ttyUSB*")  # fmt: skip
             continue
         if not allowed:
             yield bad("serial port", f"{port}: permission denied for your user",
                        f"Type: sudo usermod -aG {machine.group(path)} $USER  then log in "
                       "again")  # fmt: skip
         elif modem_manager and not _ignored_by_modem_manager(machine, port):
-            yield bad("serial port", f"ModemManager runs and may send AT commands to {port}",
+            yield bad("serial port", f"ModemManager is running and may send AT commands to {port}",
                        _modem_advice(machine, port))  # fmt: skip
         else:
             yield good("serial port", port)
 
 
 def _ignored_by_modem_manager(machine: Machine, port: str) -> bool:
-    """By udev's database: ModemManager's documentation, "Modem filter"."""
+    """Whether udev tells ModemManager to ignore a port (its documentation, "Modem filter")."""
     device = machine.text(f"sys/class/tty/{Path(port).name}/dev")
     marks = machine.text(f"run/udev/data/c{device}").splitlines() if device else []
     return any(mark in ("E:ID_MM_DEVICE_IGNORE=1", "E:ID_MM_PORT_IGNORE=1") for mark in marks)
@@ -173,7 +174,7 @@ def _modem_advice(machine: Machine, port: str) -> str:
 
 
 def _usb_cameras(machine: Machine) -> Iterator[Finding]:
-    """USB3 Vision: class ef, subclass 05, protocol 00, by aravis.rules of Aravis."""
+    """Check USB3 Vision cameras: class ef, subclass 05, protocol 00 (aravis.rules of Aravis)."""
     folder = "sys/bus/usb/devices"
     cameras = {
         entry.name.partition(":")[0]
@@ -201,7 +202,7 @@ def _usb_camera(machine: Machine, folder: str) -> Iterator[Finding]:
                        f"Type: echo '{rule}' | sudo tee -a {_RULES} && {_RELOAD}")  # fmt: skip
     speed = machine.number(f"{folder}/speed")
     if speed is not None and speed < 5000:
-        yield bad("USB camera", f"{product} is connected at {speed} Mbit/s, as USB 2",
+        yield bad("USB camera", f"{product} is connected at only {speed} Mbit/s (USB 2)",
                    "Use a USB 3 port and cable, without a hub")  # fmt: skip
     if machine.text(f"{folder}/power/control") == "auto":
         yield _suspends(product, folder)
@@ -221,7 +222,7 @@ def _usb_memory(machine: Machine) -> Iterator[Finding]:
 
 
 def _real_time(machine: Machine) -> Iterator[Finding]:
-    """Niceness and real-time priority, as the runtime and the guardian ask for them."""
+    """Check the niceness and the real-time priority that the runtime and the guardian request."""
     status = machine.text("proc/self/status")
     limits = machine.text("proc/self/limits")
     if not status or not limits:
@@ -250,7 +251,7 @@ def _capable(status: str) -> bool:
 
 
 def _limit(limits: str, name: str) -> int:
-    """The soft limit, of /proc/self/limits."""
+    """Read a soft limit from /proc/self/limits."""
     for line in limits.splitlines():
         if line.startswith(name):
             words = line[len(name) :].split()

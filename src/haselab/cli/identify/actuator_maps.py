@@ -1,4 +1,4 @@
-"""The maps of an actuator file from records: capacitance to strain, strain to voltage."""
+"""Fit and write the maps of an actuator file: capacitance to strain, strain to voltage."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Pairs:
-    """Capacitance and strain of the same moments, in order of time.
+    """Capacitance and strain at the same times, in order of time.
 
     Args:
         capacitance: in F, or relative. Shape `(N,)`.
         strain: shape `(N,)`.
         column: of the capacitance.
-        in_farads: whether the file states F as its unit, or the column's name does.
+        in_farads: whether the file, or the name of the column, states the unit F.
     """
 
     capacitance: Floats
@@ -50,18 +50,18 @@ def read_pairs(
     strain_column: str | None,
     columns: ColumnOptions,
 ) -> Pairs:
-    """Capacitances and strains of one file, or of two by the same clock.
+    """Read capacitances and strains from one file, or from two with the same clock.
 
     Args:
-        files: with the capacitance; then the one with the strain, where it is another one.
+        files: the one with the capacitance, and the one with the strain if it is another one.
         capacitance_column: that the user named, or None.
         strain_column: that the user named, or None.
         columns: what the user states about the columns.
     Returns:
-        Both; rows outside of the other file's times are left out.
+        Both; rows outside the other file's times are left out.
     Raises:
-        InputError: a column is missing, its unit is that of another quantity, or the files have
-            hardly any time in common.
+        InputError: a column is missing, its unit belongs to another quantity, or the times of the
+            files hardly overlap.
     """
     file, strain_file = files[0], files[-1]
     name = CAPACITANCE.column(file, capacitance_column)
@@ -85,7 +85,7 @@ def read_pairs(
 
 
 def _times(table: Table, file: Path, columns: ColumnOptions) -> Floats:
-    """The column of times, also of a file that states its rate as well."""
+    """The column of times, even if the file also states its rate."""
     if table.time_s is not None:
         return table.time_s
     name = columns.time or "time_s"
@@ -93,14 +93,14 @@ def _times(table: Table, file: Path, columns: ColumnOptions) -> Floats:
 
 
 def _common(time_s: Floats, known_s: Floats, file: Path, strain_file: Path) -> NDArray[np.bool_]:
-    """Rows within the times of the strain."""
+    """Select the rows within the times of the strain."""
     if not (np.diff(known_s) > 0.0).all():
-        raise InputError(f"The times do not rise everywhere. Sort the rows: {strain_file}")
+        raise InputError(f"The times do not increase everywhere. Sort the rows: {strain_file}")
     inside = (time_s >= known_s[0]) & (time_s <= known_s[-1])
     if inside.sum() < _LEAST_ROWS:
         raise InputError(
             f"Only {int(inside.sum())} rows of {file} lie within the times of the strain, "
-            f"{known_s[0]:g} to {known_s[-1]:g} s, but {_LEAST_ROWS} are needed. Record both by "
+            f"{known_s[0]:g} to {known_s[-1]:g} s, but {_LEAST_ROWS} are needed. Record both with "
             f"one clock: {strain_file}"
         )
     return np.asarray(inside, dtype=np.bool_)
@@ -116,7 +116,7 @@ def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapp
     Returns:
         The section.
     Raises:
-        InputError: the capacitance is not in F, or too few rows.
+        InputError: the capacitance is not in F, or there are too few rows.
         ResultError: the strain does not rise with the capacitance.
     """
     if not pairs.in_farads:

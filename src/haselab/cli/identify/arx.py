@@ -1,4 +1,4 @@
-"""`haselab identify arx` and `subspace`: sampled models of a sampled record."""
+"""`haselab identify arx` and `subspace`: discrete-time models of a sampled record."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, SEED, answer_options
 from haselab.cli.identify.charts import time_chart
 from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.sampled.arx import ArxOrders, fit_arx
 from haselab.identify.sampled.subspace import fit_subspace
@@ -30,16 +31,26 @@ Floats = NDArray[np.float64]
 @OUTPUT
 @RATE
 @click.option(
-    "--na", type=INTEGER, help="Outputs remembered; all three are chosen when none is given."
-)
-@click.option("--nb", type=INTEGER, help="Inputs remembered.")
+    "--na", type=INTEGER,
+    help="Set the number of past outputs. Default: chosen by --criterion, with --nb and --nk.",
+)  # fmt: skip
 @click.option(
-    "--nk", type=INTEGER, help="Samples from an input to the first output that knows of it."
+    "--nb", type=INTEGER, help="Set the number of past inputs. Default: chosen by --criterion."
 )
-@click.option("--criterion", type=click.Choice(["bic", "aic"]), default="bic", show_default=True)
-@click.option("--first", type=INTEGER, default=0, help="Rows to leave out at the start.")
-@click.option("--count", type=INTEGER, help="Rows to use.")
-@click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
+@click.option(
+    "--nk", type=INTEGER,
+    help="Set the delay from input to output in samples. Default: chosen by --criterion.",
+)  # fmt: skip
+@click.option(
+    "--criterion", type=click.Choice(["bic", "aic"]), default="bic", show_default=True,
+    help="Choose the criterion that selects --na, --nb and --nk.",
+)  # fmt: skip
+@click.option(
+    "--skip-rows", type=INTEGER, default=0, show_default=True,
+    help="Leave out this many rows at the start.",
+)  # fmt: skip
+@click.option("--rows", type=INTEGER, help="Use this many rows. Default: all.")
+@shared_option("--keep-means", is_flag=True)
 @column_options
 @answer_options(plot=True)
 def arx(
@@ -51,8 +62,8 @@ def arx(
     nb: int | None,
     nk: int | None,
     criterion: str,
-    first: int,
-    count: int | None,
+    skip_rows: int,
+    rows: int | None,
     keep_means: bool,
     *,
     columns: ColumnOptions,
@@ -60,30 +71,31 @@ def arx(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Difference equation (ARX) by least squares, its poles in continuous time.
+    """Fit a difference equation (ARX) by least squares.
 
-    For sampled plants whose noise passes through the same poles; with noise of a sensor use
-    `transfer`, which is not biased by it.
+    The poles are also given in continuous time. Use it for sampled plants whose noise passes
+    through the same poles. Sensor noise biases the fit: use `transfer` instead. FILE holds the
+    columns of input and output.
     """
     given = (na, nb, nk)
     if any(order is None for order in given) and any(order is not None for order in given):
         raise InputError(
-            f"--na, --nb, --nk = {na}, {nb}, {nk}; allowed are all three or none. Give the others."
+            f"--na, --nb, --nk are {na}, {nb}, {nk}. Give all three, or none to choose them."
         )
-    if first < 0 or (count is not None and count < 1):
+    if skip_rows < 0 or (rows is not None and rows < 1):
         raise InputError(
-            f"--first = {first}, --count = {count}; allowed are 0 and 1 or above. Correct them."
+            f"--skip-rows is {skip_rows}, --rows is {rows}. Use at least 0 and at least 1."
         )
     orders = None if na is None or nb is None or nk is None else ArxOrders(na, nb, nk)
     table = read_valid(file, [source, output], columns)
-    rows = slice(first, None if count is None else first + count)
+    used = slice(skip_rows, None if rows is None else skip_rows + rows)
     rate = rate_hz_of(table, rate_hz, file)
     fit = fit_arx(
-        table[source][rows], table[output][rows], rate, orders,
+        table[source][used], table[output][used], rate, orders,
         criterion=criterion, remove_means=not keep_means,
     )  # fmt: skip
     give(fit, [file], as_json, out)
-    save_plot(plot, lambda: _chart("ARX", table[output][rows], fit.residuals, rate, output))
+    save_plot(plot, lambda: _chart("ARX", table[output][used], fit.residuals, rate, output))
 
 
 @click.command("subspace")
@@ -91,23 +103,17 @@ def arx(
 @INPUT
 @OUTPUT
 @RATE
-@click.option("--order", type=INTEGER, help="States; up to the largest gap when not given.")
 @click.option(
-    "--block-rows",
-    type=INTEGER,
-    default=15,
-    show_default=True,
-    help="Samples of past and of future.",
-)
+    "--order", type=INTEGER,
+    help="Set the number of states. Default: up to the largest gap of the singular values.",
+)  # fmt: skip
 @click.option(
-    "--bootstrap",
-    type=click.IntRange(2, 1000),
-    default=50,
-    show_default=True,
-    help="Repeated fits for intervals.",
-)
-@click.option("--seed", type=SEED, default=1, show_default=True, help="Of the repeated fits.")
-@click.option("--keep-means", is_flag=True, help="The columns count from rest already.")
+    "--block-rows", type=INTEGER, default=15, show_default=True,
+    help="Set the number of past samples, and of future samples, in the data matrices.",
+)  # fmt: skip
+@shared_option("--bootstrap", type=click.IntRange(2, 1000), default=50, show_default=True)
+@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For --bootstrap.")
+@shared_option("--keep-means", is_flag=True)
 @column_options
 @answer_options(plot=True)
 def subspace(
@@ -122,9 +128,10 @@ def subspace(
     plot: Path | None,
     **options: int,
 ) -> None:
-    """State model of any order by projections (MOESP), without a search.
+    """Fit a state-space model by projections (MOESP).
 
-    A quick look at how many modes a record shows; `transfer` has the smaller intervals.
+    It is a fast way to see how many modes a record shows; `transfer` gives smaller intervals. FILE
+    holds the columns of input and output.
     """
     table = read_valid(file, [source, output], columns)
     rate = rate_hz_of(table, rate_hz, file)
@@ -138,7 +145,7 @@ def subspace(
 
 
 def _chart(kind: str, y: Floats, residuals: Floats, rate_hz: float, output: str) -> Chart:
-    """The last samples of the output, those that have residuals, with the model."""
+    """Measured and modelled output, for the samples that have residuals."""
     first = y.size - residuals.size
     time_s = np.arange(first, y.size) / rate_hz
     measured = y[first:]

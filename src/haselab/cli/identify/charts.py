@@ -1,4 +1,4 @@
-"""The figures of the identify commands: measured and modelled, and what is left."""
+"""The figures of the identify commands: measured and modelled data, and residuals."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def loop_chart(
 def odds_chart(
     title: str, names: Sequence[str], values: Sequence[float], axis: str = "Probability"
 ) -> Chart:
-    """Bars, such as the probabilities of rival explanations.
+    """Bars, such as the probabilities of candidate models.
 
     Args:
         title: of the figure.

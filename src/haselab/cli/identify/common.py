@@ -1,4 +1,4 @@
-"""What the commands of `haselab identify` share: options, the rate of a table, the answer."""
+"""What the commands of `haselab identify` share: options, reading records, the answer."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from haselab.base import InputError, ResultError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.columns import Quantity, advice_on_columns, check_unit, note_units
 from haselab.cli.common import REAL, emit
+from haselab.cli.options import shared_option
 from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
 from haselab.pipelines.time_axis import records_of, time_axis
@@ -49,9 +50,9 @@ __all__ = [
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
 FILES = click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
-RATE = click.option("--rate-hz", type=REAL, help="Sampling rate, in Hz. Default: from the file.")
-INPUT = click.option("--input", "source", default="u", show_default=True, help="Input column.")
-OUTPUT = click.option("--output", default="y", show_default=True, help="Output column.")
+RATE = shared_option("--rate-hz", type=REAL, detail="Default: the rate in the file.")
+INPUT = shared_option("--input", "source", default="u", show_default=True)
+OUTPUT = shared_option("--output", default="y", show_default=True)
 
 STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch")
 STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
@@ -73,7 +74,7 @@ class Fit(Protocol):
 
     @property
     def status(self) -> str:
-        """The word ok, or why there is no result."""
+        """`ok`, or why there is no result."""
 
     @property
     def succeeded(self) -> bool:
@@ -90,7 +91,7 @@ def give(
     out: Path | None,
     more: Mapping[str, Any] | None = None,
 ) -> None:
-    """Print the answer, and `more` keys; a fit without a result ends the command with code 3."""
+    """Print the answer and the keys `more`; without a result, end the command with code 3."""
     if not fit.succeeded:
         listed = " ".join(str(file) for file in files)
         if as_json:
@@ -101,7 +102,7 @@ def give(
 
 @contextmanager
 def about(*files: Path) -> Iterator[None]:
-    """What is wrong with the columns of a file ends with the file's name."""
+    """Append the names of the files to an error about their columns."""
     try:
         yield
     except InputError as error:
@@ -113,7 +114,7 @@ def about(*files: Path) -> Iterator[None]:
 def read_record(
     file: Path, names: Sequence[str], rate_hz: float | None, columns: ColumnOptions
 ) -> Table:
-    """Columns that were stored at even times; a gap in the times is an `InputError`."""
+    """Read columns sampled at even times; a gap in the times is an `InputError`."""
     table = read_columns(file, names, columns)
     if table.rate_hz is None and table.time_s is not None:
         _check_even(table, rate_hz, file)
@@ -121,7 +122,7 @@ def read_record(
 
 
 def read_columns(file: Path, names: Sequence[str], columns: ColumnOptions) -> Table:
-    """Columns whose values fit the units in their names."""
+    """Read columns and check that their values fit the units in their names."""
     table = read_valid(file, names, columns)
     _check_units(table, names)
     return table
@@ -133,8 +134,8 @@ class Recorded:
 
     Args:
         records: one for each part without gaps.
-        notes: what was done about the times.
-        input_unit: of the input, "V" or "" where it is another one or unknown.
+        notes: how uneven times were treated.
+        input_unit: "V", or "" if the input has another unit or an unknown one.
     """
 
     records: list[Record]
@@ -152,18 +153,20 @@ def recorded(
     hold: str = "zero",
     through: Path | None = None,
 ) -> Recorded:
-    """The records of a file, and what was done about its times.
+    """Read the records of a file.
 
     Args:
         file: with the columns.
         names: of the columns of input and output.
-        rate_hz: rows a second, where given.
-        held_at_hz: update rate of the converter, where given.
+        rate_hz: sampling rate; None: that of the file.
+        held_at_hz: update rate of the output converter; None: the sampling rate.
         columns: what the user states about the columns.
-        hold: the input between its updates.
-        through: actuator file whose voltage map turns the input from V into strain.
+        hold: how the input behaves between its updates.
+        through: actuator file whose voltage map converts the input from V to strain.
+    Returns:
+        The records, and how uneven times were treated.
     Raises:
-        InputError: no rate, or nothing that can be used.
+        InputError: no sampling rate, or no usable data.
         LimitError: a voltage outside the voltage map.
     """
     table = read_columns(file, names, columns)
@@ -190,7 +193,7 @@ def recorded(
 
 
 def _input_unit(table: Table, name: str) -> str:
-    """The unit "V" where the file states a voltage, or the column's name does."""
+    """Return "V" if the file or the name of the column states a voltage, else ""."""
     stated = table.units.get(name)
     is_voltage = name.endswith("_v") if stated is None else stated.si == "V"
     return "V" if is_voltage else ""
@@ -202,20 +205,22 @@ def read_valid(
     columns: ColumnOptions,
     options: Sequence[str] = ("--input", "--output"),
 ) -> Table:
-    """Columns without the rows that a column `valid` marks with 0; a note says how many.
+    """Read columns without the rows that a column `valid` marks with 0; print how many.
 
     Args:
-        file: to be read.
+        file: the file.
         names: of the columns.
         columns: what the user states about them.
-        options: that name these columns.
+        options: the options that name these columns.
+    Returns:
+        The columns.
     """
     with advice_on_columns(options):
         table = read_table(file, names, columns)
     note_units(table, file)
     if table.left_out:
         click.echo(
-            f"haselab: {table.left_out} rows with 0 in column valid are left out. {file}", err=True
+            f"haselab: left out {table.left_out} rows with 0 in column valid. {file}", err=True
         )
     return table
 
@@ -223,16 +228,16 @@ def read_valid(
 def read_quantities(
     file: Path, wanted: Mapping[Quantity, str | None], columns: ColumnOptions
 ) -> tuple[NDArray[np.float64], ...]:
-    """Columns of quantities, in SI units, in the order asked for.
+    """Read columns of quantities, in SI units and in the order of `wanted`.
 
     Args:
-        file: to be read.
-        wanted: the column of each quantity that the user named, or None.
+        file: the file.
+        wanted: the column that the user named for each quantity, or None.
         columns: what the user states about the columns.
     Returns:
         Values of each. Shape `(N,)`.
     Raises:
-        InputError: a column is missing, or its unit is that of another quantity.
+        InputError: a column is missing, or its unit belongs to another quantity.
     """
     names = {quantity: quantity.column(file, given) for quantity, given in wanted.items()}
     table = read_valid(file, list(names.values()), columns, [each.option for each in names])
@@ -251,7 +256,7 @@ def _check_units(table: Table, names: Sequence[str]) -> None:
 
 
 def _check_even(table: Table, rate_hz: float | None, file: Path) -> None:
-    """One line about the first gap or repeated time."""
+    """Refuse uneven times, and report the first gap or repeated time."""
     assert table.time_s is not None
     steps = np.diff(table.time_s)
     usual_s = float(np.median(steps)) if rate_hz is None else 1.0 / rate_hz
@@ -260,19 +265,19 @@ def _check_even(table: Table, rate_hz: float | None, file: Path) -> None:
         return
     at = int(uneven[0])
     raise InputError(
-        f"Column {table.time_name} goes on by {steps[at]:g} s after row {at + 1} ({uneven.size} "
-        f"such places) instead of {usual_s:g} s. Cut the file there and give the pieces as several "
-        f"records: {file}"
+        f"Column {table.time_name} has a step of {steps[at]:g} s after row {at + 1} instead of "
+        f"{usual_s:g} s ({uneven.size} such steps). Split the file there and give the parts as "
+        f"separate records: {file}"
     )
 
 
 def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
-    """Rate of a table: as given, else as the file states it; a contradiction is an `InputError`."""
+    """Sampling rate of a table: as given, else from the file; they must not contradict."""
     where = f"column {table.time_name}"
     if table.left_out and table.rate_hz is None:
         raise InputError(
-            f"Without the {table.left_out} rows that have 0 in column valid, the rows have no even "
-            "times (column time_s). Cut the file there and give the parts as several records: "
+            f"Without the {table.left_out} rows that have 0 in column valid, the times in column "
+            "time_s are uneven. Split the file there and give the parts as separate records: "
             f"{file}"
         )
     if given is not None and 0.0 < given < float("inf"):

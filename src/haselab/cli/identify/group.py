@@ -1,4 +1,4 @@
-"""`haselab identify`: models with uncertainty from recorded files."""
+"""`haselab identify`: identify models, with uncertainty, from recorded files."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["command"]
 
 @click.group("identify")
 def command() -> None:
-    """Models with uncertainty from records.
+    """Identify models, with confidence intervals, from records.
 
     FILE is CSV or another text table, .mat, .npz, .h5 or .tdms, as other programs write them. Units
-    in headers are read; options name the columns, --time and --unit say more about them.
+    are read from the headers. Options name the columns; --time and --unit describe them.
     """
 
 

@@ -25,6 +25,7 @@ from haselab.cli.identify.common import (
     rate_hz_of,
     read_valid,
 )
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.creep.fit import CreepFit, fit_creep
 from haselab.identify.hysteresis.fit import LoopRecord, fit_hysteresis
@@ -40,12 +41,16 @@ Floats = NDArray[np.float64]
 @INPUT
 @OUTPUT
 @RATE
-@click.option(
+@shared_option(
     "--model", type=click.Choice(["auto", "prandtl-ishlinskii", "bouc-wen"]), default="auto",
-    show_default=True, help="Which model; the data decide when auto.",
+    show_default=True, detail="auto: the one that fits the data best.",
 )  # fmt: skip
-@click.option("--operators", type=INTEGER, help="Play operators; chosen by BIC when not given.")
-@click.option("--from-s", default=0.0, help="Time from which samples count, in s.")
+@click.option(
+    "--operators", type=INTEGER, help="Set the number of play operators. Default: chosen by BIC."
+)
+@click.option(
+    "--from-s", default=0.0, show_default=True, help="Ignore samples before this time, in s."
+)
 @column_options
 @answer_options(plot=True)
 def hysteresis(
@@ -62,9 +67,10 @@ def hysteresis(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Loops to a hysteresis model with an inverse: width, rate dependence, verdict.
+    """Fit a hysteresis model, with its inverse, to loops.
 
-    Several FILES, loops at several rates, give one rate-dependent model.
+    The answer includes the width of the loop and whether it depends on the rate. Several FILES,
+    with loops at several rates, give one rate-dependent model.
     """
     records = []
     for file in files:
@@ -82,7 +88,7 @@ def hysteresis(
 
 @dataclass(frozen=True)
 class _Forecast:
-    """A creep fit whose answer holds a forecast too."""
+    """A creep fit whose answer includes a forecast."""
 
     fit: CreepFit
     later_s: float | None
@@ -108,14 +114,27 @@ class _Forecast:
 @INPUT
 @OUTPUT
 @RATE
-@click.option(
+@shared_option(
     "--model", type=click.Choice(["auto", "prony", "fractional", "logarithmic"]), default="auto",
-    show_default=True, help="Which law; the data decide when auto.",
+    show_default=True, detail="prony: exponentials; auto: the one that fits the data best.",
 )  # fmt: skip
-@click.option("--unit-step", is_flag=True, help="No input column: 1 from the first row on.")
-@click.option("--input-before", type=REAL, help="Input before the record, at rest.")
-@click.option("--leave-out-s", default=0.0, help="Leave out the time after each update, in s.")
-@click.option("--forecast-s", type=REAL, help="Output this long after the record's end, in s.")
+@click.option(
+    "--unit-step", is_flag=True,
+    help="Use an input of 1 from the first row on instead of a column.",
+)  # fmt: skip
+@click.option(
+    "--input-before", type=REAL,
+    help="Set the constant input before the record. Default: 0 if the input never changes, else "
+    "its first value.",
+)  # fmt: skip
+@click.option(
+    "--leave-out-s", default=0.0, show_default=True,
+    help="Leave out this time after each change of the input, in s.",
+)  # fmt: skip
+@click.option(
+    "--forecast-s", type=REAL,
+    help="Forecast the output this long after the end of the record, in s. Default: no forecast.",
+)  # fmt: skip
 @column_options
 @answer_options(plot=True)
 def creep(
@@ -134,7 +153,11 @@ def creep(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Creep from a held input: exponentials, a fractional law or a logarithm, and a forecast."""
+    """Fit a creep law to the response to a held input.
+
+    The laws are a sum of exponentials, a fractional law and a logarithm. FILE holds the columns of
+    input and output.
+    """
     table = read_valid(file, [output] if unit_step else [source, output], columns)
     rate = rate_hz_of(table, rate_hz, file)
     u = np.ones(table[output].size) if unit_step else table[source]
@@ -144,7 +167,7 @@ def creep(
 
 
 def _creep_chart(fit: CreepFit, u: Floats, y: Floats, rate_hz: float, output: str) -> Chart:
-    """The whole record with the model from its first row on."""
+    """The whole record with the model."""
     time_s = np.arange(y.size) / rate_hz
     modelled = fit.model.simulate(u, rate_hz)
     modelled = modelled + np.median(y - modelled)

@@ -1,4 +1,4 @@
-"""`haselab identify verdict`: which of some rival explanations the records support."""
+"""`haselab identify verdict`: compare models, and report which one the records support."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from haselab.cli.columns import column_options
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.identify.charts import odds_chart
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.model_comparison.agreement import Agreement, agree
 from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
@@ -39,17 +40,29 @@ _AGREEMENT = "agreement"
     "--question",
     type=click.Choice([*QUESTIONS, _AGREEMENT]),
     required=True,
-    help="Natural frequency in rad/s or Hz; creep mechanical or electrical; one mode or two; "
-    "agreement of answers in JSON files.",
+    help="Choose the question. reading: is the natural frequency in rad/s or Hz; creep: is creep "
+    "mechanical or electrical; modes: are there one or two modes; agreement: do the answers in "
+    "JSON files agree.",
 )
-@click.option("--input", "source", default="drive_v", show_default=True, help="Drive column, in V.")
+@shared_option("--input", "source", default="drive_v", show_default=True, detail="The drive, in V.")
 @OUTPUT
 @RATE
-@click.option("--linear", is_flag=True, help="modes: the output is proportional to the input.")
-@click.option("--slew", type=LIMIT, default=float("inf"), help="Fastest change of the drive, V/s.")
-@click.option("--key", default="natural_frequency_rad_s", show_default=True,
-              help="agreement: the number to compare.")  # fmt: skip
-@click.option("--risk", type=REAL, default=0.01, show_default=True, help="Of a wrong verdict.")
+@click.option(
+    "--linear", is_flag=True,
+    help="Assume that the output is proportional to the input, not to its square (question modes).",
+)  # fmt: skip
+@click.option(
+    "--slew", type=LIMIT, default=float("inf"),
+    help="Set the slew rate limit of the drive, in V/s. Default: no limit.",
+)  # fmt: skip
+@click.option(
+    "--key", default="natural_frequency_rad_s", show_default=True, metavar="NAME",
+    help="Name the number to compare (question agreement).",
+)  # fmt: skip
+@click.option(
+    "--risk", type=REAL, default=0.01, show_default=True,
+    help="Set the accepted probability of a wrong conclusion.",
+)  # fmt: skip
 @column_options
 @answer_options(plot=True)
 def verdict(
@@ -61,10 +74,11 @@ def verdict(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """Which explanation the records support, "cannot tell" included.
+    """Compare models and report which one the records support.
 
-    All FILES are explained together: columns of the drive in V, with its sign, and of the output.
-    With agreement they are answers of other commands in JSON.
+    The answer may be that the records do not decide. All FILES are fitted together; they hold the
+    columns of the drive, in V with its sign, and of the output. For the question agreement, FILES
+    are JSON answers of other commands.
     """
     if question == _AGREEMENT:
         agreement = _agreement(files, options["key"], options["risk"])
@@ -75,16 +89,16 @@ def verdict(
         return
     if options["linear"] and question != "modes":
         raise InputError(
-            f"--linear with --question {question}; allowed is --question modes. Leave it out: the "
-            "pull grows with the square of the voltage."
+            f"--linear is not supported with --question {question}, only with modes. Leave it out: "
+            "the force grows with the square of the voltage."
         )
-    rivals = (
+    candidates = (
         linear_mode_hypotheses()
         if options["linear"]
         else hypotheses_of(question, slew_v_s=options["slew"])
     )
     found = compare(
-        rivals,
+        candidates,
         [_record(file, columns, options) for file in files],
         risk=options["risk"],
     )
@@ -119,11 +133,11 @@ def _give(found: Verdict | Agreement, page: Sequence[str], as_json: bool, out: P
 
 
 def _page(found: Verdict) -> list[str]:
-    """The answer for a reader."""
+    """The answer as lines to read."""
     lines = [found.verdict, ""]
-    lines.append("hypothesis        misfit  numbers   2 ln odds     lead  probability")
+    lines.append("hypothesis        misfit  parameters   2 ln odds     lead  probability")
     lines += [_row(rival) for rival in found.rivals]
-    lines.append(f"worth {found.effective_samples:.3g} independent samples")
+    lines.append(f"effective number of independent samples: {found.effective_samples:.3g}")
     lines += ["", *found.notes]
     best = found.rivals[0]
     lines += ["", best.name]
@@ -141,7 +155,7 @@ def _row(rival: Rival) -> str:
     lead = "" if rival.lead != rival.lead else f"{rival.lead:.1f}"
     mark = "  excluded" if rival.excluded else ""
     return (
-        f"{rival.name:14s} {100.0 * rival.misfit:7.2f} % {rival.parameters:7d} "
+        f"{rival.name:14s} {100.0 * rival.misfit:7.2f} % {rival.parameters:10d} "
         f"{0.0 - rival.bic:11.1f} {lead:>8s} {rival.probability:12.3g}{mark}"
     )
 
@@ -164,8 +178,8 @@ def _estimate(file: Path, key: str) -> Estimate:
             else []
         )
         raise InputError(
-            f"{key} is no estimate here; present are {', '.join(present) or 'none'}. Name another "
-            f"with --key, or fit with --json --out. {file}"
+            f"The file has no estimate {key}, only {', '.join(present) or 'none at all'}. Name "
+            f"another one with --key, or repeat the fit with --out. {file}"
         )
     table = validated(EstimateTable, entry, file)
     low, high = table.ci95
@@ -175,7 +189,7 @@ def _estimate(file: Path, key: str) -> Estimate:
 
 
 def _number(value: float | None) -> float:
-    """A number that is not identifiable is null in a file."""
+    """Read null, a number that is not identifiable, as NaN."""
     return math.nan if value is None else value
 
 

@@ -1,4 +1,4 @@
-"""`haselab plan-experiment`: the next drive signal, inside the limits of the bench."""
+"""`haselab plan-experiment`: design the next drive signal within the limits of the bench."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from haselab.base import InputError, ResultError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.model.model_file import read_plant
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.cli.study.run import rig_file
 from haselab.identify.experiment_design.drives import BenchLimits
@@ -37,36 +38,39 @@ _BLOCK_DIGITS = 6
 
 @click.command("plan-experiment")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
+@shared_option("--rig", required=True, type=click.Path(path_type=Path))
 @click.option(
-    "--goal",
-    required=True,
-    help="creep, reading, modes: separate the rivals; all, or a number's name: its interval.",
+    "--goal", required=True,
+    help="Choose the goal. creep, reading, modes: separate the candidate models; all, or the name "
+    "of a parameter: reduce its interval.",
+)  # fmt: skip
+@shared_option(
+    "--duration-s", type=REAL, default=40.0, show_default=True, detail="Length of the drive signal."
 )
 @click.option(
-    "--duration-s", type=REAL, default=40.0, show_default=True, help="Length of the drive."
-)
-@click.option("--baseline-v", type=REAL, default=1.0, show_default=True, help="Drive at the start.")
-@click.option(
-    "--capacitance-f", type=REAL, default=1e-9, show_default=True, help="Of actuator and cable."
-)
-@click.option(
-    "--largest-output", type=LIMIT, default=float("inf"), help="How far it may go, its unit."
+    "--baseline-v", type=REAL, default=1.0, show_default=True,
+    help="Set the drive at the start, in V.",
+)  # fmt: skip
+@shared_option(
+    "--capacitance-f", type=REAL, default=1e-9, show_default=True, detail="Include the cable."
 )
 @click.option(
-    "--noise-std", type=REAL, default=1e-4, show_default=True, help="Of the output, its unit."
-)
+    "--largest-output", type=LIMIT, default=float("inf"),
+    help="Limit the output to this value, in its own unit. Default: no limit.",
+)  # fmt: skip
 @click.option(
-    "--samples-per-s", type=REAL, default=2.0, show_default=True, help="Independent ones."
-)
+    "--noise-std", type=REAL, default=1e-4, show_default=True,
+    help="Set the standard deviation of the output's noise, in the output's unit.",
+)  # fmt: skip
 @click.option(
-    "--systematic",
-    type=REAL,
-    default=0.05,
-    show_default=True,
-    help="What a model leaves out, of the swing.",
-)
-@answer_options(plot=True)
+    "--samples-per-s", type=REAL, default=2.0, show_default=True,
+    help="Set the number of independent samples per second.",
+)  # fmt: skip
+@click.option(
+    "--systematic", type=REAL, default=0.05, show_default=True,
+    help="Set the error of the models themselves, as a share of the output's range.",
+)  # fmt: skip
+@answer_options(None, "A CSV file of the drive signal: time_s, drive_v. Default: none.", plot=True)
 def command(
     model: Path,
     rig: Path,
@@ -76,16 +80,15 @@ def command(
     plot: Path | None,
     **options: float,
 ) -> None:
-    """The drive that separates rivals best, or shrinks an interval most.
+    """Design the drive signal of the next experiment.
 
-    MODEL.json is an answer of `identify verdict` or `identify transfer`, or a run's model.json.
-    --out names a CSV file for the drive: columns time_s, drive_v.
+    It separates candidate models, or reduces the confidence interval of a parameter, as well as the
+    limits of the bench permit. MODEL is a JSON answer of `identify verdict` or `identify transfer`,
+    or the model.json of a run.
     """
     plant = _plant(model, options["baseline_v"])
     if goal not in goals_of(plant):
-        raise InputError(
-            f"--goal = {goal}; allowed are {', '.join(goals_of(plant))}. Correct the option."
-        )
+        raise InputError(f"--goal is {goal}, but must be one of {', '.join(goals_of(plant))}.")
     config, _ = rig_file(rig)
     plan = plan_experiment(
         plant,
@@ -123,11 +126,9 @@ def _plant(path: Path, baseline_v: float) -> VoltagePlant:
 
 
 def _of_linear(plant: Plant, baseline_v: float) -> VoltagePlant:
-    """The voltage plant whose small changes about the baseline are those of a linear one."""
+    """The voltage plant that agrees with a linear one for small changes about the baseline."""
     if not baseline_v > 0.0:
-        raise InputError(
-            f"--baseline-v = {baseline_v:g} V; allowed is above 0 V. Correct the option."
-        )
+        raise InputError(f"--baseline-v is {baseline_v:g} V. Use a voltage above 0 V.")
     slow = max(plant.slow_modes, key=lambda mode: mode.gain, default=None)
     total = plant.gain + (slow.gain if slow else 0.0)
     share = slow.gain / total if slow and 0.0 < slow.gain < total else 0.0
@@ -143,11 +144,9 @@ def _of_linear(plant: Plant, baseline_v: float) -> VoltagePlant:
 
 
 def _limits(config: TwinConfig, capacitance_f: float, largest_output: float) -> BenchLimits:
-    """Window, slew and current of the rig."""
+    """Drive range, slew rate and current limit of the rig."""
     if not capacitance_f > 0.0:
-        raise InputError(
-            f"--capacitance-f = {capacitance_f:g} F; allowed is above 0 F. Correct the option."
-        )
+        raise InputError(f"--capacitance-f is {capacitance_f:g} F. Use a capacitance above 0 F.")
     amplifier, daq = config.amplifier, config.acquisition
     limits = BenchLimits.of_amplifier(
         (daq.drive_low_v, daq.drive_high_v),
@@ -168,7 +167,7 @@ def _csv(plan: ExperimentPlan) -> str:
 
 
 def _page(plan: ExperimentPlan) -> list[str]:
-    """The answer for a reader."""
+    """The answer as a table to read."""
     questions = any(planned.probability == planned.probability for planned in plan.ranked)
     figure = "probability  separation" if questions else "standard deviation"
     lines = [f"{'drive':32s} {figure}"]

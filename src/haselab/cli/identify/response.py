@@ -16,6 +16,7 @@ from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options, emit
 from haselab.cli.identify.charts import response_chart, time_chart
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
@@ -32,17 +33,25 @@ __all__ = ["free_response", "frequency_response"]
 @INPUT
 @OUTPUT
 @RATE
-@click.option(
+@shared_option(
     "--method", type=click.Choice(RESPONSE_METHODS), default="rational", show_default=True,
-    help="Local models (rational, polynomial), averaged segments (h1, h2, hv), whole periods.",
+    detail="rational, polynomial: local models; h1, h2, hv: averaged segments; periodic: whole "
+    "periods of the drive.",
 )  # fmt: skip
-@click.option("--period-s", type=REAL, help="Period of the drive, for periodic.")
-@click.option("--segment-s", type=REAL, help="Length of a segment, for h1, h2, hv.")
-@click.option("--measured-input", is_flag=True, help="The input was measured, not held.")
-@click.option("--fit", "fitted", is_flag=True, help="Fit a resonance with a delay to the lines.")
 @click.option(
-    "--slow-modes", type=INTEGER, default=0, show_default=True, help="Slow branches of that fit."
-)
+    "--period-s", type=REAL,
+    help="Set the period of the drive in s, for the method periodic. Default: none.",
+)  # fmt: skip
+@click.option(
+    "--segment-s", type=REAL,
+    help="Set the length of a segment in s, for h1, h2 and hv. Default: 1/8 of the longest record.",
+)  # fmt: skip
+@click.option(
+    "--measured-input", is_flag=True,
+    help="Treat the input as measured instead of held between its samples.",
+)  # fmt: skip
+@click.option("--fit", "fitted", is_flag=True, help="Fit a resonance with a delay to the response.")
+@shared_option("--slow-modes", type=INTEGER, default=0, show_default=True, detail="Needs --fit.")
 @column_options
 @answer_options(plot=True)
 def frequency_response(
@@ -56,7 +65,10 @@ def frequency_response(
     plot: Path | None,
     **choice: Any,
 ) -> None:
-    """Bode estimate with coherence and standard deviations; several FILES are one estimate."""
+    """Estimate the frequency response (Bode plot).
+
+    The answer includes coherence and standard deviations. Several FILES give one estimate.
+    """
     tables = [read_valid(file, [source, output], columns) for file in files]
     response = estimate_frequency_response(
         [table[source] for table in tables],
@@ -76,7 +88,7 @@ def frequency_response(
         return
     fit = response.fit(TransferStructure(slow_modes=choice["slow_modes"]))
     if as_json or out is not None:
-        # `design` and `export` read the plant; it has no covariance, so no share is reported.
+        # `design` and `export` read the plant. It has no covariance.
         plant = {"plant": fit.plant.to_dict()} if _is_plant(fit) else {}
         emit(answer | {"fit": fit.answer()} | plant, as_json=as_json, out=out)
     if not as_json:
@@ -92,7 +104,7 @@ def frequency_response(
 
 
 def _is_plant(fit: ResponseFit) -> bool:
-    """Whether all numbers of the plant were estimated."""
+    """Whether all parameters of the plant are identifiable."""
     return fit.succeeded and all(math.isfinite(e.value) for e in fit.estimates.values())
 
 
@@ -101,19 +113,20 @@ def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequenc
     if max(rates) - min(rates) > 1e-6 * rates[0]:
         listed = ", ".join(f"{rate:g}" for rate in rates)
         raise InputError(
-            f"The files have {listed} Hz; allowed is one rate. Resample them, or ask for each "
-            f"alone: {' '.join(str(file) for file in files)}"
+            f"The files have different sampling rates: {listed} Hz. Resample them, or use each "
+            f"file separately: {' '.join(str(file) for file in files)}"
         )
     return rates[0]
 
 
 @click.command("free-response")
 @FILES
-@click.option("--output", default="x", show_default=True, help="Column of the motion.")
+@shared_option("--output", default="x", show_default=True, detail="The motion.")
 @RATE
 @click.option(
-    "--creep/--no-creep", default=None, help="Fit an exponential beside the oscillation, or not; "
-    "the data decide when not given.",
+    "--creep/--no-creep", default=None,
+    help="Fit an exponential in addition to the oscillation, or do not. Default: chosen from the "
+    "data.",
 )  # fmt: skip
 @column_options
 @answer_options(plot=True)
@@ -128,7 +141,11 @@ def free_response(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Decay, damped and natural frequency (eqs. 6 and 7), hull curves; several FILES are trials."""
+    """Fit a decaying oscillation (eqs. 6 and 7).
+
+    The answer includes the decay rate, the damped and the natural frequency and both envelopes.
+    Several FILES are repeated trials.
+    """
     trials = []
     for file in files:
         table = read_valid(file, [output], columns, ["--output"])
@@ -140,7 +157,7 @@ def free_response(
 
 
 def _free_chart(fit: FreeResponseFit, trials: Sequence[FreeTrial], output: str) -> Chart:
-    """The first trial from its release on."""
+    """The first trial, from its release on."""
     modelled = fit.modelled[0]
     measured = trials[0].moving().x[-modelled.size :]
     time_s = np.asarray(fit.time_s[0][-modelled.size :])

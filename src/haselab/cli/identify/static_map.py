@@ -1,4 +1,4 @@
-"""`haselab identify map`: any static map as a smooth curve with its inverse."""
+"""`haselab identify map`: fit a smooth curve, with its inverse, to any static map."""
 
 from __future__ import annotations
 
@@ -24,9 +24,18 @@ Floats = NDArray[np.float64]
 
 @click.command("map")
 @FILE
-@click.option("--x", "abscissa", default="x", show_default=True, help="Column to map from.")
-@click.option("--y", "ordinate", default="y", show_default=True, help="Column to map to.")
-@click.option("--monotone", is_flag=True, help="Keep it rising, or falling, so it can be inverted.")
+@click.option(
+    "--x", "abscissa", default="x", show_default=True, metavar="COLUMN",
+    help="Name the column to map from.",
+)  # fmt: skip
+@click.option(
+    "--y", "ordinate", default="y", show_default=True, metavar="COLUMN",
+    help="Name the column to map to.",
+)  # fmt: skip
+@click.option(
+    "--monotone", is_flag=True,
+    help="Require a curve that only rises or only falls, so that it can be inverted.",
+)  # fmt: skip
 @column_options
 @answer_options(plot=True)
 def spline_map(
@@ -40,7 +49,10 @@ def spline_map(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Smooth curve through two columns, rows in order of time; the data choose how smooth."""
+    """Fit a smooth curve to two columns.
+
+    The rows of FILE are in order of time. The smoothness is chosen from the data.
+    """
     table = read_valid(file, [abscissa, ordinate], columns, ["--x", "--y"])
     x, y = table[abscissa], table[ordinate]
     fit = fit_map(x, y, monotone=monotone)

@@ -30,6 +30,7 @@ from haselab.cli.identify.common import (
     give,
     read_quantities,
 )
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
@@ -42,21 +43,21 @@ __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
 Floats = NDArray[np.float64]
 _KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
-_LOWEST = click.option("--stretch-min", type=REAL, help="Leave out lower stretches.")
-_HIGHEST = click.option("--stretch-max", type=REAL, help="Leave out higher stretches.")
+_LOWEST = shared_option("--stretch-min", type=REAL, detail="Default: no limit.")
+_HIGHEST = shared_option("--stretch-max", type=REAL, detail="Default: no limit.")
 
 
 def _between(
     stretch: Floats, load: Floats, low: float | None, high: float | None, file: Path
 ) -> tuple[Floats, Floats]:
-    """Stretch and load inside the asked range."""
+    """Stretch and load within the range of the options."""
     kept = np.ones(stretch.size, dtype=bool)
     kept &= stretch >= (-np.inf if low is None else low)
     kept &= stretch <= (np.inf if high is None else high)
     if not kept.any():
         raise InputError(
-            f"No stretch of the file lies in the asked range; it has [{stretch.min():g}, "
-            f"{stretch.max():g}]. Widen --stretch-min and --stretch-max: {file}"
+            f"The file has stretches from {stretch.min():g} to {stretch.max():g}, none of them "
+            f"within --stretch-min and --stretch-max. Change these limits: {file}"
         )
     return stretch[kept], load[kept]
 
@@ -65,24 +66,39 @@ def _between(
 @FILES
 @column_option(STRETCH)
 @column_option(STRESS)
-@click.option("--model", type=click.Choice(["auto", *LAWS]), default="auto", show_default=True)
+@shared_option(
+    "--model", type=click.Choice(["auto", *LAWS]), default="auto", show_default=True,
+    metavar="LAW", detail=f"auto: the one that fits best; or {', '.join(LAWS)}.",
+)  # fmt: skip
 @_LOWEST
 @_HIGHEST
 @click.option(
     "--deformation",
     multiple=True,
     type=click.Choice(list(_KINDS)),
-    help="What the test does to the width; once for all FILES, or once for each.",
+    help="State how the test deforms the sheet, once for all FILES or once for each. Default: "
+    "prestretched with --prestretch, fixed-lateral with --lateral-stretch, else uniaxial.",
 )
 @click.option(
-    "--lateral-stretch", type=REAL, help="The width is clamped at this stretch; 1 is pure shear."
+    "--lateral-stretch", type=REAL,
+    help="State the stretch at which the width is clamped; 1 is pure shear. Default: not clamped.",
+)  # fmt: skip
+@click.option(
+    "--prestretch", type=REAL,
+    help="State the equibiaxial stretch before the test, from which the stretch counts. Default: "
+    "none.",
+)  # fmt: skip
+@click.option(
+    "--electrode-natural", type=REAL,
+    help="Fit electrodes too, which are free of stress at this stretch. Default: no electrodes.",
+)  # fmt: skip
+@click.option(
+    "--electrode-stiffening", is_flag=True, help="Fit a cubic term of the electrodes too."
 )
 @click.option(
-    "--prestretch", type=REAL, help="Both ways, before the test; stretch counts from there."
-)
-@click.option("--electrode-natural", type=REAL, help="Fit electrodes too, natural at this stretch.")
-@click.option("--electrode-stiffening", is_flag=True, help="Fit their cubic term too.")
-@click.option("--at-stretch", type=REAL, multiple=True, help="Tell the stress here; repeat it.")
+    "--at-stretch", type=REAL, multiple=True,
+    help="Compute the stress at this stretch. Repeat the option for more. Default: none.",
+)  # fmt: skip
 @column_options
 @answer_options(plot=True)
 def hyperelastic(
@@ -98,9 +114,9 @@ def hyperelastic(
     plot: Path | None,
     **test: Any,
 ) -> None:
-    """Hyperelastic law from the columns of stretch and nominal stress.
+    """Fit a hyperelastic law to stretch and nominal stress.
 
-    Several FILES are tests of one material, for example uniaxial, pure shear and equibiaxial; they
+    Several FILES are tests of one material, for example uniaxial, pure shear and equibiaxial. They
     are fitted together.
     """
     kinds = _deformations(len(files), test)
@@ -113,12 +129,12 @@ def hyperelastic(
     fit = fit_hyperelastic_tests(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )
-    give(_Asked(fit, np.asarray(test["at_stretch"])), files, as_json, out)
+    give(_WithStress(fit, np.asarray(test["at_stretch"])), files, as_json, out)
     save_plot(plot, lambda: _law_chart(fit))
 
 
 def _law_chart(fit: HyperelasticFit) -> Chart:
-    """All tests, and the law in the deformation of each."""
+    """All tests, and the law for the deformation of each."""
     curves = []
     for test in fit.tests:
         kind = test.deformation.kind
@@ -138,8 +154,8 @@ def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
     kinds = list(test["deformation"]) or [implied]
     if len(kinds) not in (1, count):
         raise InputError(
-            f"--deformation was given {len(kinds)} times for {count} files; allowed is once, or "
-            "once for each file in their order. Correct the options."
+            f"--deformation was given {len(kinds)} times for {count} files. Give it once, or once "
+            "for each file in their order."
         )
     for kind, value, option in (
         ("fixed-lateral", lateral, "--lateral-stretch"),
@@ -147,8 +163,8 @@ def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
     ):
         if (kind in kinds) != (value is not None):
             raise InputError(
-                f"--deformation = {', '.join(kinds)}, {option} = {value}; allowed is {option} with "
-                f"{kind} and only with it. Correct the options."
+                f"--deformation is {', '.join(kinds)} and {option} is {value}. Give {option} with "
+                f"--deformation {kind}, and only with it."
             )
     made = [
         Deformation(
@@ -162,8 +178,8 @@ def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """A fit, and the stress that was asked of it."""
+class _WithStress:
+    """A fit whose answer includes the stress at given stretches."""
 
     fit: HyperelasticFit
     stretch: NDArray[np.float64]
@@ -180,12 +196,14 @@ class _Asked:
         answer = self.fit.answer()
         if not self.stretch.size or not self.succeeded:
             return answer
-        told = self.fit.predict(self.stretch)
+        predicted = self.fit.predict(self.stretch)
         answer["asked"] = [
             {"stretch": float(x), "nominal_stress_pa": Estimate.normal(p, s, "Pa")}
-            for x, p, s in zip(told.stretch, told.nominal_stress_pa, told.std_pa, strict=True)
+            for x, p, s in zip(
+                predicted.stretch, predicted.nominal_stress_pa, predicted.std_pa, strict=True
+            )
         ]
-        answer["notes"] = [*answer["notes"], *told.notes]
+        answer["notes"] = [*answer["notes"], *predicted.notes]
         return answer
 
 
@@ -193,14 +211,17 @@ class _Asked:
 @FILE
 @column_option(STRETCH)
 @column_option(LOAD)
-@click.option("--pieces", type=INTEGER, help="Number of pieces; chosen by BIC when not given.")
+@click.option(
+    "--segments", type=INTEGER,
+    help="Set the number of straight segments. Default: chosen by BIC, at most 6.",
+)  # fmt: skip
 @_LOWEST
 @_HIGHEST
 @column_options
 @answer_options(plot=True)
 def regions(
     file: Path,
-    pieces: int | None,
+    segments: int | None,
     stretch_min: float | None,
     stretch_max: float | None,
     stretch_column: str | None,
@@ -211,11 +232,14 @@ def regions(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Linear regions, the longest first, from the columns of stretch and force."""
+    """Find the linear regions of a force-stretch curve.
+
+    The longest region comes first. FILE holds the columns of stretch and force.
+    """
     wanted = {STRETCH: stretch_column, LOAD: load_column}
     stretch, load_n = read_quantities(file, wanted, columns)
     stretch, load_n = _between(stretch, load_n, stretch_min, stretch_max, file)
-    fit = find_regions(stretch, load_n, pieces)
+    fit = find_regions(stretch, load_n, segments)
     give(fit, [file], as_json, out)
 
     def chart() -> Chart:
@@ -233,7 +257,7 @@ def regions(
 @column_option(STRAIN)
 @column_option(VOLTAGE)
 @column_options
-@actuator_option("[drive.voltage_map] is written.")
+@actuator_option("Writes [drive.voltage_map].")
 @answer_options(plot=True)
 def voltage_map(
     file: Path,
@@ -246,7 +270,10 @@ def voltage_map(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Voltage from strain (eq. 4) from the columns of strain and voltage, in order of time."""
+    """Fit the voltage as a function of strain (eq. 4).
+
+    FILE holds the columns of strain and voltage, in order of time.
+    """
     if actuator is not None:
         load_actuator(actuator)
     strain, voltage_v = read_quantities(
@@ -269,10 +296,10 @@ def voltage_map(
 @column_option(STRAIN)
 @click.option(
     "--strain-file", type=click.Path(path_type=Path),
-    help="Take the strain from this file, whose times are by the same clock.",
+    help="Read the strain from this file, recorded with the same clock. Default: FILE.",
 )  # fmt: skip
 @column_options
-@actuator_option("[sensing.strain_map] is written: the map in F with its band.")
+@actuator_option("Writes [sensing.strain_map], the map from F with its band.")
 @answer_options(plot=True)
 def capacitance_map(
     file: Path,
@@ -286,9 +313,10 @@ def capacitance_map(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Strain from capacitance (eq. 5) from the columns of capacitance and strain.
+    """Fit the strain as a function of capacitance (eq. 5).
 
-    A capacitance in F gives a slope per F, relative capacitance a slope per its unit.
+    FILE holds the columns of capacitance and strain. The slope is per F for a capacitance in F, and
+    per unit of relative capacitance otherwise.
     """
     if actuator is not None:
         load_actuator(actuator)

@@ -1,4 +1,4 @@
-"""`haselab identify transfer`: a transfer function in continuous time."""
+"""`haselab identify transfer`: fit a transfer function in continuous time."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from haselab.cli.identify.common import (
     recorded,
 )
 from haselab.cli.model.sections import MODEL_KEYS, model_section
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
 from haselab.identify.record import HOLDS, Record
@@ -43,13 +44,11 @@ def _delay(text: str) -> str | float:
     try:
         return float(text)
     except ValueError as error:
-        raise InputError(
-            f"--delay = {text}; allowed is auto or a number of seconds. Correct the option."
-        ) from error
+        raise InputError(f"--delay is {text}. Use auto or a number of seconds.") from error
 
 
 def _fixed(pairs: Sequence[str]) -> dict[str, float]:
-    """`name=value` options."""
+    """Parse the options `NAME=VALUE`."""
     fixed = {}
     for pair in pairs:
         name, _, value = pair.partition("=")
@@ -57,8 +56,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
             fixed[name.strip()] = float(value)
         except ValueError as error:
             raise InputError(
-                f"--fix = {pair}; allowed is name=number, for example damping_ratio=0.09. "
-                "Correct the option."
+                f"--fix is {pair}. Use NAME=NUMBER, for example damping_ratio=0.09."
             ) from error
     return fixed
 
@@ -69,46 +67,45 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 @OUTPUT
 @RATE
 @click.option(
-    "--poles", type=INTEGER, default=2, show_default=True, help="Poles of the fast part, 1 to 6."
-)
+    "--poles", type=INTEGER, default=2, show_default=True,
+    help="Set the number of poles besides those of the slow modes, 1 to 6.",
+)  # fmt: skip
 @click.option(
-    "--zeros", type=INTEGER, default=0, show_default=True, help="Its zeros, at most the poles."
-)
-@click.option("--delay", default="auto", show_default=True, help="auto, or a known one in s.")
+    "--zeros", type=INTEGER, default=0, show_default=True,
+    help="Set the number of zeros, at most the number of poles.",
+)  # fmt: skip
 @click.option(
-    "--slow-modes",
-    type=INTEGER,
-    default=0,
-    show_default=True,
-    help="Slow branches beside it, 0 to 3.",
-)
-@click.option("--fix", multiple=True, metavar="NAME=VALUE", help="A known number; repeat it.")
-@click.option("--at-rest", is_flag=True, help="Each record starts at rest, for sure.")
-@click.option("--no-offset", is_flag=True, help="The output has no constant of its own.")
+    "--delay", default="auto", show_default=True, metavar="auto|S",
+    help="Estimate the delay (auto), or fix it at this value in s.",
+)  # fmt: skip
+@shared_option("--slow-modes", type=INTEGER, default=0, show_default=True)
+@click.option(
+    "--fix", multiple=True, metavar="NAME=VALUE",
+    help="Fix a parameter at a known value. Repeat the option for more. Default: none.",
+)  # fmt: skip
+@shared_option("--at-rest", is_flag=True, detail="Its initial state is then not estimated.")
+@click.option("--no-offset", is_flag=True, help="Assume that the output has no constant offset.")
 @click.option(
     "--choose", multiple=True,
     type=click.Choice(["poles", "zeros", "delay", "slow-modes", "nonlinear", "all"]),
-    help="Let the records choose it (BIC), from the given one on; repeat it.",
+    help="Choose this part of the structure by BIC, starting at the given value. Repeat the option "
+    "for more. Default: none.",
 )  # fmt: skip
 @click.option(
     "--nonlinear", type=click.Choice(NONLINEAR),
-    help="Fit a curve of the input (hammerstein), a cubic spring (duffing) or a curve of the "
-    "output (wiener) beside the poles.",
+    help="Add a nonlinear curve of the input (hammerstein), a cubic spring (duffing) or a curve of "
+    "the output (wiener). Default: none.",
 )  # fmt: skip
 @click.option(
     "--hold", type=click.Choice(HOLDS), default="zero", show_default=True,
-    help="The input between its samples: held, straight lines, or measured without aliases.",
+    help="Choose how the input behaves between its samples. zero: it is held; first: straight "
+    "lines; band-limited: it was measured behind an anti-aliasing filter.",
 )  # fmt: skip
-@click.option("--held-at-hz", type=REAL, help="Update rate of the converter, if below the file's.")
-@click.option(
-    "--bootstrap",
-    type=click.IntRange(2, 10_000),
-    help="Number of bootstrap replicates for the confidence intervals.",
-)
-@click.option("--seed", type=SEED, default=1, show_default=True, help="Of the bootstrap's noise.")
-@click.option("--through-voltage-map", is_flag=True,
-              help="Convert the input from V to strain by [drive.voltage_map].")  # fmt: skip
-@actuator_option("[drive.voltage_map] is read, [model] is written with its covariance.")
+@shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
+@shared_option("--bootstrap", type=click.IntRange(2, 10_000), detail="Default: no bootstrap.")
+@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For --bootstrap.")
+@shared_option("--through-voltage-map", is_flag=True)
+@actuator_option("Reads [drive.voltage_map] and writes [model] with its covariance.")
 @column_options
 @answer_options(plot=True)
 def transfer(
@@ -123,11 +120,11 @@ def transfer(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """Transfer function in continuous time, with intervals.
+    """Fit a transfer function in continuous time.
 
-    Several FILES give one model, each with its own initial state and offset: a chirp for the
-    resonance, steps for the slow branches. A number that the files do not determine is shown as
-    not identifiable.
+    Several FILES give one model, each with its own initial state and offset: for example a chirp
+    for the resonance and steps for the slow modes. A parameter that the files do not determine is
+    reported as not identifiable.
     """
     structure = TransferStructure(
         poles=options["poles"],
@@ -140,7 +137,8 @@ def transfer(
     )
     if actuator is None and options["through_voltage_map"]:
         raise InputError(
-            "--through-voltage-map needs the map in an actuator file. Name it by --actuator."
+            "--through-voltage-map needs the map in an actuator file. Name the file with "
+            "--actuator."
         )
     if actuator is not None:
         load_actuator(actuator)  # before a long fit
@@ -165,13 +163,11 @@ def transfer(
     fit: TransferFit
     if options["nonlinear"] and options["choose"]:
         raise InputError(
-            f"--nonlinear {options['nonlinear']} with --choose; allowed is one of them. Use "
-            "--choose nonlinear to let the records choose."
+            f"--nonlinear {options['nonlinear']} excludes --choose. Use --choose nonlinear to "
+            "choose the nonlinear part by BIC."
         )
     if options["nonlinear"] and options["bootstrap"] is not None:
-        raise InputError(
-            "--bootstrap with --nonlinear; allowed is a linear model. Leave --bootstrap out."
-        )
+        raise InputError("--bootstrap needs a linear model. Leave out --bootstrap or --nonlinear.")
     with about(*files):
         if options["nonlinear"]:
             found = fit = fit_nonlinear(records, structure, options["nonlinear"])
@@ -187,7 +183,7 @@ def transfer(
         rng = np.random.default_rng(options["seed"])
         if isinstance(fit, NonlinearFit):
             raise InputError(
-                f"--bootstrap with a {fit.kind} model; allowed is a linear one. Leave it out."
+                f"--bootstrap needs a linear model, but {fit.kind} was chosen. Leave it out."
             )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
@@ -208,8 +204,8 @@ def _save(
     """Write [model] of the actuator file."""
     if isinstance(fit, NonlinearFit):
         raise InputError(
-            f"--actuator with a {fit.kind} model, but [model] takes a linear one. Leave "
-            f"--nonlinear out, or write the model with --out. {actuator}"
+            f"[model] of an actuator file needs a linear model, but the fit is {fit.kind}. Leave "
+            f"out --nonlinear, or write the model with --out. {actuator}"
         )
     section = model_section(fit, *names, unit)
     save_section(actuator, "model", section, files, MODEL_KEYS)

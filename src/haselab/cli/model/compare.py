@@ -1,4 +1,4 @@
-"""`haselab compare`: a record that the model has not seen, predicted."""
+"""`haselab compare`: predict records that were not used for the fit of a model."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
 from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_posterior
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.prediction import Prediction, predict
 from haselab.identify.record import Record
@@ -24,7 +25,7 @@ from haselab.store.manifest import sha256_of
 
 __all__ = ["command"]
 
-_KNOWN = "not a validation: this record was used for the fit; name another one"
+_KNOWN = "not a validation: this record was used for the fit. Use another one"
 _NO_BAND = "no uncertainty: the model has no covariance"
 
 
@@ -34,12 +35,10 @@ _NO_BAND = "no uncertainty: the model has no covariance"
 @INPUT
 @OUTPUT
 @RATE
-@click.option("--at-rest", is_flag=True, help="Take each record as starting at rest at 0.")
-@click.option("--through-voltage-map", is_flag=True,
-              help="Convert the input from V to strain by [drive.voltage_map].")  # fmt: skip
-@click.option("--held-at-hz", type=REAL, help="Update rate of the converter, in Hz, if below the "
-              "file's.")  # fmt: skip
-@click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the band's plants.")
+@shared_option("--at-rest", is_flag=True, detail="Its state and offset are then taken as 0.")
+@shared_option("--through-voltage-map", is_flag=True)
+@shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
+@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For the 95 % band.")
 @column_options
 @answer_options(plot=True)
 def command(
@@ -60,9 +59,9 @@ def command(
 ) -> None:
     """Predict records in FILES that were not used for the fit of MODEL.
 
-    MODEL is an actuator file or a model.json. Reports the fit in percent, the error and the share
-    of samples inside the 95 % band. Initial state and constant of each record are fitted first,
-    unless --at-rest is given.
+    MODEL is an actuator file or a model.json. The command reports the fit in percent, the rms error
+    and the share of samples inside the 95 % band. It first estimates the initial state and the
+    offset of each record, unless --at-rest is given.
     """
     plant, posterior = read_any_plant(model), read_posterior(model)
     through = model if through_voltage_map else None
@@ -105,7 +104,7 @@ def _model_table(model: Path) -> Mapping[str, object]:
 
 
 def _noise_std(model: Path) -> float:
-    """Root mean square of the fit's residuals, where the file has it."""
+    """Root mean square of the fit's residuals; 0 if the file does not state it."""
     value = _model_table(model).get("residual_std", 0.0)
     return float(value) if isinstance(value, (int, float)) else 0.0
 

@@ -1,4 +1,4 @@
-"""`haselab design`: gains, margins and predicted step from a model."""
+"""`haselab design`: design gains for a model, with margins and the predicted step."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from haselab.cli.model.sections import (
     controller_section,
     limits_of,
 )
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import (
     Design,
@@ -47,34 +48,41 @@ from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
-_FEW = 0.9  # share of plausible plants below which a design that did not ask for one is doubtful
+_FEW = 0.9  # share of plausible plants below which a design without --probability gets a warning
 
 
 @click.command("design")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--spec", type=click.Path(path_type=Path), help="TOML file with the demands.")
 @click.option(
-    "--controller", "--structure", "structure", metavar="KIND", default="pid", show_default=True,
-    help="pi: PI as published; pid: PID with the derivative on the filtered measurement. For any "
-    "other registered kind, only compute the margins, with the parameters of the file.",
+    "--spec", type=click.Path(path_type=Path), metavar="SPEC.toml",
+    help="Read the demands from this file. Default: those of the actuator file, or built-in ones.",
+)  # fmt: skip
+@shared_option(
+    "--controller", "--structure", "structure", default="pid", show_default=True,
+    detail="pi: as published; pid: with the derivative of the filtered measurement. For any other "
+    "registered kind, only the margins are computed, with the parameters of the file.",
 )  # fmt: skip
 @loop_options
 @click.option(
     "--limits", type=(REAL, REAL), show_default="the actuator file's, else -0.05 0.1",
-    help="Range of the controller's output, in the unit of the model's input.",
+    metavar="LOW HIGH",
+    help="Limit the controller's output to this range, in the unit of the model's input.",
 )  # fmt: skip
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the search.")
+@shared_option("--seed", type=SEED, default=0, show_default=True)
 @click.option(
     "--probability", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-    help="Share of the plausible plants that has to keep phase and gain margin, for example 0.97. "
-    "Needs a model with its covariance. Default: report the share only.",
+    help="Require that this share of the plausible plants keeps phase and gain margin, for example "
+    "0.97. Needs a model with its covariance. Default: only report the share.",
 )  # fmt: skip
 @click.option(
     "--draws", type=click.IntRange(50, 20_000), default=400, show_default=True,
-    help="Number of plausible plants.",
+    help="Draw this many plausible plants.",
 )  # fmt: skip
-@click.option("--accept-shortfalls", is_flag=True, help="Write the best loop found, demands unmet.")
-@answer_options(plot=True)
+@click.option(
+    "--accept-shortfalls", is_flag=True,
+    help="Write the best controller even if it does not meet the demands.",
+)  # fmt: skip
+@answer_options(None, "A new actuator file with model and controller. Default: none.", plot=True)
 def command(
     model: Path,
     spec: Path | None,
@@ -84,12 +92,12 @@ def command(
     plot: Path | None,
     **loop: Any,
 ) -> None:
-    """Design gains for MODEL and report margins (with the loop's delay) and the predicted step.
+    """Design controller gains for MODEL and report their margins.
 
-    MODEL is an actuator file, whose [model], [drive] and demands are read and whose [controller]
-    is written, or a model.json. --out names a new actuator file for model and controller; an
-    actuator file that is MODEL then stays as it is. Where the model has a covariance, plausible
-    plants are drawn from it, and the share of them that keeps the margins is reported.
+    MODEL is a model.json or an actuator file. The command reads [model], [drive] and the demands of
+    an actuator file and writes its [controller], but leaves the file unchanged if --out is given.
+    The margins include the delay of the loop. If the model has a covariance, plausible plants are
+    drawn from it, and the share of them that keeps the margins is reported.
     """
     if loop["structure"] not in ("pi", "pid"):
         _judge(model, out, loop, as_json, plot)
@@ -101,17 +109,17 @@ def command(
     setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
     if posterior is None and loop["probability"] is not None:
         raise InputError(
-            f"--probability = {loop['probability']:g} needs the covariance of the model, but the "
-            "file holds none. Write it again with `haselab identify transfer --out`, or leave the "
-            f"option out: {model}"
+            f"--probability {loop['probability']:g} needs the covariance of the model, which the "
+            "file does not have. Write the model again with `haselab identify transfer --out`, or "
+            f"leave the option out: {model}"
         )
     design = _designed(plant, posterior, demands, setting, loop)
     if design.shortfalls and not accept_shortfalls:
         lower = "" if loop["probability"] is None else "lower --probability, "
         raise ResultError(
-            f"no {loop['structure'].upper()} met the demands; the best has "
-            f"{'; '.join(design.shortfalls)}. Relax them in --spec, shorten --delay-s, {lower}or "
-            f"take it with --accept-shortfalls: {model}"
+            f"No {loop['structure'].upper()} controller meets the demands; the best has "
+            f"{'; '.join(design.shortfalls)}. Relax the demands in --spec, shorten --delay-s, "
+            f"{lower}or accept it with --accept-shortfalls: {model}"
         )
     answer = _answer(design)
     _save(model, out, controller_section(design, loop["structure"], answer), spec)
@@ -122,8 +130,8 @@ def command(
             answer["posterior"] = _sentence(design.plausible)
         if loop["probability"] is None and design.plausible.share.value < _FEW:
             click.echo(
-                f"haselab: warning: only {_sentence(design.plausible)}. Give --probability "
-                f"{_FEW:g} to choose more careful gains: {model}",
+                f"haselab: warning: only {_sentence(design.plausible)}. Use --probability "
+                f"{_FEW:g} for more robust gains: {model}",
                 err=True,
             )
     emit(answer, as_json=as_json, out=None)
@@ -134,12 +142,12 @@ def command(
 def _judge(
     model: Path, out: Path | None, loop: dict[str, Any], as_json: bool, plot: Path | None
 ) -> None:
-    """Margins of a controller that is no PI and no PID, whose parameters nobody searches for."""
+    """Compute the margins of a controller other than PI and PID, without designing it."""
     kind = loop["structure"]
     if model.suffix.lower() != ".toml":
         raise InputError(
-            f"--controller {kind} takes its parameters from [controller] of an actuator file; this "
-            f"file has none. Name an actuator file: {model}"
+            f"--controller {kind} reads its parameters from [controller] of an actuator file, but "
+            f"the model is not an actuator file. Name one: {model}"
         )
     held = held_controller(model, kind)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
@@ -167,7 +175,7 @@ def _judge(
 
 
 def _demands(model: Path, spec: Path | None) -> DesignSpec:
-    """The demands of --spec, else those of the actuator file, else the usual ones."""
+    """The demands of --spec, else those of the actuator file, else the built-in ones."""
     if spec is not None:
         return _read_spec(spec)
     if model.suffix.lower() != ".toml":
@@ -193,7 +201,7 @@ def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path 
 
 
 def _other_controllers(path: Path, name: str) -> list[dict[str, object]]:
-    """Controllers of the file that a design of this name leaves there, beside its own."""
+    """Controllers in the file that a design with this name keeps, besides its own."""
     typed = load_actuator(path).controller
     if typed is None:
         return []
@@ -204,7 +212,7 @@ def _other_controllers(path: Path, name: str) -> list[dict[str, object]]:
 
 
 def _loop_and_covariance(model: Path) -> dict[str, object]:
-    """What a model file holds besides the plant."""
+    """The loop's rate and delay and the covariance in a model file."""
     if model.suffix.lower() == ".mat":
         return {}
     posterior = read_posterior(model)
@@ -245,7 +253,7 @@ def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
 
 
 def _sentence(found: PlausibleMargins) -> str:
-    """The shares in words."""
+    """The shares as a sentence."""
     shares = {name: f"{100.0 * share.value:.4g} %" for name, share in _shares(found).items()}
     low, high = (100.0 * end for end in found.share.ci95)
     return (

@@ -1,4 +1,4 @@
-"""`haselab export`: a model in the form of another tool."""
+"""`haselab export`: convert a model for another tool."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 from haselab.base import InputError
 from haselab.cli.common import answer_options, emit
 from haselab.cli.model.model_file import MAT_NAME, read_model
+from haselab.cli.options import shared_option
 from haselab.store.columns.mat_struct import write_mat_struct
 
 __all__ = ["command"]
@@ -16,14 +17,18 @@ __all__ = ["command"]
 
 @click.command("export")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option(
+@shared_option(
     "--to", "form", type=click.Choice(["json", "mat", "plant"]), required=True,
-    help="json: numerator and denominator; mat: the same for tf(num,den,'InputDelay',delay); "
-    "plant: the model.json of this program.",
+    detail="json: numerator and denominator; mat: the same for MATLAB's "
+    "tf(num,den,'InputDelay',delay); plant: a model.json of haselab.",
 )  # fmt: skip
-@click.option("--input-name", help="Name of the input; that of the model when not given.")
-@click.option("--output-name", help="Name of the output.")
-@answer_options()
+@click.option(
+    "--input-name", metavar="NAME", help="Set the name of the input. Default: that of the model."
+)
+@click.option(
+    "--output-name", metavar="NAME", help="Set the name of the output. Default: that of the model."
+)
+@answer_options(None, "The converted model; required for mat. Default: none.")
 def command(
     model: Path,
     form: str,
@@ -32,7 +37,10 @@ def command(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """MODEL (model.json, the rational form, or .mat) in another form."""
+    """Convert MODEL for another tool.
+
+    MODEL is a model.json, an actuator file, or a .json or .mat file that this command has written.
+    """
     rational = read_model(model)
     names = {
         "input": input_name or rational.input_name,
@@ -47,7 +55,7 @@ def command(
         return
     if out is None:
         raise InputError(
-            "--to mat needs a file to write; allowed is any path. Give --out FILE.mat."
+            "Missing option '--out': --to mat needs a file to write. Add --out FILE.mat."
         )
     fields = {
         "num": data["numerator"],

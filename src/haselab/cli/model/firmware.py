@@ -1,4 +1,4 @@
-"""`haselab firmware`: builds the microcontroller's program, tries it on the twin, writes it."""
+"""`haselab firmware`: build, simulate and flash the microcontroller's program."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from haselab.base import DeviceError, InputError, to_plain
 from haselab.cli.actuator_file import load_run
 from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.control import PidGains
 from haselab.firmware import FrontEnd
@@ -20,10 +21,10 @@ from haselab.report import write_report
 from haselab.report.analysis import Section
 from haselab.report.chart_file import write_figure
 from haselab.report.figures.chip import draw_loops
-from haselab.report.style import house_style
+from haselab.report.style import figure_style
 from haselab.rig.chip import (
+    ChipFile,
     Firmware,
-    MegaFile,
     build_firmware,
     find_tool,
     load_board,
@@ -37,34 +38,31 @@ from haselab.study.chip.loops import StepPlan, loop_row, section_of, step_experi
 
 __all__ = ["build", "command", "flash", "simulate"]
 
-_BAUD = 115_200  # of the boot loader
+_BAUD = 115_200  # baud rate of the boot loader
 _UPDATE_CYCLES = 16_000
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
-_structure = click.option(
-    "--controller",
-    "--structure",
-    "structure",
-    metavar="KIND",
-    help="Kind or name of the controller in the actuator file.  [default: that of [controller], or "
-    "the name of the file of --controller-source]",
-)
-_source = click.option(
+_structure = shared_option(
+    "--controller", "--structure", "structure",
+    detail="It is the kind or the name of a controller in the actuator file. Default: that of "
+    "[controller], or the file name of --controller-source.",
+)  # fmt: skip
+_source = shared_option(
     "--controller-source", "source", type=click.Path(path_type=Path),
-    help="Compile this C file in place of the PID.  [default: the C step that the kind brings]",
+    detail="Default: the C file of the controller's kind, if it has one.",
 )  # fmt: skip
 
 
 @click.group("firmware")
 def command() -> None:
-    """The controller on an ATmega2560."""
+    """Build, simulate or flash the microcontroller's program."""
 
 
-def _mega_file(rig: Path, board: str) -> MegaFile:
+def _chip_file(rig: Path, board: str) -> ChipFile:
     file = load_rig(rig)
-    if not isinstance(file, MegaFile) or board != "atmega2560":
+    if not isinstance(file, ChipFile) or board != "atmega2560":
         raise InputError(
-            f"--rig with kind {file.kind!r} and --board {board}, allowed are 'mega' and "
-            f"atmega2560: the one rig with a chip. Leave one of them out. {rig}"
+            f"--rig has kind {file.kind!r} and --board is {board}, but only kind 'mega' with board "
+            f"atmega2560 is supported. Leave one of the options out. {rig}"
         )
     return file
 
@@ -78,15 +76,16 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 @_structure
 @_source
 @click.option(
-    "--to", "folder", type=click.Path(path_type=Path), default=Path("out/firmware"),
-    show_default=True, help="Folder of settings.h, firmware.elf and firmware.hex.",
+    "--build-dir", "folder", type=click.Path(path_type=Path), default=Path("out/firmware"),
+    show_default=True, help="Write settings.h, firmware.elf and firmware.hex to this folder.",
 )  # fmt: skip
-@click.option(
-    "--board", default="atmega2560", show_default=True, help="A folder of firmware/board.",
+@shared_option(
+    "--board", default="atmega2560", show_default=True, metavar="BOARD",
+    detail="It is the name of a folder in firmware/board.",
 )  # fmt: skip
-@click.option(
+@shared_option(
     "--rig", type=click.Path(path_type=Path),
-    help="A rig file of kind 'mega', whose [front_end] and limits the program gets.",
+    detail="It has kind 'mega'; the program gets its [front_end] and limits. Default: none.",
 )  # fmt: skip
 @answer_options(OutputRule(built=("folder",)))
 def build(
@@ -99,13 +98,13 @@ def build(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Compile the firmware with the maps, limits and gains in RUN.
+    """Compile the firmware with the gains in RUN.
 
-    RUN is an actuator file or the folder of a study. `haselab firmware simulate` counts stack and
-    cycles.
+    RUN is an actuator file or the folder of a run. The firmware gets its maps, limits and gains.
+    `haselab firmware simulate` measures its use of stack and processor time.
     """
     load_run(run)  # warns of misspelled keys
-    file = None if rig is None else _mega_file(rig, board)
+    file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     settings = read_design(run, structure, front_end, source).settings
     if file is not None:
@@ -118,17 +117,39 @@ def build(
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
 @_source
-@click.option("--twin", type=click.Path(path_type=Path), help="Use the twin of TWIN.toml.")
-@click.option("--reading", type=click.Choice(["hz", "rad"]),
-              help="Use the default twin of this interpretation of the paper's frequency axis.  "
-              "[default: hz]")  # fmt: skip
-@click.option("--step", "step", type=(REAL, REAL), default=(0.0, 0.04), show_default=True,
-              help="Desired strain before and after.")  # fmt: skip
-@click.option("--hold", type=REAL, default=10.0, show_default=True, help="Seconds before the step.")
-@click.option("--last", type=REAL, default=10.0, show_default=True, help="Seconds after it.")
-@click.option("--precondition", type=REAL, default=2.0, show_default=True,
-              help="Drive that the sheet has seen before, in V; 0: a new sheet.")  # fmt: skip
-@click.option("--seed", type=SEED, default=1, show_default=True, help="Of the twin's noise.")
+@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@shared_option("--reading", type=click.Choice(["rad", "hz"]), detail="Default: hz.")
+@click.option(
+    "--step",
+    "step",
+    type=(REAL, REAL),
+    default=(0.0, 0.04),
+    show_default=True,
+    metavar="BEFORE AFTER",
+    help="Set the desired strain before and after the step.",
+)
+@click.option(
+    "--before-s",
+    type=REAL,
+    default=10.0,
+    show_default=True,
+    help="Set the time before the step in s.",
+)
+@click.option(
+    "--after-s",
+    type=REAL,
+    default=10.0,
+    show_default=True,
+    help="Set the time after the step in s.",
+)
+@click.option(
+    "--precondition",
+    type=REAL,
+    default=2.0,
+    show_default=True,
+    help="Set the highest drive that the actuator has had before, in V; 0: a new actuator.",
+)
+@shared_option("--seed", type=SEED, default=1, show_default=True)
 @answer_options(plot=True)
 def simulate(
     run: Path,
@@ -139,12 +160,12 @@ def simulate(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """The step experiment: chip in co-simulation, and the desktop's loops, on one twin.
+    """Simulate the firmware in a step experiment.
 
-    RUN is an actuator file, or the folder of a study, whose report shows the three side by side
-    afterwards. The desktop's
-    loop at 1 kHz has the chip's delay and limits. All three are calibrated with one reference
-    capacitor first.
+    The microcontroller, in co-simulation, and two loops on the desktop, at 100 Hz and at 1 kHz,
+    control the same twin. RUN is an actuator file or the folder of a run, whose report then shows
+    all three. The desktop loop at 1 kHz has the delay and the limits of the microcontroller. All
+    three are calibrated with one reference capacitor first.
     """
     refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")
@@ -154,7 +175,7 @@ def simulate(
     config = twin_of_reading(reading or "hz") if twin is None else load_twin(twin)
     before, after = options["step"]
     precondition_v = options["precondition"]
-    plan = StepPlan(before, after, options["hold"], options["last"], zero_m, precondition_v)
+    plan = StepPlan(before, after, options["before_s"], options["after_s"], zero_m, precondition_v)
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
     gains = None
@@ -173,7 +194,7 @@ def simulate(
     }
     section = to_plain(section_of(runs, answer["loops"]))
     if plot is not None:
-        with house_style():
+        with figure_style():
             write_figure(_draw(section), "Step by the chip and by the computer", plot)
     if (run / "results.json").is_file():
         write_json(run / "firmware" / "simulation.json", section)
@@ -182,31 +203,38 @@ def simulate(
 
 
 def _draw(section: Mapping[str, Any]) -> Figure:
-    """The responses of `section_of` in one figure."""
+    """Draw the responses of `section_of` in one figure."""
     figure = Figure(figsize=(7.0, 3.6), layout="constrained")
     draw_loops(figure, Section("chip", section))
     return figure
 
 
 def _check_image(path: Path) -> None:
-    """Refuse an image for another chip: its addresses lie beyond the ATmega2560's flash."""
+    """Refuse an image for another chip, whose addresses are beyond the ATmega2560's flash."""
     lines = path.read_text(encoding="ascii", errors="replace").split()
     pages = [line[9:13] for line in lines if line[7:9] == "04"]
     good = bool(lines) and all(line[:1] == ":" for line in lines)
     if not good or any(page > _HIGHEST_PAGE for page in pages):
         raise InputError(
-            "Not a program for the ATmega2560 (Intel HEX, below 256 kB), which is all that this "
-            f"command writes. Build without --board, or use the other chip's own tool. {path}"
+            "The file is not a program for the ATmega2560 (Intel HEX, below 256 kB), the only chip "
+            "that this command supports. Build without --board, or use the tool of the other chip. "
+            f"{path}"
         )
 
 
 @command.command("flash")
 @click.argument("firmware", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@click.option("--port", required=True, help="Serial port of the board.")
-@click.confirmation_option("--yes", prompt="Is the high-voltage module off and unplugged?")
+@click.option("--port", required=True, metavar="PORT", help="Name the serial port of the board.")
+@click.confirmation_option(
+    "--yes", prompt="Is the high-voltage module off and unplugged?",
+    help="Skip the confirmation. Switch off and unplug the high-voltage module first.",
+)  # fmt: skip
 @answer_options()
 def flash(firmware: Path, port: str, as_json: bool, out: Path | None) -> None:
-    """Write FIRMWARE (.hex) to a board with the Arduino Mega's boot loader, by avrdude."""
+    """Write FIRMWARE, a .hex file, to a board with avrdude.
+
+    The board needs the boot loader of the Arduino Mega.
+    """
     _check_image(firmware)
     tool = find_tool("avrdude", "avrdude")
     line = [tool, "-p", "m2560", "-c", "wiring", "-P", port, "-b", str(_BAUD), "-D",
@@ -214,5 +242,5 @@ def flash(firmware: Path, port: str, as_json: bool, out: Path | None) -> None:
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=120.0)
     if done.returncode != 0:
         said = (done.stderr or done.stdout).strip().splitlines() or ["nothing"]
-        raise DeviceError(f"avrdude failed: {said[-1]}. Check port, cable and boot loader. {port}")
+        raise DeviceError(f"avrdude failed: {said[-1]}. Check port, cable and boot loader: {port}")
     emit({"written": str(firmware), "port": port}, as_json=as_json, out=out)

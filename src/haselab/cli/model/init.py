@@ -1,4 +1,4 @@
-"""`haselab init`: a commented actuator file to start from."""
+"""`haselab init`: write a commented actuator file to start from."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 
 from haselab.base import InputError
 from haselab.cli.common import POSITIVE, REAL, answer_options, emit
+from haselab.cli.options import shared_option
 from haselab.store.folder import write_text
 
 __all__ = ["command"]
@@ -16,8 +17,8 @@ __all__ = ["command"]
 _KIND = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _PAGE = """\
 # One physical actuator and everything known about it. SI units.
-# Commands with --actuator write what they find into their own section; a value may be typed as
-# well. Comments and keys of your own stay as they are.
+# Commands with --actuator write their results into their own section; you may type values, too.
+# Your own comments and keys are kept.
 
 [actuator]
 name = {name}
@@ -31,7 +32,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
 
 [sensing]
 # haselab calibrate writes the calibration of the monitors, haselab identify capacitance-map the
-# map from capacitance to strain. Typed, a map is:
+# map from capacitance to strain. To type a map:
 # strain_map = {{slope_per_f = 4.9e8, offset = -0.27}}
 
 [drive]
@@ -40,16 +41,16 @@ kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
 # amplifier = "name"
 # gain_v_per_v = 5000.0
 # highest_field_v_per_m = 2e7  # in gap_m; lowers high_v where that would be more
-# haselab identify voltage-map writes the map from strain to drive voltage. Typed, it is:
+# haselab identify voltage-map writes the map from strain to drive voltage. To type it:
 # voltage_map = {{a1_v = 1.324, b1 = 3.124, a2_v = -0.2805, b2 = -26.92}}
 
 [model]
-# haselab identify transfer writes the model with its covariance. Typed, a resonance is:
+# haselab identify transfer writes the model with its covariance. To type a resonance:
 # gain = 1.0
 # natural_frequency_rad_s = 32.0
 # damping_ratio = 0.12
 # rate_hz = 100.0  # of the loop
-# loop_delay_s = 0.0075  # age of a measurement at its use
+# loop_delay_s = 0.0075  # age of a measurement when the controller uses it
 
 [controller]
 # haselab design writes the controller with its margins.
@@ -58,16 +59,26 @@ kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
 
 @click.command("init")
 @click.argument("name")
-@click.option(
-    "--kind", default="planar-hasel", show_default=True,
-    help="Kind of actuator: planar-hasel, peano-hasel, dea-stack or your own.",
+@shared_option(
+    "--kind", default="planar-hasel", show_default=True, metavar="KIND",
+    detail="planar-hasel, peano-hasel, dea-stack or your own.",
 )  # fmt: skip
-@click.option("--mass-kg", type=REAL, help="Write the hung mass, in kg.")
-@click.option("--zero-length-m", type=POSITIVE, help="Write the length at zero strain, in m.")
-@click.option("--low-v", type=REAL, default=0.0, show_default=True,
-              help="Write the lowest drive voltage, in V before the amplifier.")  # fmt: skip
-@click.option("--high-v", type=REAL, help="Write the highest drive voltage, in V.")
-@answer_options(out_help="Actuator file to write, for example leg.toml.  [required]")
+@click.option("--mass-kg", type=REAL, help="Write the hung mass in kg. Default: as a comment.")
+@click.option(
+    "--zero-length-m", type=POSITIVE,
+    help="Write the length at zero strain in m. Default: as a comment.",
+)  # fmt: skip
+@click.option(
+    "--low-v",
+    type=REAL,
+    default=0.0,
+    show_default=True,
+    help="Write the lowest drive voltage, before the amplifier, in V.",
+)
+@click.option("--high-v", type=REAL,
+              help="Write the highest drive voltage, before the amplifier, in V. Default: as a "
+              "comment.")  # fmt: skip
+@answer_options(None, "An actuator file, for example leg.toml.  [required]")
 def command(
     name: str,
     kind: str,
@@ -79,13 +90,13 @@ def command(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Write an actuator file for NAME, with a comment for what each section holds."""
+    """Write an actuator file for NAME, with comments that explain each section."""
     if out is None:
         raise click.UsageError("Missing option '--out': the actuator file to write.")
     if not _KIND.fullmatch(kind):
         raise InputError(
-            f"--kind {kind!r} is not a name of lower-case letters, digits and hyphens. Give one "
-            "like peano-hasel."
+            f"--kind is {kind!r}, but must consist of lower-case letters, digits and hyphens, for "
+            "example peano-hasel."
         )
     page = _PAGE.format(
         name=_quoted(name),
@@ -100,12 +111,12 @@ def command(
 
 
 def _line(key: str, value: float | None, example: float) -> str:
-    """A key with its value; an example behind a comment sign where there is none."""
+    """A key with its value; without a value, an example as a comment."""
     return f"# {key} = {example!r}" if value is None else f"{key} = {value!r}"
 
 
 def _quoted(text: str) -> str:
-    """A text as a basic string of TOML."""
+    """Quote a text as a basic string of TOML."""
     if not text.isprintable() or not text.strip():
         raise InputError(f"NAME is {text!r}. Give a name of printable characters.")
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,4 +1,4 @@
-"""`haselab margins`: stability margins of given gains on a model."""
+"""`haselab margins`: compute the stability margins of given gains."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from haselab.cli.common import REAL, answer_options, emit
 from haselab.cli.model.charts import loop_chart
 from haselab.cli.model.feedback import feedback_of, held_controller
 from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import LinearController, LoopSetting, Margins, PidGains, margins
 
@@ -17,7 +18,7 @@ __all__ = ["command", "margins_answer"]
 
 
 def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bool]:
-    """What is printed of margins.
+    """Collect the margins for an answer.
 
     Args:
         found: the margins.
@@ -39,16 +40,21 @@ def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bo
 
 @click.command("margins")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--kp", type=REAL, help="Proportional gain. Without gains: those of the file.")
-@click.option("--ki", type=REAL, help="Integral gain, in 1/s.")
-@click.option("--kd", type=REAL, help="Derivative gain, in s.  [default: 0]")
+@click.option(
+    "--kp", type=REAL, help="Set the proportional gain. Default: that of the actuator file."
+)
+@click.option(
+    "--ki", type=REAL, help="Set the integral gain in 1/s. Default: that of the actuator file."
+)
+@click.option("--kd", type=REAL, help="Set the derivative gain in s. Default: 0.")
 @click.option(
     "--derivative-filter-s", type=REAL,
-    help="Time constant of the measurement's filter, in s.  [default: 0]",
+    help="Set the time constant of the measurement's filter in s. Default: 0.",
 )  # fmt: skip
-@click.option(
-    "--controller", "kind", metavar="KIND",
-    help="Kind or name of the controller in the actuator file.  [default: that of [controller]]",
+@shared_option(
+    "--controller", "kind",
+    detail="It is the kind or the name of a controller in the actuator file. Default: that of "
+    "[controller].",
 )  # fmt: skip
 @loop_options
 @answer_options(plot=True)
@@ -66,10 +72,11 @@ def command(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Margins of a controller on the plant of MODEL, the loop's delay included.
+    """Compute the stability margins of a controller.
 
-    MODEL is an actuator file or a model.json. The controller is the PID of --kp and --ki, or one of
-    the actuator file: PI, PID, or any kind whose controller has the method linear_feedback.
+    MODEL is an actuator file or a model.json. The margins include the delay of the loop. The
+    controller is the PID of --kp and --ki, or one of the actuator file: PI, PID, or any kind whose
+    controller has the method linear_feedback.
     """
     setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
     given = (kp, ki, kd, derivative_filter_s)
@@ -77,14 +84,14 @@ def command(
     if any(value is not None for value in given):
         if kp is None or ki is None or kind is not None:
             raise click.UsageError(
-                "Give --kp and --ki, with --kd and --derivative-filter-s if you want, or none of "
+                "Give --kp and --ki, optionally with --kd and --derivative-filter-s, or none of "
                 "them: then --controller names a controller of the actuator file."
             )
         gains = PidGains(*(value or 0.0 for value in given))
     elif model.suffix.lower() == ".toml":
         gains = feedback_of(held_controller(model, kind), setting.rate_hz)
     else:
-        raise click.UsageError("Missing options '--kp' and '--ki': this file has no [controller].")
+        raise click.UsageError("Missing options '--kp' and '--ki': the file has no [controller].")
     plant = read_any_plant(model)
     found = margins(
         plant,

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
 from haselab.base import InputError
 from haselab.cli.actuator_file import warn_misspelled
 from haselab.cli.common import REAL
+from haselab.cli.options import shared_option
 from haselab.models.actuator.model_tables import (
     CovarianceTable,
     LoopTable,
@@ -40,12 +40,12 @@ __all__ = [
 ]
 
 MAT_NAME = "model"
-_RATE_HZ, _DELAY_S = 100.0, 0.01  # of a loop that nothing is known of
-_SAME = 1e-3  # of a response: more digits than a file rounded by hand keeps
+_RATE_HZ, _DELAY_S = 100.0, 0.01  # defaults for the loop
+_SAME = 1e-3  # relative difference of responses: a file rounded by hand has fewer digits
 
 
 def read_model(path: Path) -> RationalModel:
-    """Any model: of an actuator file, of `identify transfer`, of `export`, or a MATLAB struct.
+    """Read any model: an actuator file, `identify transfer`, `export`, or a MATLAB struct.
 
     Args:
         path: an actuator file, JSON, or a .mat file with a struct of num, den and perhaps delay.
@@ -87,16 +87,16 @@ def _data(path: Path) -> Any:
 def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
     if "num" not in fields or "den" not in fields:
         raise InputError(
-            f"the struct holds {', '.join(fields) or 'nothing'}; needed are num and den. Save "
-            f"num{{1}} and den{{1}} of the model as its fields: {path}"
+            f"The struct has the fields {', '.join(fields) or 'none'}, but must have num and den. "
+            f"Save num{{1}} and den{{1}} of the model as its fields: {path}"
         )
     scalars = {"Ts": 0.0, "delay": 0.0} | {
         name: _scalar(fields[name], path) for name in ("Ts", "delay") if name in fields
     }
     if scalars["Ts"] != 0.0:
         raise InputError(
-            f"the model is in discrete time (Ts = {scalars['Ts']:g} s); allowed is 0. "
-            f"Convert it with d2c: {path}"
+            f"The model is in discrete time (Ts = {scalars['Ts']:g} s). Convert it to continuous "
+            f"time with d2c: {path}"
         )
     table = {
         "numerator": _vector(fields["num"], path),
@@ -113,7 +113,7 @@ def _vector(field: Any, path: Path) -> list[float]:
     try:
         return [float(value) for value in np.asarray(field, dtype=np.float64).ravel()]
     except (TypeError, ValueError):
-        raise InputError(f"num and den of the struct must hold real numbers: {path}") from None
+        raise InputError(f"num and den of the struct must be real numbers: {path}") from None
 
 
 def _scalar(field: Any, path: Path) -> float:
@@ -125,12 +125,12 @@ def _scalar(field: Any, path: Path) -> float:
 
 
 def read_plant(path: Path) -> Plant:
-    """The plant of a model.json."""
+    """Read the plant of a model.json."""
     return _plant(validated(PlantTable, _plant_of(_data(path), path), path))
 
 
 def read_any_plant(path: Path) -> Plant | RationalModel:
-    """The plant of a model file: one resonance where it is that, else the rational form."""
+    """Read the plant of a model file: one resonance if it has that form, else the rational one."""
     if path.suffix.lower() != ".mat":
         data = _data(path)
         if not (isinstance(data, dict) and "numerator" in data):
@@ -146,11 +146,11 @@ def read_any_plant(path: Path) -> Plant | RationalModel:
 
 
 def read_posterior(path: Path) -> PlantPosterior | None:
-    """The numbers of a model with their covariance; None where the file holds none.
+    """Read the parameters of a model with their covariance; None if the file has none.
 
     Raises:
-        InputError: a number is not identifiable, the covariance is none, or it belongs to other
-            numbers than the model beside it.
+        InputError: a parameter is not identifiable, the covariance is invalid, or it belongs to
+            other parameters than those of the model in the file.
     """
     if path.suffix.lower() == ".mat":
         return None
@@ -167,26 +167,26 @@ def read_posterior(path: Path) -> PlantPosterior | None:
     plant, nominal = read_any_plant(path), posterior.nominal
     sizes = np.abs(np.asarray(plant.poles, dtype=complex))
     scale = np.median(sizes[sizes > 0.0]) if (sizes > 0.0).any() else 1.0
-    omega = scale * np.geomspace(0.011, 97.0, 12)  # beside a pole on the axis
+    omega = scale * np.geomspace(0.011, 97.0, 12)  # does not hit a pole on the axis
     ours, theirs = plant.frequency_response(omega), nominal.frequency_response(omega)
     if not (np.abs(ours - theirs) <= _SAME * np.abs(ours)).all():
         raise InputError(
-            "The covariance belongs to other numbers than those of the model beside it. Identify "
-            f"again, or remove the key covariance: {path}"
+            "The covariance belongs to other parameters than those of the model in the file. "
+            f"Identify the model again, or remove the key covariance: {path}"
         )
     return posterior
 
 
 def loop_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The options that say which loop a model is judged in."""
+    """Add `--delay-s` and `--rate-hz`, which describe the control loop."""
     for option in (
-        click.option(
+        shared_option(
             "--delay-s", type=REAL, show_default="the model file's, else 0.01",
-            help="Age of a measurement at its use, in s; half the hold comes on top.",
+            detail="Half the sampling period is added for the hold.",
         ),
-        click.option(
+        shared_option(
             "--rate-hz", type=REAL, show_default="the model file's, else 100",
-            help="Sampling rate, in Hz.",
+            detail="It is the rate of the control loop.",
         ),
     ):  # fmt: skip
         command = option(command)
@@ -194,20 +194,20 @@ def loop_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def loop_of(path: Path, rate_hz: float | None, delay_s: float | None) -> tuple[float, float]:
-    """Rate and delay of a loop: as given, else those of the model's file, else the defaults.
+    """Rate and delay of a loop: as given, else from the model file, else the defaults.
 
     Raises:
-        InputError: one in the file is not a number above 0.
+        InputError: a value in the file is not a number above 0.
     """
-    told = {} if path.suffix.lower() == ".mat" else read_loop(path)
+    stated = {} if path.suffix.lower() == ".mat" else read_loop(path)
     return (
-        told.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
-        told.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
+        stated.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
+        stated.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
     )
 
 
 def read_loop(path: Path) -> dict[str, float]:
-    """The loop that a model.json was measured for: `rate_hz`, `loop_delay_s`.
+    """Read the loop that a model.json was measured for: `rate_hz`, `loop_delay_s`.
 
     Raises:
         InputError: one of them is not a number above 0.
@@ -224,7 +224,7 @@ def _plant_of(data: Any, path: Path) -> dict[str, Any]:
     if not isinstance(plant, dict) or "natural_frequency_rad_s" not in plant:
         found = ", ".join(list(data)[:8]) if isinstance(data, dict) else type(data).__name__
         raise InputError(
-            f"the model holds {found[:200] or 'nothing'}; needed: an object `plant` with gain, "
-            f"natural_frequency_rad_s, damping_ratio. Add it: {path}"
+            f"The model has the keys {found[:200] or 'none'}, but must have an object `plant` with "
+            f"gain, natural_frequency_rad_s and damping_ratio. Add it: {path}"
         )
     return plant

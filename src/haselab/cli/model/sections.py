@@ -1,4 +1,4 @@
-"""Sections of the actuator file that are written from a fit or a design."""
+"""The sections [model] and [controller] of the actuator file, made from a fit or a design."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -
     Raises:
         ResultError: a number is not identifiable.
     """
-    blind = [name for name, estimate in fit.estimates.items() if np.isnan(estimate.value)]
-    if blind:
+    unknown = [name for name, estimate in fit.estimates.items() if np.isnan(estimate.value)]
+    if unknown:
         raise ResultError(
-            f"{', '.join(blind)} not identifiable from these records, so [model] was not written. "
+            f"Not identifiable from these records: {', '.join(unknown)}. [model] was not written. "
             "Add a record that determines it, fit a simpler structure, or give it with --fix."
         )
     value = {name: estimate.value for name, estimate in fit.estimates.items()}
@@ -73,15 +73,15 @@ def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -
 
 
 def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
-    """Range of a controller's output: as given, else of the actuator file, else the study's.
+    """Range of a controller's output: as given, else from the actuator file, else the study's.
 
-    The range of an actuator file is narrowed to what `[drive]` lets the voltage map put out.
+    The range is narrowed to the strains that the voltage map reaches within `[drive]`.
 
     Args:
         path: of the model.
         given: on the command line.
     Raises:
-        InputError: the file has values that cannot be.
+        InputError: the file has impossible values.
         ResultError: the drive does not reach zero strain.
     """
     if path.suffix.lower() != ".toml":

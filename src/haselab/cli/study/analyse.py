@@ -1,4 +1,4 @@
-"""`haselab analyse`: fits, designs and report again from the recorded data alone."""
+"""`haselab analyse`: repeat fits, design and report from a recording."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import click
 
 from haselab.base import InputError
-from haselab.cli.common import answer_options, tell_doubt, unverified_option
+from haselab.cli.common import answer_options, unverified_option, warn_unverified
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import analyse_on_chip
 from haselab.cli.study.recommended_mass import with_mass_limit
-from haselab.cli.study.study_run import mark_found, tell, with_date
+from haselab.cli.study.study_run import mark_found, print_results, with_date
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json
 from haselab.store.session.reader import session_file
@@ -27,55 +27,58 @@ __all__ = ["command"]
 
 
 def _own_folder(parameters: Mapping[str, Any]) -> Path | None:
-    """The folder of the session, whose derived files are written anew; None: it is not its own.
+    """The folder of the session, whose derived files are rewritten; None if it is not its own.
 
-    The folder in which a copy of a session lies may hold the results of another one.
+    A folder with a copy of a session may hold the results of another one.
     """
     session: Path = parameters["session"]
     if session.is_dir():
         return session
     own = session.parent / "session.h5"
-    if session.name == own.name or not session.exists():  # which the reader says
+    if session.name == own.name or not session.exists():  # the reader reports a missing file
         return session.parent
     return session.parent if own.exists() and session.samefile(own) else None
 
 
 def _check_ends(session: SessionReader, path: Path) -> None:
-    """Refuse a recording that was cut short: half a trial must not pass for a whole one."""
-    told = [what.partition(" ")[::2] for _, what in session.events()]
-    ended = {name for verb, name in told if verb == "end"}
-    cut = [name for verb, name in told if verb == "start" and name not in ended]
+    """Refuse a recording that was cut short: half a trial must not count as a whole one."""
+    events = [what.partition(" ")[::2] for _, what in session.events()]
+    ended = {name for verb, name in events if verb == "end"}
+    cut = [name for verb, name in events if verb == "start" and name not in ended]
     if cut:
         raise InputError(
-            f"The recording of {', '.join(cut)} was cut short; the analysis needs whole ones. Run "
-            "the study again, or read what is there with 'haselab sense --experiment NAME' or "
-            f"'haselab session export'. {path}"
+            f"The recording of {', '.join(cut)} was cut short, but the analysis needs complete "
+            "experiments. Run the study again, or read the recorded data with 'haselab sense "
+            f"--experiment NAME' or 'haselab session export'. {path}"
         )
 
 
 @click.command("analyse")
 @click.argument("session", type=click.Path(path_type=Path))
-@answer_options(OutputRule("folder", own=_own_folder), "Folder for the results.")
+@answer_options(
+    OutputRule("folder", own=_own_folder),
+    "A folder for the results. Default: the folder of SESSION.",
+)
 @unverified_option
 def command(session: Path, unverified: bool, as_json: bool, out: Path | None) -> None:
-    """Repeat all fits from SESSION, a run's folder or its session.h5, and write the report.
+    """Repeat fits, design and report from a recording.
 
-    The results go to a new folder --out, or over those in the folder of the session, whose
-    recording is never changed. What the twin's truth
-    was cannot be told from recorded data; where an earlier results.json has it, it is kept.
+    SESSION is the folder of a run or its session.h5. The results replace those in that folder,
+    unless --out is given; the recording itself is never changed. The noise-free reference values of
+    a twin cannot be computed from recorded data; they are copied from an earlier results.json.
     """
     folder = _own_folder({"session": session})
     if out is None and folder is None:
         raise InputError(
-            f"Results are written beside a session.h5; this file has another name, and the results "
-            f"there may be those of another session. Give --out DIR. {session}"
+            "The results would be written beside the file, but its name is not session.h5: results "
+            f"there may belong to another session. Add --out DIR. {session}"
         )
     target = out or folder
     assert target is not None
     refuse_linked_folders(target, "figures", "firmware")
     path = session_file(session)
     with SessionReader(path, unverified=unverified) as recorded:
-        tell_doubt(recorded.doubt, path)
+        warn_unverified(recorded.doubt, path)
         _check_ends(recorded, path)
         doubt = recorded.doubt
         if is_chip_session(recorded.header):
@@ -89,13 +92,13 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
     header = with_date(header, path.parent)
     results = write_findings(target, found, study, header, noise_free, doubt)
     mark_found(target, found, path.parent, simulated=bool(results["simulated"]))
-    tell(results, target, as_json)
+    print_results(results, target, as_json)
 
 
 def _earlier_noise_free(folder: Path) -> dict[str, float] | None:
-    """What the twin gave without noise, from the results that lie beside the session."""
+    """Noise-free reference values from earlier results in the folder of the session."""
     try:
         rows = read_json(folder / "results.json")["quantities"]
         return {row["id"]: row["noise_free"] for row in rows if "noise_free" in row} or None
     except (InputError, KeyError, TypeError):
-        return None  # no results.json beside it: nothing to keep
+        return None  # there are no earlier results

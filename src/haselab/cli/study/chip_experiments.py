@@ -1,7 +1,7 @@
-"""Rows S26 and S28 of the reference study: the chip's experiments, in a process of their own.
+"""Microcontroller experiments of the reference study (rows S26, S28), in a separate process.
 
-They begin when the study has designed its controllers and run beside the rest of it. All they need
-lies in files of the run's folder, with which `haselab run` repeats them.
+They start when the study has designed its controllers, and run in parallel with the rest of it.
+All their inputs are files in the run's folder, with which `haselab run` repeats them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from haselab.base import HaselabError, to_plain
 from haselab.cli.study.chip_run import record_on_chip
 from haselab.control import PidGains
 from haselab.firmware import FrontEnd
-from haselab.rig.chip import MegaFile, SupplyModel, read_design
+from haselab.rig.chip import ChipFile, SupplyModel, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, load_twin
 from haselab.store.actuator_file import ACTUATOR, write_sections
@@ -50,11 +50,11 @@ _PLACE = EXPERIMENTS.parent
 
 
 class ChipExperiments:
-    """The process, from the controllers' design to the end of the study.
+    """The process that plays the microcontroller experiments.
 
     Args:
         folder: of the run.
-        study: whose step the chip makes.
+        study: whose step trials the microcontroller plays.
         config: of the twin.
         seed: of its noise.
         quick: one short trial each.
@@ -73,16 +73,16 @@ class ChipExperiments:
         self._folder, self._study, self._config = folder, study, config
         self._seed, self._quick, self._keep_video = seed, quick, keep_video
         self._process: subprocess.Popen[bytes] | None = None
-        self._said: IO[bytes] | None = None
+        self._output: IO[bytes] | None = None
         self._found: dict[type, object] = {}
 
     def start(self, outcome: Outcome) -> None:
-        """As soon as all is known that the experiments need, write it and start them.
+        """Start the experiments as soon as all their inputs are known.
 
         Args:
             outcome: of one fit of the study.
         Raises:
-            DeviceError: the disk refuses.
+            DeviceError: a file cannot be written.
         """
         self._found |= {type(value): value for value in outcome.values}
         maps, dynamics = self._found.get(Maps), self._found.get(Dynamics)
@@ -106,49 +106,49 @@ class ChipExperiments:
             },
         }
         write_text(place / "chip.toml", toml_text(rig))
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
         self._process = subprocess.Popen(
             [sys.executable, "-m", __name__, str(self._folder), self._keep_video],
-            stdin=subprocess.PIPE, stdout=self._said, stderr=self._said,
-            start_new_session=True,  # Ctrl-C is for the study, whose end ends this process
+            stdin=subprocess.PIPE, stdout=self._output, stderr=self._output,
+            start_new_session=True,  # Ctrl-C goes to the study, whose end ends this process
         )  # fmt: skip
 
     def finish(self) -> Mapping[str, str]:
         """Wait for the end.
 
         Returns:
-            Why an experiment was left out, by its row; the report says it too.
+            Why an experiment was left out, by its row; the report states it, too.
         """
-        if self._process is None or self._said is None:
+        if self._process is None or self._output is None:
             return {}
         path = self._folder / EXPERIMENTS
         if self._process.wait() != 0:
-            self._said.seek(0)
-            lines = self._said.read().decode(errors="replace").strip().splitlines()
-            why = f"its process ended early: {lines[-1] if lines else 'it does not say why'}."
+            self._output.seek(0)
+            lines = self._output.read().decode(errors="replace").strip().splitlines()
+            why = f"its process ended early: {lines[-1] if lines else 'no message'}."
             write_json(path, {"left_out": dict.fromkeys((CHIP, MINIATURE), why)})
         left_out = read_json(path).get("left_out", {})
         rows = ((CHIP, "S26"), (MINIATURE, "S28"))
         return {row: str(left_out[name]) for name, row in rows if name in left_out}
 
     def stop(self) -> None:
-        """End the process, whatever it does."""
+        """End the process, whatever its state."""
         process = self._process
         if process is not None:
             assert process.stdin is not None
             with contextlib.suppress(OSError):
-                process.stdin.close()  # which it takes for the end
+                process.stdin.close()  # tells it to end
             try:
                 process.wait(_END_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        if self._said is not None:
-            self._said.close()
+        if self._output is not None:
+            self._output.close()
 
 
 def main(folder: Path, keep_video: str) -> None:
-    """Play both experiments and the desktop's loops beside them.
+    """Play both experiments, and the same steps with the desktop's loops.
 
     Args:
         folder: of the run, with actuator.toml and the files of `ChipExperiments`.
@@ -172,21 +172,21 @@ def main(folder: Path, keep_video: str) -> None:
 
 @contextlib.contextmanager
 def _left_out(known: dict[str, Any], name: str) -> Iterator[None]:
-    """An experiment that cannot be played leaves the other one and the study as they are."""
+    """Note why an experiment cannot be played; the other one and the study continue."""
     try:
         yield
     except HaselabError as error:
         known["left_out"][name] = " ".join(str(error).split())
 
 
-def _chip_file(path: Path) -> MegaFile:
+def _chip_file(path: Path) -> ChipFile:
     file = load_rig(path)
-    assert isinstance(file, MegaFile)
+    assert isinstance(file, ChipFile)
     return file
 
 
-def _desktops(file: MegaFile, place: Path, steps: StepStudy) -> dict[str, Any]:
-    """The same step by the desktop's loops at 100 Hz and at the chip's rate."""
+def _desktops(file: ChipFile, place: Path, steps: StepStudy) -> dict[str, Any]:
+    """Play the same step with the desktop's loops, at 100 Hz and at the chip's rate."""
     assert file.simulator is not None
     found = read_design(place.parent, file.structure, FrontEnd())
     settings = found.settings
@@ -203,7 +203,7 @@ def _desktops(file: MegaFile, place: Path, steps: StepStudy) -> dict[str, Any]:
 
 
 def _write_miniature(folder: Path, steps: StepStudy) -> MiniatureDesign:
-    """Maps, gains, rig and steps of the miniature bench, as files."""
+    """Write maps, gains, rig and steps of the miniature bench to files."""
     place, supply = folder / _PLACE, SupplyModel()
     chip = _chip_file(place / "chip.toml")
     assert chip.simulator is not None
@@ -231,13 +231,13 @@ def _write_miniature(folder: Path, steps: StepStudy) -> MiniatureDesign:
 def _scaled(design: MiniatureDesign) -> str:
     return (
         f"the supply reaches {1e-3 * design.highest_v:g} kV, so the step is {design.step:g}, about "
-        f"{1e-3 * design.baseline_v:.3g} to {1e-3 * design.top_v:.3g} kV by the model; its zero is "
+        f"{1e-3 * design.baseline_v:.3g} to {1e-3 * design.top_v:.3g} kV in the model; its zero is "
         f"the study's strain of {design.zero_strain:.3g}"
     )
 
 
 def _end_with_the_study() -> None:
-    """End this process as soon as nobody holds the other end of its standard input."""
+    """End this process when the study, at the other end of its standard input, has ended."""
     while os.read(0, 4096):  # not by sys.stdin, whose lock would be held when this process ends
         pass
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Step trials on a chip: what `run` and `analyse` do with a rig that closes its own loop."""
+"""Step trials on a microcontroller, which closes its own loop: for `run` and `analyse`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, cast
 from haselab.cli.bench.arming import Operator, armed_rig
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
-from haselab.cli.study.study_run import check_folder, kept_in, tell
-from haselab.rig.chip import MegaFile, opened_chip
+from haselab.cli.study.study_run import check_folder, kept_in, print_results
+from haselab.rig.chip import ChipFile, opened_chip
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.safety.gate import Gate
 from haselab.store.session.writer import SessionReader
@@ -28,14 +28,14 @@ __all__ = ["analyse_on_chip", "play_on_chip", "record_on_chip"]
 
 def play_on_chip(
     study: StepStudy,
-    file: MegaFile,
+    file: ChipFile,
     path: Path,
     folder: Path,
     keep_video: str,
     operator: Operator | None,
     as_json: bool,
 ) -> None:
-    """Open the chip, arm it, play the steps, write the folder, print the table.
+    """Play step trials on a microcontroller, write the folder, print the table.
 
     Args:
         study: what is played.
@@ -43,21 +43,21 @@ def play_on_chip(
         path: of it.
         folder: of the run.
         keep_video: which frames are kept.
-        operator: who arms it; None: nobody has to.
+        operator: who arms it; None: no confirmation is needed.
         as_json: print JSON.
     """
-    tell(record_on_chip(study, file, path, folder, keep_video, operator), folder, as_json)
+    print_results(record_on_chip(study, file, path, folder, keep_video, operator), folder, as_json)
 
 
 def record_on_chip(
     study: StepStudy,
-    file: MegaFile,
+    file: ChipFile,
     path: Path,
     folder: Path,
     keep_video: str,
     operator: Operator | None = None,
 ) -> dict[str, Any]:
-    """The same without report and table.
+    """Play step trials on a microcontroller and write the folder, without report and table.
 
     Args:
         study: what is played.
@@ -65,9 +65,9 @@ def record_on_chip(
         path: of it.
         folder: of the run.
         keep_video: which frames are kept.
-        operator: who arms it; None: nobody has to.
+        operator: who arms it; None: no confirmation is needed.
     Returns:
-        What results.json holds.
+        The content of results.json.
     """
     check_folder(folder)
     options = RunOptions(folder, _seed(file), cast(KeepVideo, keep_video),
@@ -91,12 +91,12 @@ def record_on_chip(
     return write_chip_findings(folder, found, header)
 
 
-def _seed(file: MegaFile) -> int:
+def _seed(file: ChipFile) -> int:
     return 0 if file.simulator is None else file.simulator.seed
 
 
 def analyse_on_chip(session: SessionReader, target: Path, as_json: bool) -> None:
-    """The same results from the recorded session alone.
+    """Repeat the results from the recorded session, and print the table.
 
     Args:
         session: of a run on a chip.
@@ -104,4 +104,4 @@ def analyse_on_chip(session: SessionReader, target: Path, as_json: bool) -> None
         as_json: print JSON.
     """
     found, header = analyse_chip_session(session)
-    tell(write_chip_findings(target, found, header, session.doubt), target, as_json)
+    print_results(write_chip_findings(target, found, header, session.doubt), target, as_json)

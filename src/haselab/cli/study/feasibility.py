@@ -1,4 +1,4 @@
-"""`haselab plan feasibility`: whether a bench can do a study, before it is energised."""
+"""`haselab plan feasibility`: check whether a bench can play a study."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 
 from haselab.base import InputError, to_plain
 from haselab.base.chart import Chart, Curve, Panel
-from haselab.cli.common import actuator_option, answer_options
+from haselab.cli.common import answer_options
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.cli.study.run import planned
 from haselab.rig.rig_file import load_rig
@@ -26,23 +27,26 @@ __all__ = ["command"]
 
 
 def _page(found: Feasibility) -> str:
-    lines = [f"{'':32s} {'asked':>10s} {'allowed':>10s}        in"]
+    lines = [f"{'':32s} {'requested':>10s} {'limit':>10s}        in"]
     for c in found.checks:
         word = "" if c.ok else "TOO HIGH. " + c.advice
-        asked = "not known" if math.isnan(c.asked) else f"{c.asked:.4g}"
-        asked = "no end" if math.isinf(c.asked) else asked
-        lines.append(
-            f"{c.name:32s} {asked:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}".rstrip()
-        )
+        value = "unknown" if math.isnan(c.requested) else f"{c.requested:.4g}"
+        value = "infinite" if math.isinf(c.requested) else value
+        row = f"{c.name:32s} {value:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}"
+        lines.append(row.rstrip())
     return "\n".join([*lines, "", "feasible" if found.ok else "not feasible"])
 
 
 @click.command("feasibility")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
-@click.option("--quick", is_flag=True, help="Apply the study's table `quick`.")
-@actuator_option("its voltage of zero strain and its controller, as in haselab run.")
-@answer_options(out_help="Also write the JSON result to this file.", plot=True)
+@shared_option("--rig", required=True, type=click.Path(path_type=Path))
+@shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
+@shared_option(
+    "--actuator",
+    type=click.Path(path_type=Path),
+    detail="Its voltage of zero strain and its controller are used as by haselab run.",
+)
+@answer_options(plot=True)
 def command(
     study: Path,
     rig: Path,
@@ -52,17 +56,19 @@ def command(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Whether a bench can play STUDY.toml: current, slew, bandwidth, field, stretch.
+    """Check whether a bench can play STUDY.
 
-    Connects to nothing and applies no voltage. Exits with 2 where the bench cannot.
+    The command compares current, slew rate, bandwidth, electric field and stretch with the limits
+    of the bench. It does not connect to any instrument and applies no voltage. The exit code is 2
+    if the bench cannot play the study. STUDY is a TOML file.
     """
     plan = planned(load_study(study, quick=quick), actuator)
     file = load_rig(rig)
     rated = rated_rig(file, plan, rig)
     if rated is None:
         raise InputError(
-            f"No table [rating] for a rig of kind {file.kind!r}; allowed are a twin, or a bench "
-            f"with one. Say there what amplifier and actuator withstand. {rig}"
+            f"The rig file, of kind {file.kind!r}, has no table [rating]. Add one with the limits "
+            f"of amplifier and actuator, or use a twin. {rig}"
         )
     found = judge_study(plan, *rated)
     answer = {
@@ -78,11 +84,12 @@ def command(
 
 
 def _chart(found: Feasibility) -> Chart:
-    """What is asked as a part of what is allowed, check by check."""
-    shown = [check for check in found.checks if check.allowed > 0.0 and math.isfinite(check.asked)]
+    """Draw each requested value as a fraction of its limit."""
+    shown = [c for c in found.checks if c.allowed > 0.0 and math.isfinite(c.requested)]
     at = np.arange(len(shown), dtype=np.float64)
-    share = np.array([check.asked / check.allowed for check in shown])
+    share = np.array([check.requested / check.allowed for check in shown])
     names = [textwrap.fill(check.name, 12) for check in shown]
-    limit = Curve(np.array([-0.5, len(shown) - 0.5]), np.ones(2), "allowed")
-    panel = Panel("", "Asked over allowed", (Curve(at, share, "asked", "bars"), limit), ticks=names)
-    return Chart("Feasibility: asked over allowed", (panel,))
+    bars = Curve(at, share, "requested", "bars")
+    limit = Curve(np.array([-0.5, len(shown) - 0.5]), np.ones(2), "limit")
+    panel = Panel("", "Requested over limit", (bars, limit), ticks=names)
+    return Chart("Feasibility: requested value over limit", (panel,))

@@ -1,4 +1,4 @@
-"""Whether a study could be played with the mass that its operating point recommends (S18)."""
+"""Check whether a study can be played with the mass recommended for its operating point (S18)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from haselab.rig.twin.bench import describe
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import describe
 from haselab.safety.feasibility import Feasibility
 from haselab.study.definition import Study
 from haselab.study.feasibility import judge_study, rating_of_twin
@@ -20,7 +20,7 @@ _GRID_KG = 0.01
 
 
 def with_mass_limit(found: Findings, study: Study, rig_config: Mapping[str, Any]) -> Findings:
-    """The findings, with what keeps the recommended mass from being hung.
+    """Add to the findings whether the recommended mass is within the limits of the bench.
 
     Args:
         found: of a study.
@@ -34,16 +34,16 @@ def with_mass_limit(found: Findings, study: Study, rig_config: Mapping[str, Any]
     if mass_kg is None:
         return found
     twin = twin_of(rig_config)
-    told = (
+    remark = (
         "check current and field at that mass with 'haselab plan feasibility' first"
         if twin is None
-        else _told(twin, study, float(mass_kg))
+        else _remark(twin, study, float(mass_kg))
     )
-    note = f"{found.notes['S18.baseline']}; {told}"
+    note = f"{found.notes['S18.baseline']}; {remark}"
     return replace(found, notes={**found.notes, "S18.baseline": note})
 
 
-def _told(twin: TwinConfig, study: Study, mass_kg: float) -> str:
+def _remark(twin: TwinConfig, study: Study, mass_kg: float) -> str:
     judged = _judged(twin, study, mass_kg)
     if judged.ok:
         return "the study can be played with that mass"

@@ -1,4 +1,4 @@
-"""`haselab report`: figures and page of a run's folder, or the page of an actuator file."""
+"""`haselab report`: write the report of a run, or the page of an actuator file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _is_actuator(source: Path) -> bool:
 
 
 def _own_page(parameters: Mapping[str, Any]) -> Path:
-    """The page that is written anew each time."""
+    """The default path of the page, which is rewritten each time."""
     source: Path = parameters["source"]
     if _is_actuator(source):
         return source.with_name(f"{source.stem}-report.html")
@@ -35,14 +35,15 @@ def _own_page(parameters: Mapping[str, Any]) -> Path:
 
 @click.command("report")
 @click.argument("source", metavar="DIR|A.toml", type=click.Path(path_type=Path))
-@answer_options(OutputRule(own=_own_page))
+@answer_options(
+    OutputRule(own=_own_page), "An HTML page. Default: DIR/report.html, or A-report.html."
+)
 def command(source: Path, as_json: bool, out: Path | None) -> None:
     """Write the report of a run, or the page of an actuator.
 
-    Of the folder of a run: report.html and figures/*.svg. Of an actuator file: one page with all
-    that it knows (calibration, maps with their bands, model with intervals, controller with
-    margins, provenance), and the commands for what it lacks. --out names the page; without it the
-    page is DIR/report.html, or A-report.html beside the file.
+    For DIR, the folder of a run, the report is DIR/report.html, with its figures in DIR/figures.
+    For A.toml, an actuator file, the page shows calibration, maps with their bands, model with
+    intervals, controller with margins and provenance, and the commands that add what is missing.
     """
     page_path = out or _own_page({"source": source})
     if page_path.is_dir():

@@ -1,4 +1,4 @@
-"""`haselab reproduce`: the reference study on the twin."""
+"""`haselab reproduce`: run the reference study on the twin."""
 
 from __future__ import annotations
 
@@ -9,9 +9,16 @@ import click
 
 from haselab.cli.bench.arming import armed_rig
 from haselab.cli.common import answer_options, refuse_two_twins
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_experiments import ChipExperiments
-from haselab.cli.study.study_run import MAX_SEED, execute, twin_rig
+from haselab.cli.study.study_run import (
+    MAX_SEED,
+    RUN_FOLDER,
+    execute,
+    keep_video_option,
+    twin_rig,
+)
 from haselab.rig.rig_file import TwinFile
 from haselab.study.definition import builtin_study
 
@@ -19,27 +26,12 @@ __all__ = ["command"]
 
 
 @click.command("reproduce")
-@click.option(
-    "--reading",
-    type=click.Choice(["rad", "hz"]),
-    help="Use the default twin of this interpretation of the paper's frequency axis: rad/s as "
-    "printed, or Hz.  [default: hz]",
-)
-@click.option(
-    "--twin",
-    type=click.Path(path_type=Path),
-    help="Use the twin of TWIN.toml, which has a reading.",
-)
-@click.option("--seed", type=click.IntRange(0, MAX_SEED), default=1, show_default=True)
-@click.option("--quick", is_flag=True, help="Fewer trials and frames.")
-@click.option(
-    "--keep-video",
-    type=click.Choice(["none", "sample", "all"]),
-    default="sample",
-    show_default=True,
-    help="Camera frames to keep.",
-)
-@answer_options(OutputRule("folder"), "New folder for the recording and the results.")
+@shared_option("--reading", type=click.Choice(["rad", "hz"]), detail="Default: hz.")
+@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@shared_option("--seed", type=click.IntRange(0, MAX_SEED), default=1, show_default=True)
+@shared_option("--quick", is_flag=True, detail="It has fewer trials and frames.")
+@keep_video_option
+@answer_options(OutputRule("folder"), RUN_FOLDER)
 def command(
     reading: Literal["rad", "hz"] | None,
     twin: Path | None,
@@ -49,7 +41,11 @@ def command(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Run the whole reference study on the twin: every test, fit, design and step experiment."""
+    """Run the reference study on the simulated bench.
+
+    It plays every test, fits all models, designs the controllers, plays the step experiments and
+    writes the report. No hardware is needed.
+    """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
     refuse_two_twins(reading, twin)

@@ -1,4 +1,4 @@
-"""`haselab run`: any study on any rig."""
+"""`haselab run`: run a study on a bench, real or simulated."""
 
 from __future__ import annotations
 
@@ -11,12 +11,19 @@ from haselab.base import InputError, Limits
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.cli.common import actuator_option, answer_options
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip
-from haselab.cli.study.study_run import execute, execute_on, twin_rig
+from haselab.cli.study.study_run import (
+    RUN_FOLDER,
+    execute,
+    execute_on,
+    keep_video_option,
+    twin_rig,
+)
 from haselab.pipelines.calibration_file import load_calibration
 from haselab.rig import Rig
-from haselab.rig.chip import MegaFile
+from haselab.rig.chip import ChipFile
 from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.rig_file import TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
@@ -31,40 +38,34 @@ __all__ = ["command", "planned", "rig_file"]
 
 
 def rig_file(path: Path) -> tuple[TwinConfig, int]:
-    """The twin that a rig file describes, and its seed, for what only a twin can do.
+    """Read the configuration and the seed of the twin that a rig file describes.
 
     Args:
         path: of the TOML file.
     Returns:
         Configuration and seed.
     Raises:
-        InputError: no such file, a fault in it, another kind of rig, or both a twin and a reading.
+        InputError: no such file, an error in it, another kind of rig, or both a twin and a reading.
     """
     file = load_rig(path)
     if not isinstance(file, TwinFile):
         raise InputError(
-            f"RIG has kind = {file.kind!r}, but this command needs kind = 'twin'. {path}"
+            f"The rig has kind = {file.kind!r}, but this command needs kind = 'twin'. {path}"
         )
     return file.configuration(path), file.seed
 
 
 @click.command("run")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--rig", required=True, type=click.Path(path_type=Path), help="RIG.toml")
-@click.option("--quick", is_flag=True, help="Apply the study's table `quick`.")
-@click.option(
-    "--keep-video",
-    type=click.Choice(["none", "sample", "all"]),
-    default="sample",
-    show_default=True,
-    help="Camera frames to keep.",
-)
+@shared_option("--rig", required=True, type=click.Path(path_type=Path))
+@shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
+@keep_video_option
 @actuator_option(
-    "its limits and its calibration apply; its maps and its controller are used where the study "
-    "has no [triangle] and no [control]; the run's actuator.toml starts from it."
+    "Its limits and its calibration apply; its maps and its controller are used if the study has "
+    "no [triangle] and no [control]. The run's actuator.toml starts as a copy of it."
 )
 @arming_options
-@answer_options(OutputRule("folder"), "New folder for the recording and the results.  [required]")
+@answer_options(OutputRule("folder"), RUN_FOLDER)
 def command(
     study: Path,
     rig: Path,
@@ -76,13 +77,14 @@ def command(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Play STUDY.toml on a rig, fit all results and write the report.
+    """Run STUDY on a bench and write the report.
 
-    HIGH VOLTAGE WILL BE APPLIED on a real bench. The study is checked against [rating] first;
-    without [rating] it is not checked. Then you acknowledge the last trip, if there was one, and
-    confirm. A microcontroller rig (kind = "mega") takes a study of step trials. The folder gets an
-    actuator.toml with the maps, the model and the controllers found; --actuator itself stays as it
-    is. With --actuator, a study of [steps] alone plays the controller of the file.
+    HIGH VOLTAGE WILL BE APPLIED on a real bench. The command first checks the study against the
+    [rating] of the rig file; without [rating] there is no check. Then it asks you to acknowledge
+    the last trip, if there was one, and to confirm. STUDY is a TOML file; a microcontroller (kind =
+    "mega") needs a study of step trials. The maps, model and controllers found are written to
+    actuator.toml in the folder of the run; the file of --actuator is not changed. With --actuator,
+    a study that only has [steps] plays the controller of the file.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
@@ -90,11 +92,11 @@ def command(
 
     operator = Operator(yes, acknowledge)
     known = None if actuator is None else load_actuator(actuator)
-    if isinstance(file, MegaFile):
+    if isinstance(file, ChipFile):
         if actuator is not None:
             raise InputError(
-                "A microcontroller takes its limits from the firmware. Leave --actuator out, and "
-                f"build the firmware with: haselab firmware build {actuator}"
+                "--actuator has no effect on a microcontroller, whose limits are in its firmware. "
+                f"Leave it out, and build the firmware with: haselab firmware build {actuator}"
             )
         trials = load_step_study(study, quick=quick)
         armed_by = operator if file.port is not None else None
@@ -117,7 +119,7 @@ def command(
 
 
 def planned(study: Study, actuator: Path | None) -> Study:
-    """The study with what an actuator file adds to it, see `with_known`.
+    """Add the content of an actuator file to a study, see `with_known`.
 
     Args:
         study: as its file says.
@@ -158,7 +160,7 @@ def _limit(rig: Rig, actuator: Path) -> None:
     """Limit the drive to what the actuator withstands as well.
 
     Raises:
-        InputError: no voltage is within both limits.
+        InputError: no voltage is within both ranges.
     """
     limits = rig.description.drive_limits
     low, high = load_actuator(actuator).drive_ends_v(rig.description.amplifier_gain)
@@ -166,14 +168,14 @@ def _limit(rig: Rig, actuator: Path) -> None:
     high_v = limits.high if high is None else min(limits.high, high)
     if not low_v < high_v:
         raise InputError(
-            f"[drive] allows {low} to {high} V, but the rig puts out {limits.low:g} to "
-            f"{limits.high:g} V. Correct low_v, high_v and highest_field_v_per_m. {actuator}"
+            f"[drive] permits {low} to {high} V, but the rig outputs {limits.low:g} to "
+            f"{limits.high:g} V. Change low_v, high_v and highest_field_v_per_m. {actuator}"
         )
     narrowed = Limits(limits.name, low_v, high_v, limits.unit)
     rig.description = replace(rig.description, drive_limits=narrowed)
 
 
 def _start_from(actuator: Path | None, folder: Path) -> None:
-    """The run's actuator file starts as a copy."""
+    """Copy the actuator file to the folder of the run."""
     if actuator is not None:
         write_text(folder / ACTUATOR, read_text(actuator, "actuator file"))

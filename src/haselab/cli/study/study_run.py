@@ -1,4 +1,4 @@
-"""What `reproduce`, `run` and `analyse` share: from a study to a folder and a table."""
+"""What `reproduce`, `run` and `analyse` share: run a study, write its folder, print its table."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from haselab.base import InputError, ResultError, to_plain
 from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
+from haselab.cli.options import shared_option
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig
 from haselab.rig.rig_file import MAX_SEED
-from haselab.rig.twin.bench import make_twin
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.manifest import read_manifest, recorded_when
@@ -33,49 +34,57 @@ from haselab.study.run import RunOptions, noise_free_results, run_study, session
 
 __all__ = [
     "MAX_SEED",
-    "Beside",
+    "RUN_FOLDER",
+    "ParallelExperiments",
     "check_folder",
     "execute",
     "execute_on",
+    "keep_video_option",
     "kept_in",
     "mark_found",
-    "tell",
+    "print_results",
     "twin_rig",
     "with_date",
 ]
 
+RUN_FOLDER = "A new folder for the recording and the results.  [required]"
+keep_video_option = shared_option(
+    "--keep-video", type=click.Choice(["none", "sample", "all"]), default="sample",
+    show_default=True, detail="sample: the first and the last second of each experiment.",
+)  # fmt: skip
 
-class Beside(Protocol):
-    """Experiments of another bench that belong to a study and run beside it."""
+
+class ParallelExperiments(Protocol):
+    """Experiments of a study that run on another bench at the same time."""
 
     def start(self, outcome: Outcome) -> None:
-        """Hear what each fit gives; begin with what the study has designed."""
+        """Take the outcome of a fit; start once all that the experiments need is known."""
 
     def finish(self) -> Mapping[str, str]:
-        """Wait for the end; why an experiment was left out, by its row."""
+        """Wait for the end; return why an experiment was left out, by its row."""
 
     def stop(self) -> None:
-        """End at once; nothing where they have ended."""
+        """End at once, if still running."""
 
 
 def twin_rig(config: TwinConfig, seed: int) -> Rig:
-    """The simulated bench of a configuration."""
+    """Make the simulated bench of a configuration."""
     return make_twin(config, seed)
 
 
 def kept_in(folder: Path) -> str:
-    """What an interrupted run says of its recording."""
-    return f"What was recorded is kept in {folder}."
+    """The note of an interrupted run about its recording."""
+    return f"The data recorded so far are kept in {folder}."
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse what cannot become the folder of a run."""
+    """Refuse a path that cannot become the folder of a run."""
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out names a file, not a folder. Name another one. {folder}")
+        raise InputError(f"--out names a file, not a folder. Name a new folder. {folder}")
 
 
 def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
-    """Refuse a study that this rig would refuse later, when hours of it have been played."""
+    """Refuse a study now that this rig would refuse hours later."""
     check_folder(folder)
     check_drives(study, rig.description)
 
@@ -88,7 +97,7 @@ def execute(
     folder: Path,
     keep_video: str,
     as_json: bool,
-    beside: Beside | None = None,
+    parallel: ParallelExperiments | None = None,
     known: ActuatorTables | None = None,
 ) -> None:
     """Run a study on a twin, write its folder, print its table.
@@ -101,13 +110,13 @@ def execute(
         folder: of the run.
         keep_video: which frames are kept.
         as_json: print JSON.
-        beside: experiments beside it; None: there are none.
+        parallel: experiments that run at the same time; None: there are none.
         known: the actuator file that the study starts from; None: there is none.
     """
     rig_config = config.model_dump(mode="json")
     options = RunOptions(folder, seed, cast(KeepVideo, keep_video), rig_config, known)
     noise_free_of = functools.partial(noise_free_results, config, study, known)
-    _execute(study, rig, options, as_json, noise_free_of, beside)
+    _execute(study, rig, options, as_json, noise_free_of, parallel)
 
 
 def execute_on(
@@ -119,7 +128,7 @@ def execute_on(
     as_json: bool,
     known: ActuatorTables | None = None,
 ) -> None:
-    """Run a study on a rig whose truth nobody knows, write its folder, print its table."""
+    """Run a study on a real rig, write its folder, print its table."""
     options = RunOptions(folder, 0, cast(KeepVideo, keep_video), rig_config, known)
     _execute(study, rig, options, as_json)
 
@@ -130,39 +139,39 @@ def _execute(
     options: RunOptions,
     as_json: bool,
     noise_free_of: Callable[[Findings], dict[str, float]] | None = None,
-    beside: Beside | None = None,
+    parallel: ParallelExperiments | None = None,
 ) -> None:
     folder = options.folder
     _check_before_anything_moves(study, rig, folder)
     progress = Interruptible(progress_bar())
     noise_free = None
     try:
-        if beside is None:
+        if parallel is None:
             found = run_study(study, rig, options, progress)
         else:
-            found = run_study(study, rig, options, progress, beside.start)
+            found = run_study(study, rig, options, progress, parallel.start)
         if noise_free_of is not None:
-            progress.advance(0.0, "the twin without noise")
+            progress.advance(0.0, "noise-free reference run")
             noise_free = _noise_free(noise_free_of, found)
-        if beside is not None:
-            progress.advance(0.0, "the chip's experiments")
-            for row, why in beside.finish().items():
-                click.echo(f"haselab: {row} is left out: {why}", err=True)
+        if parallel is not None:
+            progress.advance(0.0, "microcontroller experiments")
+            for row, why in parallel.finish().items():
+                click.echo(f"haselab: {row} was left out: {why}", err=True)
     except KeyboardInterrupt as stop:
         stop.add_note(kept_in(folder))
         raise
     finally:
         rig.safe()
         progress.stop()
-        if beside is not None:
-            beside.stop()
+        if parallel is not None:
+            parallel.stop()
     if study.is_reference:
         found = with_chip_rows(found, folder)
     found = with_mass_limit(found, study, options.rig_config)
     header = with_date(session_header(study, rig.description, options), folder)
     results = write_findings(folder, found, study, header, noise_free)
     mark_found(folder, found, folder, simulated=bool(results["simulated"]))
-    tell(results, folder, as_json)
+    print_results(results, folder, as_json)
 
 
 def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> dict[str, Any]:
@@ -182,12 +191,12 @@ def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> dict[str, 
 
 
 def mark_found(folder: Path, found: Findings, recorded_in: Path | None, *, simulated: bool) -> None:
-    """Write where the sections of a run's actuator file come from.
+    """Write the provenance of the sections in a run's actuator file.
 
     Args:
         folder: of the results.
         found: what was written to the file.
-        recorded_in: folder of the session, whose manifest holds its hash; None: it has none.
+        recorded_in: folder of the session, whose manifest holds its hash; None: there is none.
         simulated: the run was played on a twin.
     """
     try:
@@ -201,7 +210,7 @@ def mark_found(folder: Path, found: Findings, recorded_in: Path | None, *, simul
 def _noise_free(
     noise_free_of: Callable[[Findings], dict[str, float]], found: Findings
 ) -> dict[str, float] | None:
-    """What the twin gives without noise; a fit that fails there takes nothing from the results."""
+    """Results of the twin without noise; None, with a note, if a fit fails there."""
     try:
         return noise_free_of(found)
     except ResultError as error:
@@ -209,9 +218,12 @@ def _noise_free(
         return None
 
 
-def tell(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:
+def print_results(results: Mapping[str, Any], folder: Path, as_json: bool) -> None:
     """Write the report and print the results."""
-    from haselab.report import results_table, write_report  # matplotlib takes half a second
+    from haselab.report import (
+        results_table,
+        write_report,
+    )  # matplotlib takes half a second to import
 
     plain = to_plain(results)
     page = write_report(folder)

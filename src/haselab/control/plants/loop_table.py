@@ -91,12 +91,12 @@ class LoopTable:
     """Loops as numbers, one row each.
 
     Args:
-        rows: coefficients, states at the start, controller, noise. Shape `(B, COLUMNS)`.
+        rows: coefficients, states at the start, controller, noise. Shape `(B,)`.
         branches: slow branches that are counted in.
         period_s: time between samples, in s.
     """
 
-    rows: NDArray[np.float64]
+    rows: NDArray[np.void]
     branches: int
     period_s: float
 
@@ -139,7 +139,7 @@ class LoopTable:
                 f"{_LONGEST_DELAY}. Lower the rate or the delay."
             )
         rows = _rows(held, gains, setting, noise_std)
-        largest = float(np.abs(rows).max())
+        largest = float(np.abs(rows.view(np.float64)).max())
         if not largest < _LARGEST:
             raise InputError(
                 f"a loop holds {largest:g}; allowed: what single precision holds, "
@@ -154,16 +154,19 @@ class LoopTable:
 
 def _rows(
     held: HeldPlants, gains: Sequence[PidGains], setting: LoopSetting, noise_std: ArrayLike
-) -> NDArray[np.float64]:
-    """The columns as `native/bindings/bind_loops.cpp` reads them."""
+) -> NDArray[np.void]:
+    """The loops as the C code reads them; branches that a plant does not have are 0."""
     loops, branches = held.slow_decay.shape
     u = float(np.float32(setting.initial_u))  # as the controller has it
-    unused = np.zeros((loops, _loops.SLOW - branches))
-    limits_and_u = np.full((loops, 3), (setting.saturation.low, setting.saturation.high, u))
-    law = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains])
-    std = np.broadcast_to(np.asarray(noise_std, dtype=float), loops)
-    return np.hstack(
-        [held.free, held.push, held.feed[:, None], held.slow_decay, unused, held.slow_push, unused,
-         held.rest * u, unused, law, limits_and_u, held.static_gain[:, None] * u,
-         held.samples[:, None], std[:, None]]
-    )  # fmt: skip
+    rows = np.zeros(loops, _loops.LOOP)
+    rows["free"], rows["push"], rows["feed"] = held.free, held.push, held.feed
+    rows["slow_decay"][:, :branches] = held.slow_decay
+    rows["slow_push"][:, :branches] = held.slow_push
+    rows["start"], rows["slow_start"][:, :branches] = np.split(held.rest * u, [2], axis=1)
+    rows["kp"], rows["ki"], rows["kd"], rows["filter_s"] = np.array(
+        [(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]
+    ).T
+    rows["u_low"], rows["u_high"] = setting.saturation.low, setting.saturation.high
+    rows["u"], rows["rest"] = u, held.static_gain * u
+    rows["delay"], rows["noise_std"] = held.samples, noise_std
+    return rows

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.identify.frequency.local_fit import (
-    Problem,
+    LocalProblem,
     solve,
     start_denominators,
     tune_denominators,
@@ -92,7 +92,7 @@ class _Choice:
 
 
 def centres(
-    windows: Callable[[Floats], Problem], wanted_hz: Floats, half_hz: float, *, rational: bool
+    windows: Callable[[Floats], LocalProblem], wanted_hz: Floats, half_hz: float, *, rational: bool
 ) -> Centres:
     """Values at the centres of windows about the wanted frequencies.
 
@@ -121,7 +121,7 @@ def centres(
     return Centres(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _values(problem: Problem, choice: _Choice) -> tuple[NDArray[Any], ...]:
+def _values(problem: LocalProblem, choice: _Choice) -> tuple[NDArray[Any], ...]:
     """The fields of `Centres`."""
     rows, factors = problem.linear.shape[1:]
     solved = solve(problem, choice.d)
@@ -181,7 +181,7 @@ class _Told:
     plain: Floats
 
 
-def _told(problem: Problem) -> _Told:
+def _told(problem: LocalProblem) -> _Told:
     plain = solve(problem, np.zeros((problem.y.shape[0], _ORDER), dtype=np.complex128)).cost
     d = start_denominators(problem)
     solved = solve(problem, d)
@@ -206,7 +206,7 @@ def _resonances(told: _Told, wanted_hz: Floats, half_hz: float, start: int) -> l
     return found
 
 
-def _none(problem: Problem, start: int) -> _Choice:
+def _none(problem: LocalProblem, start: int) -> _Choice:
     """No denominator anywhere."""
     count, rows = problem.y.shape
     return _Choice(
@@ -218,7 +218,7 @@ def _none(problem: Problem, start: int) -> _Choice:
 
 
 def _chosen(
-    problem: Problem,
+    problem: LocalProblem,
     choice: _Choice,
     wanted_hz: Floats,
     half_hz: float,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Problem", "Solved", "solve", "start_denominators", "tune_denominators"]
+__all__ = ["LocalProblem", "Solved", "solve", "start_denominators", "tune_denominators"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -20,7 +20,7 @@ _SINGULAR = 1e-12
 
 
 @dataclass(frozen=True)
-class Problem:
+class LocalProblem:
     """Least squares of `y = linear @ factors / (1 + slopes @ d)` in each of K windows.
 
     Args:
@@ -33,9 +33,9 @@ class Problem:
     slopes: Complexes
     y: Complexes
 
-    def at(self, which: NDArray[Any]) -> Problem:
+    def at(self, which: NDArray[Any]) -> LocalProblem:
         """The problem of some windows."""
-        return Problem(self.linear[which], self.slopes[which], self.y[which])
+        return LocalProblem(self.linear[which], self.slopes[which], self.y[which])
 
     def bottom(self, d: Complexes) -> Complexes:
         """Denominators on all rows, of at most 1e12 contrast. Shape `(K, R, 1)`."""
@@ -64,7 +64,7 @@ class Solved:
     cost: Floats
 
 
-def solve(problem: Problem, d: Complexes) -> Solved:
+def solve(problem: LocalProblem, d: Complexes) -> Solved:
     """Linear least squares at denominators `d`, Shape `(K, 2)`."""
     bottom = problem.bottom(d)
     q, inverse, size = _orthogonal(problem.linear / bottom)
@@ -92,7 +92,7 @@ def _orthogonal(matrix: Complexes) -> tuple[Complexes, Complexes, Floats]:
     return q, np.linalg.inv(triangle), size
 
 
-def start_denominators(problem: Problem) -> Complexes:
+def start_denominators(problem: LocalProblem) -> Complexes:
     """Denominators by least squares on the misfit times the denominator, weighted by the last.
 
     Source: Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963), 56.
@@ -126,7 +126,7 @@ class _Projected:
         self.cost[which] = other.cost[which]
 
 
-def _projected(problem: Problem, d: Complexes) -> _Projected:
+def _projected(problem: LocalProblem, d: Complexes) -> _Projected:
     bottom = problem.bottom(d)
     q, _, _ = _orthogonal(problem.linear / bottom)
     dual = q.conj().transpose(0, 2, 1)
@@ -147,7 +147,7 @@ def _step(now: _Projected, damping: Floats) -> Complexes:
     return np.asarray(step[:, :, 0])
 
 
-def tune_denominators(problem: Problem, d: Complexes) -> Complexes:
+def tune_denominators(problem: LocalProblem, d: Complexes) -> Complexes:
     """Denominators of least misfit of the output, from a start; all windows at once.
 
     Source: Levenberg-Marquardt on the projected misfit, Kaufman, BIT 15 (1975), 49.

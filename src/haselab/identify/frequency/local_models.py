@@ -11,7 +11,7 @@ from scipy.sparse import block_array, csr_array
 
 from haselab.identify.frequency.lines import EXCITED, Lines
 from haselab.identify.frequency.local_choice import Centres, centres
-from haselab.identify.frequency.local_fit import Problem
+from haselab.identify.frequency.local_fit import LocalProblem
 
 __all__ = ["Spectrum", "harmonic_leakage", "local_response"]
 
@@ -195,13 +195,13 @@ def _mixing(
     return csr_array(block_array([[plus.real, -minus.imag], [plus.imag, minus.real]]))
 
 
-def _problem(windows: _Windows) -> Problem:
+def _problem(windows: _Windows) -> LocalProblem:
     powers = windows.place[:, :, None] ** np.arange(_ORDER + 1)
     own = windows.record[:, None] == np.arange(int(windows.record[-1]) + 1)
     columns = [powers * windows.u[:, :, None]]
     columns += [powers * own[None, :, k, None] for k in range(own.shape[1])]
     slopes = powers[:, :, 1:].astype(np.complex128)
-    return Problem(np.concatenate(columns, axis=2), slopes, windows.y)
+    return LocalProblem(np.concatenate(columns, axis=2), slopes, windows.y)
 
 
 def harmonic_leakage(
@@ -231,9 +231,9 @@ def harmonic_leakage(
     rest = y[lines] - response[:, None] * u[lines]
     powers = (offsets / half)[:, None] ** np.arange(_ORDER + 1)
 
-    def windows(some: Floats) -> Problem:
+    def windows(some: Floats) -> LocalProblem:
         at = np.searchsorted(harmonics, np.rint(some / periods).astype(np.intp))
         linear = np.broadcast_to(powers, (some.size, *powers.shape)).astype(np.complex128)
-        return Problem(linear, linear[:, :, 1:], rest[at])
+        return LocalProblem(linear, linear[:, :, 1:], rest[at])
 
     return centres(windows, periods * harmonics.astype(np.float64), half, rational=True)

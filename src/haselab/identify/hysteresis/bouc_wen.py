@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from haselab import _models
 from haselab.identify.hysteresis.problem import (
+    HysteresisProblem,
     Numbers,
-    Problem,
     Scale,
     Shapes,
     Solved,
@@ -55,7 +55,7 @@ class BoucWenFamily:
         """The weight is free."""
         return np.array([-np.inf]), np.array([np.inf])
 
-    def _memory(self, search: Floats, problem: Problem) -> Floats:
+    def _memory(self, search: Floats, problem: HysteresisProblem) -> Floats:
         exponent = float(search[2]) if self.free_exponent else 1.0
         memories = []
         for u in problem.inputs:
@@ -66,7 +66,7 @@ class BoucWenFamily:
             memories.append(w)
         return problem.pick(memories)
 
-    def shapes(self, search: Floats, problem: Problem) -> Shapes:
+    def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
         """The memory, its derivatives by differences, on the problem's rows."""
         here = self._memory(search, problem)
         slopes = np.empty((search.size, here.size, 1))
@@ -77,7 +77,7 @@ class BoucWenFamily:
         return Shapes(here[:, None], slopes)
 
 
-def solve_bouc_wen(problem: Problem, curve: Numbers, free_exponent: bool) -> Solved:
+def solve_bouc_wen(problem: HysteresisProblem, curve: Numbers, free_exponent: bool) -> Solved:
     """Best solution of several starts, ranked by what each memory explains beside a curve.
 
     Args:

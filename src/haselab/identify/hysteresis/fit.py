@@ -21,7 +21,7 @@ from haselab.identify.hysteresis.loops import (
 )
 from haselab.identify.hysteresis.parameters import hysteresis_estimates, model_of
 from haselab.identify.hysteresis.prandtl_ishlinskii import PlayFamily, simplified
-from haselab.identify.hysteresis.problem import Family, Numbers, Problem, Scale
+from haselab.identify.hysteresis.problem import Family, HysteresisProblem, Numbers, Scale
 from haselab.identify.hysteresis.search import (
     BOUC_WEN,
     CURVE,
@@ -244,7 +244,7 @@ def _describe(
 ) -> HysteresisFit:
     """The chosen model on all rows, judged."""
     masks = [record.settled() for record in records]
-    problem = Problem(records, scale, masks, _ROWS)
+    problem = HysteresisProblem(records, scale, masks, _ROWS)
     start, family = chosen.solved.numbers, chosen.family
     numbers = problem.solve(family, start, steps=60, gain=1e-9).numbers
     while isinstance(family, PlayFamily):
@@ -315,7 +315,7 @@ def _validation(
     early = [mask & (np.arange(mask.size) < cut) for mask, cut in zip(masks, cuts, strict=True)]
     if sum(int(mask.sum()) for mask in early) < 2 * numbers.vector.size:
         return math.nan
-    problem = Problem(records, scale, early, _ROWS)
+    problem = HysteresisProblem(records, scale, early, _ROWS)
     fitted = model_of(family, problem.solve(family, numbers).numbers, scale)
     modelled = [fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records]
     return fit_percent(

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from haselab.base import Estimate
 from haselab.identify.hysteresis.bouc_wen import BoucWenFamily, bouc_wen_model
 from haselab.identify.hysteresis.prandtl_ishlinskii import PlayFamily, play_model
-from haselab.identify.hysteresis.problem import LEAST_GAIN, Family, Numbers, Problem, Scale
+from haselab.identify.hysteresis.problem import (
+    LEAST_GAIN,
+    Family,
+    HysteresisProblem,
+    Numbers,
+    Scale,
+)
 from haselab.identify.noise import coloured_covariance
 from haselab.models.hysteresis.common import Hysteresis
 
@@ -87,7 +93,9 @@ def _values(family: Family, numbers: Numbers, scale: Scale) -> Floats:
     return np.concatenate([search, [offset, ratio * numbers.gain], factors, zones])
 
 
-def hysteresis_estimates(problem: Problem, family: Family, numbers: Numbers) -> dict[str, Estimate]:
+def hysteresis_estimates(
+    problem: HysteresisProblem, family: Family, numbers: Numbers
+) -> dict[str, Estimate]:
     """All numbers with intervals; those at a bound or beyond the data's reach are NaN.
 
     Args:

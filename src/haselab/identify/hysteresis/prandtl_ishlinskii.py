@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from haselab._models import Plays
 from haselab.identify.hysteresis.problem import (
+    HysteresisProblem,
     Numbers,
-    Problem,
     Scale,
     Shapes,
     Solved,
@@ -63,7 +63,7 @@ class PlayFamily:
         zero, free = np.zeros(self.count), np.full(self.count, np.inf)
         return (zero, free) if self.side >= 0 else (-free, zero)
 
-    def shapes(self, search: Floats, problem: Problem) -> Shapes:
+    def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
         """Plays and their derivatives on the problem's rows."""
         thresholds = np.ascontiguousarray(search[: self.count])
         rate_s = float(search[-1]) if self.rated else 0.0
@@ -89,7 +89,7 @@ class PlayFamily:
 
 
 def add_operator(
-    problem: Problem, family: PlayFamily, solved: Solved
+    problem: HysteresisProblem, family: PlayFamily, solved: Solved
 ) -> tuple[PlayFamily, Solved] | None:
     """One more operator, where the residuals ask for it most, then all numbers solved again.
 
@@ -130,7 +130,7 @@ def add_operator(
 
 
 def evenly_spaced(
-    problem: Problem, curve: Numbers, side: int, count: int
+    problem: HysteresisProblem, curve: Numbers, side: int, count: int
 ) -> tuple[PlayFamily, Solved]:
     """Evenly spaced operators, all numbers solved from there, those without a weight left out.
 
@@ -158,7 +158,7 @@ def evenly_spaced(
 
 
 def with_rate(
-    problem: Problem, family: PlayFamily, solved: Solved, filter_s: float
+    problem: HysteresisProblem, family: PlayFamily, solved: Solved, filter_s: float
 ) -> tuple[PlayFamily, Solved]:
     """The same operators with thresholds that grow with the rate.
 

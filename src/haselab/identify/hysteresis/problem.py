@@ -16,8 +16,8 @@ from haselab.models.hysteresis.common import DeadZones
 __all__ = [
     "LEAST_GAIN",
     "Family",
+    "HysteresisProblem",
     "Numbers",
-    "Problem",
     "Scale",
     "Shapes",
     "Solved",
@@ -57,7 +57,7 @@ class Family(Protocol):
     def factor_bounds(self) -> tuple[Floats, Floats]:
         """Lowest and highest factors of the memories. Shape `(C,)` each."""
 
-    def shapes(self, search: Floats, problem: Problem) -> Shapes:
+    def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
         """Memories and their derivatives on the problem's rows."""
 
 
@@ -173,7 +173,7 @@ def zones_of(bends: Floats, scale: Scale | None = None) -> DeadZones:
     )
 
 
-class Problem:
+class HysteresisProblem:
     """Records in units of -1 to 1, and the rows of them that count.
 
     Args:

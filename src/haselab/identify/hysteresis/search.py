@@ -18,7 +18,7 @@ from haselab.identify.hysteresis.prandtl_ishlinskii import (
     play_model,
     with_rate,
 )
-from haselab.identify.hysteresis.problem import Family, Numbers, Problem, Scale, Solved
+from haselab.identify.hysteresis.problem import Family, HysteresisProblem, Numbers, Scale, Solved
 from haselab.identify.model_choice import APART, bic, effective_count
 
 __all__ = [
@@ -65,7 +65,7 @@ class Candidate:
     bic: float
 
 
-def rate_spread(problem: Problem) -> float:
+def rate_spread(problem: HysteresisProblem) -> float:
     """Ratio of the high to the low rates of the input that the rows hold (90 to 10 %)."""
     rates = [
         np.abs(np.diff(u, prepend=u[0])) * rate_hz
@@ -78,7 +78,7 @@ def rate_spread(problem: Problem) -> float:
 class _Judge:
     """The criterion of all rivals, with one effective number of samples."""
 
-    def __init__(self, problem: Problem, richest: Solved, family: Family) -> None:
+    def __init__(self, problem: HysteresisProblem, richest: Solved, family: Family) -> None:
         residuals = np.split(problem.residuals(family, richest.numbers), problem.ends)
         self.count = problem.y.size
         self.effective = effective_count(residuals)
@@ -100,7 +100,7 @@ def _best(tried: Sequence[Candidate]) -> Candidate:
 
 def search_hysteresis(
     records: Sequence[LoopRecord], scale: Scale, wanted: Sequence[str], operators: int | None
-) -> tuple[Problem, dict[str, Candidate]]:
+) -> tuple[HysteresisProblem, dict[str, Candidate]]:
     """The best candidate of each wanted kind, and of a curve without memory.
 
     Args:
@@ -111,7 +111,7 @@ def search_hysteresis(
     Returns:
         The thinned problem, and candidates by kind.
     """
-    problem = Problem(records, scale, [record.settled() for record in records], _ROWS)
+    problem = HysteresisProblem(records, scale, [record.settled() for record in records], _ROWS)
     none = PlayFamily(0)
     curves = [
         problem.solve(none, Numbers(np.zeros(0), 0.0, 1.0, np.zeros(0), np.ones(count)))
@@ -137,7 +137,9 @@ def search_hysteresis(
     return problem, found
 
 
-def _best_bouc_wen(problem: Problem, judge: _Judge, curves: Sequence[Solved]) -> Candidate:
+def _best_bouc_wen(
+    problem: HysteresisProblem, judge: _Judge, curves: Sequence[Solved]
+) -> Candidate:
     """The dead zones that go best with an exponent of 1, then the exponent free as well."""
     tried = [
         judge.rate(BOUC_WEN, BoucWenFamily(), solve_bouc_wen(problem, curve.numbers, False))
@@ -149,7 +151,7 @@ def _best_bouc_wen(problem: Problem, judge: _Judge, curves: Sequence[Solved]) ->
 
 
 def _grow(
-    problem: Problem, path: list[tuple[PlayFamily, Solved]], count: int
+    problem: HysteresisProblem, path: list[tuple[PlayFamily, Solved]], count: int
 ) -> list[tuple[PlayFamily, Solved]]:
     """The path with operators added until there are `count`, or none is asked for."""
     path = list(path)
@@ -162,7 +164,7 @@ def _grow(
 
 
 def _best_plays(
-    problem: Problem,
+    problem: HysteresisProblem,
     judge: _Judge,
     curve: Numbers,
     path: list[tuple[PlayFamily, Solved]],
@@ -200,7 +202,7 @@ def _count(candidate: Candidate) -> int:
     return cast(PlayFamily, candidate.family).count
 
 
-def _filtered(problem: Problem, judge: _Judge, rated: Candidate) -> Candidate:
+def _filtered(problem: HysteresisProblem, judge: _Judge, rated: Candidate) -> Candidate:
     """The rate's filter that explains the loops best, of time constants a factor of 2 apart."""
     family = cast(PlayFamily, rated.family)
     tried = [rated]
@@ -214,13 +216,13 @@ def _filtered(problem: Problem, judge: _Judge, rated: Candidate) -> Candidate:
     return min(rivals, key=lambda candidate: (_runs_away(problem, candidate), candidate.detail))
 
 
-def _runs_away(problem: Problem, rated: Candidate) -> bool:
+def _runs_away(problem: HysteresisProblem, rated: Candidate) -> bool:
     model = play_model(cast(PlayFamily, rated.family), rated.solved.numbers, problem.scale)
     return model.feedback(max(problem.rates_hz)) >= 1.0
 
 
 def _best_count(
-    problem: Problem,
+    problem: HysteresisProblem,
     judge: _Judge,
     path: list[tuple[PlayFamily, Solved]],
     operators: int | None,

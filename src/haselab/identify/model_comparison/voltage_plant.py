@@ -39,11 +39,16 @@ _SPACING = 0.26  # of the natural frequencies that are tried first, in their log
 _DEPTH, _CREEP_S = 1e-2, 0.4  # a time constant below this part of the record, and below this
 # time, is no creep
 _MOST_VOLTS = 100.0
+_SECOND = ("second_natural_frequency_rad_s", "second_damping_ratio", "second_share")
 _NAMES = (
     "natural_frequency_rad_s", "damping_ratio", "delay_s", "creep_share", "creep_time_constant_s",
-    "second_natural_frequency_rad_s", "second_damping_ratio", "second_share",
+    *_SECOND,
 )  # fmt: skip
-_LOGARITHMIC = np.array([True, True, False, False, True, True, True, False])
+_AT = {name: place for place, name in enumerate(_NAMES)}
+_FREQUENCY, _CREEP, _BESIDE = (
+    _AT["natural_frequency_rad_s"], _AT["creep_time_constant_s"], _AT[_SECOND[0]],
+)  # fmt: skip
+_LOGARITHMIC = np.array([name not in ("delay_s", "creep_share", "second_share") for name in _NAMES])
 _LONGEST_DELAY_S = 0.05
 
 
@@ -87,7 +92,7 @@ class VoltageStructure:
     @property
     def size(self) -> int:
         """Searched numbers."""
-        return 8 if self.two_modes else 5
+        return len(_NAMES) if self.two_modes else len(_NAMES) - len(_SECOND)
 
 
 @dataclass(frozen=True)
@@ -117,21 +122,23 @@ class _Range:
 
     def near(self, plant: VoltagePlant) -> Floats:
         """Where a plant lies, or the nearest place in the ranges."""
-        numbers = [
-            plant.natural_frequency_rad_s, plant.damping_ratio, plant.delay_s, plant.creep_share,
-            plant.creep_time_constant_s, *(plant.second_mode or (1.0, 0.1, 0.0)),
-        ]  # fmt: skip
-        values = np.array(numbers[: self.low.size])
+        second = dict(zip(_SECOND, plant.second_mode or (1.0, 0.1, 0.0), strict=True))
+        names = _NAMES[: self.low.size]
+        values = np.array([second[n] if n in second else getattr(plant, n) for n in names])
         logarithmic = _LOGARITHMIC[: self.low.size]
         return self.search(np.where(logarithmic, np.log(np.maximum(values, 1e-9)), values))
 
     def plant(self, search: Floats) -> VoltagePlant:
         """The plant of searched numbers, with gains of one."""
         numbers = self.numbers(search)
-        n = np.where(_LOGARITHMIC[: numbers.size], np.exp(numbers), numbers).tolist()
-        second = (n[5], n[6], n[7]) if self.structure.two_modes else None
+        values = np.where(_LOGARITHMIC[: numbers.size], np.exp(numbers), numbers).tolist()
+        named = dict(zip(_NAMES, values, strict=False))
+        second = None
+        if self.structure.two_modes:
+            frequency, damping, share = (named.pop(name) for name in _SECOND)
+            second = (frequency, damping, share)
         ones = (1.0,) * self.structure.powers
-        return VoltagePlant(self.structure.creep, ones, n[0], n[1], n[2], n[3], n[4], second)
+        return VoltagePlant(self.structure.creep, ones, **named, second_mode=second)
 
 
 @dataclass(frozen=True)
@@ -332,27 +339,43 @@ def _ranges(records: Sequence[Record], structure: VoltageStructure) -> _Range:
     shortest_s = max(min(_DEPTH * longest_s, _CREEP_S), 3.0 * period_s)
     slow = (math.log(shortest_s), math.log(2.0 * longest_s))
     damping = (math.log(2e-3), math.log(1.5))
-    ends = [first, damping, (0.0, _LONGEST_DELAY_S), (0.0, 0.95), slow]
-    if structure.two_modes:
-        ends += [reach, damping, (-0.95, 0.95)]
-    low_ends, high_ends = np.array(ends).T
+    ends = {
+        "natural_frequency_rad_s": first,
+        "damping_ratio": damping,
+        "delay_s": (0.0, _LONGEST_DELAY_S),
+        "creep_share": (0.0, 0.95),
+        "creep_time_constant_s": slow,
+        "second_natural_frequency_rad_s": reach,
+        "second_damping_ratio": damping,
+        "second_share": (-0.95, 0.95),
+    }
+    low_ends, high_ends = np.array([ends[name] for name in _NAMES[: structure.size]]).T
     return _Range(structure, low_ends, np.maximum(high_ends, low_ends))
 
 
 def _starts(ranges: _Range) -> list[Floats]:
     """First numbers over the range of natural frequency and of creep."""
     low, span = ranges.low, ranges.high - ranges.low
-    middle = np.array([0.0, math.log(0.1), 0.012, 0.3, 0.0, 0.0, math.log(0.05), 0.1])[: low.size]
+    known = {
+        "damping_ratio": math.log(0.1),
+        "delay_s": 0.012,
+        "creep_share": 0.3,
+        "second_damping_ratio": math.log(0.05),
+        "second_share": 0.1,
+    }
+    middle = np.array([known.get(name, 0.0) for name in _NAMES[: low.size]])
     starts = []
-    count = max(math.ceil(span[0] / _SPACING), 3)
+    count = max(math.ceil(span[_FREQUENCY] / _SPACING), 3)
     for part in (np.arange(count) + 0.5) / count:
         for slow in (0.4, 0.75):
             start = middle.copy()
-            start[[0, 4]] = low[[0, 4]] + np.array([part, slow]) * span[[0, 4]]
+            for place, share in ((_FREQUENCY, part), (_CREEP, slow)):
+                start[place] = low[place] + share * span[place]
             for apart in (0.35, 0.7) if ranges.structure.two_modes else (0.0,):
                 if apart:
                     start = start.copy()
-                    start[5] = low[5] + (start[0] - low[5] + apart * span[5]) % span[5]
+                    away = start[_FREQUENCY] - low[_BESIDE] + apart * span[_BESIDE]
+                    start[_BESIDE] = low[_BESIDE] + away % span[_BESIDE]
                 starts.append(ranges.search(start))
     return starts
 
@@ -388,7 +411,7 @@ def _apart(solutions: Sequence[Solution]) -> list[Floats]:
     """The best starts, no more than two of one natural frequency."""
     kept: list[Floats] = []
     for solution in solutions:
-        if sum(other[0] == solution.search[0] for other in kept) < _TWINS:
+        if sum(other[_FREQUENCY] == solution.search[_FREQUENCY] for other in kept) < _TWINS:
             kept.append(solution.search)
         if len(kept) == _POLISHED:
             break

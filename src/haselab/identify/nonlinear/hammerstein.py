@@ -16,7 +16,7 @@ from haselab.identify.record import Record
 from haselab.identify.residual_tests import lags_of, means_before
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer.parameters import numbers_of, poles_of, zeros_of
-from haselab.identify.transfer.problem import Columns, Problem
+from haselab.identify.transfer.problem import Columns, TransferProblem
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import delay_margin_s
 
@@ -132,7 +132,7 @@ class _Hammerstein:
         if found is None or whole is None:
             return None
         # An offset of the curve is part of the record's own offset, which the fit has found.
-        return Problem(self.layout, whole, delay_margin_s(whole)).predict(found.best.found)
+        return TransferProblem(self.layout, whole, delay_margin_s(whole)).predict(found.best.found)
 
 
 def fit_hammerstein(
@@ -224,7 +224,9 @@ def _searched(
     if best is None:
         return None
     margin_s = delay_margin_s(records)
-    problems = [None if p is None else Problem(layout, p, margin_s) for p in curve.parts(records)]
+    problems = [
+        None if p is None else TransferProblem(layout, p, margin_s) for p in curve.parts(records)
+    ]
     count = sum(r.y.size for r in records)
     columns = _extended(curve, problems, best)
     for _ in range(_STEPS):
@@ -258,7 +260,7 @@ def _searched(
     return _Solution(curve, best, columns)
 
 
-def _extended(curve: _Curve, problems: Sequence[Problem | None], best: Best) -> Columns:
+def _extended(curve: _Curve, problems: Sequence[TransferProblem | None], best: Best) -> Columns:
     """Sensitivities of poles and common factors, then of the curve's factors."""
     base = best.columns
     free = replace(best.found, own=[np.zeros_like(own) for own in best.found.own])

@@ -23,8 +23,10 @@ __all__ = ["fit_output_curve", "fit_spring"]
 
 Floats = NDArray[np.float64]
 _PLANT = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
-_PLACES = (0, 1, 2, 5)  # of these among the numbers of oscillator.h
-_SPRING = {2: 3, 3: 4}
+_AT = _identify.OSCILLATOR  # places among the numbers of oscillator.h
+_PLACES = (_AT["log_omega"], _AT["log_zeta"], _AT["gain"], _AT["delay"])
+_SPRING = {2: _AT["q2"], 3: _AT["q3"]}
+_BEGIN = [_AT["start"], _AT["rate"]]
 _SHARES = (0.0, 0.1, 0.4, 1.5, -0.1, -0.4)  # of the spring's force that is cubic
 _FIRST = 3000  # outputs on which starts are compared
 _FIRST_STEPS = 8
@@ -124,12 +126,12 @@ class _Search:
         plant[model.free] = numbers[: model.free.size]
         curve = numbers[model.free.size : model.shared]
         first = model.shared + i * model.own
-        inner = np.zeros(8)
+        inner = np.zeros(len(_AT))
         inner[list(_PLACES)] = plant
         if model.spring:
             inner[[_SPRING[k] for k in model.powers]] = curve
         if model.structure.initial_state:
-            inner[6:] = numbers[first : first + 2]
+            inner[_BEGIN] = numbers[first : first + 2]
         u, rate_hz = self._inputs[i]
         x, by, finite = _identify.oscillate(
             u, rate_hz, r.input_before or 0.0, r.hold != "zero",
@@ -148,7 +150,7 @@ class _Search:
         for column, k in enumerate(model.powers, start=model.free.size):
             z[:, column] = by[_SPRING[k]] if model.spring else x**k
         if model.structure.initial_state:
-            z[:, first : first + 2] = (slope * by[6:]).T
+            z[:, first : first + 2] = (slope * by[_BEGIN]).T
         if model.structure.offset:
             z[:, first + model.own - 1] = 1.0
             modelled = modelled + numbers[first + model.own - 1]

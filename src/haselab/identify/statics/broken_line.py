@@ -105,12 +105,13 @@ def _extended(
         if start >= end or grid.counts[end] - grid.counts[start] < least:
             continue
         uu, uv, vv, u, v, one = grid.quadratics[start, end]
-        a, b = before[:, 0] + uu, before[:, 1] + u
+        square, linear, constant = before.T
+        a, b = square + uu, linear + u
         safe = np.where(a > 0.0, a, 1.0)
         functions.append(
             np.column_stack(
                 [vv - uv**2 / (4.0 * safe), v - uv * b / (2.0 * safe),
-                 one + before[:, 2] - b**2 / (4.0 * safe)]
+                 one + constant - b**2 / (4.0 * safe)]
             )
         )  # fmt: skip
         paths.append(np.column_stack([path, np.full(len(path), start)]))

@@ -12,7 +12,7 @@ from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.noise import noise_behind
 from haselab.identify.transfer.fit import TransferFit
 from haselab.identify.transfer.layout import Layout, layout_of
-from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.start import delay_margin_s
 from haselab.models.filters import lfilter
 
@@ -89,7 +89,7 @@ def _drawn(
             white = np.sqrt(variance) * rng.normal(size=clean.size + _BURN_IN)
             noise = lfilter([1.0], polynomial, white)[_BURN_IN:]
             simulated.append(replace(record, y=clean + noise))
-        found = Problem(layout, simulated, margin_s).minimise(start, fit.best.bounds)
+        found = TransferProblem(layout, simulated, margin_s).minimise(start, fit.best.bounds)
         numbers = layout.full(found.search)
         factors = layout.factor_template.copy()
         factors[np.isnan(factors)] = found.shared

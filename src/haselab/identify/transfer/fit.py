@@ -27,7 +27,7 @@ from haselab.identify.transfer.parameters import (
     poles_of,
     zeros_of,
 )
-from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.profile import profiled
 from haselab.identify.transfer.search import Best, best_fit, has_line
 from haselab.identify.transfer.start import delay_margin_s
@@ -73,6 +73,7 @@ class TransferFit:
         notes: what the reader of the numbers should know, a sentence each.
         best: what the search found; None without a result.
         rivals: other minima that the search met, with their likelihoods.
+        ambiguous: two models explain the records: the fit is right, its numbers may not be.
     """
 
     status: str
@@ -87,16 +88,12 @@ class TransferFit:
     notes: tuple[str, ...] = ()
     best: Best | None = None
     rivals: tuple[Rival, ...] = ()
+    ambiguous: bool = False
 
     @property
     def succeeded(self) -> bool:
         """Whether the numbers may be used."""
         return self.status == "ok"
-
-    @property
-    def ambiguous(self) -> bool:
-        """Whether two models explain the records: the fit is right, its numbers may not be."""
-        return self.status.startswith("ambiguous")
 
     @property
     def records(self) -> tuple[Record, ...]:
@@ -266,7 +263,8 @@ def fit_transfer(
         return _no_result(layout_of(structure), tones)
     fit = _fit(layout_of(structure), records, applied=applied)
     if _doubtful(fit):
-        fit = replace(fit, status=_why(structure, records) or fit.status)
+        why = _why(structure, records)
+        fit = fit if why is None else replace(fit, status=why, ambiguous=False)
     if fit.succeeded and fit.fit_percent < _LITTLE and fit.input_correlation_p < _RELATED:
         fit = replace(fit, status=_UNEXPLAINED.format(fit.fit_percent))
     alone = all(np.ptp(record.u) == 0.0 for record in records)
@@ -310,15 +308,16 @@ def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> Transfe
         return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
     found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
     fit = _describe(layout, found.best)
-    status = fit.status if found.fault is None else found.fault
-    return replace(fit, status=status, notes=(*fit.notes, *found.notes))
+    if found.fault is not None:
+        fit = replace(fit, status=found.fault, ambiguous=False)
+    return replace(fit, notes=(*fit.notes, *found.notes))
 
 
 def _doubtful(fit: TransferFit) -> bool:
     """Whether the columns may be swapped: little is explained, or nothing was found."""
-    if fit.succeeded or fit.status.startswith("ambiguous"):
+    if fit.succeeded or fit.ambiguous:
         return fit.fit_percent < _SWAPPED and fit.residual_whiteness_p < _RELATED
-    return fit.status.startswith("no result") and not math.isfinite(fit.fit_percent)
+    return not math.isfinite(fit.fit_percent)
 
 
 def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
@@ -408,10 +407,11 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
     modelled = tuple(r.y - e for r, e in zip(records, residuals, strict=True))
     numbers = layout.full(found.search)
     estimates, covariance, notes = numbers_of(layout, best, inner)
-    problem = Problem(layout, records, delay_margin_s(records))
+    problem = TransferProblem(layout, records, delay_margin_s(records))
     rivals = rivals_of(layout, problem, residuals, best.others, estimates) if best.others else ()
+    doubt = ambiguity(rivals, estimates)
     return TransferFit(
-        ambiguity(rivals, estimates) or "ok",
+        doubt or "ok",
         layout.structure,
         estimates,
         covariance,
@@ -423,6 +423,7 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
         (*notes, *_notes(layout.structure, best, estimates)),
         best,
         rivals,
+        ambiguous=bool(doubt),
     )
 
 
@@ -433,9 +434,9 @@ def _validation(layout: Layout, best: Best) -> float:
     if any(cut < 8 or np.ptp(r.y[:cut]) == 0.0 for r, cut in zip(records, cuts, strict=True)):
         return math.nan
     margin_s = delay_margin_s(records)
-    training = Problem(layout, records, margin_s, share)
+    training = TransferProblem(layout, records, margin_s, share)
     fit = training.minimise(best.found.search, best.bounds, gain=1e-7)
-    predicted = Problem(layout, records, margin_s).predict(fit)
+    predicted = TransferProblem(layout, records, margin_s).predict(fit)
     return fit_percent(
         [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],
         [output[cut:] for output, cut in zip(predicted, cuts, strict=True)],

@@ -19,7 +19,7 @@ from haselab.identify.record import Record
 from haselab.identify.transfer.checks.clipping import richer_fits
 from haselab.identify.transfer.fit import TransferFit
 from haselab.identify.transfer.layout import TransferStructure, layout_of
-from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import best_fit
 from haselab.identify.transfer.start import delay_margin_s
 
@@ -150,8 +150,8 @@ def _held_out_errors(fit: TransferFit) -> list[Floats] | None:
         return None
     layout = layout_of(fit.structure)
     margin_s = delay_margin_s(records)
-    found = Problem(layout, early, margin_s).minimise(
+    found = TransferProblem(layout, early, margin_s).minimise(
         fit.best.found.search, fit.best.bounds, gain=1e-7
     )
-    modelled = Problem(layout, records, margin_s).predict(found)
+    modelled = TransferProblem(layout, records, margin_s).predict(found)
     return [(r.y - m)[cut(r) :] for r, m in zip(records, modelled, strict=True)]

@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from haselab.base import Estimate
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.transfer.layout import Layout, layout_of
-from haselab.identify.transfer.problem import Found, Problem
+from haselab.identify.transfer.problem import Found, TransferProblem
 from haselab.identify.transfer.search import Best
 from haselab.identify.transfer.start import delay_margin_s
 
@@ -133,7 +133,7 @@ def _endless(layout: Layout, best: Best, at: int) -> bool:
     held = layout_of(replace(layout.structure, fixed=fixed))
     others = layout.free != at
     bounds = best.bounds[0][others], best.bounds[1][others]
-    rival = Problem(held, best.records, delay_margin_s(best.records)).minimise(
+    rival = TransferProblem(held, best.records, delay_margin_s(best.records)).minimise(
         best.found.search[others], bounds, gain=1e-7
     )
     count = sum(record.y.size for record in best.records)

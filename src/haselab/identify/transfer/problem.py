@@ -13,7 +13,7 @@ from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
 from haselab.models.filters import resample_poly
 
-__all__ = ["Columns", "Found", "Problem", "fine_input"]
+__all__ = ["Columns", "Found", "TransferProblem", "fine_input"]
 
 Floats = NDArray[np.float64]
 _FINER = 8  # straight lines between so many points a sample stand for a band-limited input
@@ -56,7 +56,7 @@ class Columns:
     own: tuple[Floats, ...]
 
 
-class Problem:
+class TransferProblem:
     """Least squares over some records.
 
     Args:

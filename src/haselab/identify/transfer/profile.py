@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.identify.transfer.layout import Layout
-from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import Best, settled
 from haselab.identify.transfer.start import delay_margin_s
 
@@ -47,7 +47,7 @@ def profiled(layout: Layout, best: Best, std: Floats) -> tuple[Floats, Best | No
         np.diag(np.linalg.pinv(gram / np.outer(scale, scale)))[:size] / scale[:size] ** 2, 1e-300
     )
     fastest = max(abs(p) for s in layout.sections for p in s.poles(layout.full(found.search)))
-    problem = Problem(layout, best.records, delay_margin_s(best.records))
+    problem = TransferProblem(layout, best.records, delay_margin_s(best.records))
     for i, at in enumerate(layout.free):
         unit = fastest if layout.names[at] == "delay_s" else 1.0
         if not _NARROW < std[i] * unit < math.inf:
@@ -63,7 +63,7 @@ def profiled(layout: Layout, best: Best, std: Floats) -> tuple[Floats, Best | No
 
 
 def _side(
-    problem: Problem, best: Best, at: int, std: float, rise: float
+    problem: TransferProblem, best: Best, at: int, std: float, rise: float
 ) -> tuple[float, Floats | None]:
     """Factor for a deviation on one side; numbers of lower cost that were met on the way."""
     low, high = best.bounds

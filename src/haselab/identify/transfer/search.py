@@ -14,7 +14,7 @@ from haselab.identify.noise import whiteness_p
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.ambiguity import stands_alone
 from haselab.identify.transfer.layout import Layout, layout_of
-from haselab.identify.transfer.problem import Columns, Found, Problem
+from haselab.identify.transfer.problem import Columns, Found, TransferProblem
 from haselab.identify.transfer.start import (
     SHARES,
     coarse_grid,
@@ -74,7 +74,7 @@ def best_fit(
     explain as much. Else starts at all delays are ranked and polished on fewer outputs, the
     likely ones on all.
     """
-    problem = Problem(layout, records, delay_margin_s(records))
+    problem = TransferProblem(layout, records, delay_margin_s(records))
     bounds = search_bounds(layout, records)
     spread = sum(float(((r.y - r.y.mean()) ** 2).sum()) for r in records)
     tried: list[Best] = []
@@ -159,7 +159,10 @@ def _without_lines(layout: Layout, search: Floats) -> Iterator[Floats]:
 
 
 def settled(
-    problem: Problem, records: Sequence[Record], start: Floats, bounds: tuple[Floats, Floats]
+    problem: TransferProblem,
+    records: Sequence[Record],
+    start: Floats,
+    bounds: tuple[Floats, Floats],
 ) -> Best | None:
     """The solution that a start leads to, its numbers in order; None: no finite one."""
     found = problem.minimise(start, bounds)
@@ -178,7 +181,7 @@ def _polished(
     """Solutions on fewer outputs that the others do not rule out, the best first."""
     bounds = search_bounds(layout, records)
     reduced = thinned(records, _FEW * layout.free.size)
-    few = Problem(layout, reduced, delay_margin_s(records))
+    few = TransferProblem(layout, reduced, delay_margin_s(records))
     spread = sum(float(((r.y - r.y.mean()) ** 2).sum()) for r in reduced)
     ranked = _ranked(few, starts, bounds)
     for share in SHARES:
@@ -208,7 +211,7 @@ def _polished(
 
 
 def _ranked(
-    problem: Problem, starts: Iterable[Floats], bounds: tuple[Floats, Floats]
+    problem: TransferProblem, starts: Iterable[Floats], bounds: tuple[Floats, Floats]
 ) -> list[Found]:
     found = (problem.project(np.clip(start, *bounds)) for start in starts)
     return sorted((f for f in found if math.isfinite(f.cost)), key=lambda f: f.cost)

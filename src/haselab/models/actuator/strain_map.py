@@ -69,10 +69,11 @@ class StrainMap:
                     f"{name} of the strain map is [{ends[0]:g}, {ends[1]:g}]. Give the lower end "
                     "first."
                 )
-        if self.covariance is not None and np.shape(self.covariance) != (4, 4):
+        columns = [len(row) for row in self.covariance or ()]
+        if self.covariance is not None and columns != [4] * 4:
             raise InputError(
-                f"The covariance of the strain map has the shape {np.shape(self.covariance)}, but "
-                "needs 4 rows and columns: slope_per_f, offset, curvature_per_f2, cubic_per_f3."
+                f"The covariance of the strain map has rows of {columns} numbers, but needs 4 rows "
+                "of 4: slope_per_f, offset, curvature_per_f2, cubic_per_f3."
             )
 
     @property

@@ -1,1 +1,1 @@
-"""Example data sets, simulated by the twin when they are asked for."""
+"""Example data sets, simulated by the twin on demand."""

@@ -1,4 +1,4 @@
-"""Example data sets: a file as other programs write it, and the commands that use it."""
+"""Example data sets: files in the formats of other programs, and the commands that use them."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _SEED = 8
 
 @dataclass(frozen=True)
 class DataSet:
-    """A data set that can be written.
+    """An example data set.
 
     Args:
         name: of the data set.
         title: one line about it.
         text: what was recorded and how.
-        tables: gives the text of each file by its name.
-        commands: that use the files, in their order, without the word haselab.
+        tables: function that returns the text of each file by its name.
+        commands: that use the files, in order, without the word haselab.
     """
 
     name: str
@@ -39,7 +39,7 @@ class DataSet:
 
 
 def _german(header: str, columns: Sequence[Floats], form: str = "%.7g") -> str:
-    """A table with a preamble, semicolons and decimal commas, as of a German Excel."""
+    """Format a table with a preamble, semicolons and decimal commas, as a German Excel does."""
     lines = ["haselab twin, simulated;;", "Datum;23.11.2026;", "", header]
     for row in zip(*columns, strict=True):
         lines.append(";".join(form % value for value in row).replace(".", ","))
@@ -73,7 +73,7 @@ def _chirp() -> dict[str, str]:
 
 def _release() -> dict[str, str]:
     time_s, x_m = recordings.released(_SEED)
-    # The first samples after the drop belong to the fall, not to the free oscillation.
+    # The first samples after the drop are the fall, not the free oscillation.
     return {"release.csv": _plain("Time (ms),Displacement (mm)", [1e3 * time_s, 1e3 * x_m])}
 
 
@@ -102,8 +102,8 @@ DATA_SETS: tuple[DataSet, ...] = (
     DataSet(
         "cycles",
         "Voltage, capacitance and strain of three triangles",
-        "A row every 50 ms: voltage at the actuator, capacitance by self-sensing, strain by a "
-        "camera, from the first row on.",
+        "A row every 50 ms: voltage at the actuator, capacitance from self-sensing, strain "
+        "relative to the first row from a camera.",
         _cycles,
         (
             "identify capacitance-map cycles.csv --capacitance C --strain Dehnung "
@@ -115,9 +115,9 @@ DATA_SETS: tuple[DataSet, ...] = (
     ),
     DataSet(
         "chirp",
-        "Displacement while the drive is a chirp about an operating point",
-        "80 s at 100 Hz, 0.1 Hz to 3 Hz and back, an amplitude of 0.04 V ahead of the amplifier "
-        "(200 V) about 1 V; 0.25 kg hang from the actuator.",
+        "Displacement while the drive is a chirp around an operating point",
+        "80 s at 100 Hz, 0.1 Hz to 3 Hz and back, an amplitude of 0.04 V before the amplifier "
+        "(200 V) around 1 V, with a hung mass of 0.25 kg.",
         _chirp,
         (
             "identify transfer chirp.csv --input Drive --output Displacement "
@@ -129,15 +129,15 @@ DATA_SETS: tuple[DataSet, ...] = (
     ),
     DataSet(
         "release",
-        "Free oscillation after a hung weight is dropped",
-        "8 s at 100 Hz; the weight of 0.25 kg was lifted until the actuator was at rest.",
+        "Free oscillation after a hung mass is dropped",
+        "8 s at 100 Hz; the mass of 0.25 kg was lifted until the actuator was at rest.",
         _release,
         ("identify free-response release.csv --output Displacement --plot release.svg",),
     ),
     DataSet(
         "tensile",
         "Stretch and force of a slow tensile test",
-        "60 loads, each held for 30 s; the stretch counts from the natural length of the shell, "
+        "60 loads, each held for 30 s; the stretch is relative to the natural length of the shell, "
         "which is clamped at 3 times its natural width.",
         _tensile,
         ("identify regions tensile.csv --stretch Streckung --load Kraft --plot regions.svg",),
@@ -146,28 +146,28 @@ DATA_SETS: tuple[DataSet, ...] = (
 
 
 def find_data_set(name: str) -> DataSet:
-    """The data set of a name.
+    """Return the data set with a name.
 
     Args:
         name: of the data set.
     Returns:
         The data set.
     Raises:
-        InputError: there is none of this name.
+        InputError: there is no data set with this name.
     """
     for data_set in DATA_SETS:
         if data_set.name == name:
             return data_set
     names = ", ".join(data_set.name for data_set in DATA_SETS)
-    raise InputError(f"There is no example '{name}'. Name one of {names}.")
+    raise InputError(f"There is no example '{name}'. Use one of {names}.")
 
 
 def write_data_set(data_set: DataSet, folder: Path) -> list[Path]:
-    """Simulate a data set and write it with a README.md of the commands that use it.
+    """Simulate and write a data set, with a README.md that shows the commands to use.
 
     Args:
-        data_set: which.
-        folder: where to write; it exists.
+        data_set: the data set.
+        folder: an existing folder.
     Returns:
         The files, README.md last.
     """

@@ -1,4 +1,4 @@
-"""What the twin records for the example data sets."""
+"""Recordings of the twin for the example data sets."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.runner import lockin_of
 from haselab.signals import linear_chirp, triangle
 
@@ -23,13 +23,13 @@ _SETTLE_S = 30.0
 
 @dataclass(frozen=True)
 class Cycles:
-    """Triangles of the drive, a row every fifth block.
+    """Triangles of the drive, with a row for every fifth block.
 
     Args:
         time_s: middle of each block. Shape `(N,)`.
         voltage_v: at the actuator. Shape `(N,)`.
-        capacitance_f: by the lock-in. Shape `(N,)`.
-        strain: from the first row. Shape `(N,)`.
+        capacitance_f: from the lock-in. Shape `(N,)`.
+        strain: relative to the first row. Shape `(N,)`.
     """
 
     time_s: Floats
@@ -39,7 +39,7 @@ class Cycles:
 
 
 def _bench(seed: int, *, carrier: bool) -> TwinBench:
-    """A twin with its weight hung and at rest."""
+    """Make a twin with its hung mass, at rest."""
     bench = TwinBench(twin_of_reading("rad"), seed)
     bench.hang(_MASS_KG)
     bench.wait(_SETTLE_S)
@@ -51,7 +51,7 @@ def _bench(seed: int, *, carrier: bool) -> TwinBench:
 
 
 def _played(bench: TwinBench, drive_v: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Codes of all blocks, and the length in the middle of each, as a camera measures it."""
+    """Play a drive; return the codes of all blocks and the length at the middle of each."""
     codes, length_m = [], []
     for value in drive_v:
         before_m = bench.length_m
@@ -63,7 +63,7 @@ def _played(bench: TwinBench, drive_v: Floats, rng: np.random.Generator) -> tupl
 
 
 def monitors(seed: int) -> tuple[Floats, Floats, float]:
-    """Two seconds of a triangle.
+    """Record both monitors during two seconds of a triangle.
 
     Args:
         seed: of all noise.
@@ -74,18 +74,18 @@ def monitors(seed: int) -> tuple[Floats, Floats, float]:
     rig = describe(twin_of_reading("rad"))
     drive_v = triangle(0.0, 1.2, 0.5, 1, 1.0 / _BLOCK_S)
     codes, _ = _played(bench, drive_v, np.random.default_rng(seed))
-    every = 4  # 200 kHz are more than a carrier of 2 kHz needs
+    every = 4  # 200 kHz is more than a carrier of 2 kHz needs
     volts = codes.reshape(-1, 2)[::every] * rig.volt_per_code
     return volts[:, 0], volts[:, 1], rig.rate_hz / every
 
 
 def cycles(seed: int) -> Cycles:
-    """Three triangles of the drive with capacitance and strain.
+    """Record capacitance and strain during three triangles of the drive.
 
     Args:
         seed: of all noise.
     Returns:
-        A row every fifth block.
+        The recording, with a row for every fifth block.
     """
     bench = _bench(seed, carrier=True)
     rig = describe(twin_of_reading("rad"))
@@ -101,12 +101,12 @@ def cycles(seed: int) -> Cycles:
 
 
 def chirp(seed: int) -> tuple[Floats, Floats, Floats]:
-    """A small chirp about an operating point, up and down again.
+    """Record a small chirp around an operating point, up and down again.
 
     Args:
         seed: of all noise.
     Returns:
-        Time in s, drive in V about the operating point, and displacement in m. Shape `(N,)` each.
+        Time in s, drive in V relative to the operating point, displacement in m. Shape `(N,)` each.
     """
     bench = _bench(seed, carrier=False)
     rate_hz, middle_v = 1.0 / _BLOCK_S, 1.0
@@ -122,7 +122,7 @@ def chirp(seed: int) -> tuple[Floats, Floats, Floats]:
 
 
 def released(seed: int) -> tuple[Floats, Floats]:
-    """The weight is lifted and dropped.
+    """Record the free response after the hung mass is lifted and dropped.
 
     Args:
         seed: of all noise.
@@ -140,7 +140,7 @@ def released(seed: int) -> tuple[Floats, Floats]:
 
 
 def pulled(seed: int) -> tuple[Floats, Floats]:
-    """A slow tensile test.
+    """Record a slow tensile test.
 
     Args:
         seed: of all noise.

@@ -1,1 +1,1 @@
-"""Monitor voltages in a file to capacitance in a table."""
+"""Compute capacitance from the monitor voltages in a file."""

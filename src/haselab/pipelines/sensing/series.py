@@ -1,4 +1,4 @@
-"""Series that follow from a recorded experiment: capacitance of each block, strain in time."""
+"""Series computed from a recorded experiment: capacitance of each block, strain over time."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ _REQUEST = Request(
 
 
 def derived_series(reader: SessionReader, experiment: str) -> Mapping[str, Columns]:
-    """Capacitance and strain of one experiment of a session.
+    """Compute capacitance and strain of one experiment of a session.
 
     Args:
         reader: of the session, open.
         experiment: its name.
     Returns:
         `capacitance` (time_s, capacitance_f, capacitance_std_f, resistance_ohm,
-        relative_capacitance, valid; a row a block) where the session states its carrier, and
-        `strain` (time_s, length_px, strain_from_start and, where the scale is known, length_m; a
-        row a frame) where the frames show both rows of fiducials.
+        relative_capacitance, valid; one row per block) if the session states its carrier, and
+        `strain` (time_s, length_px, strain_from_start and, if the scale is known, length_m; one
+        row per frame) if the frames show both rows of fiducials.
     Raises:
         InputError: no such experiment, or its data cannot be read.
     """
@@ -71,7 +71,7 @@ def _capacitance(reader: SessionReader, record: ExperimentRecord) -> Columns:
 
 
 def _strain(tracks: NDArray[np.void], time_s: NDArray[np.float64], header: Any) -> Columns:
-    """Distance of the rows of fiducials, and its change from the first frame that shows them."""
+    """Distance of the rows of fiducials, and its change since the first frame that shows them."""
     length_px = gauge_length(tracks, 1.0)
     good = np.flatnonzero(np.isfinite(length_px))
     start_px = length_px[good[0]] if good.size else np.nan

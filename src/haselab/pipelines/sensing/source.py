@@ -1,4 +1,4 @@
-"""What `haselab sense` reads: both monitors of a file or of a session, and how to read them."""
+"""Open the input of `haselab sense`: both monitors of a file or a session, and their scales."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from haselab.store.session.reader import SessionReader, session_file
 if TYPE_CHECKING:
     from haselab.store.columns.session import SessionColumns
 
-# What only sessions and calibrations need is imported where they are opened: with HDF5 and the
-# rooms of the rig a start takes longer than the sensing of a gigabyte.
+# Modules for sessions and calibrations are imported where these are opened: importing HDF5 and the
+# rig takes longer than sensing a gigabyte.
 
 __all__ = ["Request", "Source", "open_source", "session_config", "too_short"]
 
@@ -29,18 +29,18 @@ _MOST_SAMPLES = 2_000_000  # of a block
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
 _BLOCK_S, _CHARGE_BLOCK_S = 0.01, 0.5
 _SHORTEST, _SHORTEST_CHARGE = 8, 16  # samples of a block
-_NO_CONVERTER_V = 1e6  # full scale of volts at the actuator
+_NO_CONVERTER_V = 1e6  # full scale for volts at the actuator
 _FULL_SCALE_V, _FULL_SCALE_CODES = 10.0, 32767.0
-_LAST_CODE = 1.0 - 0.5**11  # of full scale: where the coarsest converter in use, 12 bits, ends
+_LAST_CODE = 1.0 - 0.5**11  # of full scale: last code of the coarsest converter, 12 bits
 _MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
 _MIN_AMPLITUDE_CODES = 5.0
-_RATE_ROWS = 4096  # whose times are compared with --rate-hz
-_PIECE_ROWS = 1 << 20  # 8 MB a column in double precision
+_RATE_ROWS = 4096  # number of times that are compared with --rate-hz
+_PART_ROWS = 1 << 20  # 8 MB per column in double precision
 
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asked for, beyond the file and the answer's place; None: not given."""
+    """The options, besides those for file and output; None: not given."""
 
     carrier_hz: float | None
     rate_hz: float | None
@@ -65,14 +65,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Source:
-    """Both monitors and what a method must know of them.
+    """Both monitors, and the configuration of the method.
 
     Args:
         stream: voltage, then current.
         config: for the method.
         volt_per_reading: 1 for records in volts.
-        session: whose blocks these are, if any.
-        in_monitor_volts: nobody stated the scale of the voltage; the usual one is taken.
+        session: of these blocks, if there is one.
+        in_monitor_volts: the scale of the voltage was not stated; the default is used.
     """
 
     stream: ColumnStream
@@ -82,8 +82,8 @@ class Source:
     in_monitor_volts: bool = False
 
     def pieces(self) -> Iterator[tuple[NDArray[Any], ...]]:
-        """Both columns in pieces of whole blocks, but for the last."""
-        blocks = max(1, _PIECE_ROWS // self.config.block_samples)
+        """Yield both columns in parts; all but the last consist of whole blocks."""
+        blocks = max(1, _PART_ROWS // self.config.block_samples)
         return self.stream.pieces(blocks * self.config.block_samples)
 
     def block_start_s(self, first: int, count: int) -> NDArray[np.float64]:
@@ -98,12 +98,12 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
 
     Args:
         path: of it.
-        request: the user's wishes.
-        opened: closes what is opened.
+        request: the options.
+        opened: exit stack that closes the file.
     Returns:
-        Where to read, and the configuration.
+        The monitors, and the configuration.
     Raises:
-        InputError: the file cannot be sensed, or the user stated too little about it.
+        InputError: the file cannot be sensed, or options are missing.
     """
     if session_file(path).is_file():
         path = session_file(path)
@@ -126,7 +126,7 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
 
 
 def _refuse_with_charge(request: Request, path: Path) -> None:
-    """Options that speak of a carrier."""
+    """Refuse options about the carrier."""
     given = {
         "--carrier-hz": request.carrier_hz,
         "--blank-s": request.blank_s,
@@ -147,8 +147,8 @@ def _refuse_session(path: Path, *, unverified: bool) -> None:
     experiments = session_experiments(path, unverified=unverified)
     if experiments is not None:
         raise InputError(
-            f"This is a session with the experiments {', '.join(experiments) or 'none'}. Name one "
-            f"with --experiment. {path}"
+            f"The file is a session with the experiments {', '.join(experiments) or 'none'}. Name "
+            f"one with --experiment. {path}"
         )
 
 
@@ -181,7 +181,7 @@ def _limit(request: Request, ampere: float, volt_per_reading: float) -> float:
 
 
 def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
-    """A record in volts."""
+    """Open a record in volts."""
     stream = opened.enter_context(
         open_columns(
             path, (request.v_column, request.i_column),
@@ -194,7 +194,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     if request.carrier_hz is None and not charge:
         raise InputError(
             "The file states no carrier. Add --carrier-hz, or sense a record without a "
-            f"carrier by --method charge. {path}"
+            f"carrier with --method charge. {path}"
         )
     if rate_hz is None:
         raise InputError(
@@ -208,8 +208,8 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
         where = "--rate-hz" if request.rate_hz else "the file"
         unit = "" if request.rate_hz else ", or convert the file's times if they are not in s"
         raise InputError(
-            f"--block-s {block_s:g} is a block of {block_samples:.3g} samples at the rate of "
-            f"{where}, {rate_hz:.6g} Hz. A block needs {shortest} to {_MOST_SAMPLES} samples. "
+            f"--block-s {block_s:g} gives a block of {block_samples:.3g} samples at the rate of "
+            f"{where}, {rate_hz:.6g} Hz, but a block needs {shortest} to {_MOST_SAMPLES} samples. "
             f"Choose another --block-s{unit}. {path}"
         )
     if stream.rows is not None and stream.rows < block_samples:
@@ -223,12 +223,12 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
 
 
 def _at_the_actuator(stream: ColumnStream, request: Request, path: Path) -> Request:
-    """Scales that follow from stated units: kV and A are of the actuator, V may be of a monitor."""
+    """Derive scales from stated units: kV and A are actuator values, V may be a monitor voltage."""
     v, i = stream.units
     for option, unit, good in (("--v", v, ("V",)), ("--i", i, ("V", "A"))):
         if unit is not None and unit.si not in good:
             raise InputError(
-                f"The column of {option} is in {unit.symbol}, but it needs {' or '.join(good)}. "
+                f"The column of {option} is in {unit.symbol}, but must be in {' or '.join(good)}. "
                 f"Name another column, or state its unit with --unit. {path}"
             )
     if v is not None and v.factor > 1.0 and request.volt_per_monitor_volt is None:
@@ -241,7 +241,7 @@ def _at_the_actuator(stream: ColumnStream, request: Request, path: Path) -> Requ
 
 
 def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None:
-    """As given, else as the file states it; a contradiction is an `InputError`."""
+    """Sampling rate as given, else from the file; they must not contradict each other."""
     given = request.rate_hz
     if given is None:
         return stream.rate_hz
@@ -253,7 +253,7 @@ def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None
         return given
     name, time_s = head
     steps = np.diff(time_s)
-    # Times with few digits repeat; then they cannot state a rate so exactly.
+    # Times with few digits repeat, so they state the rate less exactly.
     if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
         found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
         nearest = min(found, key=lambda rate: abs(rate / given - 1.0))
@@ -291,7 +291,7 @@ def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> Lock
 
 
 def _of_session(session: SessionColumns, request: Request, path: Path) -> Source:
-    """Codes of an experiment; what the user names goes before what the session holds."""
+    """Open the codes of an experiment; options override the settings of the session."""
     config = session_config(session, session.block_samples, request, path)
     volt_per_code = float(session.stated("rig", "volt_per_code"))
     return Source(session.columns(), config, volt_per_code, session)
@@ -300,17 +300,17 @@ def _of_session(session: SessionColumns, request: Request, path: Path) -> Source
 def session_config(
     session: SessionReader, block_samples: int, request: Request, path: Path
 ) -> LockinConfig:
-    """How the codes of a session are sensed.
+    """Configuration for sensing the codes of a session.
 
     Args:
         session: open.
         block_samples: samples of a channel in one of its blocks.
-        request: the user's wishes.
+        request: the options.
         path: of the session, for messages.
     Returns:
         The configuration of the lock-in, in codes.
     Raises:
-        InputError: the session and the user state too little, or contradict each other.
+        InputError: settings are missing, or the options contradict the session.
     """
     rate_hz = float(session.stated("rig", "rate_hz"))
     if request.rate_hz is not None:
@@ -318,8 +318,8 @@ def session_config(
     volt_per_code = float(session.stated("rig", "volt_per_code"))
     if request.block_s is not None and round(request.block_s * rate_hz) != block_samples:
         raise InputError(
-            f"--block-s {request.block_s:g}, but the session's blocks have "
-            f"{block_samples / rate_hz:g} s, one output each. Leave out --block-s. {path}"
+            f"--block-s is {request.block_s:g}, but the session's blocks, with one output each, "
+            f"have {block_samples / rate_hz:g} s. Leave out --block-s. {path}"
         )
     ohm, ampere = _ohm_per_ratio(
         request,
@@ -345,12 +345,12 @@ def session_config(
 
 
 def _is_imported(session: SessionReader) -> bool:
-    """Whether the session came from a file that has no blocks of a rig."""
+    """Whether the session was imported from a file, without the blocks of a rig."""
     return not session.states("rig", "switch_sample")
 
 
 def _number(session: SessionReader, default: float, *keys: str) -> float:
-    """What an imported session states, or the default of files."""
+    """A setting of an imported session, or the default for files."""
     if _is_imported(session) and not session.states(*keys):
         return default
     return float(session.stated(*keys))
@@ -369,14 +369,14 @@ def _carrier_hz(session: SessionReader, path: Path) -> float:
 
 
 def _blank(session: SessionReader, request: Request, rate_hz: float) -> tuple[int, int]:
-    """From a block's start, or from the recorded sample of the output's update."""
+    """Samples to ignore: from a block's start, or from the recorded update of the output."""
     if request.method == "paper":
-        return (0, 0)  # the study's own chain knows no blanking
+        return (0, 0)  # the paper's chain has no blanking
     if request.blank_s is not None:
         return (0, round(request.blank_s * rate_hz))
     if _is_imported(session):
         return (0, 0)  # its updates are searched
-    from haselab.runtime.runner import BLANKING_S  # the rooms of the rig, for a session alone
+    from haselab.runtime.runner import BLANKING_S  # imports the rig, for sessions only
 
     switch = int(session.stated("rig", "switch_sample"))
     switch %= int(session.stated("rig", "block_samples"))
@@ -384,8 +384,8 @@ def _blank(session: SessionReader, request: Request, rate_hz: float) -> tuple[in
 
 
 def too_short(samples: int, block_samples: int, rate_hz: float, path: Path) -> InputError:
-    """The error for a record that fills no block."""
+    """Make the error for a record that is shorter than one block."""
     return InputError(
-        f"The record has {samples} samples, a block {block_samples}. Shorten "
+        f"The record has {samples} samples, but a block has {block_samples}. Shorten "
         f"--block-s to {samples / rate_hz:g} s or less. {path}"
     )

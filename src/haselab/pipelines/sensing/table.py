@@ -1,4 +1,4 @@
-"""The answer of `haselab sense`, in pieces: rows of a CSV file, JSON, and a summary."""
+"""The answer of `haselab sense`, part by part: rows of a CSV file, JSON, and a summary."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ __all__ = [
     "Judged",
     "Summary",
     "columns_of",
-    "json_pieces",
+    "json_parts",
 ]
 
 Columns = dict[str, NDArray[np.float64]]
 
-# The contract's, in its order; then what else is known of each block.
+# The columns of the public contract, in its order; then further ones.
 COLUMNS = (
     "time_s", "capacitance_f", "capacitance_std_f", "resistance_ohm", "relative_capacitance",
     "phase_rad", "v_pp_v", "i_pp_v", "valid", "resistance_std_ohm", "leakage_s", "leakage_std_s",
     "reason",
 )  # fmt: skip
-_SAMPLE = 1 << 17  # valid blocks that the medians are taken of, at least half as many
+_SAMPLE = 1 << 17  # most valid blocks for the medians; at least half as many are used
 _JSON_VALUES = 1 << 16
 _NOTHING: Mapping[int, str] = MappingProxyType({})
 _MOST_REASONS = 4  # in a warning
-_MOST_WORDS = 12  # models and causes in a summary
+_MOST_CAUSES = 12  # models and causes in a summary
 _SEEN_NUMBERS = re.compile(
     r" (at|of) [-\d.e]+ (ms|and [-\d.e]+ ms)| from [-\d.e]+ to [-\d.e]+ ms| of degree \d+|^by .*"
 )
@@ -47,7 +47,7 @@ _SEEN_NUMBERS = re.compile(
 
 @dataclass(frozen=True)
 class Judged:
-    """What is said of some blocks beside their numbers.
+    """Validity of some blocks, and the reasons.
 
     Args:
         reason: 0 where a block is valid, else a sum of keys of `REASONS`. Shape `(blocks,)`.
@@ -58,7 +58,7 @@ class Judged:
     seen: Mapping[int, str]
 
     def texts(self) -> list[tuple[bool, str]]:
-        """Whether each block is valid, and why not or by which model beyond the plain one."""
+        """Whether each block is valid, and why not, or the model other than the plain one."""
         words = {mask: (mask == 0, reason_text(mask)) for mask in set(self.reason.tolist())}
         rows = [words[mask] for mask in self.reason.tolist()]
         for block, text in self.seen.items():
@@ -76,9 +76,9 @@ def columns_of(
     reactance_scale: float,
     capacitance_scale: float,
 ) -> Columns:
-    """The columns of numbers, all but `valid` and `reason`; those of lost blocks are NaN."""
+    """All columns but `valid` and `reason`; NaN for lost blocks."""
     relative = np.full(sensed.valid.shape, np.nan)
-    shown = sensed.valid & np.isfinite(sensed.phase_rad)  # only a carrier has a phase
+    shown = sensed.valid & np.isfinite(sensed.phase_rad)  # there is a phase only with a carrier
     relative[shown] = relative_capacitance(
         sensed.v_pp[shown],
         sensed.i_pp[shown],
@@ -103,7 +103,7 @@ def columns_of(
 
 
 class CsvRows:
-    """Writes rows as they come; nine digits, far below the noise of any block.
+    """Writes rows as they come, with nine digits, far below the noise of any block.
 
     Args:
         file: a new text file.
@@ -117,7 +117,7 @@ class CsvRows:
     def write(
         self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
     ) -> None:
-        """The rows of some blocks."""
+        """Write the rows of some blocks."""
         rows = Judged(reason, seen).texts()
         for row in set(rows) - set(self._forms):
             self._forms[row] = _row_form(*row)
@@ -127,20 +127,20 @@ class CsvRows:
 
 
 def _row_form(valid: bool, words: str) -> str:
-    """Form of one row with these words."""
+    """Format string of one row with these texts."""
     numbers = dict.fromkeys(COLUMNS, "%.9g")
     numbers |= {"time_s": "%.12g", "valid": str(int(valid)), "reason": _quoted(words)}
     return ",".join(numbers.values()) + "\n"
 
 
 def _quoted(text: str) -> str:
-    """A text as CSV and the % of a form ask for it."""
+    """Quote a text for CSV, and escape its % for a format string."""
     text = text.replace("%", "%%")
     return '"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text
 
 
 class Collected:
-    """Keeps all columns for an answer in one piece."""
+    """Keeps all columns in memory."""
 
     def __init__(self) -> None:
         self._columns: list[Columns] = []
@@ -154,13 +154,13 @@ class Collected:
         self._judged.append(Judged(reason, seen))
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """One column of numbers as a whole; `valid` as 0 and 1."""
+        """Return one whole column; `valid` as 0 and 1."""
         if name == "valid":
             return np.concatenate([(each.reason == 0).astype(np.float64) for each in self._judged])
         return np.concatenate([columns[name] for columns in self._columns])
 
     def values(self, name: str) -> Iterator[list[Any]]:
-        """One column, some values at a time."""
+        """Yield one column, some values at a time."""
         for columns, judged in zip(self._columns, self._judged, strict=True):
             words = judged.texts() if name == "reason" else []
             for k in range(0, judged.reason.size, _JSON_VALUES):
@@ -173,8 +173,8 @@ class Collected:
                     yield to_plain(columns[name][part])
 
 
-def json_pieces(answer: Mapping[str, Any], collected: Collected) -> Iterator[str]:
-    """One JSON document: the answer, then every column as an array, in pieces of text."""
+def json_parts(answer: Mapping[str, Any], collected: Collected) -> Iterator[str]:
+    """Yield one JSON document in parts: the answer, then every column as an array."""
     yield json.dumps(to_plain(answer), indent=2)[:-2]
     for name in COLUMNS:
         yield f',\n  "{name}": ['
@@ -185,14 +185,14 @@ def json_pieces(answer: Mapping[str, Any], collected: Collected) -> Iterator[str
 
 
 class _Median:
-    """Median in bounded memory: of all values, or of every second, fourth... of a long record."""
+    """Median in bounded memory: of all values, or of every 2nd, 4th, ... of a long record."""
 
     def __init__(self) -> None:
         self._kept = np.empty(_SAMPLE)
         self._count, self._stride, self._seen = 0, 1, 0
 
     def add(self, values: NDArray[np.float64]) -> None:
-        for k in range(0, values.size, _SAMPLE // 2):  # no more than fits after one thinning
+        for k in range(0, values.size, _SAMPLE // 2):  # at most what fits after one thinning
             self._add(values[k : k + _SAMPLE // 2])
 
     def _add(self, values: NDArray[np.float64]) -> None:
@@ -225,7 +225,7 @@ class Summary:
     def write(
         self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
     ) -> None:
-        """Take note of some blocks."""
+        """Add some blocks."""
         valid = reason == 0
         self.blocks += valid.size
         v_pp = columns["v_pp_v"]
@@ -259,10 +259,10 @@ class Summary:
             "median_capacitance_f": self._capacitance_f.value(),
             "median_resistance_ohm": self._resistance_ohm.value(),
             "invalid": {reason_text(mask): count for mask, count in self.masks.most_common()},
-            "seen": dict(self.seen.most_common(_MOST_WORDS)),
-            "models": dict(models.most_common(_MOST_WORDS)),
+            "seen": dict(self.seen.most_common(_MOST_CAUSES)),
+            "models": dict(models.most_common(_MOST_CAUSES)),
         }
 
     def why_not(self) -> str:
-        """The reasons of the blocks that are not valid, the most frequent first."""
+        """Why blocks are not valid, the most frequent reasons first."""
         return "; ".join(f"{count} {text}" for text, count in self._why.most_common(_MOST_REASONS))

@@ -1,1 +1,1 @@
-"""A video to tracks, displacements and strain in a table."""
+"""Compute tracks, displacements and strain from a video."""

@@ -17,7 +17,7 @@ __all__ = ["gauge_of", "strain_answer"]
 
 
 def gauge_of(points: Points, rest_px: Floats, kept: Kept) -> GaugeStrain | None:
-    """Strain between the points upper* and lower*; NaN in frames where a group is lost."""
+    """Strain between the points upper* and lower*; NaN if a group is lost."""
     upper, lower = points.group("upper"), points.group("lower")
     if not upper.size or not lower.size:
         return None
@@ -35,7 +35,7 @@ def gauge_of(points: Points, rest_px: Floats, kept: Kept) -> GaugeStrain | None:
 
 
 def strain_answer(gauge: GaugeStrain | None, kept: Kept, out: Path) -> dict[str, Any] | None:
-    """What the answer says of the strain; the strain of all frames as a table beside `out`."""
+    """Summarise the strain for the answer; write that of all frames to a table beside `out`."""
     if gauge is None:
         return None
     path = out.with_name(out.stem + "-strain.csv")

@@ -1,4 +1,4 @@
-"""What is kept of a track of any length: some points always, all points of some frames."""
+"""Keep tracks of any length in bounded memory: some points always, all points sometimes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FEWEST_FRAMES = 16
 
 @dataclass(frozen=True)
 class KeptTracks:
-    """All points in every so many frames.
+    """All points in every n-th frame.
 
     Args:
         frame: numbers of the frames. Shape `(K,)`.
@@ -36,7 +36,7 @@ class KeptTracks:
 
 
 class Kept:
-    """Takes blocks as they come, in bounded memory but for the few points named.
+    """Collects blocks in bounded memory, except for a few points that are always kept.
 
     Args:
         points: number of points.
@@ -56,7 +56,7 @@ class Kept:
         self.valid = np.zeros(points, np.int64)
 
     def add(self, block: Block) -> None:
-        """Take note of some frames."""
+        """Add some frames."""
         tracks = block.tracks
         self.frames += len(block.time_s)
         self.valid += tracks.valid.sum(axis=0)
@@ -74,7 +74,7 @@ class Kept:
 
     @property
     def expected_wrong(self) -> float:
-        """Share of the valid positions expected to be wrong; see `audit.wrong_share`."""
+        """Expected share of the valid positions that are wrong; see `audit.wrong_share`."""
         return wrong_share(self._wrong, int(self.valid.sum()), self.frames * len(self.valid))
 
     @property
@@ -84,15 +84,15 @@ class Kept:
 
     @property
     def number(self) -> NDArray[np.intp]:
-        """Numbers of all frames in the recording, missing ones counted."""
+        """Numbers of all frames in the recording, including missing ones."""
         return np.concatenate(self._numbers)
 
     def always(self) -> Tracks:
-        """The few points in all frames."""
+        """The points that are always kept, in all frames."""
         return _joined(self._full)
 
     def thinned(self) -> KeptTracks:
-        """All points in every so many frames."""
+        """All points in every n-th frame."""
         frames, times_s, tracks = zip(*self._thin, strict=True)
         return KeptTracks(np.array(frames, np.intp), np.array(times_s), _joined(list(tracks)))
 

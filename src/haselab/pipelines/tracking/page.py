@@ -1,4 +1,4 @@
-"""The page of a tracked clip, filled from the answer."""
+"""Write the page about a tracked video from the answer."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def write_report(
     Args:
         path: of the page.
         answer: of the command.
-        clip: first frame, points, their places at rest.
+        clip: first frame, points, their positions at rest.
         kept: tracks.
         gauge: strain of all frames.
-        warnings: lines for its head.
+        warnings: lines for the top of the page.
     """
     frame, points, rest_px = clip
     thin, times = kept.thinned(), kept.time_s

@@ -1,4 +1,4 @@
-"""Which points a clip is tracked by: from a table, or found, with the reasons told."""
+"""Choose the points to track, from a table or found in a frame, and the tracker."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ __all__ = [
 Tracker = PointTracker | ParticleTracker | GuidedTracker
 State = TrackState | ParticleState | GuidedState
 
-PILOT_FRAMES = 24  # by which a tracker is chosen
+PILOT_FRAMES = 24  # used to choose a tracker
 
 _FEWEST_FOR_NEIGHBOURS = 12
 _MOST_HOLD = 0.9
 _HARDLY_HOLD = 0.5
 _ON_DOT_PX = 2.0
-_DIFFUSED_PX, _DIFFUSED_LOSSY_PX = 0.3, 2.0  # a codec too shakes the points of one body
-_MORE_HELD = 0.05  # of the positions, by points that are tracked independently
-_WIDENED = 1.1  # of the deviations, by points that do not fit their neighbours
-_STRAIGHT_ROW = 0.05  # scatter of a fiducial row across itself, over the rows' distance
+_DIFFUSED_PX, _DIFFUSED_LOSSY_PX = 0.3, 2.0  # a codec also moves the points of one body
+_MORE_VALID = 0.05  # further share of positions found when points are tracked independently
+_WIDENED = 1.1  # ratio of the deviations when points do not fit their neighbours
+_STRAIGHT_ROW = 0.05  # scatter of a row of fiducials across it, relative to the rows' distance
 _FEWEST_FOR_GAUGE = 30
 _GAUGE_BAND = 0.12  # of the height of all particles, from either end
 _SUBSET_PX = (15, 41)  # least, most
@@ -60,14 +60,14 @@ _SUBSET_SIGMAS = 7.0
 
 @dataclass(frozen=True)
 class Choice:
-    """How a clip is tracked.
+    """The chosen tracker, and why.
 
     Args:
         tracker: of the points.
         state: at rest.
         options: of the tracker.
-        why: of its model.
-        together: the points moved as one body over the first frames.
+        why: reason for the model.
+        together: the points moved as one body in the first frames.
     """
 
     tracker: Tracker
@@ -78,7 +78,7 @@ class Choice:
 
     @classmethod
     def of(cls, rest: list[Frame], points: Points, options: TrackOptions, why: str) -> Choice:
-        """A tracker with these options, at rest."""
+        """Make a tracker with these options, at rest."""
         tracker = PointTracker(points.place_px, options)
         return cls(tracker, tracker.init(rest), options, why)
 
@@ -90,17 +90,24 @@ class Points:
     Args:
         names: of the points.
         place_px: positions `[x, y]` in the first frame, in px. Shape `(P, 2)`.
-        subset_px: side of a subset that suits them, in px.
-        why: what was chosen and why, sentence by sentence.
+        subset_px: suitable side of a subset, in px.
+        chosen: what was chosen and why, one sentence each.
+        gauge: which points are `upper1-3` and `lower1-3`, and why; empty without them.
     """
 
     names: list[str]
     place_px: Floats
     subset_px: int
-    why: tuple[str, ...] = ()
+    chosen: tuple[str, ...] = ()
+    gauge: str = ""
+
+    @property
+    def why(self) -> tuple[str, ...]:
+        """All sentences."""
+        return (*self.chosen, *filter(None, [self.gauge]))
 
     def group(self, prefix: str) -> NDArray[np.intp]:
-        """Indices of the points whose name begins so."""
+        """Indices of the points whose name has this prefix."""
         return np.flatnonzero([name.startswith(prefix) for name in self.names])
 
     def named(self, names: Sequence[str]) -> NDArray[np.intp]:
@@ -111,19 +118,19 @@ class Points:
         """
         unknown = sorted(set(names) - set(self.names))
         if unknown:
-            raise InputError(f"No point has the name {', '.join(unknown)}. Correct the names.")
+            raise InputError(f"No point has the name {', '.join(unknown)}. Use names of points.")
         return np.array([self.names.index(name) for name in names], np.intp)
 
 
 def read_points(path: Path, frame: Frame) -> Points:
-    """Points of a table with the columns `point`, `x_px`, `y_px`.
+    """Read points from a table with the columns `point`, `x_px`, `y_px`.
 
     Args:
         path: of the table.
-        frame: the first frame, on which all points must lie.
+        frame: the first frame, which must contain all points.
 
     Raises:
-        InputError: the table cannot be read, or a point lies outside the picture.
+        InputError: the table cannot be read, or a point is outside the frame.
     """
     text = read_text(path, "table of points")
     try:
@@ -133,16 +140,18 @@ def read_points(path: Path, frame: Frame) -> Points:
     columns = set(rows[0]) if rows else set()
     if not {"point", "x_px", "y_px"} <= columns:
         raise InputError(
-            f"The table of points has the columns {sorted(map(str, columns))}; needed are "
-            f"point, x_px, y_px and at least one row. {path}"
+            f"The table of points has the columns {', '.join(sorted(map(str, columns)))}, but must "
+            f"have point, x_px, y_px and at least one row. {path}"
         )
     try:
         place = np.array([[float(row["x_px"]), float(row["y_px"])] for row in rows])
     except (TypeError, ValueError) as error:
-        raise InputError(f"A position is not a number ({error}). Correct it. {path}") from None
+        raise InputError(
+            f"A position in the table of points is not a number ({error}). Change it. {path}"
+        ) from None
     names = [row["point"] for row in rows]
     if len(set(names)) < len(names):
-        raise InputError(f"Two points have the same name. Give each its own. {path}")
+        raise InputError(f"Two points in the table have the same name. Rename one of them. {path}")
     _check_on_picture(names, place, frame, path)
     return Points(names, place, _SUBSET_PX[0])
 
@@ -155,14 +164,14 @@ def _check_on_picture(names: list[str], place: Floats, frame: Frame, path: Path)
         index = int(np.argmax(outside))
         x, y = place[index]
         raise InputError(
-            f"{int(outside.sum())} of {len(place)} points lie outside the picture, the first is "
-            f"{names[index]!r} at ({x:g}, {y:g}) px; allowed is x from 0 to {width - 1}, y from 0 "
-            f"to {height - 1}. Correct them (x right, y down, in px). {path}"
+            f"{int(outside.sum())} of {len(place)} points are outside the frame, the first is "
+            f"{names[index]!r} at ({x:g}, {y:g}) px. Use x from 0 to {width - 1} and y from 0 to "
+            f"{height - 1} (x right, y down, in px). {path}"
         )
 
 
 def _clamp_dots(image: Frame) -> tuple[list[str], Floats]:
-    """Both rows of three clamp dots; no point where they are not plain."""
+    """Find both rows of three clamp dots; no points if they are not clear."""
     try:
         place = detect_fiducials(image, 6, rows=2)
     except ResultError:
@@ -175,18 +184,19 @@ def _clamp_dots(image: Frame) -> tuple[list[str], Floats]:
 
 
 def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
-    """Particles well spread over the image, and the clamp dots where there are any.
+    """Find particles, well spread over the image, and the clamp dots if there are any.
 
     Args:
         image: the first frame.
-        count: of particles, at most.
-        subset_px: side of a subset, in px; `None` to choose it by the dots' size.
+        count: maximum number of particles.
+        subset_px: side of a subset, in px; `None`: chosen from the size of the dots.
 
     Raises:
-        ResultError: nothing stands out of the noise.
+        ResultError: nothing exceeds the noise.
     """
     profile = find_profile(image)
     names, clamps = _clamp_dots(image)
+    gauge = ""
     why = [
         f"{profile.polarity} dots of {profile.sigma_px:g} px standard deviation are the strongest"
     ]
@@ -204,23 +214,25 @@ def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
     if names:
         away = np.linalg.norm(found[:, None] - clamps[None], axis=2).min(axis=1)
         found = found[away > half]
-        why.append("upper1-3, lower1-3: two straight rows of three large dots, taken for clamps")
-    why.append(f"{len(found)} particles, strong and far from each other (--count {count})")
+        gauge = (
+            "upper1-3, lower1-3: two straight rows of three large dots, assumed to be the clamps"
+        )
+    why.append(f"{len(found)} particles, strong and far apart (--count {count})")
     names = names + [f"p{index}" for index in range(len(found))]
-    return Points(names, np.concatenate([clamps, found]), subset_px, tuple(why))
+    return Points(names, np.concatenate([clamps, found]), subset_px, tuple(why), gauge)
 
 
 def name_gauge(points: Points) -> Points:
-    """Three particles near either end named `upper1-3`, `lower1-3`, as the reference study does.
+    """Name three particles near each end `upper1-3` and `lower1-3`, as the reference study does.
 
-    Where the clamps carry no dots: of the particles within 12 % of the height from either end,
-    those nearest to a quarter, the middle and three quarters of the width.
+    If the clamps have no dots, these are the particles within 12 % of the height from either end
+    that are nearest to a quarter, half and three quarters of the width.
 
     Args:
         points: of a sheet that holds together.
 
     Returns:
-        The same points; unchanged when a gauge is named already, or too few are there.
+        The points; unchanged if a gauge is already named, or there are too few points.
 
     Source: reference study, row S12 (three points near the lower clamp, averaged).
     """
@@ -248,28 +260,27 @@ def name_gauge(points: Points) -> Points:
         "no clamp dots: upper1-3, lower1-3 are the particles nearest to a quarter, the middle and "
         f"three quarters of the width, within {100 * _GAUGE_BAND:g} % of the height of either end"
     )
-    return replace(points, names=names, why=(*points.why, reason))
+    return replace(points, names=names, gauge=reason)
 
 
 def without_gauge(points: Points) -> Points:
-    """The same points, none of them named as a gauge: particles in a liquid have no strain."""
+    """Remove the names of the gauge: particles in a liquid have no strain."""
     named = ("upper", "lower")
     names = [
         f"q{index}" if name.startswith(named) else name for index, name in enumerate(points.names)
     ]
-    why = tuple(line for line in points.why if not line.startswith("upper1-3"))
-    return replace(points, names=names, why=why)
+    return replace(points, names=names, gauge="")
 
 
 @dataclass(frozen=True)
 class _Pilot:
-    """How a tracker does over the first frames.
+    """Performance of a tracker in the first frames.
 
     Args:
         held: share of the positions that are valid.
         std_px: their standard deviation, mean of each frame. Shape `(F,)`.
-        scatter_px: largest rms of a frame's displacements about an affine motion of all; points
-            that jump together, or that a codec shakes, do not drift apart, independent ones do.
+        scatter_px: largest rms deviation of a frame's displacements from a common affine motion. It
+            is large for points that move independently, not for those that jump together.
     """
 
     held: float
@@ -278,7 +289,7 @@ class _Pilot:
 
     @property
     def widened(self) -> float:
-        """Mean deviation over that of the frame in which it is least."""
+        """Ratio of the mean deviation to that of the best frame."""
         return float(self.std_px.mean() / self.std_px.min()) if self.std_px.size else 1.0
 
 
@@ -307,15 +318,15 @@ def choose_tracker(
     *,
     lossy: bool = False,
 ) -> Choice:
-    """A tracker of the model asked for; `auto` takes the neighbours where there are enough points.
+    """Choose a tracker with the requested model; `auto` uses neighbours if there are enough points.
 
-    Particles that move independently do not hold together: the pilot loses many of them. Each is
-    then followed by itself, as long as its identity is certain.
+    If particles move independently, a tracker with neighbours loses many of them in the first
+    frames. Each is then followed separately, as long as its identity is certain.
     """
     if model != "auto":
         asked: Model = model  # type: ignore[assignment]
         options = replace(options, model=asked)
-        return Choice.of(rest, points, options, f"model {model}: asked for")
+        return Choice.of(rest, points, options, f"model {model}: requested")
     single = "model translation: "
     if len(points.names) < _FEWEST_FOR_NEIGHBOURS:
         guides = find_guides(rest[0], points.place_px, options)
@@ -326,7 +337,7 @@ def choose_tracker(
                 return Choice.of(
                     rest, points, options, f"{single}each point is tracked independently"
                 )
-            why = f"{single}few points; {len(guides)} dots around them identify them"
+            why = f"{single}few points, identified by {len(guides)} dots around them"
             return Choice(guided, guided.init(rest), options, why)
         single += f"fewer than {_FEWEST_FOR_NEIGHBOURS} points, each is tracked independently"
         return Choice.of(rest, points, options, single)
@@ -334,12 +345,12 @@ def choose_tracker(
     try:
         tracker = PointTracker(points.place_px, together)
     except InputError:
-        single += "the points lie on one line, each is tracked independently"
+        single += "the points are on one line, each is tracked independently"
         return Choice.of(rest, points, options, single)
     state = tracker.init(rest)
     pilot = _pilot(frames, tracker, state, points)
     held, seen = pilot.held, min(len(frames), PILOT_FRAMES)
-    told = f"{100 * held:.0f} % of the points hold together over the first {seen} frames"
+    share = f"{100 * held:.0f} % of the points hold together over the first {seen} frames"
     bends = not lossy and pilot.widened > _WIDENED
     if (held < _MOST_HOLD or bends) and _on_particles(points, rest[0]):
         lone = replace(options, subset_px=lone_subset_px(rest[0], options.subset_px))
@@ -350,17 +361,17 @@ def choose_tracker(
         surer = (
             bends and alone.held >= held and _WIDENED * alone.std_px.mean() < pilot.std_px.mean()
         )
-        if alone.scatter_px > least_px and (alone.held > held + _MORE_HELD or surer):
-            why = f"particles that move independently: only {told}"
+        if alone.scatter_px > least_px and (alone.held > held + _MORE_VALID or surer):
+            why = f"particles that move independently: only {share}"
             if surer:
-                why = "particles whose motion bends within the distance of their neighbours"
+                why = "particles whose motion varies strongly between neighbours"
             why += f"; subsets of {lone.subset_px} px"
             return Choice(particles, at_rest, replace(lone, model="translation"), why)
-    return Choice(tracker, state, together, f"model neighbours: {told}", held > _MOST_HOLD)
+    return Choice(tracker, state, together, f"model neighbours: {share}", held > _MOST_HOLD)
 
 
 def _on_particles(points: Points, frame: Frame) -> bool:
-    """Do most points lie on dots of one kind?"""
+    """Whether most points are on dots of one kind."""
     seen = locate_particles(frame, find_profile(frame), margin_px=4).points_px
     if not len(seen):
         return False

@@ -1,4 +1,4 @@
-"""What turns pixels into metres, and takes the lens and a moving stand out of positions."""
+"""Scale from pixels to metres, and correction for lens and a moving stand."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from haselab.pipelines.tracking.points import Points, read_points
 from haselab.pipelines.tracking.table import Block
 from haselab.store.folder import read_json, write_json
 from haselab.store.video.opening import open_video
-from haselab.tracking import Reason
+from haselab.tracking import LossReason
 from haselab.tracking.camera.lens import Lens, calibrate_lens, find_checkerboard
 from haselab.tracking.camera.rigid import fit_rigid_motion
 from haselab.tracking.camera.scale import (
@@ -28,11 +28,11 @@ from haselab.tracking.options import Floats, Frame
 
 __all__ = [
     "Correction",
-    "ScaleWish",
+    "ScaleOptions",
+    "describe_scale",
     "make_correction",
     "read_lens",
     "scale_of",
-    "told",
     "with_fixed",
 ]
 
@@ -40,15 +40,15 @@ _MM = 1e-3
 
 
 @dataclass(frozen=True)
-class ScaleWish:
-    """The options of the scale, as typed; at most one of the first four.
+class ScaleOptions:
+    """The options for the scale, as typed; at most one of the first four.
 
     Args:
-        mm_per_px: known.
+        mm_per_px: a known scale.
         points: `x1,y1,x2,y2,MM`.
         ruler: `x1,y1,x2,y2,MM` with the length from tick to tick.
         board: `COLUMNSxROWS,MM` with the side of a square.
-        picture: of ruler or board; without it they are in the first frame.
+        picture: of ruler or board; None: the first frame.
     """
 
     mm_per_px: float | None
@@ -59,7 +59,7 @@ class ScaleWish:
 
 
 def _numbers(option: str, text: str, form: str) -> list[float]:
-    """Numbers of an option, as many as its form has."""
+    """Parse the numbers of an option, as many as its form has."""
     count = form.count(",") + 1
     try:
         values = [float(part) for part in text.split(",")]
@@ -73,7 +73,7 @@ def _numbers(option: str, text: str, form: str) -> list[float]:
 
 
 def _board(option: str, text: str) -> tuple[int, int, float]:
-    """`9x6,5`: inner corners along both sides, side of a square in mm."""
+    """Parse `9x6,5`: inner corners along both sides, side of a square in mm."""
     corners, _, side = text.partition(",")
     columns, _, rows = corners.lower().partition("x")
     try:
@@ -92,16 +92,16 @@ def _picture(path: Path | None, first: Frame) -> Frame:
         return next(iter(video))
 
 
-def scale_of(wish: ScaleWish, first: Frame, lens: Lens | None) -> Estimate | None:
-    """Metres per pixel; `None` when no scale was asked for.
+def scale_of(wish: ScaleOptions, first: Frame, lens: Lens | None) -> Estimate | None:
+    """Find the metres per pixel; `None` if no scale was requested.
 
     Args:
         wish: the options.
         first: frame of the video.
-        lens: whose distortion is taken out of points and corners; not out of a ruler.
+        lens: for correcting points and corners, but not a ruler.
 
     Raises:
-        InputError: more than one scale, or one that is not positive.
+        InputError: more than one scale is given, or one that is not positive.
         ResultError: no ruler or board is found.
     """
     given = {
@@ -110,12 +110,12 @@ def scale_of(wish: ScaleWish, first: Frame, lens: Lens | None) -> Estimate | Non
     }  # fmt: skip
     names = [name for name, value in given.items() if value is not None]
     if len(names) > 1:
-        raise InputError(f"{' and '.join(names)} exclude each other; give one scale.")
+        raise InputError(f"{' and '.join(names)} exclude each other. Use only one of them.")
     if wish.mm_per_px is not None:
         if not (math.isfinite(wish.mm_per_px) and wish.mm_per_px > 0.0):
             raise InputError(
-                f"--scale-mm-per-px {wish.mm_per_px:g} is not a positive number. Give the length "
-                "of a pixel in mm."
+                f"--scale-mm-per-px is {wish.mm_per_px:g}. Use a positive number, the length of a "
+                "pixel in mm."
             )
         return Estimate.normal(wish.mm_per_px * _MM, 0.0, "m/px")
     if wish.points is not None:
@@ -140,7 +140,7 @@ def _without_lens(points_px: Floats, lens: Lens | None) -> Floats:
 
 
 def read_lens(path: Path | None, board: str | None, out: Path) -> Lens | None:
-    """A lens from its file, or calibrated from a folder of pictures and kept beside the answer.
+    """Read a lens from its file, or calibrate it from pictures and write it beside the answer.
 
     Args:
         path: lens.json, or a folder of pictures of a checkerboard.
@@ -148,7 +148,7 @@ def read_lens(path: Path | None, board: str | None, out: Path) -> Lens | None:
         out: of the answer.
 
     Raises:
-        InputError: no such file, not a lens, or no board told.
+        InputError: no such file, not a lens, or no board given.
         ResultError: too few pictures show the board.
     """
     if path is None:
@@ -182,12 +182,14 @@ def _lens_of(data: Any, path: Path) -> Lens:
         if (focal.shape, centre.shape, five.shape) != ((2,), (2,), (5,)):
             raise ValueError("numbers are missing")
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"Not a lens of haselab ({error}); calibrate it anew. {path}") from None
+        raise InputError(
+            f"The file is not a lens of haselab ({error}). Calibrate the lens again. {path}"
+        ) from None
     return lens
 
 
 def with_fixed(points: Points, fixed: str | None, frame: Frame) -> tuple[Points, NDArray[np.intp]]:
-    """The points with the fixed ones among them, and which those are.
+    """Add the fixed points to the tracked ones, and return which they are.
 
     Args:
         points: that are tracked.
@@ -204,7 +206,7 @@ def with_fixed(points: Points, fixed: str | None, frame: Frame) -> tuple[Points,
     more = read_points(Path(fixed), frame)
     twice = sorted(set(more.names) & set(points.names))
     if twice:
-        raise InputError(f"The name {twice[0]!r} is also that of another point. {fixed}")
+        raise InputError(f"Two points have the name {twice[0]!r}. Rename one of them. {fixed}")
     first = len(points.names)
     together = replace(
         points,
@@ -216,12 +218,12 @@ def with_fixed(points: Points, fixed: str | None, frame: Frame) -> tuple[Points,
 
 @dataclass(frozen=True)
 class Correction:
-    """Lens and stand, taken out of blocks of tracks.
+    """Corrects blocks of tracks for the lens and the motion of the stand.
 
     Args:
         lens: if it is known.
-        fixed: indices of the points that should stand still.
-        rest_px: all points in the first frame, the lens taken out. Shape `(P, 2)`.
+        fixed: indices of the fixed points.
+        rest_px: all points in the first frame, corrected for the lens. Shape `(P, 2)`.
     """
 
     lens: Lens | None
@@ -229,7 +231,7 @@ class Correction:
     rest_px: Floats
 
     def block(self, block: Block) -> Block:
-        """The block with corrected positions; points are lost where no fixed one is found."""
+        """Correct the positions; points are lost in frames without any fixed point."""
         if self.lens is None and not self.fixed.size:
             return block
         t = block.tracks
@@ -245,7 +247,7 @@ class Correction:
             )
             x, y, std_x, std_y = motion.undo(x, y, std_x, std_y)
         valid = t.valid & np.isfinite(x)
-        untied = np.where(t.valid & ~valid, np.uint8(Reason.UNTIED), np.uint8(0))
+        untied = np.where(t.valid & ~valid, np.uint8(LossReason.UNTIED), np.uint8(0))
         tracks = replace(
             t,
             x_px=x,
@@ -261,22 +263,24 @@ class Correction:
 def make_correction(
     lens: Lens | None, fixed: NDArray[np.intp], place_px: Floats, frame: Frame
 ) -> Correction:
-    """The correction of a clip.
+    """Make the correction for a video.
 
     Raises:
-        InputError: the lens is of pictures of another size.
+        InputError: the lens was calibrated with pictures of another size.
     """
     height, width = frame.shape
     if lens is not None and lens.size_px != (width, height):
         raise InputError(
-            f"The lens was calibrated for pictures of {lens.size_px[0]} x {lens.size_px[1]} px, "
-            f"the video has {width} x {height} px. Calibrate at the video's size."
+            f"The lens was calibrated with pictures of {lens.size_px[0]} x {lens.size_px[1]} px, "
+            f"but the video has {width} x {height} px. Calibrate with pictures of the same size."
         )
     return Correction(lens, fixed, _without_lens(place_px, lens))
 
 
-def told(lens: Lens | None, fixed: Sequence[str], scale: Estimate | None) -> dict[str, Any]:
-    """What the answer says of it."""
+def describe_scale(
+    lens: Lens | None, fixed: Sequence[str], scale: Estimate | None
+) -> dict[str, Any]:
+    """Summarise lens, fixed points and scale for the answer."""
     return {
         "scale_mm_per_px": None if scale is None else scale.scaled(1e3, "mm/px"),
         "lens": None if lens is None else {"rms_px": lens.rms_px},

@@ -1,4 +1,4 @@
-"""Frames decoded ahead, points followed meanwhile: a clip as blocks of tracks."""
+"""Decode frames in the background and track points: a video as blocks of tracks."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _BATCHES_AHEAD = 2
 
 
 class Clock:
-    """Times of frames: of a table, of a rate, or of the file.
+    """Times of frames, from a table, from a rate, or from the file.
 
     Args:
-        rate_hz: overrules the file's.
-        times_s: overrule both, as they stand.
+        rate_hz: overrides that of the file.
+        times_s: override both.
         path: of the table.
-        doubt: why the times are not verified; empty where they are.
+        doubt: why the times are not verified; empty if they are.
     """
 
     def __init__(
@@ -50,14 +50,14 @@ class Clock:
 
     @property
     def rate_hz(self) -> float | None:
-        """Mean rate of this clock, `None` where the file's own holds."""
+        """Mean rate of this clock; `None`: that of the file."""
         if self._times_s is None or len(self._times_s) < 2:
             return self._rate_hz
         span_s = self._times_s[-1] - self._times_s[0]
         return (len(self._times_s) - 1) / span_s if span_s > 0.0 else None
 
     def of(self, video: VideoReader) -> Clock:
-        """This clock for a video: a table of all recorded frames loses those that are missing.
+        """Adapt the clock to a video: remove the times of missing frames from the table.
 
         Raises:
         """
@@ -70,16 +70,16 @@ class Clock:
         return self
 
     def time_s(self, index: int, file_s: float, number: int | None = None) -> float:
-        """Time of a frame, in s; `number` is its place in the recording where frames are missing.
+        """Time of a frame in s; `number` is its position in the recording if frames are missing.
 
         Raises:
-            InputError: the table ends before.
+            InputError: the table has too few times.
         """
         if self._times_s is not None:
             if index >= len(self._times_s):
                 raise InputError(
-                    f"The table of times has {len(self._times_s)} frames, the video has more. "
-                    f"Take the table of this video. {self._path}"
+                    f"The table of times has {len(self._times_s)} frames, but the video has more. "
+                    f"Use the table of this video. {self._path}"
                 )
             return self._times_s[index]
         place = index if number is None else number
@@ -89,23 +89,23 @@ class Clock:
 def read_clock(
     rate_hz: float | None, times: Path | None, experiment: str | None, *, unverified: bool = False
 ) -> Clock:
-    """The clock asked for.
+    """Read the requested clock.
 
     Args:
-        rate_hz: frames a second.
+        rate_hz: frames per second.
         times: CSV with the columns `frame,time_s`, or a session file.
         experiment: of the session.
         unverified: read a session whose checksums do not match.
 
     Raises:
-        InputError: the table cannot be read or holds no time.
+        InputError: the table cannot be read, or has no times.
     """
     if times is None:
         return Clock(rate_hz)
     doubt = ""
     if times.suffix.lower() in (".h5", ".hdf5"):
         if experiment is None:
-            raise InputError(f"Name the experiment of the session: --experiment NAME. {times}")
+            raise InputError(f"--times names a session. Add --experiment NAME. {times}")
         with SessionReader(times, unverified=unverified) as session:
             doubt = session.doubt
             found = session.experiment(experiment).frame_time_s.tolist()
@@ -113,14 +113,14 @@ def read_clock(
         found = read_times(times)
     if not found or not np.isfinite(found).all():
         raise InputError(
-            f"The table holds no times of frames; needed is CSV with the columns frame,time_s, or "
-            f"a session and --experiment. {times}"
+            f"The file has no times of frames. Use a CSV file with the columns frame,time_s, or a "
+            f"session with --experiment. {times}"
         )
     return Clock(times_s=found, path=times, doubt=doubt)
 
 
 def _batches(video: VideoReader, clock: Clock) -> Iterator[list[Timed] | HaselabError]:
-    """Frames some at a time; where the video breaks off, the error after the last of them."""
+    """Yield frames in batches; if the video breaks off, yield the error after the last one."""
     batch: list[Timed] = []
     size, clock = 1, clock.of(video)
     try:
@@ -141,12 +141,12 @@ def _batches(video: VideoReader, clock: Clock) -> Iterator[list[Timed] | Haselab
 
 
 def read_ahead(video: VideoReader, clock: Clock) -> Iterator[list[Timed]]:
-    """Frames with their times, some at a time, the next ones read and decoded in a thread.
+    """Yield frames with their times in batches, read and decoded in a background thread.
 
     At most three batches of 8 MB are in memory.
 
     Raises:
-        HaselabError: where the video breaks off, after its last whole frame has been given out.
+        HaselabError: the video breaks off; raised after its last whole frame.
     """
     for batch in ahead(_batches(video, clock), _BATCHES_AHEAD):
         if isinstance(batch, HaselabError):
@@ -161,9 +161,9 @@ def blocks(
     look: Look,
     number: Callable[[int], int],
 ) -> Iterator[Block]:
-    """The points in all frames; `look` sees each frame with its points.
+    """Track the points in all frames; call `look` with each frame and its points.
 
-    `number` gives a frame's number in the recording by how many were read before.
+    `number` converts the count of frames read before to the frame's number in the recording.
     """
     first = 0
     for batch in batches:
@@ -178,11 +178,11 @@ def blocks(
 
 
 class Opening:
-    """A clip whose first frames are looked at before all of them are followed, decoded once.
+    """Gives access to the first frames of a video before tracking, without decoding them twice.
 
     Args:
         batches: from `read_ahead`.
-        count: frames to look at.
+        count: number of first frames.
     """
 
     def __init__(self, batches: Iterator[list[Timed]], count: int) -> None:
@@ -201,10 +201,10 @@ class Opening:
         self.frames = [frame for batch in self._first for _, frame in batch]
 
     def all(self) -> Iterator[list[Timed]]:
-        """All batches from the first; the first frames are forgotten as they go.
+        """Yield all batches from the first one; release the first frames on the way.
 
         Raises:
-            HaselabError: where the video breaks off, as `read_ahead`.
+            HaselabError: the video breaks off, see `read_ahead`.
         """
         self.frames = []
         while self._first:
@@ -215,7 +215,7 @@ class Opening:
 
 
 class UntilBroken:
-    """The same blocks, up to an error, which is kept instead of raised.
+    """Iterates over blocks up to an error, which is stored instead of raised.
 
     Args:
         items: of blocks.

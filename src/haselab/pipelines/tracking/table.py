@@ -1,7 +1,7 @@
 """The table of tracks: rows of a CSV file, formatted many at a time.
 
-Numbers become text by tables of digit groups, eight bytes each, so that writing does not hold up
-tracking: about 0.3 us a row.
+Numbers are formatted with tables of digit groups, eight bytes each, about 0.3 us per row, so that
+writing does not slow down tracking.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.tracking import Reason, Tracks
+from haselab.tracking import LossReason, Tracks
 from haselab.tracking.options import Floats
 
 __all__ = ["COLUMNS", "METRES", "Block", "TrackRows", "reason_name"]
 
-# The contract's, in its order; then displacements where there is a scale, and the reason.
+# The columns of the public contract; then displacements if there is a scale, and the reason.
 COLUMNS = ("frame", "time_s", "point", "x_px", "y_px", "std_x_px", "std_y_px", "quality", "valid")
 METRES = ("displacement_x_m", "displacement_y_m")
 
 Words = NDArray[np.uint64]
 
 _GROUP = 100_000  # five digits
-_NAN, _INF = 2 * _GROUP, 2 * _GROUP + 1  # places in the table of integers
+_NAN, _INF = 2 * _GROUP, 2 * _GROUP + 1  # indices in the table of integers
 _PIXEL_STEP, _METRE_STEP = 1e-5, 1e-12  # last digit of a position, of a displacement
 
 
@@ -39,7 +39,7 @@ class Block:
         first: how many frames were read before.
         time_s: times of the frames, in s. Shape `(F,)`.
         tracks: of all points. Shape `(F, P)`.
-        number: numbers of the frames in the recording, missing ones counted. Shape `(F,)`.
+        number: numbers of the frames in the recording, including missing ones. Shape `(F,)`.
     """
 
     first: int
@@ -49,12 +49,12 @@ class Block:
 
 
 def reason_name(mask: int) -> str:
-    """Why a point is not valid, as one word of the table; empty where it is."""
-    return "+".join(str(flag.name).lower() for flag in Reason if mask & flag)
+    """Why a point is not valid, as one word of the table; empty if it is valid."""
+    return "+".join(str(flag.name).lower() for flag in LossReason if mask & flag)
 
 
 def _as_words(texts: Sequence[bytes]) -> Words:
-    """Texts filled up with zero bytes, as rows of 64-bit words. Shape `(N, words)`."""
+    """Pad texts with zero bytes to rows of 64-bit words. Shape `(N, words)`."""
     width = -(-max(len(text) for text in texts) // 8) * 8
     return np.array(texts, f"S{width}").view(np.uint64).reshape(len(texts), -1)
 
@@ -68,7 +68,7 @@ def _digits(count: int) -> NDArray[np.uint8]:
 
 @cache
 def _integers() -> Words:
-    """Text of 0 to 99,999, of the same with a minus, of nan and inf."""
+    """Texts of 0 to 99,999, of their negatives, and of nan and inf."""
     text = np.zeros((2 * _GROUP + 2, 8), np.uint8)
     digits = _digits(5)
     blank = (np.cumsum(digits != ord("0"), axis=1) == 0) & (np.arange(5) < 4)
@@ -81,7 +81,7 @@ def _integers() -> Words:
 
 @cache
 def _group(before: str, count: int, after: str) -> Words:
-    """Digit groups between two texts; one more entry with `after` alone, for nan."""
+    """Digit groups between two texts; one more entry with only `after`, for nan."""
     text = np.zeros((_GROUP + 1, 8), np.uint8)
     start = len(before)
     text[:_GROUP, :start] = np.frombuffer(before.encode(), np.uint8)
@@ -94,7 +94,7 @@ def _group(before: str, count: int, after: str) -> Words:
 
 
 def _fixed(values: Floats, step: float, groups: Sequence[tuple[Words, int]]) -> list[Words]:
-    """Numbers in fixed point: the integer part, then groups of digits, the last with a comma."""
+    """Format numbers in fixed point: the integer part, then groups of digits and a comma."""
     finite = np.isfinite(values)
     scale = round(1.0 / step)
     units = np.rint(np.abs(np.where(finite, values, 0.0)) / step).astype(np.int64)
@@ -125,12 +125,12 @@ class TrackRows:
         self._flags = _as_words([b"0,", b"1,"])[:, 0]
 
     def header(self) -> bytes:
-        """The first line."""
+        """The header line."""
         metres = () if self._metres_per_px is None else METRES
         return (",".join((*COLUMNS, *metres, "reason")) + "\n").encode()
 
     def block(self, block: Block, rest_px: Floats) -> bytes:
-        """All points of some frames, frame by frame. `rest_px` has the shape `(P, 2)`."""
+        """Format all points of some frames, frame by frame. `rest_px` has the shape `(P, 2)`."""
         frames, points = block.tracks.x_px.shape
         tracks = block.tracks
         reason = np.zeros(tracks.valid.shape, np.uint8) if tracks.reason is None else tracks.reason
@@ -153,13 +153,13 @@ class TrackRows:
         reason: NDArray[np.uint8],
         rest_px: Floats,
     ) -> bytes:
-        """Any rows, in the order of the frames.
+        """Format any rows, in the order of the frames.
 
         Args:
             frame, time_s, point, reason: number of the frame, its time in s, index of the point's
                 name, why it is not valid. Shape `(R,)`.
             numbers: x, y, their deviations, quality. Shape `(5, R)`.
-            rest_px: where the displacement begins. Shape `(2, R)`.
+            rest_px: origin of the displacement. Shape `(2, R)`.
 
         Returns:
             The lines.
@@ -188,7 +188,7 @@ class TrackRows:
 
 
 def _field(name: str) -> bytes:
-    """A name as a field of CSV, with the comma."""
+    """Format a name as a field of CSV, with the comma."""
     line = io.StringIO()
     csv.writer(line, lineterminator=",").writerow([name.replace("\0", "")])
     return line.getvalue().encode()

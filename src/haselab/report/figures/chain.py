@@ -1,4 +1,4 @@
-"""Figure S6: the printed sensing chain beside the lock-in."""
+"""Figure S6: the paper's sensing chain compared with the lock-in."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def _chain(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "chain",
     "Figure S6",
-    "Capacitance in cycles 2 to 5 of the triangle, by the lock-in and by the paper's sensing chain "
-    "(low-pass, mean of the periods, peak to peak, phase; eqs. 2 and 3), and their difference: "
-    "averaging over periods does not remove the ramp and the steps of the drive.",
+    "Capacitance in cycles 2 to 5 of the triangle test, from the lock-in and from the paper's "
+    "sensing chain (low-pass, mean of the periods, peak to peak, phase; eqs. 2 and 3), and their "
+    "difference. Averaging over periods does not remove the ramp and the steps of the drive.",
     (Panel("", "Paper's sensing chain and lock-in", _chain, wide=True, height_in=3.8),),
     needs="chain",
 )

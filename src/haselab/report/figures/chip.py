@@ -1,4 +1,4 @@
-"""Figure S4: the loop on the chip beside those of the desktop."""
+"""Figures S4 and S5: the loop on the microcontroller compared with those of the desktop."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _BAND = 0.05
 
 
 def draw_loops(host: FigureBase, section: Section) -> None:
-    """Responses of several loops to one step.
+    """Draw the responses of several loops to one step.
 
     Args:
-        host: takes the axes.
+        host: figure for the axes.
         section: `desired` and `loops`, each with `time_s` and `strain`.
     Raises:
         LeftOutError: the section lacks them.
@@ -65,7 +65,7 @@ def _miniature(host: FigureBase, run: RunFolder) -> None:
 
 
 def _played(run: RunFolder, name: str) -> Section:
-    """A section of analysis.json that holds responses, and not why there are none."""
+    """A section of analysis.json with responses; it may hold the reason why there are none."""
     section = run.section(name)
     reason = run.analysis[name].get("left_out") if isinstance(run.analysis[name], Mapping) else ""
     if reason:
@@ -76,23 +76,23 @@ def _played(run: RunFolder, name: str) -> Section:
 PLAN = FigurePlan(
     "chip",
     "Figure S4",
-    "One step by three loops with the same gains: the desktop at 100 Hz, the desktop at the chip's "
-    "rate and delay, and the chip itself in co-simulation. The actuator has been through a "
-    "triangle before, as that of figure 6 has, unless 'haselab firmware simulate --precondition 0' "
-    "drew this: an actuator that was never stretched softens during the step and overshoots more, "
-    "see docs/firmware.md. Desktop: true strain of "
-    "one trial. Chip: mean of its trials by the camera, or the true strain of one trial after "
-    "'haselab firmware simulate'. The ringing is included.",
+    "One step with three loops with the same gains: the desktop at 100 Hz, the desktop at the "
+    "microcontroller's rate and delay, and the microcontroller (chip) in co-simulation. As in "
+    "figure 6, a triangle was played before the step, unless the figure comes from 'haselab "
+    "firmware simulate --precondition 0': an actuator that was never stretched softens during the "
+    "step and overshoots more (docs/firmware.md). Desktop: true strain of one trial. Chip: mean of "
+    "its trials, measured by the camera, or the true strain of one trial after 'haselab firmware "
+    "simulate'. The ringing is included.",
     (Panel("", "From the bench to the chip", _loops, wide=True, height_in=3.2),),
     needs="chip",
 )
 MINIATURE = FigurePlan(
     "miniature",
     "Figure S5",
-    "The miniature bench: the chip computes phase, strain and controller, and an off-the-shelf "
-    "supply on a serial line gives the high voltage. The supply reaches half of the study's "
-    "voltage, so zero strain and step are other ones than in figure 6, see row S28. Mean of the "
-    "trials by the camera, in co-simulation with the same actuator.",
+    "The miniature bench: the microcontroller computes phase, strain and controller, and a "
+    "commercial supply on a serial line provides the high voltage. The supply reaches half of the "
+    "study's voltage, so zero strain and step differ from those of figure 6 (row S28). Mean of the "
+    "trials, measured by the camera, in co-simulation with the same actuator.",
     (Panel("", "Miniature bench", _miniature, wide=True, height_in=3.2),),
     needs="miniature",
 )

@@ -78,8 +78,8 @@ def _sweep(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "bode-plant",
     "Figure S1",
-    "The plant from the chirp. A: frequency response with one standard deviation as a band, the "
-    "fitted models, and the coherence. B: the chirp in time, with the models' answers.",
+    "Chirp experiment. A: measured frequency response, with one standard deviation as a band, "
+    "fitted models, and coherence. B: response to the chirp in time, with those of the models.",
     (
         Panel("A", "Frequency response", _bode, wide=True, height_in=5.2),
         Panel("B", "Chirp", _sweep, wide=True, height_in=2.8),

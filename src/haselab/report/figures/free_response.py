@@ -1,4 +1,4 @@
-"""Figure 5: the dropped mass."""
+"""Figure 5: the free response after the mass is dropped."""
 
 from __future__ import annotations
 
@@ -67,17 +67,17 @@ def _free_response(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig5",
     "Figure 5",
-    "Free response at the operating voltage: the mass is lifted and dropped. Displacement as it "
-    "was recorded, from where eq. 6 comes to rest: trials (blue, red) with the standard deviation "
-    "of the three tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and "
-    "with an exponential creep term (dashed), and the exponential curves through the positive "
-    "(green) and the negative (purple) peaks (triangles), which the paper calls hull curves: least "
-    "squares of the peaks' logarithms, where at least two peaks stand out of the creep.",
+    "Free response at the operating voltage: the mass is lifted and dropped. Displacement relative "
+    "to the final value of eq. 6: trials (blue, red) with the standard deviation of the three "
+    "tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and with an "
+    "exponential creep term (dashed), and the exponential envelopes (hull curves in the paper) of "
+    "the positive (green) and the negative (purple) peaks (triangles). The envelopes are "
+    "least-squares fits to the logarithms of the peaks, if at least two peaks exceed the creep.",
     (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
     plain_caption="Free response at the operating voltage: the mass is lifted and dropped. "
-    "Displacement as it was recorded: trials (blue, red) with the standard deviation of the three "
-    "tracked points as bands, their mean (light blue), the decaying oscillation alone (dotted) and "
-    "with an exponential creep term (dashed), and the exponential envelopes through the positive "
-    "(green) and the negative (purple) peaks (triangles): least squares of the peaks' logarithms, "
-    "where at least two peaks stand out of the creep.",
+    "Measured displacement: trials (blue, red) with the standard deviation of the three tracked "
+    "points as bands, their mean (light blue), the decaying oscillation alone (dotted) and with "
+    "an exponential creep term (dashed), and the exponential envelopes of the positive (green) "
+    "and the negative (purple) peaks (triangles). The envelopes are least-squares fits to the "
+    "logarithms of the peaks, if at least two peaks exceed the creep.",
 )

@@ -1,4 +1,4 @@
-"""Figure S7: closed-loop trials beside the paper's."""
+"""Figure S7: closed-loop trials in addition to the paper's."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def _further(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "further",
     "Figure S7",
-    "Additional closed-loop trials: strain by the camera (blue) and desired (green). With the "
-    "paper's sensing chain in place of the lock-in and a larger carrier; with extra delay, for "
-    "which the PI gains are reduced if necessary; and with a reference that drives the output "
-    "(grey, right axis) to its limit (dotted, right axis).",
+    "Additional closed-loop trials: strain measured by the camera (blue) and desired strain "
+    "(green). From the top: with the paper's sensing chain instead of the lock-in and a larger "
+    "carrier; with extra delay, for which the PI gains are reduced if necessary; and with a "
+    "reference that drives the output (grey, right axis) to its limit (dotted, right axis).",
     (Panel("", "Further trials", _further, wide=True, height_in=6.0),),
     needs="further",
 )

@@ -57,7 +57,7 @@ PLAN = FigurePlan(
     "fig7",
     "Figure 7",
     "Bode plot of the plant alone (red) and of the loop with each controller (blue: the "
-    "reference PI; other colours: further designs), delay of the loop included. Dots mark the "
-    "cross-over; grey lines 0 dB and −180°.",
+    "reference PI; other colours: further designs), including the delay of the loop. Dots mark the "
+    "crossover; grey lines mark 0 dB and −180°.",
     (Panel("", "Plant and loop", _loop, wide=True, height_in=5.2),),
 )

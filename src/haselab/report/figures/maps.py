@@ -1,4 +1,4 @@
-"""Figure 3: the triangle test and the two maps read from it."""
+"""Figure 3: the triangle test and the two maps identified from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SAMPLES_DRAWN = 4000
 
 
 def _add_kv(axes: Axes) -> None:
-    """Right-hand axis: what the amplifier makes of the DAQ voltage."""
+    """Right-hand axis: the voltage at the output of the amplifier."""
     right = axes.secondary_yaxis("right", functions=scale_by(_KV_PER_DAQ_VOLT))
     right.set_ylabel("Actuator (kV)")
 
@@ -141,23 +141,24 @@ PLAN = FigurePlan(
     "amplifier's 5 kV per volt), strain from the camera about the operating point (mean and "
     "standard deviation of three points at the lower clamp), capacitance. The first cycle is not "
     "repeatable and is excluded from the fits; the others still drift (S13). B: voltage against "
-    "strain through the hysteresis loop, the fit of eq. 4, and eq. 4 with the paper's own "
+    "strain, with its hysteresis loop, the fit of eq. 4, and eq. 4 with the paper's own "
     "constants; zero strain is the chosen baseline. C: strain against capacitance: every buffer of "
-    "cycles 2 to 5 (grey), means of rising and falling edge at equal times from the turn (blue), "
-    "the line of eq. 5 through these means. D: strain of the camera and strain rebuilt from "
-    "capacitance by the map in farads that the loops use, with the band of cycles left out.",
+    "cycles 2 to 5 (grey), means of the rising and the falling edge at equal times from the peak "
+    "(blue), and the line of eq. 5 through these means. D: strain measured by the camera, and "
+    "strain computed from capacitance with the map that the control loops use; its 95 % band comes "
+    "from leaving out cycles.",
     (
         Panel("A", "Triangle test", _triangle, wide=True, height_in=5.0),
         Panel("B", "Voltage map", _voltage_map, height_in=3.0),
         Panel("C", "Capacitance map", _capacitance_map, height_in=3.0),
-        Panel("D", "Strain rebuilt from capacitance", _reconstruction, wide=True, height_in=2.4),
+        Panel("D", "Strain computed from capacitance", _reconstruction, wide=True, height_in=2.4),
     ),
     plain_caption="Voltage, strain and capacitance in the triangle test. A: drive voltage (DAQ "
     "output), strain from the camera about the operating point (mean and standard deviation of "
     "three points at the lower clamp), capacitance. The first cycles are excluded from the fits. "
-    "B: voltage against strain through the hysteresis loop, and the fit of two exponentials; zero "
-    "strain is the chosen baseline. C: strain against capacitance: every block of the cycles that "
-    "count (grey), means of rising and falling edge at equal times from the turn (blue), the "
-    "straight line through these means. D: strain of the camera and strain rebuilt from "
-    "capacitance by the quadratic map that the loops use.",
+    "B: voltage against strain, with its hysteresis loop, and the fit of two exponentials; zero "
+    "strain is the chosen baseline. C: strain against capacitance: every block of the fitted "
+    "cycles (grey), means of the rising and the falling edge at equal times from the peak (blue), "
+    "and the straight line through these means. D: strain measured by the camera, and strain "
+    "computed from capacitance with the quadratic map that the control loops use.",
 )

@@ -1,4 +1,4 @@
-"""A figure is a list of panels, drawn one by one for the page and together for the file."""
+"""Figures as lists of panels, drawn separately for the page and together for the file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, FigureBase, SubFigure
 
 from haselab.report.analysis import LeftOutError
 from haselab.report.folder import RunFolder
-from haselab.report.style import house_style, inline_svg, to_svg
+from haselab.report.style import figure_style, inline_svg, to_svg
 
 __all__ = ["Drawing", "DrawnPanel", "FigurePlan", "Panel", "draw_figure"]
 
@@ -19,12 +19,12 @@ _HALF_INCH, _WIDE_INCH = 3.4, 6.8
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture of a figure.
+    """One panel of a figure.
 
     Args:
         letter: `A`, `B` ..., or `""` for the only panel.
         title: what it shows, in a few words.
-        draw: puts the axes into a (sub)figure; raises `LeftOutError` when the folder lacks data.
+        draw: draws into a (sub)figure; raises `LeftOutError` if the folder lacks data.
         wide: takes the full width of the page, else half.
         height_in: height, in inch.
     """
@@ -47,12 +47,12 @@ class FigurePlan:
 
     Args:
         name: file name without its ending.
-        label: how the text calls it.
+        label: such as `Figure 3`.
         caption: what is shown, and how to read it.
         panels: in reading order.
-        needs: section of analysis.json without which the figure is no part of the report; empty:
-            it always is, and says what it lacks.
-        plain_caption: for a study that is not compared with the paper; "" where `caption` is one.
+        needs: section of analysis.json without which the report omits the figure; empty: the report
+            always has the figure, with notes about missing data.
+        plain_caption: for a study that is not compared with the paper; "": use `caption`.
     """
 
     name: str
@@ -63,13 +63,13 @@ class FigurePlan:
     plain_caption: str = ""
 
     def caption_of(self, is_reference: bool) -> str:
-        """The caption in the reference study, or in another one."""
+        """The caption for the reference study, or for another study."""
         return self.caption if is_reference else self.plain_caption or self.caption
 
 
 @dataclass(frozen=True)
 class DrawnPanel:
-    """A panel as it stands on the page.
+    """A panel drawn for the page.
 
     Args:
         svg: inline SVG.
@@ -85,7 +85,7 @@ class Drawing:
     """A drawn figure.
 
     Args:
-        plan: what was asked for.
+        plan: the figure's plan.
         document: SVG document of all panels that could be drawn, `""` when none could.
         panels: the same panels one by one, for the page.
         notes: one sentence for each panel left out.
@@ -98,7 +98,7 @@ class Drawing:
 
 
 def draw_figure(plan: FigurePlan, run: RunFolder) -> Drawing:
-    """Draw what the folder's data allow.
+    """Draw the panels of a figure for which the folder has data.
 
     Args:
         plan: the figure.
@@ -109,13 +109,13 @@ def draw_figure(plan: FigurePlan, run: RunFolder) -> Drawing:
     """
     drawn: list[tuple[Panel, str]] = []
     notes: list[str] = []
-    with house_style():
+    with figure_style():
         for panel in plan.panels:
             try:
                 document = _alone(plan, panel, run)
             except LeftOutError as reason:
                 name = f"Panel {panel.letter}" if panel.letter else "The figure"
-                notes.append(f"{name} is left out: {reason}")
+                notes.append(f"{name} was left out: {reason}")
             else:
                 drawn.append((panel, document))
     inline = tuple(DrawnPanel(inline_svg(document), panel.wide) for panel, document in drawn)
@@ -154,7 +154,7 @@ def _together(plan: FigurePlan, drawn: Sequence[tuple[Panel, str]]) -> str:
 
 
 def _packed(panels: Sequence[Panel]) -> list[list[Panel]]:
-    """Wide panels in rows of their own, half panels in pairs."""
+    """Arrange wide panels in separate rows, and half panels in pairs."""
     rows: list[list[Panel]] = []
     for panel in panels:
         if not panel.wide and rows and len(rows[-1]) == 1 and not rows[-1][0].wide:

@@ -1,4 +1,4 @@
-"""Figure S3: what the fits leave over."""
+"""Figure S3: the residuals of the fits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _parts(residual: Array, unit: str) -> str:
 
 
 def _at(x: Array, fit_x: Array, fit_y: Array) -> Array:
-    """The fitted curve at the data's places, NaN outside the fit's range."""
+    """The fitted curve at the abscissas of the data, NaN outside its range."""
     order = np.argsort(fit_x)
     return np.interp(x, fit_x[order], fit_y[order], left=np.nan, right=np.nan)
 
@@ -118,10 +118,10 @@ def _free_response(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "residuals",
     "Figure S3",
-    "Residuals, measured minus fitted. A: the chirp under each model; structure that is left "
-    "over is dynamics the model lacks. B: the voltage map; the two branches are the hysteresis. "
-    "C: the static load test. D: the free response. Misfit is the smooth part of the residuals, "
-    "noise the part that changes at random from one value to the next.",
+    "Residuals, measured minus fitted. A: chirp, for each model; remaining structure shows "
+    "dynamics that the model lacks. B: voltage map; the two branches are the hysteresis. C: static "
+    "load test. D: free response. Misfit is the smooth part of the residuals, noise the part that "
+    "changes at random from one value to the next.",
     (
         Panel("A", "Chirp", _chirp, wide=True, height_in=2.6),
         Panel("B", "Voltage map", _voltage_map, height_in=2.6),

@@ -1,4 +1,4 @@
-"""Figure S2: self-sensed strain against the camera."""
+"""Figure S2: self-sensed strain compared with the camera."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _sensing(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "sensing",
     "Figure S2",
-    "Strain sensed by capacitance against the strain of the camera, and their difference, in "
+    "Strain sensed by capacitance and strain measured by the camera, and their difference in "
     "percentage points of strain.",
     (Panel("", "Self-sensed and tracked strain", _sensing, wide=True, height_in=3.6),),
 )

@@ -18,7 +18,9 @@ def _regions(axes: Axes, section: Section) -> None:
     regions = section.sections("regions")
     chosen = int(section.number("chosen")) + 1 if "chosen" in section else 0
     if chosen and str(chosen) not in regions:
-        raise LeftOutError(f"'static.chosen' in analysis.json is none of {len(regions)} regions.")
+        raise LeftOutError(
+            f"'static.chosen' in analysis.json is not one of {len(regions)} regions."
+        )
     for at, region in regions.items():
         stretch, load_n = region.array("stretch"), region.array("load_n")
         if at == str(chosen):
@@ -84,9 +86,9 @@ PLAN = FigurePlan(
     "fig4",
     "Figure 4",
     "Static load test. Measured load against stretch (blue), Arruda-Boyce fit of the shell with "
-    "the electrodes' spring beside it (red), linear regions of the piecewise-linear fit with as "
-    "many pieces as BIC prefers (green) and their centres (asterisks). The region chosen for the "
-    "experiments is the yellow band; the diamond is the operating point: the rig's weight and the "
-    "stretch at the baseline voltage, which lengthens the actuator beyond the curve at 0 V.",
+    "the electrodes' spring in parallel (red), linear regions of a piecewise-linear fit with the "
+    "number of segments of lowest BIC (green) and their centres (asterisks). The yellow band is "
+    "the region chosen for the experiments; the diamond is the operating point: the hung weight, "
+    "and the stretch at the baseline voltage, which exceeds that of the curve at 0 V.",
     (Panel("", "Load against stretch", _static, wide=True, height_in=3.6),),
 )

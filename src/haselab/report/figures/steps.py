@@ -84,12 +84,12 @@ def _each_group(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig6",
     "Figure 6",
-    "Step experiments. The actuator is first driven to zero strain, then the step follows; in open "
-    "loop it creeps, so that it is off zero before the step and beyond or short of it at the end. "
-    "A: desired strain (green), mean of the trials in each mode, measured "
-    "independently by the camera at its frame rate, with one standard deviation as a band; rise "
-    "times in the table are with the ringing averaged out. B: the same with each trial "
-    "(faint) and the strain that the controller itself sensed (thin grey).",
+    "Step experiments. The actuator is first driven to zero strain, then the step follows. In "
+    "open loop it creeps, so its strain differs from zero before the step and from the desired "
+    "strain at the end. A: desired strain (green), and mean of the trials in each mode, measured "
+    "independently by the camera, with one standard deviation as a band. The rise times in the "
+    "table are computed after averaging out the ringing. B: each trial (faint), and the strain "
+    "sensed by the controller (thin grey).",
     (
         Panel("A", "Open and closed loop", _overview, wide=True, height_in=3.2),
         Panel("B", "Trials and self-sensed strain", _each_group, wide=True, height_in=5.0),

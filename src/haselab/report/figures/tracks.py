@@ -1,4 +1,4 @@
-"""Figure 2: the tracked particles, the strain along the length, the lateral motion."""
+"""Figure 2: tracked particles, strain along the length, lateral motion."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _along(host: FigureBase, run: RunFolder) -> None:
 
 
 def _ylim_from_zero(values: Array) -> tuple[float, float]:
-    """Limits that hold zero, so that 'homogeneous' is judged against the strain itself."""
+    """Limits that include zero, so that homogeneity is judged relative to the strain."""
     low, high = min(0.0, float(np.nanmin(values))), max(0.0, float(np.nanmax(values)))
     margin = 0.2 * (high - low or 1.0)
     return low - (margin if low < 0.0 else 0.0), high + (margin if high > 0.0 else 0.0)
@@ -101,8 +101,8 @@ PLAN = FigurePlan(
     "Figure 2",
     "Automatic tracking. A: paths of all tracked particles over the first frame, with the "
     "mid-line (white) and the three points picked for the strain (green circles). B: strain of "
-    "slices along the length (0 at the fixed clamp, 1 at the load); a level line means that the "
-    "stretch is homogeneous. C: lateral motion of each particle (positive: to the right) against "
+    "slices along the length (0 at the fixed clamp, 1 at the load); a horizontal line means a "
+    "homogeneous stretch. C: lateral motion of each particle (positive: to the right) against "
     "its distance from the mid-line; the free sides move most.",
     (
         Panel("A", "Particle paths", _tracks, height_in=3.3),

@@ -1,6 +1,5 @@
 """The ATmega2560: its firmware built from a checkout, and run in co-simulation with the twin."""
 
-from haselab.rig.chip.bench import MegaBench
 from haselab.rig.chip.boards import Board, board_names, checkout, load_board
 from haselab.rig.chip.build import Firmware, build_cosim, build_firmware, find_tool
 from haselab.rig.chip.calibrate import (
@@ -9,9 +8,10 @@ from haselab.rig.chip.calibrate import (
     calibrated_firmware,
     chip_correction,
 )
+from haselab.rig.chip.chip_bench import ChipBench
 from haselab.rig.chip.design import ChipDesign, read_design
 from haselab.rig.chip.opening import (
-    MegaFile,
+    ChipFile,
     OpenedChip,
     key_of_port,
     opened_chip,
@@ -24,11 +24,11 @@ __all__ = [
     "REFERENCE",
     "Board",
     "Calibrated",
+    "ChipBench",
     "ChipDesign",
+    "ChipFile",
     "CoSim",
     "Firmware",
-    "MegaBench",
-    "MegaFile",
     "OpenedChip",
     "Output",
     "SerialChip",

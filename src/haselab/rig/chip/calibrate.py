@@ -12,8 +12,8 @@ from haselab.firmware import ChipSettings
 from haselab.firmware.messages import KeepAlive, Status
 from haselab.rig.chip.build import Firmware, build_cosim, build_firmware
 from haselab.rig.chip.simulator import CoSim
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench
 
 __all__ = ["REFERENCE", "Calibrated", "calibrated_firmware", "chip_correction"]
 

@@ -18,22 +18,22 @@ from haselab.firmware import ChipSettings, FrontEnd
 from haselab.rig import Camera, Frames, Gate, Rig
 from haselab.rig.bench_config import CameraField, SpecimenConfig
 from haselab.rig.cameras.opening import open_camera
-from haselab.rig.chip.bench import MegaBench, describe_chip
 from haselab.rig.chip.calibrate import calibrated_firmware
+from haselab.rig.chip.chip_bench import ChipBench, describe_chip
 from haselab.rig.chip.design import read_design
 from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
 from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel
 from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
-from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.rig.twin.history import precondition
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, TwinBench
 from haselab.store.toml import PrintableSection
 
 __all__ = [
+    "ChipFile",
     "FrontEndConfig",
-    "MegaFile",
     "OpenedChip",
     "SimulatorConfig",
     "key_of_port",
@@ -99,7 +99,7 @@ class SimulatorConfig(PrintableSection):
         return load_twin(path.parent / self.twin)
 
 
-class MegaFile(PrintableSection):
+class ChipFile(PrintableSection):
     """`kind = "mega"`, `run = "DIR"`, and `port` or a table `simulator`."""
 
     kind: Literal["mega"]
@@ -124,7 +124,10 @@ class MegaFile(PrintableSection):
         None, gt=0, le=20, description="fastest change of the drive, where the module is slower"
     )
     bandgap_v: float | None = Field(
-        None, ge=1.0, le=1.2, description="of this chip's reference, measured; see docs/firmware.md"
+        None,
+        ge=1.0,
+        le=1.2,
+        description="of this chip's reference, measured; see docs/control/firmware.md",
     )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
     camera: CameraField = Field(None, description="of a real bench")
@@ -178,7 +181,7 @@ def key_of_port(port: str) -> str:
 
 
 @contextlib.contextmanager
-def opened_chip(file: MegaFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
+def opened_chip(file: ChipFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
     """The chip of a rig file; leaving the context is 0 V and the link closed.
 
     In co-simulation the firmware is built, calibrated with a reference capacitor, and built again.
@@ -219,9 +222,9 @@ def _bench(
     settings: ChipSettings,
     gate: Gate,
     bandgap_v: float | None,
-) -> MegaBench:
+) -> ChipBench:
     try:
-        bench = gate.instrument(MegaBench(link, settings, bandgap_v))
+        bench = gate.instrument(ChipBench(link, settings, bandgap_v))
     except BaseException:
         link.close()
         raise
@@ -230,7 +233,7 @@ def _bench(
 
 
 def _on_port(
-    opened: contextlib.ExitStack, bench: MegaBench, file: MegaFile, settings: ChipSettings
+    opened: contextlib.ExitStack, bench: ChipBench, file: ChipFile, settings: ChipSettings
 ) -> Rig:
     assert file.specimen is not None
     assert file.camera is not None
@@ -348,7 +351,7 @@ def _simulated(
 
 
 def _rig_of_sheet(
-    bench: MegaBench,
+    bench: ChipBench,
     settings: ChipSettings,
     chip: CoSim,
     sheet: _Sheet,

@@ -9,12 +9,11 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
-from haselab.base import DeviceError, InputError
+from haselab.base import Closing, DeviceError, InputError
 from haselab.rig.chip.link import ChipLink
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 
 __all__ = ["CLOCK_HZ", "SLOTS", "SLOT_S", "CoSim", "Output", "Track"]
 
@@ -44,7 +43,7 @@ class Track(NamedTuple):
     high_v: float
 
 
-class CoSim(ChipLink):
+class CoSim(Closing, ChipLink):
     """A chip that runs beside a twin. Use as a context: its end ends the process.
 
     Args:
@@ -79,17 +78,6 @@ class CoSim(ChipLink):
         except (OSError, subprocess.CalledProcessError) as error:
             self._folder.cleanup()
             raise DeviceError(f"The co-simulation does not start ({error}). {program}") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the process."""

@@ -22,8 +22,8 @@ from haselab.firmware.messages import State, Trace
 from haselab.rig.chip.simulator import CLOCK_HZ, SLOT_S, CoSim
 from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 from haselab.rig.instruments.petapicovoltron.supply import PetaPicoVoltron
-from haselab.rig.twin.bench import TwinBench
 from haselab.rig.twin.serve.supply.server import SupplyFaults, SupplyServer
+from haselab.rig.twin.twin_bench import TwinBench
 from haselab.store.toml import Section
 
 __all__ = ["SuppliedCoSim", "SupplyModel", "SupplyOutput"]

@@ -3,7 +3,7 @@
 A driver is a class that derives from one of `DaqInstrument`, `GeneratorInstrument`,
 `SupplyInstrument` and `CameraInstrument`, and is listed in the entry-point group
 `haselab.instruments`. The drivers in this package are written in the same way;
-docs/add-an-instrument.md is the tutorial.
+docs/extend/add-an-instrument.md is the tutorial.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from haselab import _camera
 from haselab.base import InputError, LimitError, Limits
 
-__all__ = ["CameraConfig", "TwinCamera"]
+__all__ = ["TwinCamera", "TwinCameraConfig"]
 
 _TABLE_SIZE = 4096
 _EDGE_REACH = 16.0  # edge widths after which native/twin/camera.c calls an edge over
@@ -22,7 +22,7 @@ _SIDE_MARGIN = 0.96  # no particle sits closer to a free side, in half-widths
 _CLAMP_OVERHANG_PX = 14.0  # by which a clamp is wider than what it holds
 
 
-class CameraConfig(BaseModel):
+class TwinCameraConfig(BaseModel):
     """Everything that shapes the twin's pictures, apart from the sheet's own dimensions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -87,7 +87,7 @@ class CameraConfig(BaseModel):
     read_noise_grey: float = Field(0.6, ge=0, le=50, description="Standard deviation in the dark")
 
     @model_validator(mode="after")
-    def _check_pairs(self) -> CameraConfig:
+    def _check_pairs(self) -> TwinCameraConfig:
         if self.exposure_s * self.rate_hz > 1:
             raise ValueError(
                 f"exposure_s = {self.exposure_s:g} s is longer than a frame, "
@@ -133,13 +133,13 @@ class TwinCamera:
     Source: reference study, section on the strain distribution (fig. 2), for the field's form.
 
     Example:
-        >>> camera = TwinCamera(CameraConfig(), half_width_m=0.06, free_length_m=0.05, seed=1)
+        >>> camera = TwinCamera(TwinCameraConfig(), half_width_m=0.06, free_length_m=0.05, seed=1)
         >>> camera.render([[0.080, 0.0802], [0.081, 0.081]], first_index=0).shape
         (2, 512, 512)
     """
 
     def __init__(
-        self, config: CameraConfig, half_width_m: float, free_length_m: float, seed: int
+        self, config: TwinCameraConfig, half_width_m: float, free_length_m: float, seed: int
     ) -> None:
         scale = config.scale_m_per_px
         Limits("camera seed", 0, 2**63 - 1, "").check(seed)
@@ -151,7 +151,9 @@ class TwinCamera:
         self._half_width_px = half_width_m / scale
         self._free_length_px = free_length_m / scale
         self._check_neck()
-        self._blobs = np.vstack([self._speckle(np.random.default_rng(seed)), self._fiducials()])
+        self._blobs = np.concatenate(
+            [self._speckle(np.random.default_rng(seed)), self._fiducials()]
+        )
         self._scene = self._native_scene(seed)
 
     def exposure_times_s(self, frame_times_s: ArrayLike) -> NDArray[np.float64]:
@@ -164,7 +166,7 @@ class TwinCamera:
             Times in s. Shape `(F, exposure_samples)`.
 
         Example:
-            >>> config = CameraConfig(exposure_s=1e-3, exposure_samples=2)
+            >>> config = TwinCameraConfig(exposure_s=1e-3, exposure_samples=2)
             >>> TwinCamera(config, 0.06, 0.05, seed=1).exposure_times_s([1.0])
             array([[0.99975, 1.00025]])
         """
@@ -245,10 +247,10 @@ class TwinCamera:
 
     def _positions_px(self, length_m: float) -> NDArray[np.float64]:
         length_px = self._lengths_px([[length_m]])[0, 0]
-        along, across, across_necked = self._blobs[:, :3].T
+        along, across = self._blobs["along"], self._blobs["across"]
         neck = self._contraction(length_px) * 4 * along * (1 - along)
         x_px = (self.config.width_px - 1) / 2 + self._half_width_px * (
-            across - neck * across_necked
+            across - neck * self._blobs["across_necked"]
         )
         return np.column_stack([x_px, self.config.top_px + along * length_px])
 
@@ -280,8 +282,8 @@ class TwinCamera:
     def _shape(self, lengths_px: NDArray[np.float64]) -> tuple[int, int, int]:
         return (lengths_px.shape[0], self.config.height_px, self.config.width_px)
 
-    def _speckle(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Rows S, X, X|X|^p, sigma, depth of the particles: random sequential addition."""
+    def _speckle(self, rng: np.random.Generator) -> NDArray[np.void]:
+        """The particles, by random sequential addition."""
         c = self.config
         half_x = _SIDE_MARGIN * self._half_width_px
         length = c.particle_stretch * self._free_length_px
@@ -294,21 +296,27 @@ class TwinCamera:
             if (((placed[:count] - candidate) ** 2).sum(axis=1) >= nearest**2).all():
                 placed[count] = candidate
                 count += 1
-        across = (placed[:, 0] - half_x) / self._half_width_px
-        along = c.particle_margin + placed[:, 1] / length
-        sigma = rng.uniform(c.particle_sigma_low_px, c.particle_sigma_high_px, c.particles)
-        depth = rng.uniform(c.particle_depth_low_grey, c.particle_depth_high_grey, c.particles)
-        necked = across * np.abs(across) ** c.neck_exponent
-        return np.column_stack([along, across, necked, sigma, depth])
-
-    def _fiducials(self) -> NDArray[np.float64]:
-        """Rows like those of the particles; on the clamp lines, where the field is rigid."""
-        across = (
-            np.tile([-1.0, 0.0, 1.0], 2) * self.config.fiducial_spacing_px / self._half_width_px
+        x, y = placed.T
+        across = (x - half_x) / self._half_width_px
+        blobs = np.empty(c.particles, _camera.BLOB)
+        blobs["along"], blobs["across"] = c.particle_margin + y / length, across
+        blobs["sigma_px"] = rng.uniform(
+            c.particle_sigma_low_px, c.particle_sigma_high_px, c.particles
         )
-        sigma, depth = self.config.fiducial_sigma_px, self.config.fiducial_depth_grey
-        along = np.repeat([0.0, 1.0], 3)
-        return np.column_stack([along, across, 0 * along, 0 * along + sigma, 0 * along + depth])
+        blobs["depth_grey"] = rng.uniform(
+            c.particle_depth_low_grey, c.particle_depth_high_grey, c.particles
+        )
+        blobs["across_necked"] = across * np.abs(across) ** c.neck_exponent
+        return blobs
+
+    def _fiducials(self) -> NDArray[np.void]:
+        """Dots on the clamp lines, where the field is rigid."""
+        c = self.config
+        blobs = np.zeros(6, _camera.BLOB)
+        blobs["along"] = np.repeat([0.0, 1.0], 3)
+        blobs["across"] = np.tile([-1.0, 0.0, 1.0], 2) * c.fiducial_spacing_px / self._half_width_px
+        blobs["sigma_px"], blobs["depth_grey"] = c.fiducial_sigma_px, c.fiducial_depth_grey
+        return blobs
 
     def _native_scene(self, seed: int) -> _camera.Scene:
         from scipy.special import expit  # a guardian reads rig files and needs none of this
@@ -318,12 +326,22 @@ class TwinCamera:
         x = (np.arange(c.width_px) - mid) / c.width_px
         y = (np.arange(c.height_px) - (c.height_px - 1) / 2) / c.height_px
         clamp = max(self._half_width_px, c.fiducial_spacing_px) + _CLAMP_OVERHANG_PX
-        geometry = [c.top_px, mid, self._half_width_px, self._free_length_px, c.neck_coefficient]
-        geometry += [c.edge_px, c.clamp_inside_px, c.clamp_outside_px]
-        geometry += [c.background_grey, c.sheet_grey, c.clamp_grey]
+        geometry = _camera.Geometry(
+            top_px=c.top_px,
+            mid_px=mid,
+            half_width_px=self._half_width_px,
+            free_length_px=self._free_length_px,
+            neck=c.neck_coefficient,
+            edge_px=c.edge_px,
+            clamp_inside_px=c.clamp_inside_px,
+            clamp_outside_px=c.clamp_outside_px,
+            background_grey=c.background_grey,
+            sheet_grey=c.sheet_grey,
+            clamp_grey=c.clamp_grey,
+        )
         single = np.float32
         return _camera.Scene(
-            geometry=np.array(geometry),
+            geometry=geometry,
             illumination_x=(
                 1 + c.illumination_tilt_x * x - 4 * c.illumination_vignette * x**2
             ).astype(single),
@@ -331,14 +349,15 @@ class TwinCamera:
                 single
             ),
             clamp_x=expit((clamp - np.abs(x) * c.width_px) / c.edge_px).astype(single),
-            blobs=np.ascontiguousarray(self._blobs),
-            noise=np.array([c.shot_gain_grey, c.read_noise_grey], dtype=single),
+            blobs=self._blobs,
+            shot_gain_grey=c.shot_gain_grey,
+            read_noise_grey=c.read_noise_grey,
             normal_table=_normal_table(),
             seed=seed,
         )
 
 
-def _visible_lengths(config: CameraConfig) -> Limits:
+def _visible_lengths(config: TwinCameraConfig) -> Limits:
     """Lengths at which the clamps do not touch and the lower dots are wholly in the picture."""
     dots = _DOT_REACH * config.fiducial_sigma_px
     low = 2 * max(config.clamp_inside_px + 2 * config.edge_px, dots)

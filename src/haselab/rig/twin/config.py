@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from haselab.base import InputError
-from haselab.rig.twin.camera import CameraConfig
+from haselab.rig.twin.camera import TwinCameraConfig
 from haselab.store.toml import Section, read_toml, validated
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "PLANAR_HASEL",
     "READINGS",
-    "Acquisition",
+    "AcquisitionConfig",
     "Amplifier",
     "Dielectric",
     "Electrodes",
@@ -126,7 +126,7 @@ class Amplifier(Section):
     i_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 A of output")
 
 
-class Acquisition(Section):
+class AcquisitionConfig(Section):
     """Multiplexed converter and the drive output it shares the clock with."""
 
     rate_hz: float = Field(200e3, ge=1e4, le=1e6)
@@ -157,7 +157,7 @@ class TwinConfig(Section):
     """The whole bench."""
 
     name: str = "twin"
-    kind: str = Field(PLANAR_HASEL, description="of actuator: see docs/add-an-actuator.md")
+    kind: str = Field(PLANAR_HASEL, description="of actuator: see docs/extend/add-an-actuator.md")
     actuator: dict[str, float | tuple[float, ...]] = Field(
         {}, description="parameters of another kind than planar-hasel"
     )
@@ -169,8 +169,8 @@ class TwinConfig(Section):
     load: Load = Load()
     dielectric: Dielectric = Dielectric()
     amplifier: Amplifier = Amplifier()
-    acquisition: Acquisition = Acquisition()
-    camera: CameraConfig = CameraConfig()
+    acquisition: AcquisitionConfig = AcquisitionConfig()
+    camera: TwinCameraConfig = TwinCameraConfig()
 
     @model_validator(mode="after")
     def _one_actuator(self) -> Self:
@@ -225,7 +225,7 @@ class TwinConfig(Section):
         return self.law.free_length_m
 
 
-# What the two readings of the paper's frequency axis ask of the bench (docs/adr/0003).
+# What the two interpretations of the paper's frequency axis require of the bench (ADR 3).
 READINGS: dict[str, dict[str, dict[str, float]]] = {
     "rad": {"load": {"added_inertia_kg": 9.3}, "viscosity": {"damping_n_s_per_m": 7.5}},
     "hz": {"load": {"added_inertia_kg": 0.0}, "viscosity": {"damping_n_s_per_m": 1.85}},

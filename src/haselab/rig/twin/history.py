@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from haselab.rig.twin.bench import TwinBench
+from haselab.rig.twin.twin_bench import TwinBench
 from haselab.signals import constant, triangle
 
 __all__ = ["precondition"]

@@ -1,4 +1,4 @@
-"""The program's side of the guardians: starts the two processes and notices when one is lost."""
+"""Start the two guardian processes from the program and notice when one of them is lost."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from haselab.safety.interlock import HEARTBEATS, Interlock
 
 __all__ = ["UNARMED_S", "Guardians", "guardian_command"]
 
-UNARMED_S = 86400.0  # a person may take so long until the bench is armed
-_START_S = 60.0  # drivers take seconds to load on a busy computer
+UNARMED_S = 86400.0  # longest time until a person arms the bench
+_START_S = 60.0  # drivers need seconds to load on a busy computer
 _BYE_S = 2.0
 _ACT_S = 12.0  # three instruments over a network, each tried twice
-_EVERY_S = 0.05  # between two looks at their pipes
+_EVERY_S = 0.05  # between two checks of their pipes
 
 
 def guardian_command(path: Path) -> tuple[str, ...]:
-    """The command of a guardian of a real bench, without slot and log.
+    """Return the command that starts a guardian of a real bench, without slot and log.
 
     Args:
         path: of the rig file.
@@ -35,15 +35,15 @@ def guardian_command(path: Path) -> tuple[str, ...]:
 
 
 class _Process:
-    """One guardian."""
+    """One guardian process."""
 
     def __init__(self, command: Sequence[str], slot: int) -> None:
         self.slot = slot
         self.name = f"Guardian {slot + 1}"
-        self.said = ""  # its outcome, once it has acted
+        self.result = ""  # what it did, once it has acted
         self.fault = ""
         self.acting = False
-        self.pid = 0  # once it is ready
+        self.pid = 0  # known once it is ready
         self._program = os.getpid()
         self._heard = b""
         self._heartbeat = Heartbeat()
@@ -53,7 +53,7 @@ class _Process:
         )  # fmt: skip
 
     def is_ready(self, word: str, key: str) -> bool:
-        """Whether its first line says that it watches over this bench."""
+        """Whether its first line confirms that it watches this bench."""
         verb, _, rest = word.partition(" ")
         pid, _, named = rest.partition(" ")
         self.pid = int(pid) if pid.isdecimal() else 0
@@ -61,20 +61,20 @@ class _Process:
 
     @property
     def out(self) -> int:
-        """Descriptor of what it says."""
+        """File descriptor of its output."""
         assert self.process.stdout is not None
         return self.process.stdout.fileno()
 
-    def say(self, line: str) -> None:
-        """One line to it; where it has ended, `lost` says so. A fork says nothing."""
+    def send(self, line: str) -> None:
+        """Send it one line; if it has ended, `lost` reports it. A fork sends nothing."""
         if os.getpid() != self._program:
             return
         assert self.process.stdin is not None
         with contextlib.suppress(OSError):
             os.write(self.process.stdin.fileno(), line.encode() + b"\n")
 
-    def next_word(self, wait_s: float) -> str | None:
-        """The next line that it says; None where there is none in time."""
+    def next_line(self, wait_s: float) -> str | None:
+        """Return its next line of output, or None if none comes in time."""
         if b"\n" not in self._heard:
             ready, _, _ = select.select([self.out], [], [], max(0.0, wait_s))
             self._heard += os.read(self.out, 4096) if ready else b""
@@ -83,37 +83,37 @@ class _Process:
         line, _, self._heard = self._heard.partition(b"\n")
         return line.decode(errors="replace")
 
-    def hear(self) -> None:
-        """Take in what it has said."""
-        while (word := self.next_word(0.0)) is not None:
+    def receive(self) -> None:
+        """Read its output so far."""
+        while (word := self.next_line(0.0)) is not None:
             verb, _, rest = word.partition(" ")
             self.acting = True
             if verb == "acted":
-                self.said = f"{self.name} made the bench safe: {rest}."
+                self.result = f"{self.name} made the bench safe: {rest}."
             elif verb == "tried":
-                self.said = f"{self.name} could not make the bench safe ({rest})."
+                self.result = f"{self.name} could not make the bench safe ({rest})."
                 self.fault = rest
 
     def lost(self, beats: int, now_s: float) -> str:
-        """Why it does not watch; empty while it does."""
+        """Why it no longer watches the bench; empty while it does."""
         silent_s = self._heartbeat.silent_s(beats, now_s)
-        if self.said:
-            return self.said
+        if self.result:
+            return self.result
         if silent_s > SILENT_S:
             return (
                 f"{self.name} (process {self.pid}) has not responded for {silent_s:.2g} s. "
-                "Close other programs, then start the command again."
+                "Close other programs, then run the command again."
             )
         return ""
 
     def works(self) -> bool:
-        """Whether an outcome may still come."""
+        """Whether it may still report a result."""
         ended = self.process.poll() is not None
-        self.hear()
-        return not (self.said or ended)
+        self.receive()
+        return not (self.result or ended)
 
     def close(self) -> None:
-        """After a good-bye; one that does not end is killed."""
+        """Wait until it ends after `bye`; kill it if it does not."""
         if os.getpid() != self._program:
             return
         try:
@@ -123,18 +123,18 @@ class _Process:
             self.process.wait()
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
-                with contextlib.suppress(OSError):  # what was left to write had no reader
+                with contextlib.suppress(OSError):  # nothing reads what was left to write
                     pipe.close()
 
 
 class Guardians:
-    """Two independent processes that make the bench safe when this one, or one of them, is gone.
+    """Two independent processes that make the bench safe when this program or one of them dies.
 
-    Use as a context: its end is a good-bye, upon which they do nothing.
+    Use as a context: at its end they are told to stop and leave the bench as it is.
 
     Args:
         command: of one guardian; slot and log are appended.
-        log: what they did is added to this file, one line of JSON each time.
+        log: file to which they append what they did, one line of JSON each time.
         interlock: of the bench, owned by this program.
         clock: monotonic, in s.
     """
@@ -154,14 +154,14 @@ class Guardians:
 
     @property
     def pids(self) -> list[int]:
-        """Of the processes."""
+        """Process numbers of the guardians."""
         return [each.pid for each in self._processes]
 
     def start(self) -> None:
-        """Start both and wait until they watch.
+        """Start both and wait until they watch the bench.
 
         Raises:
-            DeviceError: one does not start, or does not reach the bench.
+            DeviceError: One does not start, or cannot connect to the bench.
         """
         self._log.parent.mkdir(parents=True, exist_ok=True)
         self._interlock.lease(UNARMED_S)
@@ -172,19 +172,19 @@ class Guardians:
         ]
         end_s = self._clock() + _START_S
         for each in self._processes:
-            while (word := each.next_word(end_s - self._clock())) is None:
+            while (word := each.next_line(end_s - self._clock())) is None:
                 if self._clock() >= end_s or each.process.poll() is not None:
                     break
             if word is None or not each.is_ready(word, self._interlock.key):
                 self.close()
-                why = (word or "no answer").removeprefix("failed ")
+                why = (word or "it did not respond").removeprefix("failed ")
                 raise DeviceError(
                     f"{each.name} did not start: {why}. Nothing was energised. Run 'haselab rig "
                     "check' on this rig file."
                 )
 
     def lost(self) -> str:
-        """Why one of them does not watch any more, or what it did; empty while both watch."""
+        """Why one of them no longer watches, or what it did; empty while both watch."""
         self._lost = self._lost or self._look()
         return self._lost
 
@@ -195,11 +195,11 @@ class Guardians:
         if now_s - self._looked_s >= _EVERY_S:
             self._looked_s = now_s
             for each in self._processes:
-                each.hear()
+                each.receive()
                 code = each.process.poll()
-                if code is not None and not each.said:
+                if code is not None and not each.result:
                     return (
-                        f"{each.name} has ended (exit code {code}). Start the command again; if it "
+                        f"{each.name} has ended (exit code {code}). Run the command again; if it "
                         "ends again, find out what ends it."
                     )
         count = self._interlock.heartbeat_count
@@ -207,17 +207,17 @@ class Guardians:
         return next((why for why in found if why), "")
 
     def make_safe(self, reason: str) -> None:
-        """Ask both to act now; the second one finds what the first has done. Never raises.
+        """Request 0 V from both now; the second one finds what the first has done. Never raises.
 
         Args:
             reason: for the log.
         """
         for each in self._processes:
-            each.say(f"safe {' '.join(reason.split())}")
+            each.send(f"safe {' '.join(reason.split())}")
             each.acting = True
 
     def outcome(self) -> str:
-        """Wait for what came of `make_safe`. Never raises.
+        """Wait for the result of `make_safe`. Never raises.
 
         Returns:
             Why the bench is not known to be safe; empty as soon as one guardian has confirmed it.
@@ -225,27 +225,27 @@ class Guardians:
         end_s = self._clock() + _ACT_S
         while self._clock() < end_s:
             working = [each for each in self._processes if each.works()]
-            if any(each.said and not each.fault for each in self._processes):
+            if any(each.result and not each.fault for each in self._processes):
                 return ""
             if not working:
                 break
             select.select([each.out for each in working], [], [], 0.05)
         faults = [
-            f"{each.name}: {each.fault or 'no answer'}" for each in self._processes if each.acting
+            f"{each.name}: {each.fault or 'no reply'}" for each in self._processes if each.acting
         ]
         return "; ".join(faults) or "no guardian was started"
 
     def close(self) -> None:
-        """Good-bye: they end and do nothing; one at work is waited for. Never raises.
+        """Stop the guardians without action; wait for one that is acting. Never raises.
 
         Safe to call twice.
         """
         for each in self._processes:
-            each.hear()
-        if any(each.acting and not each.said for each in self._processes):
+            each.receive()
+        if any(each.acting and not each.result for each in self._processes):
             self.outcome()
         for each in self._processes:
-            each.say("bye")
+            each.send("bye")
         for each in self._processes:
             each.close()
         self._processes = []

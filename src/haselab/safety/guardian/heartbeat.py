@@ -1,18 +1,18 @@
-"""Whether a counter in shared memory still goes on, judged fairly on a busy computer."""
+"""Detect a stopped counter in shared memory, without false alarms on a busy computer."""
 
 from __future__ import annotations
 
 __all__ = ["SILENT_S", "Heartbeat"]
 
-SILENT_S = 0.25  # a guardian that has not counted for so long is lost
-_LONGEST_S = 0.04  # that one look may add: where the whole computer paused, nobody was silent
+SILENT_S = 0.25  # a guardian whose counter stopped for longer is lost
+_LONGEST_S = 0.04  # most that one check may add: a pause of the whole computer must not count
 
 
 class Heartbeat:
-    """Adds up the time in which a counter stood still.
+    """Adds up the time in which a counter did not change.
 
-    Only time in which the observer itself looked often counts, so a pause of the whole computer is
-    not taken for the silence of one process.
+    Only time in which the observer itself checked often counts, so that a pause of the whole
+    computer is not mistaken for the failure of one process.
     """
 
     def __init__(self) -> None:
@@ -21,13 +21,13 @@ class Heartbeat:
         self._silent_s = 0.0
 
     def silent_s(self, count: int, now_s: float) -> float:
-        """How long the counter has stood still.
+        """Return how long the counter has not changed.
 
         Args:
             count: its value now.
             now_s: monotonic clock, in s.
         Returns:
-            Time in s, 0 where it has changed since the last look.
+            Time in s; 0 if it has changed since the last check.
         """
         step_s, self._look_s = min(now_s - self._look_s, _LONGEST_S), now_s
         self._silent_s = 0.0 if count != self._last else self._silent_s + step_s

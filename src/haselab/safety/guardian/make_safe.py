@@ -1,4 +1,4 @@
-"""A bench made safe from outside, over connections of its own, whoever holds the instruments."""
+"""Make a bench safe from another process, over separate connections to its instruments."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from haselab.safety.interlock import Interlock
 
 __all__ = ["make_safe", "revoke_and_make_safe"]
 
-_WARM_S = 1.0  # a connection that stood has to do it in this time; then a new one is made
+_WARM_S = 1.0  # time limit for the open connection; after it a new one is made
 _HEAD_START_S = 0.05
-_WITHIN_S = 5.0  # the longest that an instrument is waited for
-_REFUSED_S = 3.0  # that an instrument is tried which refuses the connection
+_WITHIN_S = 5.0  # longest wait for an instrument
+_REFUSED_S = 3.0  # how long to retry an instrument that refuses the connection
 _NO_KEY = (
     "permission NOT revoked: the board reports no serial number and the rig file has none. Other "
-    "programs may still energise this bench: stop them, and set daq.serial_number"
+    "programs may still energise this bench. Stop them, and set daq.serial_number"
 )
 _NO_BOARD = (
-    "permission NOT revoked: the driver of the board, which knows the bench, cannot be used. Stop "
-    "the program that uses this bench"
+    "permission NOT revoked: the driver of the board, which identifies the bench, cannot be used. "
+    "Stop the program that uses this bench"
 )
-_CALL_S = 0.15  # that a call of the program is waited for before acting all the same
+_CALL_S = 0.15  # longest wait for a call of the program before acting anyway
 
 
 def revoke_and_make_safe(config: BenchConfig | BenchOutputs, reason: str) -> list[tuple[str, str]]:
-    """Take a bench from whoever uses it: revoke the permission, then take all to 0 V.
+    """Revoke the permission of the program that uses a bench, then take everything to 0 V.
 
     Args:
         config: of the bench.
-        reason: that the next arming has to acknowledge.
+        reason: text that the next arming has to acknowledge.
     Returns:
-        As `make_safe`; and `interlock` with what is wrong where the permission was not revoked.
+        As `make_safe`; and `interlock` with the fault if the permission was not revoked.
     """
     daq = _daq_of(config)
     if daq is None:
@@ -48,7 +48,7 @@ def revoke_and_make_safe(config: BenchConfig | BenchOutputs, reason: str) -> lis
     board, section = daq
     link: DaqConnection | None = None
     key = board.key_of(section)
-    with contextlib.suppress(DeviceError):  # the board's own row says so
+    with contextlib.suppress(DeviceError):  # reported in the board's own row
         link = board.connect(section)
         key = link.key
     try:
@@ -91,14 +91,14 @@ def _behind(
         return safe
 
     interlock.make_safe(act, _CALL_S)
-    for other in others:  # a call of its program could have followed
+    for other in others:  # its program could have made another call
         with contextlib.closing(other):
             other.make_safe(act, _CALL_S)
     return [*found, ("interlock", unrecorded)] if unrecorded else found
 
 
 def _daq_of(config: BenchConfig | BenchOutputs) -> tuple[DaqInstrument[Any], Any] | None:
-    """The board's driver and section; None where its driver cannot be used."""
+    """The board's driver and section; None if its driver cannot be used."""
     for each in config.instruments():
         if isinstance(each.instrument, DaqInstrument):
             return each.instrument, each.config
@@ -108,16 +108,16 @@ def _daq_of(config: BenchConfig | BenchOutputs) -> tuple[DaqInstrument[Any], Any
 def make_safe(
     config: BenchConfig | BenchOutputs, link: DaqConnection | None = None
 ) -> list[tuple[str, str]]:
-    """Shut every instrument down, all at once: one that hangs does not keep the others.
+    """Shut all instruments down in parallel, so that one that hangs does not delay the others.
 
-    The board has a head start, since it has the high voltage. Each instrument is shut down by its
-    own driver, see `OutputInstrument.shut_down`, over a connection of its own.
+    The board is first, since it sets the high voltage. Each instrument is shut down by its own
+    driver, see `OutputInstrument.shut_down`, over a separate connection.
 
     Args:
         config: of the bench.
-        link: to the board, where one stands already; another one is made if it fails.
+        link: open connection to the board, if there is one; a new one is made if it fails.
     Returns:
-        For each instrument its section and what is wrong, empty where it is off.
+        For each instrument its section and its fault, which is empty if the instrument is off.
     """
     until_s = time.monotonic() + _WITHIN_S
     under_way = []
@@ -134,7 +134,7 @@ def make_safe(
 
 
 class _BackgroundCall:
-    """An act in a thread of its own, which the end of the program does not wait for."""
+    """A call in its own thread, for which the end of the program does not wait."""
 
     def __init__(self, act: Callable[[], object], name: str, trials: int = 2) -> None:
         self._error: Exception | None = None
@@ -143,22 +143,23 @@ class _BackgroundCall:
         self._thread.start()
 
     def _run(self) -> None:
-        for _ in range(self._trials):  # the program may take what was meant for us
+        for _ in range(self._trials):  # the program may have read our reply
             self._error = quietly(self._act)
             if self._error is None:
                 return
 
     def fault(self, wait_s: float) -> str:
-        """What is wrong; empty if the act is done within this time."""
+        """The error of the call; empty if it succeeds within this time."""
         self._thread.join(max(0.0, wait_s))
-        found = "" if self._error is None else str(self._error)  # of the first trial, if two
+        # of the first attempt, while the second one runs
+        found = "" if self._error is None else str(self._error)
         if self._thread.is_alive():
             return found or "timed out while waiting for a reply"
         return found
 
 
 def _shut_down_daq(board: DaqInstrument[Any], section: Any, link: DaqConnection | None) -> None:
-    """Over the connection that stands; over a new one where that does not do it in time."""
+    """Use the open connection first, then a new one if that does not succeed in time."""
     if link is not None and not _BackgroundCall(link.shut_down, "warm").fault(_WARM_S):
         return
     board.shut_down(section, _REFUSED_S)

@@ -1,17 +1,16 @@
 """`python -m haselab.safety.guardian.process RIG.toml SLOT LOG`: one of a bench's two guardians.
 
-It loads the drivers, reaches the board over a connection of its own, and prints `ready PROCESS
-KEY`. Then it watches, every 20 ms, and makes the bench safe when
+It loads the drivers, opens its own connection to the board, and prints `ready PROCESS KEY`. Then it
+checks every 20 ms and makes the bench safe when
 
-- its stdin ends or its parent changes: the program is gone;
-- the program's lease in the interlock has run out: the program is stopped or hangs;
-- the other guardian has stopped counting while the bench is live;
-- it is ended by SIGTERM, or reads `safe REASON` on stdin.
+- its stdin ends or its parent changes: the program has ended;
+- the program's lease in the interlock has expired: the program is stopped or hangs;
+- the other guardian's counter has stopped while the bench is live;
+- it receives SIGTERM, or reads `safe REASON` on stdin.
 
-Making safe revokes the permission first, so that no program can energise the bench again without
-a new arming. What it did is one line of JSON in LOG; on stdout it says `acting`, then `acted
-REASON`, or `tried REASON: FAULTS` where an instrument did not confirm that it is off. The line
-`bye` ends it.
+It revokes the permission first, so that no program can energise the bench without arming again.
+It appends what it did to LOG, as one line of JSON, and prints `acting`, then `acted REASON`, or
+`tried REASON: FAULTS` if an instrument did not confirm that it is off. The line `bye` ends it.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from haselab.safety.interlock import HEARTBEATS, Interlock
 __all__ = ["main"]
 
 _TICK_S = 0.02
-_WAIT_S = 0.15  # for a call under way, or for the other guardian at work
+_WAIT_S = 0.15  # for a running call, or for the other guardian
 _REAL_TIME, _NICENESS = 1, -10
 
 
@@ -55,7 +54,7 @@ class _Guardian:
         self._text = b""
 
     def watch(self) -> None:
-        """Until the program says good-bye, or the bench had to be made safe."""
+        """Watch until the program sends `bye` or the bench had to be made safe."""
         self.interlock.count_heartbeat(self._slot)
         _say(f"ready {os.getpid()} {self.interlock.key}")
         while True:
@@ -72,12 +71,12 @@ class _Guardian:
                 return
 
     def ended(self, number: int, frame: FrameType | None) -> None:
-        """Somebody ends this guardian: the bench is not left alone."""
+        """Handle SIGTERM: make the bench safe before this guardian ends."""
         del frame
         self._ended = f"the guardian received {signal.Signals(number).name}"
 
     def _word(self) -> str:
-        """`bye`, or why to act."""
+        """Read a line from the program: `bye`, or why to act."""
         data = os.read(0, 4096)
         if not data:
             return "the program has ended"
@@ -106,14 +105,14 @@ class _Guardian:
     def _act(self, reason: str) -> None:
         _say("acting")
         begun_s = time.monotonic()
-        with contextlib.suppress(OSError):  # nothing comes before 0 V
+        with contextlib.suppress(OSError):  # 0 V comes first
             if self.interlock.live or not self.interlock.reason:
                 self.interlock.revoke(f"{reason[:1].upper()}{reason[1:]}")
         found: list[tuple[str, str]] = []
 
         def act() -> bool:
             revision = self.interlock.revision
-            if self.interlock.confirmed_safe:  # by the other guardian
+            if self.interlock.confirmed_safe:  # the other guardian was faster
                 return True
             found[:] = make_safe(self._config, self._link)
             safe = not any(fault for _, fault in found)
@@ -139,27 +138,27 @@ class _Guardian:
                 for name, fault in found
             ],
         }
-        with contextlib.suppress(OSError):  # a full disk keeps nobody from 0 V
+        with contextlib.suppress(OSError):  # a full disk must not delay 0 V
             log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             os.write(log, (json.dumps(record) + "\n").encode())
             os.close(log)
 
 
 def _confirmation(name: str, fault: str) -> dict[str, bool]:
-    """What the log claims of an instrument: the board's output is commanded, not measured."""
+    """Log entry of an instrument; the board's output is commanded, not measured."""
     if name == "daq":
         return {"commanded_0_v": not fault, "measured": False}
     return {"confirmed_off": not fault}
 
 
 def _say(word: str) -> None:
-    """One line to the program, which may have ended."""
+    """Print one line for the program, which may have ended."""
     with contextlib.suppress(OSError):
         os.write(1, word.encode() + b"\n")
 
 
 def _raise_priority() -> None:
-    """Before other programs, where the system allows it: a guardian computes nothing."""
+    """Raise this process's priority if the system allows it; it needs little processor time."""
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(_REAL_TIME))
     except (AttributeError, OSError):
@@ -168,22 +167,22 @@ def _raise_priority() -> None:
 
 
 def main(words: list[str]) -> str:
-    """Watch over a bench.
+    """Run one guardian.
 
     Args:
-        words: rig file, slot of the heartbeat, log.
+        words: rig file, slot of the heartbeat, log file.
     Returns:
-        Why it could not; empty after a good-bye or after it has acted.
+        Why it could not watch; empty after `bye` or after it has acted.
     """
-    for name in ("SIGINT", "SIGHUP", "SIGPIPE"):  # they are meant for the program
+    for name in ("SIGINT", "SIGHUP", "SIGPIPE"):  # these are for the program
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     path, slot, log = Path(words[0]), int(words[1]), Path(words[2])
     try:
         file = load_rig(path)
         if not isinstance(file, BenchConfig):
-            raise ValueError(f"kind is {file.kind!r}, but a guardian needs 'bench'. {path}")
-        for each in file.instruments():  # drivers are slow to load
+            raise ValueError(f"kind is {file.kind!r}, but a guardian needs kind = 'bench'. {path}")
+        for each in file.instruments():  # drivers load slowly
             with contextlib.suppress(Exception):  # `shut_down` reports what is missing
                 each.instrument.check_driver()
         link = daq_of(file.daq).connect(file.daq)

@@ -1,4 +1,4 @@
-"""Deadlines of a loop on a rig that runs by the wall clock: late and missed ticks, counted."""
+"""Count late and missed ticks of a loop on a real-time rig."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 __all__ = ["Deadlines", "Ticks"]
 
-_WINDOW = 100  # ticks over which late ones are limited
-_SOONEST = 16  # blocks among which the soonest gives the offset of the two clocks
+_WINDOW = 100  # ticks over which late ones are counted
+_SOONEST = 16  # blocks among which the earliest gives the offset of the two clocks
 
 
 @dataclass(frozen=True)
 class Ticks:
-    """What a loop has made of its deadlines.
+    """How well a loop met its deadlines.
 
     Args:
         count: ticks in all.
-        late: outputs given when more than half of the time for it was gone.
+        late: outputs given after more than half of the available time.
         missed: outputs given so late that they took effect too late.
         worst_s: longest time from the end of a block to the next output, in s.
     """
@@ -38,14 +38,13 @@ class Ticks:
 class Deadlines:
     """Compares the wall clock with the rig's clock at each output.
 
-    The end of a block on the rig's clock is known on the wall clock from the block that arrived
-    soonest among the last ones, whatever the clocks' zero is. A rig whose clock stands still for
-    a moment, as a served twin's may, is forgiven after as many blocks.
+    The block that arrived earliest among the last ones gives the offset of the two clocks. A rig
+    whose clock pauses, as a served twin's may, is compensated after as many blocks.
 
     Args:
-        deadline_s: from the end of a block to its output: a block, and one for each output queued.
-        missed_limit: as many missed ticks in a row are one too many.
-        late_limit: as many late ticks in the last hundred are one too many.
+        deadline_s: from the end of a block to its output: one block, plus one per queued output.
+        missed_limit: number of missed ticks in a row that is a fault.
+        late_limit: number of late ticks in the last hundred that is a fault.
         clock: monotonic, in s.
     """
 
@@ -56,13 +55,13 @@ class Deadlines:
         self._missed_limit, self._late_limit = missed_limit, late_limit
         self.start()
 
-    def start(self, foreseen_s: float = 0.0) -> None:
-        """Count from here.
+    def start(self, queued_s: float = 0.0) -> None:
+        """Start counting.
 
         Args:
-            foreseen_s: so much later an output may be given, since it waits in the device already.
+            queued_s: extra time for each output, because so many are queued in the device.
         """
-        self._deadline_s = self._usual_s + foreseen_s
+        self._deadline_s = self._usual_s + queued_s
         self._count = self._late = self._missed = self._row = 0
         self._worst_s = 0.0
         self._ahead_s: deque[float] = deque(maxlen=_SOONEST)
@@ -70,7 +69,7 @@ class Deadlines:
         self._pending_s: float | None = None
 
     def arrived(self, rig_s: float) -> None:
-        """A block has arrived.
+        """Note that a block has arrived.
 
         Args:
             rig_s: the rig's clock at its last sample.
@@ -79,7 +78,7 @@ class Deadlines:
         self._pending_s = rig_s
 
     def answered(self) -> str:
-        """The next output has been given; why the loop has to stop, empty if it need not."""
+        """Note that the next output was given; return why the loop must stop, or an empty text."""
         if self._pending_s is None:
             return ""
         delay_s = self._clock() - self._pending_s - min(self._ahead_s)
@@ -106,10 +105,10 @@ class Deadlines:
     def _fault(self, what: str) -> str:
         return (
             f"Lost deadline: {what} (worst {1e3 * self._worst_s:.1f} ms, limit "
-            f"{1e3 * self._deadline_s:g} ms). Close other programs, or set a longer block_samples."
+            f"{1e3 * self._deadline_s:g} ms). Close other programs, or set block_samples higher."
         )
 
     @property
     def ticks(self) -> Ticks:
-        """Counted since `start`."""
+        """Ticks counted since `start`."""
         return Ticks(self._count, self._late, self._missed, self._worst_s)

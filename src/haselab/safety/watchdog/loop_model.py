@@ -1,4 +1,4 @@
-"""What a closed loop is expected to look like: strain and capacitance range, static strain."""
+"""Expected values of a closed loop: strain and capacitance range, static strain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from haselab.rig import RigDescription
 __all__ = ["LoopModel", "capacitance_range", "loop_model"]
 
 _GRID = 501
-_REAL = 1e-9  # imaginary part of a root, relative, that is rounding
+_REAL = 1e-9  # relative imaginary part of a root that is a rounding error
 
 
 @dataclass(frozen=True)
@@ -25,16 +25,16 @@ class LoopModel:
         block_s: length of a block.
         strain_low: lower end of the strain range of the voltage map.
         strain_high: upper end of it.
-        map_drive_v: drive voltages, rising, shape `(N,)`.
+        map_drive_v: drive voltages in rising order. Shape `(N,)`.
         map_strain: static strain at each. Shape `(N,)`.
         drive_reach_v: largest drive voltage in magnitude.
         gain: of the amplifier.
-        carrier_v: peak of the sensing signal ahead of the amplifier.
+        carrier_v: peak of the sensing signal at the amplifier's input.
         code_per_v: codes of the voltage monitor per volt of drive.
         level: samples of a block whose mean is the level of the output: settled, and whole periods
             of the carrier.
-        queued: outputs that wait before they take effect.
-        capacitance_map: factors of the strain map, see `capacitance_range`; None where
+        queued: number of queued outputs.
+        capacitance_map: coefficients of the strain map, see `capacitance_range`; None if the
             strain does not come from the capacitance.
     """
 
@@ -65,14 +65,14 @@ def loop_model(
     settle_s: float,
     capacitance_map: tuple[float, float, float, float] | None,
 ) -> LoopModel:
-    """The model of a loop on a rig.
+    """Build the model of a loop on a rig.
 
     Args:
         rig: nominal values.
         voltage_map: static strain to drive.
-        saturation: lowest and highest strain that the loop asks the map for.
-        carrier: frequency in Hz and peak ahead of the amplifier in V.
-        settle_s: what the output takes to settle.
+        saturation: lowest and highest strain that the loop passes to the map.
+        carrier: frequency in Hz and peak at the amplifier's input in V.
+        settle_s: settling time of the output.
         capacitance_map: see `LoopModel`.
     """
     low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
@@ -101,14 +101,14 @@ def loop_model(
 def capacitance_range(
     strain_map: tuple[float, float, float, float], strain_low: float, strain_high: float
 ) -> tuple[float, float]:
-    """Capacitances of a strain range, in F, on the branch of the map that begins at 0 F.
+    """Capacitances of a strain range, in F, on the branch of the map that starts at 0 F.
 
     Args:
         strain_map: slope (1/F), offset, curvature (1/F^2) and cubic factor (1/F^3).
         strain_low: lower end.
         strain_high: upper end.
     Returns:
-        Lowest and highest; where the branch does not reach an end, 0 or the place where it turns.
+        Lowest and highest; if the branch does not reach an end, 0 or its turning point.
     """
     factors = np.array(strain_map)[[3, 2, 0, 1]] * [1e-27, 1e-18, 1e-9, 1.0]  # falling powers, nF
     turn = min(_positive(np.polyder(factors)), default=math.inf)
@@ -116,7 +116,7 @@ def capacitance_range(
     for strain in (strain_low, strain_high):
         shifted = factors - [0.0, 0.0, 0.0, strain]
         reached = [root for root in _positive(shifted) if root <= turn]
-        outward = shifted[3] * factors[2] < 0.0  # the branch goes towards the strain
+        outward = shifted[3] * factors[2] < 0.0  # the branch approaches the strain
         ends.append(min(reached, default=turn if outward else 0.0))
     return 1e-9 * min(ends), 1e-9 * max(ends)
 

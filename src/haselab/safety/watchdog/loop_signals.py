@@ -1,4 +1,4 @@
-"""Checks of single signals of a closed loop: range, repetition, jumps, oscillation, delay."""
+"""Checks of individual signals of a closed loop: range, repetition, jumps, oscillation, delay."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from haselab.safety.watchdog.settings import WatchdogSettings
 __all__ = ["WINDOW_S", "Delay", "Jumps", "Plausible", "Repeats", "Swings"]
 
 WINDOW_S = 0.5
-_MEMORY_S = 1.0  # in which a value may not come again and again
+_MEMORY_S = 1.0  # window in which a value must not repeat often
 _CHATTER_S = 0.2
 _SLOW_S = 3.0
-_SCATTER = 6.0  # times the recent RMS that a single change may be above its limit
-_ASKED = 2  # reversals of the drive that one of the reference explains: there, and back
-_REFERENCE_SWING = 0.01  # of the strain range: a reversal of the reference
+_SCATTER = 6.0  # a single change may exceed its limit by this multiple of the recent RMS
+_ASKED = 2  # reversals of the drive explained by one of the reference: there, and back
+_REFERENCE_SWING = 0.01  # smallest reversal of the reference, as a fraction of the strain range
 _LAGS = 10
-_FOLLOWED = 24  # blocks that are compared at each lag
+_FOLLOWED = 24  # blocks compared at each lag
 _LAG_EVERY = 3
-_LAG_RATIO = 3.0  # of residuals, from the lag that should be to the one that fits best
-_LEAST_CODES = 1.0  # of residual; less is noise of the converter
+_LAG_RATIO = 3.0  # ratio of residuals: expected lag to best lag
+_LEAST_CODES = 1.0  # smallest residual; less is converter noise
 
 
 class Plausible:
-    """Strain and capacitance are finite and within what the maps were calibrated for."""
+    """Check that strain and capacitance are within the calibrated range of the maps."""
 
     def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
         margin = settings.range_margin * model.range
@@ -38,7 +38,7 @@ class Plausible:
             self._farad = capacitance_range(model.capacitance_map, self._low, self._high)
 
     def fault(self, strain: float, capacitance_f: float | None) -> str:
-        """Why the loop must stop; NaN is no value and is counted elsewhere."""
+        """Return why the loop must stop, or an empty text; missing values (NaN) are ignored."""
         low_f, high_f = self._farad
         if capacitance_f is not None and not low_f <= capacitance_f <= high_f:
             return (
@@ -54,7 +54,7 @@ class Plausible:
 
 
 class Repeats:
-    """A measured signal with noise never repeats itself exactly."""
+    """Detect a frozen signal: a measured signal with noise never repeats itself exactly."""
 
     def __init__(self, what: str, block_s: float, repeat_s: float, advice: str) -> None:
         self._what, self._advice = what, advice
@@ -66,7 +66,7 @@ class Repeats:
         self._again = self._same = 0
 
     def fault(self, value: float) -> str:
-        """Why the loop must stop; a block is given by its hash."""
+        """Return why the loop must stop, or an empty text; pass a block by its hash."""
         counts = self._counts
         self._again = self._again + 1 if value in counts else 0
         self._same = self._same + 1 if value == self._last else 0
@@ -81,11 +81,11 @@ class Repeats:
         if self._again < self._limit:
             return ""
         how = "stuck at one value" if self._same >= self._limit else "repeating old values"
-        return f"{self._what} {how} for {self._again} in a row. {self._advice}"
+        return f"{self._what} {how} for {self._again} values in a row. {self._advice}"
 
 
 class Jumps:
-    """Inertia bounds how much the strain's rate changes from one value to the next."""
+    """Check changes of the strain rate, which the actuator's inertia limits."""
 
     def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
         self._limit = settings.jump_share * model.range
@@ -96,11 +96,11 @@ class Jumps:
         self._last: list[float] = []
 
     def clear(self) -> None:
-        """What comes next does not follow on what was."""
+        """Start anew: the next value does not follow the last one."""
         self._last = []
 
     def fault(self, strain: float, blocks: int) -> str:
-        """Why the loop must stop; `blocks` since the value before."""
+        """Return why the loop must stop, or an empty text; `blocks` have passed since the last."""
         self._last.append(strain)
         if len(self._last) < 3:
             return ""
@@ -116,8 +116,8 @@ class Jumps:
         self._sum += change * change
         if change > allowed:
             return (
-                f"Strain jumped: from {b:.4g} to {c:.4g}, its rate changed by {change:.2g} per "
-                f"block, but the actuator allows {allowed:.2g}. Check the sensor and its cables."
+                f"Strain jumped from {b:.4g} to {c:.4g}: its rate changed by {change:.2g} per "
+                f"block (limit {allowed:.2g}). Check the sensor and its cables."
             )
         chatter = math.sqrt(max(self._sum, 0.0) / len(squares))
         if len(squares) == squares.maxlen and chatter > self._chatter:
@@ -129,7 +129,7 @@ class Jumps:
 
 
 class _Reversals:
-    """Counts reversals of at least some amplitude."""
+    """Counts reversals of at least a given amplitude."""
 
     def __init__(self, amplitude: float) -> None:
         self._amplitude = amplitude
@@ -137,7 +137,7 @@ class _Reversals:
         self._direction = 0
 
     def happened(self, value: float) -> bool:
-        """Whether this value completes one."""
+        """Whether this value completes a reversal."""
         if not self._low <= value:
             self._low = value
         if not self._high >= value:
@@ -153,7 +153,7 @@ class _Reversals:
 
 
 class Swings:
-    """Oscillation of the drive beyond that of the reference, and the charging energy.
+    """Check the drive for oscillation that the reference does not explain, and for charging energy.
 
     Args:
         block_s: length of a block.
@@ -180,7 +180,7 @@ class Swings:
         self._energy = 0.0
 
     def fault(self, drive_v: float, reference: float, capacitance_f: float | None) -> str:
-        """Why the loop must stop."""
+        """Return why the loop must stop, or an empty text."""
         self._count += 1
         change = self._drive.happened(drive_v) - _ASKED * (
             reference == reference and self._reference.happened(reference)
@@ -199,7 +199,7 @@ class Swings:
                 least_v = self._settings.swing_share * self._reach_v * self._gain
                 return (
                     f"Output oscillates: {swings} swings of {least_v:.4g} V or more in "
-                    f"{window_s:g} s that the reference does not ask for (limit "
+                    f"{window_s:g} s that the reference does not contain (limit "
                     f"{per_s * window_s:g}). Lower the gains, or look for a delay in the loop."
                 )
         return ""
@@ -222,12 +222,13 @@ class Swings:
             power = f" ({watt:.2g} W)"
         return (
             f"Output charges the actuator too often: {per_s:.3g} full charges per second{power} "
-            f"(limit {self._settings.charges_per_s:g}). Lower the gains; look for noise."
+            f"(limit {self._settings.charges_per_s:g}). Lower the gains; check the sensor for "
+            "noise."
         )
 
 
 class Delay:
-    """The voltage monitor shows the drive as late as the rig file states."""
+    """Check that the voltage monitor lags the drive by no more than the rig file states."""
 
     def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
         self._model, self._allowed = model, settings.extra_delay_blocks
@@ -238,7 +239,7 @@ class Delay:
         self._counted = model.level.stop - model.level.start > 0
 
     def fault(self, codes: NDArray[np.int16], drive_v: float) -> str:
-        """Why the loop must stop."""
+        """Return why the loop must stop, or an empty text."""
         if not self._counted:
             return ""
         level = codes[self._model.level, 0]
@@ -252,16 +253,16 @@ class Delay:
         if self._against < 2:
             return ""
         return (
-            f"Delay grown: the voltage monitor follows the drive {lag} blocks "
+            f"Delay too long: the voltage monitor follows the drive {lag} blocks "
             f"({1e3 * lag * self._model.block_s:.3g} ms) later than the rig file states (limit "
-            f"{self._allowed}). Check the acquisition's buffer and what else the computer does."
+            f"{self._allowed} blocks). Check the acquisition's buffer and close other programs."
         )
 
     def _lag(self) -> int:
-        """Blocks by which the monitor is later than it should be; 0 where none is better."""
+        """Blocks by which the monitor lags more than expected; 0 if no other lag fits better."""
         level, drive = np.array(self._level), np.array(self._drive)
         level -= level.mean()
-        # Row j: the drive j blocks earlier than the one that should be in force.
+        # Row j: the drive j blocks before the one that should be in force.
         shifted = np.lib.stride_tricks.sliding_window_view(drive, _FOLLOWED)
         shifted = shifted[: _LAGS + 1][::-1]
         shifted = shifted - shifted.mean(axis=1, keepdims=True)

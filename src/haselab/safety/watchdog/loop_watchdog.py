@@ -1,4 +1,4 @@
-"""Watches a closed loop block by block: signals plausible and alive, plant and output behaving."""
+"""Monitor a closed loop block by block: its signals, the actuator's response and the output."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class LoopSample:
     """One block of a closed loop.
 
     Args:
-        strain: measured; NaN where there is none.
-        capacitance_f: that gave it; None with another sensor.
-        drive_v: in force during the block, ahead of the amplifier.
+        strain: measured; NaN if there is none.
+        capacitance_f: from which it was computed; None with another sensor.
+        drive_v: in force during the block, at the amplifier's input.
         reference: desired strain; NaN in open loop.
-        fresh: the strain is new: False while a frame of the camera holds.
-        age_s: of the frame at the end of the block; None with another sensor.
+        fresh: whether the strain is new; False while the last camera frame is reused.
+        age_s: age of the frame at the end of the block; None with another sensor.
     """
 
     strain: float
@@ -41,12 +41,12 @@ class LoopSample:
 
 
 def _blocks(block_s: float, settings: WatchdogSettings) -> Repeats:
-    advice = "The acquisition is frozen: check its link."
+    advice = "The acquisition is frozen. Check its link."
     return Repeats("Block", block_s, settings.repeat_s, advice)
 
 
 class OutputWatchdog:
-    """Watches a rig that closes its own loop: it shows blocks and its output, no strain.
+    """Watches a rig that closes its own loop and reports blocks and its output, but no strain.
 
     Args:
         rig: nominal values.
@@ -63,11 +63,11 @@ class OutputWatchdog:
         self._swings = Swings(rig.block_s, reach_v, rig.amplifier_gain, range_, settings)
 
     def fault(self, codes: NDArray[np.int16], drive_v: float, reference: float) -> str:
-        """Why the loop must stop after this block; empty if it need not.
+        """Return why the loop must stop after this block, or an empty text.
 
         Args:
             codes: of the block.
-            drive_v: that the rig reports, ahead of the amplifier.
+            drive_v: reported by the rig, at the amplifier's input.
             reference: desired strain.
         """
         return self._blocks.fault(hash(codes.tobytes())) or self._swings.fault(
@@ -81,8 +81,9 @@ class LoopWatchdog:
     Args:
         model: of the loop.
         settings: limits.
-        rating: of the dielectric; None where it is not known.
-        before_v: drive at which the actuator was at rest before the loop closes; None: it moves.
+        rating: of the dielectric; None if it is unknown.
+        before_v: drive at which the actuator was in equilibrium before the loop closes; None: it
+            was moving.
     """
 
     def __init__(
@@ -99,11 +100,11 @@ class LoopWatchdog:
             "Strain",
             model.block_s,
             settings.repeat_s,
-            "The sensor is frozen, or its steps are too coarse: check camera, monitors and cables.",
+            "The sensor is frozen, or its steps are too coarse. Check camera, monitors and cables.",
         )
         self._jumps = Jumps(model, settings)
-        # The loop's first output steps from rest. A chain that leaves nothing of a block out takes
-        # the step for a change of strain, in the block in which it comes out of the queue.
+        # The loop's first output is a step from equilibrium. A sensing chain without blanking
+        # mistakes that step for a change of strain, in the block in which it leaves the queue.
         self._stepping = model.queued + 1
         self._swings = Swings(model.block_s, model.drive_reach_v, model.gain, model.range, settings)
         self._delay = Delay(model, settings)
@@ -119,11 +120,11 @@ class LoopWatchdog:
         self._held = 1
 
     def fault(self, codes: NDArray[np.int16], sample: LoopSample) -> str:
-        """Why the loop must stop after this block; empty if it need not.
+        """Return why the loop must stop after this block, or an empty text.
 
         Args:
             codes: of the block, shape `(block_samples, 2)`.
-            sample: what the loop made of it.
+            sample: values that the loop computed from it.
         """
         return (
             self._blocks.fault(hash(codes.tobytes()))
@@ -154,7 +155,7 @@ class LoopWatchdog:
         )
 
     def _static(self, drive_v: float) -> float:
-        """Strain that a drive would hold at rest, by the voltage map."""
+        """Static strain of a drive, by the voltage map."""
         return float(np.interp(drive_v, self._model.map_drive_v, self._model.map_strain))
 
     def _gaps(self) -> str:
@@ -163,8 +164,8 @@ class LoopWatchdog:
             return ""
         return (
             f"Strain lost in {lost} of the last {len(self._lost)} blocks (limit "
-            f"{math.floor(self._settings.lost_share * window)}). Check carrier, monitors and "
-            "camera."
+            f"{math.floor(self._settings.lost_share * window)}). Check the carrier, the monitors "
+            "and the camera."
         )
 
     def _late(self, sample: LoopSample) -> str:
@@ -172,8 +173,7 @@ class LoopWatchdog:
             return ""
         return (
             f"Frame too old: taken {sample.age_s:.3g} s before the end of the block (limit "
-            f"{self._settings.frame_age_s:g} s). Check the camera's link and what else the "
-            "computer does."
+            f"{self._settings.frame_age_s:g} s). Check the camera's link, and close other programs."
         )
 
     def _field(self, sample: LoopSample) -> str:

@@ -1,4 +1,4 @@
-"""Does the strain react to the drive, and in the right direction?"""
+"""Check that the strain responds to the drive, and in the right direction."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ __all__ = ["POINTS", "Reaction", "direction_ratio"]
 
 POINTS = 50  # of a window
 _FEWEST = 30
-_LEAST_MOVE = 0.03  # of the drive in a window, part of the range: below it noise decides
+# least change of the drive in a window, as a fraction of the range; below it noise dominates
+_LEAST_MOVE = 0.03
 _NOISE_STD = 4.0
 _AGREE = 2  # evaluations in a row
-_START = 1.5  # the ratio must be so much larger where the plant is taken to be at rest
+# the ratio must be larger by this factor if the plant is assumed to start in equilibrium
+_START = 1.5
 
 Floats = NDArray[np.float64]
 _SUBSETS = [list(s) for n in (3, 2, 1) for s in itertools.combinations(range(3), n)]
@@ -25,7 +27,7 @@ _SUBSETS = [list(s) for n in (3, 2, 1) for s in itertools.combinations(range(3),
 
 @functools.cache
 def _projector(count: int, order: int) -> Floats:
-    """Takes a polynomial of this order out of `count` values."""
+    """Matrix that removes a polynomial of this order from `count` values."""
     q, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), order + 1))
     return np.asarray(np.eye(count) - q @ q.T)
 
@@ -36,9 +38,9 @@ def _residual(gram: Floats, product: Floats, energy: float) -> float:
     Args:
         gram: of the columns, shape `(3, 3)`.
         product: of the columns with the data, shape `(3,)`.
-        energy: of the data.
+        energy: sum of squares of the data.
     Returns:
-        Sum of squares that is left.
+        Sum of squares of the residuals.
     """
     least = energy
     for subset in _SUBSETS:
@@ -49,13 +51,13 @@ def _residual(gram: Floats, product: Floats, energy: float) -> float:
             continue
         if found.min() >= 0.0:
             least = min(least, energy - float(found @ product[subset]))
-            if len(subset) == 3:  # the free minimum obeys the constraint
+            if len(subset) == 3:  # the unconstrained minimum meets the constraint
                 break
     return max(least, 0.0)
 
 
 def _free(gram: Floats, product: Floats) -> Floats:
-    """Least squares without a constraint; negative where the columns depend on each other."""
+    """Unconstrained least squares; negative coefficients if the columns are linearly dependent."""
     try:
         return np.asarray(np.linalg.solve(gram, product), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -71,13 +73,13 @@ def direction_ratio(
     \omega^2(\varepsilon - g\,x - \varepsilon_0)$. Integrated twice this is linear in three
     coefficients that cannot be negative, for either sign of $g$; initial position and speed and
     $\varepsilon_0$ are a parabola, which is projected out. No parameter of the plant is needed.
-    Where the window begins with a step of the drive, the step is a parabola too; if the plant was
-    at rest before, $\varepsilon_0$ is known and only position and speed are free.
+    If the window begins with a step of the drive, the step is a parabola too; if the plant was
+    in equilibrium before, $\varepsilon_0$ is known and only position and speed are free.
 
     Args:
-        static: strain that the drive would hold at rest, $x$. Shape `(N,)`.
+        static: static strain of the drive, $x$. Shape `(N,)`.
         strain: measured. Shape `(N,)`.
-        rest: $x$ before the window, if the plant was at rest there.
+        rest: $x$ before the window, if the plant was in equilibrium there.
         floor: RMS residual below which the right sign is good enough, and 1 is returned.
     Returns:
         Ratio of the RMS residuals; about 1 or less for a plant that moves the right way.
@@ -88,9 +90,10 @@ def direction_ratio(
         [-once, -np.cumsum(once), np.cumsum(np.cumsum(static - before)), strain], axis=1
     )
     columns = _projector(len(strain), 2 if rest is None else 1) @ columns
-    columns[:, :3] /= np.linalg.norm(columns[:, :3], axis=0) + 1e-30
-    gram, energy = columns[:, :3].T @ columns[:, :3], float(columns[:, 3] @ columns[:, 3])
-    product = columns[:, :3].T @ columns[:, 3]
+    causes, effect = columns[:, :-1], columns[:, -1]
+    causes /= np.linalg.norm(causes, axis=0) + 1e-30
+    gram, energy = causes.T @ causes, float(effect @ effect)
+    product = causes.T @ effect
     if _free(gram, product).min() >= 0.0:  # the best of all fits has the right sign
         return 1.0
     right = _residual(gram, product, energy)
@@ -102,20 +105,20 @@ def direction_ratio(
 
 
 def _scatter(strain: Floats) -> float:
-    """Standard deviation of the noise, by second differences; jumps hardly count."""
+    """Standard deviation of the noise, from second differences; robust against jumps."""
     return float(np.median(np.abs(np.diff(strain, 2)))) / (0.6745 * math.sqrt(6.0))
 
 
 class Reaction:
-    """Judges a window of 0.5 s, in points of a block or more.
+    """Checks the response of the strain in a window of 0.5 s, in points of one or more blocks.
 
     Args:
-        range_: width of the strain's range.
+        range_: width of the strain range.
         move_share: see `WatchdogSettings`.
         response_share: see `WatchdogSettings`.
         ratio: see `WatchdogSettings.direction_ratio`.
-        every: blocks in a point.
-        rest: static strain of the drive before the loop closes; the plant is at rest there.
+        every: blocks per point.
+        rest: static strain of the drive before the loop closes, where the plant is in equilibrium.
     """
 
     def __init__(
@@ -137,16 +140,16 @@ class Reaction:
         self._odd = False
 
     def clear(self) -> None:
-        """What comes next does not follow on what was."""
+        """Start anew: the next value does not follow the last one."""
         self._static.clear()
         self._strain.clear()
         self._sums, self._against, self._rest = [0.0, 0.0, 0], 0, None
 
     def fault(self, static: float, strain: float) -> str:
-        """Why the loop must stop after this block.
+        """Return why the loop must stop after this block, or an empty text.
 
         Args:
-            static: strain that the drive would hold at rest.
+            static: static strain of the drive.
             strain: measured.
         """
         sums = self._sums
@@ -173,7 +176,7 @@ class Reaction:
     def _judge(self, static: Floats, strain: Floats) -> str:
         if len(strain) == POINTS and (fault := self._dead(static, strain)):
             return fault
-        floor = self._ratio * _scatter(strain)  # no fit leaves less than the noise
+        floor = self._ratio * _scatter(strain)  # no fit has smaller residuals than the noise
         ratio = direction_ratio(static, strain, floor=floor)
         if len(strain) > _FEWEST and np.ptp(static[-_FEWEST:]) > _LEAST_MOVE * self._range:
             ratio = max(ratio, direction_ratio(static[-_FEWEST:], strain[-_FEWEST:], floor=floor))
@@ -185,18 +188,18 @@ class Reaction:
         return (
             "Strain moves against the drive: a plant with the wrong sign explains the last "
             f"{len(strain) * self._every} blocks {ratio:.2g} times better than one with the right "
-            "sign. Check the strain map, the voltage map, the polarity of the monitors, that the "
-            "sensor belongs to this actuator, and that it neither drifts nor lags."
+            "sign. Check the strain map, the voltage map and the polarity of the monitors, and "
+            "that the sensor measures this actuator without drift or delay."
         )
 
     def _alive(self, strain: Floats) -> bool:
-        """The strain moves now: one that does not react shows no direction."""
+        """Whether the strain moves now; otherwise it shows no direction."""
         recent = strain[-POINTS // 2 :]
         noise = _scatter(strain)
         return float(np.ptp(recent)) > self._share * self._move + 8.0 * noise
 
     def _dead(self, static: Floats, strain: Floats) -> str:
-        """The drive went away from where it was 0.4 s ago and stayed away: did strain move?"""
+        """Check that the strain moved if the drive has left its value of 0.4 s ago for good."""
         before, after = static[: POINTS // 5], static[2 * POINTS // 5 :]
         move = max(float(after.min() - before.max()), float(before.min() - after.max()))
         if move < self._move:
@@ -208,6 +211,6 @@ class Reaction:
         if reacted > self._share * move + _NOISE_STD * noise / math.sqrt(5.0):
             return ""
         return (
-            f"Strain does not react: it moved by {reacted:.2g} while the drive moved by {move:.2g} "
-            "of static strain. Check that the sensor belongs to this actuator."
+            f"Strain does not respond: it changed by {reacted:.2g} while the drive's static strain "
+            f"changed by {move:.2g}. Check that the sensor measures this actuator."
         )

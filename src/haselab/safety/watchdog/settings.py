@@ -1,4 +1,4 @@
-"""Limits of the loop watchdog, all finite, and the check that refuses others."""
+"""Limits of the loop watchdog, which must all be finite."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ __all__ = ["FieldRating", "WatchdogSettings", "permit_expired", "require_finite"
 
 
 def require_finite(section: str, settings: Any) -> None:
-    """Refuse a limit that is not a finite number above zero: it would switch its check off.
+    """Refuse a limit that is not a finite number above zero, as it would disable its check.
 
     Args:
         section: of the rig file, for the message.
         settings: a dataclass of numbers and booleans.
     Raises:
-        InputError: infinite, not a number, zero or negative.
+        InputError: A limit is infinite, not a number, zero or negative.
     """
     for name in (field.name for field in fields(settings)):
         value = getattr(settings, name)
@@ -35,14 +35,14 @@ def require_finite(section: str, settings: Any) -> None:
 class FieldRating:
     """Electric field that the dielectric withstands, and its thickness at a known capacitance.
 
-    The volume of the dielectric does not change, so that its thickness goes with $C^{-1/2}$.
+    The volume of the dielectric is constant, so its thickness is proportional to $C^{-1/2}$.
 
     Args:
         limit_v_per_m: highest field, margin included.
         thickness_m: of the dielectric at `capacitance_f`.
         capacitance_f: of the actuator at that thickness.
     Raises:
-        InputError: a number that is not finite and above zero.
+        InputError: A number is not finite and above zero.
     """
 
     limit_v_per_m: float
@@ -53,7 +53,7 @@ class FieldRating:
         require_finite("rating", self)
 
     def field_v_per_m(self, voltage_v: float, capacitance_f: float) -> float:
-        """Field at a voltage and a sensed capacitance, both positive."""
+        """Electric field at a voltage and a sensed capacitance, both positive."""
         return voltage_v / self.thickness_m * math.sqrt(capacitance_f / self.capacitance_f)
 
 
@@ -64,26 +64,28 @@ class WatchdogSettings:
     "Range" is the strain range of the voltage map. Rates count over a window of 0.5 s.
 
     Args:
-        range_margin: how far strain may leave the range on either side, part of its width.
-        repeat_s: how long a block, strain or frame may repeat what came within the last second.
-        lost_share: part of the blocks of a window that may have no strain.
-        jump_share: change of the strain's rate from one block to the next, part of the range; six
-            times the recent scatter is added.
-        chatter_share: RMS of that change over 0.2 s, part of the range.
-        swing_share: smallest reversal of the drive that counts as a swing, part of its limits.
-        swings_per_s: swings that the reference does not make itself.
+        range_margin: how far strain may leave the range on either side, as a fraction of its
+            width.
+        repeat_s: how long a block, strain or frame may repeat values of the last second.
+        lost_share: fraction of the blocks of a window that may have no strain.
+        jump_share: change of the strain's rate from one block to the next, as a fraction of the
+            range; six times the recent scatter is added.
+        chatter_share: RMS of that change over 0.2 s, as a fraction of the range.
+        swing_share: smallest reversal of the drive that counts as a swing, as a fraction of its
+            limits.
+        swings_per_s: swings that are not part of the reference.
         slow_swings_per_s: the same over 3 s, for slow oscillations.
         charges_per_s: charging energy, $\\Delta V^2$, in full charges to the drive's limit.
-        move_share: move of the drive, in static strain, from which on strain must react, part of
-            the range.
-        response_share: reaction within the window, part of that move.
+        move_share: change of the drive, in static strain, to which strain must respond, as a
+            fraction of the range.
+        response_share: least response within the window, as a fraction of that change.
         direction_ratio: how many times better a plant that moves the wrong way may explain the
             window (RMS of residuals) than one that moves the right way.
-        extra_delay_blocks: blocks by which the monitor may lag behind the drive, besides the delay
-            that the rig file states.
-        frame_age_s: age of the frame that gives the strain, video feedback.
+        extra_delay_blocks: blocks by which the monitor may lag the drive beyond the delay that
+            the rig file states.
+        frame_age_s: largest age of the frame that gives the strain, for video feedback.
     Raises:
-        InputError: a number that is not finite and above zero.
+        InputError: A number is not finite and above zero.
     """
 
     range_margin: float = 0.5
@@ -106,7 +108,7 @@ class WatchdogSettings:
 
 
 def permit_expired(armed_s: float, permit_age_s: float) -> str:
-    """Why a bench must not stay armed any longer; empty while it may.
+    """Return why a bench must not stay armed any longer, or an empty text.
 
     Args:
         armed_s: time since it was armed, in s.

@@ -118,13 +118,13 @@ class _Cuts:
         score: penalised chi-square, infinite where too little counts.
         over: chi-square beyond its mean, in standard deviations.
         raw: the score however little counts.
-        parts: first piece, count of pieces, parameters, kind; `(blocks, pieces, 4)`.
+        parts: `part` of native/sensing/parts.h; `(blocks, pieces)`.
     """
 
     score: Floats
     over: Floats
     raw: Floats
-    parts: NDArray[np.int32]
+    parts: NDArray[np.void]
 
     def with_blocks(self, blocks: NDArray[np.intp], other: _Cuts) -> _Cuts:
         return _Cuts(*(_with(getattr(self, f.name), blocks, getattr(other, f.name))
@@ -235,7 +235,7 @@ class DriveLibrary:
             better = np.flatnonzero(cuts.score < chosen.drive.score[left])
             return self._put(chosen.drive, y, left, better, cuts, self._tau, harmonics)
         cuts = self._cuts(some, 0.0, harmonics)
-        out = self.pieces.count - cuts.parts[:, :, 1].sum(axis=1)
+        out = self.pieces.count - cuts.parts["count"].sum(axis=1)
         worse = np.flatnonzero((cuts.over > UNEXPLAINED) | (out >= _MANY))
         if worse.size:
             self._tau = self._learned(some[worse], harmonics)
@@ -274,8 +274,8 @@ class DriveLibrary:
     def _cuts(self, y: Floats, tau: float, apart: bool) -> _Cuts:
         """The best cut of each block into parts; y in standard deviations."""
         pieces = self.pieces.count
-        parts = np.zeros((len(y), pieces, 4), dtype=np.int32)
-        result = np.empty((len(y), 3))
+        parts = np.zeros((len(y), pieces), _sense.PART)
+        result = np.empty(len(y), _sense.PARTS_RESULT)
         tables = [self._parts(0.0, apart).native]
         limits = [2, min(_MOST_DEGREE_OF_PART + 1, _WIDE)]
         if tau:
@@ -285,13 +285,13 @@ class DriveLibrary:
             y, tables, [*limits, _GAP, _SPARE], [self._price, self._cut_price, _LEFT_OUT],
             parts, result,
         )  # fmt: skip
-        used = parts[:, :, 1].sum(axis=1)
-        freedom = 4.0 * used - 2.0 * parts[:, :, 2].sum(axis=1)
+        used = parts["count"].sum(axis=1)
+        freedom = 4.0 * used - 2.0 * parts["size"].sum(axis=1)
         enough = used >= max(4, pieces // 2)
         return _Cuts(
-            np.where(enough, result[:, 0], np.inf),
-            np.where(enough, _over(result[:, 1], freedom), np.inf),
-            result[:, 0],
+            np.where(enough, result["score"], np.inf),
+            np.where(enough, _over(result["misfit"], freedom), np.inf),
+            result["score"],
             parts,
         )
 
@@ -324,8 +324,11 @@ class DriveLibrary:
             return drive
         blocks, pieces = left[better], self.pieces.count
         parts = cuts.parts[better]
-        at, _ = np.nonzero(parts[:, :, 1])
-        first, count, size, kind = parts[parts[:, :, 1] > 0].T.astype(np.intp)
+        at, _ = np.nonzero(parts["count"])
+        some = parts[parts["count"] > 0]
+        first, count, size, kind = (
+            some[name].astype(np.intp) for name in ("first", "count", "size", "kind")
+        )
         carrier = np.zeros((blocks.size, 2, pieces, 2))
         used = np.zeros((blocks.size, pieces), dtype=bool)
         harmonic = np.zeros((blocks.size, 2, len(HARMONICS)), dtype=np.complex128)
@@ -371,11 +374,11 @@ class DriveLibrary:
         )
         return drive.with_blocks(blocks, put)
 
-    def _words(self, parts: NDArray[np.int32], tau: float) -> str:
+    def _words(self, parts: NDArray[np.void], tau: float) -> str:
         """What is left out, and what the parts are made of."""
         piece_ms = 1e3 * self.pieces.length / self.pieces.rate_hz
         short, long, degree, at = [], [], 0, self.pieces.count
-        for first, count, size, kind in [*parts.tolist(), [0, 0, 0, 0]]:
+        for first, count, size, kind in [*parts.tolist(), (0, 0, 0, 0)]:
             gap = at - first - count
             if gap > _MOST_OF_STEP:
                 long.append(f"transient from {piece_ms * (at - gap):.2g} to {piece_ms * at:.2g} ms")
@@ -389,7 +392,7 @@ class DriveLibrary:
         if short:
             steps = "step at " if len(short) == 1 else "steps at "
             words.insert(0, steps + " and ".join(short[::-1]))
-        if parts[:, 3].any():
+        if parts["kind"].any():
             words.append(f"tail of {1e3 * tau / self.pieces.rate_hz:.2g} ms")
         if degree > 1:
             words.append(f"drive of degree {degree}")

@@ -58,7 +58,7 @@ class BlockPlan:
 
 
 class _Choice(NamedTuple):
-    row: Floats
+    native: NDArray[np.void]
     quadrature: float
     level: float
     slope: float
@@ -116,8 +116,8 @@ def make_plan(config: LockinConfig, *, alone: bool = False, vectors: int = 512) 
         table=table,
         turn=turns,
         local=local,
-        whitening=np.array([whitening[0, 0], whitening[0, 1], whitening[1, 1]]),
-        choices=np.stack([choice.row for choice in choices]),
+        whitening=whitening,
+        choices=np.concatenate([choice.native for choice in choices]),
         period_s=1.0 / config.rate_hz,
         omega_rad_s=2.0 * np.pi * config.carrier_hz,
         full_scale=config.full_scale,
@@ -241,15 +241,13 @@ def _choice(
     level = np.array([0.0, 0.0, 1.0, 0.0, share])
     middles = starts + 0.5 * (sizes - 1)
     duration_s = n / config.rate_hz
+    native = np.zeros(1, _sense.CHOICE)
+    native["used"][0, : used.size] = used
+    native["after"][0, : after.size] = after
+    native["inverse"], native["samples"], native["after_share"] = inverse, samples, share
+    native["full"] = (used & full).sum()
     return _Choice(
-        np.concatenate(
-            [
-                np.pad(used.astype(float), (0, _ALL - used.size)),
-                np.pad(after.astype(float), (0, _ALL - used.size)),
-                inverse.ravel(),
-                [samples, float((used & full).sum()), share],
-            ]
-        ),
+        native,
         0.5 * float(inverse[0, 0] + inverse[1, 1]),
         float(level @ inverse @ level),
         float(inverse[3, 3]) / duration_s**2,

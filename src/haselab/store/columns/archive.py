@@ -1,4 +1,4 @@
-"""What a file of columns holds: members by name, read from their first value on."""
+"""The interface to files of columns: members by name, read from their first value on."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 from haselab.store.columns.units import split_header
 
 __all__ = [
@@ -103,9 +102,9 @@ class MissingColumnsError(InputError):
     """Columns that a file lacks.
 
     Args:
-        wanted: names that are not there.
-        present: names that are there.
-        file: that lacks them.
+        wanted: names that are missing.
+        present: existing names.
+        file: the file.
         advice: what to do.
     """
 
@@ -114,18 +113,16 @@ class MissingColumnsError(InputError):
         wanted: Sequence[str],
         present: Iterable[str],
         file: Path,
-        advice: str = "Name a column that is there",
+        advice: str = "Name an existing column",
     ) -> None:
         self.wanted, self.present, self.file = list(wanted), list(present), file
         listed = ", ".join(self.present[:_MOST_LISTED]) or "none"
         if len(self.present) > _MOST_LISTED:
             listed += f" and {len(self.present) - _MOST_LISTED} more"
-        super().__init__(
-            f"The file lacks {', '.join(wanted)}; present are {listed}. {advice}: {file}"
-        )
+        super().__init__(f"The file lacks {', '.join(wanted)}; it has {listed}. {advice}: {file}")
 
     def advised(self, advice: str) -> MissingColumnsError:
-        """The same error with other advice, such as the options that name the columns."""
+        """Make this error with other advice, such as the options that name the columns."""
         return MissingColumnsError(self.wanted, self.present, self.file, advice)
 
 
@@ -215,7 +212,7 @@ def _in_memory(stream: io.FileIO, place: int) -> bool:
         return False
 
 
-class Archive(ABC):
+class Archive(Closing, ABC):
     """A file of named columns.
 
     Args:
@@ -266,7 +263,7 @@ class Archive(ABC):
         return full[0] if full else self._by_name_without_unit(name)
 
     def _by_name_without_unit(self, name: str) -> str | None:
-        """The only column whose name is this one and a unit, such as `U [mV]` for U."""
+        """The only column with this name and a unit, such as `U [mV]` for U."""
         full = [
             other
             for other in self.names
@@ -279,8 +276,8 @@ class Archive(ABC):
 
     def _ambiguous(self, name: str, full: Sequence[str]) -> InputError:
         return InputError(
-            f"Column {name} is there {len(full)} times ({', '.join(full)}). "
-            f"Give the full name: {self.file}"
+            f"The file has {len(full)} columns {name} ({', '.join(full)}). "
+            f"Use the full name: {self.file}"
         )
 
     def plain_name(self, full: str) -> str:
@@ -288,7 +285,7 @@ class Archive(ABC):
         return split_header(full.rpartition("/")[2])[0]
 
     def unit_text(self, full: str) -> str:
-        """The unit that the file states for a column, as text; empty where it states none."""
+        """The unit that the file states for a column, as text; empty if there is none."""
         return split_header(full.rpartition("/")[2])[1] or split_header(full)[1]
 
     def locate_all(self, names: Sequence[str]) -> list[str]:
@@ -311,20 +308,9 @@ class Archive(ABC):
         """Close the file."""
         self._open.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
 
 class MemberArchive(Archive):
-    """A file whose columns are read each for itself.
+    """A file whose columns are read separately.
 
     Args:
         file: where it is.
@@ -339,7 +325,7 @@ class MemberArchive(Archive):
         return list(self.members)
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
-        """A member of one number that is called `rate_hz` or the like."""
+        """Value of a member of one number with a name like `rate_hz`."""
         del names
         for name in RATE_NAMES:
             full = [other for other in self.members if other.rpartition("/")[2] == name]
@@ -363,11 +349,11 @@ class MemberArchive(Archive):
         member = self.members[name]
         if member.dtype.kind not in _REAL_KINDS:
             raise InputError(
-                f"Column {name} does not hold real numbers. Export it as numbers: {self.file}"
+                f"Column {name} does not contain real numbers. Export it as numbers: {self.file}"
             )
         if member.size and max(member.shape, default=1) != member.size:
             raise InputError(
-                f"Column {name} has shape {member.shape}, but a column has one value a row. "
+                f"Column {name} has shape {member.shape}, but must have one value per row. "
                 f"Split it into columns: {self.file}"
             )
         return member.size

@@ -1,4 +1,4 @@
-"""Columns of text tables: perhaps a preamble, a header row, then rows of numbers."""
+"""Columns of text tables: an optional preamble, a header row, then rows of numbers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class CsvArchive(Archive):
         file: where it is.
         opened: closes what the archive opens.
     Raises:
-        InputError: empty, or laid out so that two meanings are possible.
+        InputError: the file is empty or ambiguous.
     """
 
     def __init__(self, file: Path, opened: contextlib.ExitStack) -> None:
@@ -77,8 +77,8 @@ class CsvArchive(Archive):
     def _several(self, name: str, places: Sequence[int]) -> InputError:
         listed = ", ".join(str(place + 1) for place in places)
         return InputError(
-            f"Column {name} is there {len(places)} times, as columns {listed}. Give the number of "
-            f"the column instead of the name: {self.file}"
+            f"The file has {len(places)} columns {name}: columns {listed}. Use the number of the "
+            f"column instead of its name: {self.file}"
         )
 
     def _by_number(self, name: str) -> str | None:
@@ -117,12 +117,12 @@ class CsvArchive(Archive):
         return self._rate_hz
 
     def rows(self, names: Sequence[str]) -> int | None:
-        """Unknown: lines are counted by reading them."""
+        """Unknown before all lines are read."""
         del names
         return None
 
     def share_read(self) -> float | None:
-        """Bytes read over those of the file."""
+        """Share of the file's bytes that has been read."""
         return self._read_bytes / max(1, self.file.stat().st_size)
 
     def start(self, names: Sequence[str]) -> Take:
@@ -131,8 +131,8 @@ class CsvArchive(Archive):
         for name, place in zip(names, places, strict=True):
             if place in self._layout.mixed:
                 raise InputError(
-                    f"Column {name} has decimal points, but other columns have decimal commas, so "
-                    "its points may separate thousands. Export the table with one decimal mark: "
+                    f"Column {name} has points, but other columns have decimal commas, so its "
+                    "points may be thousands separators. Export the table with one decimal mark: "
                     f"{self.file}"
                 )
         more = self._lines()
@@ -172,7 +172,7 @@ class CsvArchive(Archive):
 
 
 def _distinct(names: Sequence[str], cells: int) -> list[str]:
-    """A name of its own for each column."""
+    """Give each column a unique name."""
     if not names:
         return [str(k + 1) for k in range(cells)]
     if not names[-1] and len(names) > cells:
@@ -188,7 +188,7 @@ def _distinct(names: Sequence[str], cells: int) -> list[str]:
 
 
 class _Rows:
-    """Lines of a table to rows of numbers.
+    """Converts lines of a table to rows of numbers.
 
     Args:
         layout: of the table.
@@ -243,12 +243,13 @@ class _Rows:
         for name, place in zip(self._names, self._places, strict=True):
             cell = cells[place] if place < len(cells) else ""
             text = cell.replace("∞", "inf")
+            two_marks = self._decimal == "," and "." in text
             if self._decimal == ",":
-                text = text.replace(",", ".") if "." not in text else "two marks"
-            if not (is_number(cell) and _is_float(text)):
-                found = f"holds '{cell}'" if cell else "has no value"
+                text = text.replace(",", ".")
+            if two_marks or not (is_number(cell) and _is_float(text)):
+                found = f"has '{cell}'" if cell else "has no value"
                 raise InputError(
-                    f"Column {name} {found} in line {number}. Correct or remove the line: "
+                    f"Column {name} {found} in line {number}. Change or remove the line: "
                     f"{self._file}"
                 )
             row.append(float(text))

@@ -35,7 +35,7 @@ _ONE_CHUNK_BYTES = 1 << 20  # datasets in smaller chunks are read several chunks
 
 
 def chunked_reader(dataset: h5py.Dataset, axis: int, opened: contextlib.ExitStack) -> Read:
-    """Reads a dataset along one axis by whole chunks, so that none is decompressed twice.
+    """Read a dataset along one axis by whole chunks, so that none is decompressed twice.
 
     Args:
         dataset: whose other axes are read in full.
@@ -107,7 +107,7 @@ def _only_deflated(dataset: h5py.Dataset, axis: int) -> bool:
 
 
 def _load_packed(dataset: h5py.Dataset, axis: int, opened: contextlib.ExitStack) -> Load:
-    """Chunks inflated by as many threads as there are processors: HDF5 uses one."""
+    """Inflate chunks with as many threads as there are processors: HDF5 uses one."""
     pool = opened.enter_context(ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)))
     chunk, slow = dataset.chunks[axis], _load_any(dataset, axis)
     values = int(np.prod(dataset.chunks, dtype=np.int64)) // chunk
@@ -150,8 +150,8 @@ def _opened(file: Path) -> h5py.File:
     if opened.doubt:
         opened.file.close()
         raise InputError(
-            f"The numbers of this session are not verified ({opened.doubt}). Type 'haselab session "
-            f"export' and read what that writes. {file}"
+            f"The numbers of this session are not verified ({opened.doubt}). Use 'haselab session "
+            f"export' and read the exported files. {file}"
         )
     return opened.file
 
@@ -192,8 +192,8 @@ class Hdf5Archive(MemberArchive):
 
     def _lies_elsewhere(self, name: str) -> InputError:
         return InputError(
-            f"The values of {name} lie in another file, which is not read. Copy them into this "
-            f"one, for instance by h5repack. {self.file}"
+            f"The values of {name} are in another file, which is not read. Copy them into this "
+            f"one, for example with h5repack. {self.file}"
         )
 
     def _collect(self, name: str, item: Any) -> None:

@@ -1,8 +1,8 @@
 """Columns of MATLAB files of version 5 (`save -v6`, `-v7`), walked element by element.
 
 A variable is a tree of elements, each a tag (type, bytes) and data padded to 8 bytes. Only tags and
-names are read to find the arrays; their values are then read piece by piece, straight from the
-file or from the zlib stream that holds the variable.
+names are read to find the arrays; their values are then read in parts, directly from the file or
+from the zlib stream that contains the variable.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class MatArchive(MemberArchive):
         head = self._walk.read(_HEADER_BYTES)
         order = {b"IM": "<", b"MI": ">"}.get(head[126:128])
         if len(head) < _HEADER_BYTES or order is None:
-            raise ValueError("it is no MATLAB file of version 5 or 7.3")
+            raise ValueError("it is not a MATLAB file of version 5 or 7.3")
         self._order = order
         self.members = {name: member for name, member in self._variables() if name}
 

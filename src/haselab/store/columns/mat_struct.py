@@ -56,23 +56,24 @@ def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
     good, content = _loaded_aside(path)
     if not good:
         raise InputError(
-            f"not a MATLAB file of version 5 ({' '.join(str(content).split())[:80]}); allowed is "
-            f"one of save -v6 or -v7. Save it so: {path}"
+            f"The file is not a MATLAB file of version 5 ({' '.join(str(content).split())[:80]}). "
+            f"Save it with -v6 or -v7: {path}"
         )
     structs = {key: value for key, value in content.items() if isinstance(value, dict)}
     chosen = structs.get(name, next(iter(structs.values())) if len(structs) == 1 else None)
     if chosen is None:
         found = ", ".join(key for key in content if not key.startswith("__")) or "nothing"
         raise InputError(
-            f"the file holds {found}; needed is a struct `{name}`. Save it as that: {path}"
+            f"The file has the variables {found}, but no struct {name!r}. Save the struct with "
+            f"that name: {path}"
         )
     return {key: v if isinstance(v, str) else np.asarray(v) for key, v in chosen.items()}
 
 
 def _loaded_aside(path: Path) -> tuple[bool, Any]:
-    """The file's variables, or why there are none, read in a process of its own.
+    """Read the file's variables in a separate process; return them, or the error.
 
-    scipy's compiled reader crashes on some damaged files; here that ends this process alone.
+    scipy's compiled reader crashes on some damaged files; here only the separate process ends.
     """
     command = [sys.executable, "-m", __name__, str(path)]
     done = subprocess.run(command, capture_output=True, check=False)

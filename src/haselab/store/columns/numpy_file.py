@@ -118,7 +118,7 @@ class NpyArchive(Archive):
         return list(names)
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
-        """Nothing: an array states no rate."""
+        """None: an array does not state a rate."""
         del names
         return None
 
@@ -127,8 +127,8 @@ class NpyArchive(Archive):
         types = [self._dtype[name] for name in names] if self._names else [self._dtype]
         if not all(dtype.kind in "fiub" and dtype.shape == () for dtype in types):
             raise InputError(
-                f"The array holds {self._dtype}, but columns are real numbers, or fields of one "
-                f"each. Save it again: {self.file}"
+                f"The array has the type {self._dtype}, but must contain real numbers, or fields "
+                f"with one real number each. Save it again: {self.file}"
             )
         if not self._names:
             return self._shape[0] * self._shape[1] // 2

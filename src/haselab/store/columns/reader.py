@@ -1,4 +1,4 @@
-"""Named columns of numbers, piece by piece, from files that may be larger than memory."""
+"""Read named columns of numbers in parts, from files that may be larger than memory."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import contextlib
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 from haselab.store.columns.archive import Archive
 from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
@@ -51,7 +50,7 @@ _KINDS = {
 
 
 def _unreadable(file: Path, error: Exception) -> InputError:
-    """The error for a file that is damaged: its readers raise anything."""
+    """Make the error for a damaged file, for which the libraries raise any exception."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return InputError(f"The file cannot be read ({reason}). Export it again: {file}")
 
@@ -64,12 +63,12 @@ def _is_hdf5(file: Path) -> bool:
 
 
 def open_archive(path: Path | str) -> Archive:
-    """The file's columns by name; nothing but their names and places is read.
+    """Open a file of columns; only the names and places of the columns are read.
 
     Args:
         path: of a file; its ending states its kind.
     Returns:
-        What the file holds; close it.
+        The open file; close it.
     Raises:
         InputError: no such file, unknown kind, or damaged.
     """
@@ -79,8 +78,8 @@ def open_archive(path: Path | str) -> Archive:
     kind = file.suffix.lower()
     if kind not in _KINDS:
         raise InputError(
-            f"Files of the kind '{kind}' are not read. Export the data as CSV, or as one of "
-            f"{' '.join(_KINDS)}: {file}"
+            f"Files with the ending '{kind}' are not supported. Export the data as CSV, or as one "
+            f"of {' '.join(_KINDS)}: {file}"
         )
     if file.stat().st_size == 0 and kind not in _TEXT_ENDINGS:
         raise InputError(f"The file is empty. Record again: {file}")
@@ -89,7 +88,7 @@ def open_archive(path: Path | str) -> Archive:
     module, name = _KINDS[kind]
     opener: Callable[[Path, contextlib.ExitStack], Archive] = getattr(
         importlib.import_module(f"haselab.store.columns.{module}"), name
-    )  # each reader with its library when it is needed: `haselab sense` must start at once
+    )  # libraries are imported on demand: `haselab sense` must start fast
     opened = contextlib.ExitStack()
     try:
         return opener(file, opened)
@@ -107,7 +106,7 @@ def rate_of_times(time_s: NDArray[Any]) -> float | None:
     Args:
         time_s: shape `(N,)`.
     Returns:
-        Rows a second; None where the steps are uneven, not positive or not finite.
+        Rows per second; None if the steps are uneven, not positive or not finite.
     Example:
         >>> rate_of_times(np.array([0.0, 0.01, 0.02]))
         100.0
@@ -121,7 +120,7 @@ def rate_of_times(time_s: NDArray[Any]) -> float | None:
 
 
 def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
-    """Refuse a rate that is off the file's by more than 0.1 % and 1.5 rows over the record.
+    """Refuse a rate that differs from the file's by more than 0.1 % and 1.5 rows in total.
 
     Args:
         given_hz: by the user.
@@ -136,8 +135,8 @@ def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Pa
     """
     if abs(found_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
         raise InputError(
-            f"--rate-hz = {given_hz:g} contradicts {where}, which has {found_hz:.6g} rows a "
-            f"second. Leave out --rate-hz, or correct the file: {file}"
+            f"--rate-hz is {given_hz:g}, but {where} has {found_hz:.6g} rows per second. Leave out "
+            f"--rate-hz, or change the file: {file}"
         )
 
 
@@ -161,8 +160,8 @@ def pairs_of(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any] | None:
     return np.lib.stride_tricks.as_strided(one, (one.size, 2), (2 * step, step))
 
 
-class ColumnStream:
-    """Columns of one file, read piece by piece.
+class ColumnStream(Closing):
+    """Columns of one file, read in parts.
 
     Args:
         archive: what the file holds; closed with the stream.
@@ -283,31 +282,20 @@ class ColumnStream:
             first = int(np.argmax(uneven))
             row = self.rows_read + first + (1 if last_s is not None else 2)
             raise InputError(
-                f"Column {self._times} steps by {steps[first]:g} s to row {row}, before by "
-                f"{1.0 / self.rate_hz:g} s. Cut the record there, or state the rate with "
-                f"--rate-hz: {self._archive.file}"
+                f"Column {self._times} has a step of {steps[first]:g} s before row {row}, but "
+                f"{1.0 / self.rate_hz:g} s elsewhere. Split the record there, or state the rate "
+                f"with --rate-hz: {self._archive.file}"
             )
 
     def close(self) -> None:
         """Close the file."""
         self._archive.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
 
 def head_of_times(
     path: Path | str, options: ColumnOptions, rows: int
 ) -> tuple[str, NDArray[np.float64]] | None:
-    """Name and first values of the column of times, in s; None where there is none of numbers.
+    """Read the name and the first values, in s, of the column of times; None if there is none.
 
     Args:
         path: of the file.
@@ -316,7 +304,7 @@ def head_of_times(
     Returns:
         The name, and the values of shape `(rows,)` or fewer.
     Raises:
-        InputError: the column that the options name is not there or holds no numbers.
+        InputError: the column that the options name is missing or does not contain numbers.
     """
     with open_archive(path) as archive:
         name = time_column(archive, options)
@@ -347,7 +335,7 @@ def open_columns(
     use_times: bool = True,
     options: ColumnOptions = AS_THE_FILE_STATES,
 ) -> ColumnStream:
-    """Open named columns of a file for reading piece by piece.
+    """Open named columns of a file for reading in parts.
 
     Memory is needed for a piece alone, whatever the file's length; of a compressed HDF5 file also
     for one chunk of each column.

@@ -1,4 +1,4 @@
-"""What a user may state about the columns of a file: which one is the time, and units."""
+"""What a user states about the columns of a file: the column of times, and units."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiem
 
 @dataclass(frozen=True)
 class ColumnOptions:
-    """What is stated about a file's columns beyond what the file states itself.
+    """Statements of the user about the columns of a file.
 
     Args:
-        time: name of the column of times; None: it is looked for.
-        units: unit of a column by its name, such as `{"U": "mV"}`; goes before the file's.
+        time: name of the column of times; None: found by name.
+        units: units by column name, such as `{"U": "mV"}`; they override those in the file.
     """
 
     time: str | None = None
@@ -37,7 +37,7 @@ AS_THE_FILE_STATES = ColumnOptions()
 
 
 def stated_unit(archive: Archive, full: str, options: ColumnOptions) -> Unit | None:
-    """The unit of a column, from the options, else from the file; None where nobody states one.
+    """The unit of a column, from the options, else from the file; None if it is not stated.
 
     Args:
         archive: the file.
@@ -64,8 +64,8 @@ def stated_unit(archive: Archive, full: str, options: ColumnOptions) -> Unit | N
 def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = ()) -> str | None:
     """Full name of the column of times.
 
-    A column is taken for the time by its name (time, Zeit, t, X_Value and the like) when it is the
-    only one with the first of these names and its unit, if it states one, is a time.
+    A column is used as the time if it is the only one with the first of the names time, Zeit, t,
+    X_Value and the like, and if its unit, if stated, is a time.
 
     Args:
         archive: the file.
@@ -74,7 +74,7 @@ def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = 
     Returns:
         The name; None where there is none.
     Raises:
-        InputError: the column that the options name is not there or holds no times.
+        InputError: the column that the options name is missing or has no times.
     """
     if options.time is not None:
         (full,) = archive.locate_all([options.time])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
@@ -24,7 +24,7 @@ _NAMES = ("v_monitor", "i_monitor")
 
 
 def session_experiments(path: Path, *, unverified: bool = False) -> list[str] | None:
-    """Names of the experiments with blocks in a session; None where the file is no session.
+    """Names of the experiments with blocks in a session; None if the file is not a session.
 
     Args:
         path: of any file.
@@ -76,12 +76,12 @@ class _CodesArchive(Archive):
 
 
 class SessionColumns(SessionReader):
-    """A session whose codes are read piece by piece.
+    """A session whose codes are read in parts.
 
     Args:
         path: of session.h5.
         experiment: whose blocks are read.
-        unverified: read on where a checksum does not match.
+        unverified: continue if a checksum does not match.
     Raises:
         InputError: no session, damaged, no such experiment, or one without blocks.
     """
@@ -101,8 +101,8 @@ class SessionColumns(SessionReader):
         there = [name for name in self.names if self._file["experiments"][name]["codes"].shape[0]]
         if experiment not in there:
             raise InputError(
-                f"No experiment {experiment!r} with blocks; there are "
-                f"{', '.join(there) or 'none'}. Name one of them. {self._path}"
+                f"The session has no experiment {experiment!r} with blocks, only "
+                f"{', '.join(there) or 'none at all'}. Name one of them. {self._path}"
             )
         return self._file["experiments"][experiment]
 
@@ -122,6 +122,3 @@ class SessionColumns(SessionReader):
         """Close the file."""
         self._opened.close()
         super().close()
-
-    def __enter__(self) -> Self:
-        return self

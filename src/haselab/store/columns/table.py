@@ -25,7 +25,7 @@ __all__ = ["Table", "read_table"]
 
 Floats = NDArray[np.float64]
 _PIECE_ROWS = 1 << 20
-_LARGEST = 1e30  # whose powers a fit can bear
+_LARGEST = 1e30  # powers of it do not overflow in a fit
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _valid_rows(archive: Archive, wanted: Sequence[str], rows: int) -> NDArray[n
 def _column(
     archive: Archive, name: str, options: ColumnOptions = AS_THE_FILE_STATES
 ) -> NDArray[Any] | None:
-    """A column that nobody asked for; None where there is none of numbers."""
+    """Read an optional column; None if there is no such column of numbers."""
     try:
         if archive.locate(name) is None:
             return None
@@ -124,7 +124,7 @@ def _column(
 def _times(
     archive: Archive, kept: NDArray[np.bool_], options: ColumnOptions
 ) -> tuple[str | None, Floats | None]:
-    """The column of times and its name; nothing where there is none of finite numbers."""
+    """Read the column of times; return None if there is none of finite numbers."""
     name = time_column(archive, options)
     if name is None:
         return None, None
@@ -132,7 +132,7 @@ def _times(
     if times is None or times.size != kept.size or not np.isfinite(times[kept]).all():
         if options.time is not None:
             raise InputError(
-                f"Column {options.time} holds no times: each row needs a number of seconds, or of "
+                f"Column {options.time} has no times: each row needs a number of seconds, or of "
                 f"the unit that --unit states. Name another column with --time: {archive.file}"
             )
         return None, None
@@ -147,7 +147,7 @@ def _finite(name: str, values: NDArray[Any], file: Path) -> Floats:
     bad = np.flatnonzero(~(np.abs(vector) <= _LARGEST))
     if bad.size:
         raise InputError(
-            f"Column {name} holds {vector[bad[0]]:g} in row {bad[0] + 1} ({bad.size} such rows). "
+            f"Column {name} has {vector[bad[0]]:g} in row {bad[0] + 1} ({bad.size} such rows). "
             f"Remove these rows, or use finite numbers up to {_LARGEST:g}: {file}"
         )
     return vector

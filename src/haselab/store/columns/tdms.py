@@ -23,7 +23,7 @@ _MOST_PACKED = 8  # bytes of a scaled value for one in the file
 
 
 class _Bounded(io.FileIO):
-    """A file that is never asked for more than it has: lengths in a damaged file are anything."""
+    """A file that never reads beyond its end: lengths in a damaged file are arbitrary."""
 
     def __init__(self, file: Path) -> None:
         super().__init__(file, "rb")
@@ -65,7 +65,7 @@ class TdmsArchive(MemberArchive):
         held = sum(math.prod(m.shape) * m.dtype.itemsize for m in self.members.values())
         if held > _MOST_PACKED * file.stat().st_size:
             raise InputError(
-                f"The file states {held} bytes of values but has {file.stat().st_size}. Export it "
+                f"The file states {held} bytes of values, but has {file.stat().st_size}. Export it "
                 f"again: {file}"
             )
 

@@ -1,4 +1,4 @@
-"""How a text table is laid out: encoding, separator, decimal mark, preamble, header, units."""
+"""Find the layout of a text table: encoding, separator, decimal mark, preamble, header, units."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def _encoding(head: bytes) -> str:
 
 
 def _some(lines: list[str]) -> list[str]:
-    """The first lines, as many as can be looked at in no time."""
+    """The first lines, few enough to be examined quickly."""
     count = characters = 0
     for line in lines[:_MOST_LINES]:
         characters += len(line)
@@ -157,7 +157,7 @@ def _is_comment(line: str) -> bool:
 
 
 def _guess(lines: Sequence[str], delimiter: str | None) -> _Guess | None:
-    """The layout by this delimiter; None where it shows no rows of numbers."""
+    """The layout with this delimiter; None if it gives no rows of numbers."""
     numbered = [
         (number, split_cells(line, delimiter))
         for number, line in enumerate(lines)

@@ -32,7 +32,7 @@ _WORDS = {
     "n/mm2": "N/mm²", "n/mm^2": "N/mm²", "n/m2": "N/m²", "v/um": "V/µm", "none": "1",
     "sequence": "1", "samples": "1",
 }  # fmt: skip
-# Endings of names, as in voltage_kv. Those of SI units state nothing: they are what is assumed.
+# Endings of names, as in voltage_kv. Those of SI units are the default, so they state nothing.
 _ENDINGS = {
     "mv": "mV", "uv": "µV", "kv": "kV", "ma": "mA", "ua": "µA", "na": "nA", "ms": "ms", "us": "µs",
     "ns": "ns", "pf": "pF", "nf": "nF", "uf": "µF", "mm": "mm", "um": "µm", "cm": "cm",
@@ -107,7 +107,7 @@ def parse_unit(text: str, where: str) -> Unit:
     Returns:
         The unit.
     Raises:
-        InputError: it is not known, or upper and lower case decide and do not.
+        InputError: the unit is unknown, or ambiguous in upper and lower case.
     Example:
         >>> parse_unit("kV", "--unit")
         Unit(symbol='kV', si='V', factor=1000.0)
@@ -117,7 +117,7 @@ def parse_unit(text: str, where: str) -> Unit:
     unit = _find(text)
     if unit is None:
         raise InputError(
-            f"{where} states the unit '{text.strip()}', which is not known or ambiguous. Use V, "
+            f"{where} states the unit '{text.strip()}', which is unknown or ambiguous. Use V, "
             "mV, kV, A, mA, s, ms, F, pF, m, mm, N, Pa, %, or 1 for a pure number."
         )
     return unit

@@ -38,8 +38,8 @@ def _scales(reader: SessionReader, path: Path) -> tuple[float, float]:
     sampling = Sampling.of_header(1, reader.header)
     if sampling.volt_per_code is None or sampling.rate_hz is None:
         raise InputError(
-            "The session's header lacks rig.volt_per_code or rig.rate_hz, so what its codes mean "
-            f"is not known. Record anew with this version. {path}"
+            "The session's header lacks rig.volt_per_code or rig.rate_hz, so its codes cannot be "
+            f"converted to volts and seconds. Record again with this version. {path}"
         )
     return sampling.volt_per_code, sampling.rate_hz
 
@@ -66,7 +66,7 @@ def session_tables(
     pandas = _library("pandas")
     path = session_file(path)
     with SessionReader(path) as reader:
-        reader.experiment(experiment)  # a name that is not there is refused here
+        reader.experiment(experiment)  # refuses an unknown name
         scales = _scales(reader, path)
         recorded = tables_of(reader, experiment, "", *scales)
         tables = dict(zip(("monitors", "blocks", "tracks"), recorded, strict=True))

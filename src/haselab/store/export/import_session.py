@@ -1,4 +1,4 @@
-"""Columns of another tool's file as a session: codes, blocks, and where they came from."""
+"""Import the columns of another tool's file as a session: codes, blocks and provenance."""
 
 from __future__ import annotations
 
@@ -76,14 +76,14 @@ class _Scale:
 
 @dataclass(frozen=True)
 class Imported:
-    """What became of a file.
+    """Summary of an import.
 
     Args:
         blocks: recorded.
-        samples_left: at the end, that fill no block.
+        samples_left: samples at the end that do not fill a block.
         rate_hz: samples per second and channel.
         volt_per_code: of both channels.
-        largest_rounding_v: what was lost by making codes of the readings, in V.
+        largest_rounding_v: largest rounding error of the codes, in V.
         volt_per_monitor_volt: scale of the voltage monitor in the session.
         ampere_per_monitor_volt: scale of the current monitor in the session, in A/V.
         assumed_seconds: column of times that states no unit and was taken as seconds; empty: none.
@@ -139,8 +139,8 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
         blocks, left, worst_v = _copy(stream, session, plan, scale, rate_hz, file)
     if blocks == 0:
         raise InputError(
-            f"{left} samples are less than a block of {plan.block_samples}. Shorten --block-samples"
-            f" or record for longer. {file}"
+            f"The file has {left} samples, but a block has {plan.block_samples}. Lower "
+            f"--block-samples, or record for longer. {file}"
         )
     return Imported(
         blocks, left, rate_hz, scale.volt_per_code, worst_v, volt_per_unit, ampere_per_unit, assumed
@@ -161,8 +161,8 @@ def _scale(file: Path, plan: ImportPlan) -> _Scale:
     for unit, good, what in (*wanted, *((unit, ("V",), "drive") for unit in rest)):
         if unit is not None and unit.si not in good:
             raise InputError(
-                f"The column of the {what} is in {unit.symbol}, but it needs {' or '.join(good)}. "
-                f"Name another column, or state its unit with --unit. {file}"
+                f"The column of the {what} is in {unit.symbol}, but must be in "
+                f"{' or '.join(good)}. Name another column, or state its unit with --unit. {file}"
             )
     peaks = (1.0, 1.0) if plan.volt_per_code else _peaks(file, plan)
     per_volt = [
@@ -191,7 +191,7 @@ def _peaks(file: Path, plan: ImportPlan) -> tuple[float, float]:
             for k, column in enumerate(piece[:2]):
                 if np.issubdtype(column.dtype, np.integer):
                     raise InputError(
-                        f"The columns hold integers: codes of a converter. Give --volt-per-code. "
+                        f"The columns contain integers, codes of a converter. Add --volt-per-code. "
                         f"{file}"
                     )
                 peaks[k] = max(peaks[k], float(np.abs(column).max()))
@@ -211,8 +211,8 @@ def _codes(
     if not fits.all():
         row = int(np.argmin(fits))
         raise InputError(
-            f"Row {first + row + 1} reads {values[row].tolist()}, but {volt:g} V per code reach "
-            f"{_LARGEST * volt:g} V. Raise --volt-per-code, or remove values that are no numbers. "
+            f"Row {first + row + 1} has {values[row].tolist()}, but {volt:g} V per code only reach "
+            f"{_LARGEST * volt:g} V. Raise --volt-per-code, or remove values that are not numbers. "
             f"{file}"
         )
     return rounded.astype(np.int16), float(np.abs(rounded - scaled).max() * volt)

@@ -1,4 +1,4 @@
-"""A session as Neurodata Without Borders: for archives that take nothing else."""
+"""Export a session as Neurodata Without Borders, a format that some archives require."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_nwb(reader: SessionReader, path: Path, volt_per_code: float, rate_hz: 
         nwb: Any = importlib.import_module("pynwb")
     except ImportError:
         raise InputError(
-            f"NWB files need pynwb. Install haselab[formats], or take --to mat. {path}"
+            f"NWB files need pynwb. Install haselab[formats], or use --to mat. {path}"
         ) from None
     header = json.dumps(reader.header)
     file = nwb.NWBFile(

@@ -1,4 +1,4 @@
-"""A session in the form of other tools: CSV, Parquet, MATLAB, LabVIEW's TDMS, NWB."""
+"""Export a session for other tools: CSV, Parquet, MATLAB, LabVIEW's TDMS, NWB."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _RAW_INPUT = 0xFFFFFFFF  # of LabVIEW's scales: the numbers as they are stored
 
 @dataclass(frozen=True)
 class _Source:
-    """One session on its way out.
+    """A session to export.
 
     Args:
         path: of session.h5.
@@ -66,7 +66,7 @@ class _Source:
 
 @dataclass(frozen=True)
 class Exported:
-    """What became of a session.
+    """Summary of an export.
 
     Args:
         files: written.
@@ -116,7 +116,7 @@ def export_session(
             large for the form, or a library that is missing.
     """
     if form not in FORMS:
-        raise InputError(f"No form {form!r}; there are {', '.join(FORMS)}. Name one of them.")
+        raise InputError(f"Unknown format {form!r}. Use one of {', '.join(FORMS)}.")
     path = session_file(path)
     with SessionReader(path, unverified=unverified) as reader:
         _keep_only(reader, experiments, path)
@@ -130,8 +130,8 @@ def export_session(
         sampling = Sampling.of_header(1, reader.header)
         if sampling.volt_per_code is None or sampling.rate_hz is None:
             raise InputError(
-                f"The session's header lacks rig.volt_per_code or rig.rate_hz, so what its codes "
-                f"mean is not known. Record anew with this version. {path}"
+                f"The session's header lacks rig.volt_per_code or rig.rate_hz, so its codes cannot "
+                f"be converted to volts and seconds. Record again with this version. {path}"
             )
         new_names = _names_of(reader, form)
         source = _Source(path, reader, sampling.volt_per_code, sampling.rate_hz, new_names, derived)
@@ -152,8 +152,8 @@ def _keep_only(reader: SessionReader, wanted: Sequence[str], path: Path) -> None
     for name in wanted:
         if name not in reader.names:
             raise InputError(
-                f"No experiment '{name}' in this session; there are "
-                f"{', '.join(reader.names) or 'none'}. Name one of them: {path}"
+                f"The session has no experiment '{name}', only "
+                f"{', '.join(reader.names) or 'none at all'}. Name one of them: {path}"
             )
     if wanted:
         reader.names[:] = [name for name in reader.names if name in wanted]
@@ -212,9 +212,9 @@ def _mat(source: _Source, out: Path) -> Iterator[Path]:
         size = 2 * record.codes.size  # single precision of one channel
         if size > _MAT_BYTES:
             raise InputError(
-                f"A channel of {name!r} has {size / 1e9:.1f} GB, a MATLAB file of version 5 takes "
-                f"2.1 GB. MATLAB reads the session itself by h5read; or take --to parquet. "
-                f"{source.path}"
+                f"A channel of {name!r} has {size / 1e9:.1f} GB, but a MATLAB file of version 5 "
+                "can hold only 2.1 GB. Read the session in MATLAB with h5read, or use --to "
+                f"parquet. {source.path}"
             )
         volts = (record.codes * source.volt_per_code).astype(np.float32)
         structs[source.experiments[name]] = {
@@ -247,7 +247,7 @@ def _tdms(source: _Source, out: Path) -> Iterator[Path]:
         tdms: Any = importlib.import_module("nptdms")
     except ImportError:
         raise InputError(
-            f"LabVIEW files need nptdms. Install haselab[formats], or take --to csv. {out}"
+            f"LabVIEW files need nptdms. Install haselab[formats], or use --to csv. {out}"
         ) from None
     scale = {
         "unit_string": "V",

@@ -1,4 +1,4 @@
-"""The tables of a session, piece by piece, as CSV or Parquet."""
+"""Export the tables of a session in parts, as CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Table:
 
 
 def event_table(reader: SessionReader) -> Table:
-    """What happened, and when."""
+    """The events with their times."""
 
     def pieces() -> Iterator[Columns]:
         events = reader.events()
@@ -153,7 +153,7 @@ def write_parquet(table: Table, folder: Path, header: str) -> Path:
         parquet: Any = importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise InputError(
-            f"Parquet files need pyarrow. Install haselab[formats], or take --to csv. {folder}"
+            f"Parquet files need pyarrow. Install haselab[formats], or use --to csv. {folder}"
         ) from None
     path = folder / f"{table.name}.parquet"
     writer: Any = None

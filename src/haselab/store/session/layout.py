@@ -176,7 +176,7 @@ def settings_text(name: str, settings: Mapping[str, Any]) -> bytes:
     text = write_settings(settings)
     if len(text) > _SETTINGS_BYTES:
         raise InputError(
-            f"Settings of {name!r} have {len(text)} bytes, allowed are {_SETTINGS_BYTES}. "
+            f"Settings of {name!r} have {len(text)} bytes, but at most {_SETTINGS_BYTES} fit. "
             "Shorten them."
         )
     return text

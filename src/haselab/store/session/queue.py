@@ -1,4 +1,4 @@
-"""Jobs done in order by a thread of their own: a slow disk does not hold up who records."""
+"""Do jobs in order in a background thread, so that a slow disk does not delay the recorder."""
 
 from __future__ import annotations
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import h5py
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 from haselab.store.session.checksums import check_links
 from haselab.store.session.layout import (
     BLOCK_ORDER,
@@ -40,7 +40,7 @@ def session_file(path: str | Path) -> Path:
     return path / "session.h5" if path.is_dir() else path
 
 
-class SessionReader:
+class SessionReader(Closing):
     """Reads a session, also one whose writer was killed or still writes.
 
     Several readers may be open in one process; a handle of h5py's own on the same growing file may
@@ -88,13 +88,13 @@ class SessionReader:
         line = str(error).partition("\n")[0] or type(error).__name__
         if isinstance(error, ChangedError):
             return InputError(
-                f"The session has changed since it was recorded ({line}). Restore session.h5 from "
-                "a backup. 'analyse', 'sense' and 'session export' read it with --unverified and "
-                f"mark the result. {self._path}"
+                f"The session was changed after the recording ({line}). Restore session.h5 from a "
+                "backup, or read it with 'analyse', 'sense' or 'session export' and --unverified, "
+                f"which mark the result. {self._path}"
             )
         return InputError(
-            f"Not a whole haselab session ({line}). Copy the file again from where it was "
-            f"recorded. {self._path}"
+            f"The file is not a complete haselab session ({line}). Copy the original file again. "
+            f"{self._path}"
         )
 
     def experiment(self, name: str) -> ExperimentRecord:
@@ -167,9 +167,9 @@ class SessionReader:
         for key in keys:
             if not (isinstance(found, dict) and key in found):
                 raise InputError(
-                    f"The session's header lacks {'.'.join(keys)}: it was made by another program "
-                    f"or an old version. Export its codes as .npz and name all by options. "
-                    f"{self._path}"
+                    f"The session's header lacks {'.'.join(keys)}: it was written by another "
+                    "program or an old version. Export its codes as .npz and give all values as "
+                    f"options. {self._path}"
                 )
             found = found[key]
         return found
@@ -187,9 +187,3 @@ class SessionReader:
         """Close the file."""
         self._tail.close()
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

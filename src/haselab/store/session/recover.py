@@ -1,4 +1,4 @@
-"""A recording whose writer was killed becomes an ordinary file again, with every block it took."""
+"""Repair a recording whose writer was killed, with every block that was recorded."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def recover(folder: Path) -> Recovery:
     Returns:
         What was found and done.
     Raises:
-        InputError: no session, or damaged beyond reading.
+        InputError: no session, or an unreadable one.
         DeviceError: it is still being written, or the disk refuses.
     """
     if folder.is_file():
@@ -99,7 +99,7 @@ def recover(folder: Path) -> Recovery:
 
 def _still_written(path: Path) -> DeviceError:
     return DeviceError(
-        f"The session is still being written; end the program that records it. {path}"
+        f"The session is still being written. End the program that records it. {path}"
     )
 
 
@@ -128,7 +128,7 @@ def _verified(path: Path) -> dict[str, int]:
         for name in session.names:
             record = session.experiment(name)
             if not np.all(np.isfinite(record.block_start_s)):
-                raise InputError(f"Blocks of {name!r} have no time; record anew. {path}")
+                raise InputError(f"Blocks of {name!r} have no time. Record again. {path}")
             counts[name] = len(record.codes)
     return counts
 

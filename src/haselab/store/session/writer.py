@@ -146,8 +146,7 @@ class SessionWriter:
             raw = io.FileIO(path, "x+")
         except FileExistsError:
             raise InputError(
-                f"There is a session already; nothing in it was changed. Name another folder. "
-                f"{path}"
+                f"The folder has a session already; it was not changed. Name another folder. {path}"
             ) from None
         except OSError as error:
             raise self._failed(error) from None
@@ -185,7 +184,7 @@ class SessionWriter:
         after = f", after waiting for {rule.patience_s:g} s" if rule.patience_s else ""
         return DeviceError(
             f"The disk is too slow: {0.1 * rule.chunks:g} s of data wait to be written{after}. "
-            f"The recording up to here is kept. Use a faster disk. {self._path}"
+            f"The data recorded so far are kept. Use a faster disk. {self._path}"
         )
 
     def _text(self, name: str, settings: dict[str, Any]) -> bytes:

@@ -42,7 +42,7 @@ def _unpack(file: BinaryIO, at: int, form: struct.Struct, path: Path) -> tuple[A
     if not 0 <= at <= size - form.size:
         raise broken(
             f"The .cine file has {size} bytes, its header names bytes {at} to {at + form.size}",
-            "It is truncated or damaged; copy it again.",
+            "It is truncated or damaged. Copy it again.",
             path,
         )
     file.seek(at)
@@ -53,7 +53,9 @@ def _layout(file: BinaryIO, path: Path) -> _Layout:
     head = _unpack(file, 0, _FILE_HEADER, path)
     if head[0] != b"CI":
         raise broken(
-            f"The file begins with {head[0]!r}, a .cine file with b'CI'", "Check the file.", path
+            f"The file begins with {head[0]!r}, but a .cine file begins with b'CI'",
+            "Check the file.",
+            path,
         )
     compression, count, bitmap, setup, offsets = head[2], head[7], head[8], head[9], head[10]
     _, width, height, _, bits, packing, *_ = _unpack(file, bitmap, _BITMAP_HEADER, path)
@@ -65,21 +67,22 @@ def _layout(file: BinaryIO, path: Path) -> _Layout:
     if compression or packing or bits not in (8, 16) or mosaic:
         raise broken(
             f"The .cine file has compression {compression}, packing {packing}, {bits} bits a "
-            f"pixel and colour filter {mosaic}; read are 0, 0, 8 or 16, and 0",
+            f"pixel and colour filter {mosaic}; supported are 0, 0, 8 or 16, and 0",
             _CONVERT,
             path,
         )
     if min(width, abs(height), count) < 1 or width * abs(height) > MOST_PIXELS:
         raise broken(
-            f"The header states {count} frames of {width} x {height} px; read are one and more, of "
-            f"up to {MOST_PIXELS} pixels",
+            f"The header states {count} frames of {width} x {height} px; supported is at least "
+            f"one, of up to {MOST_PIXELS} pixels",
             "Copy the file again.",
             path,
         )
     size = path.stat().st_size
     if offsets + 8 * count > size:
         raise broken(
-            f"The .cine file ends at byte {size}, its header reaches to byte {offsets + 8 * count}",
+            f"The .cine file ends at byte {size}, but its header extends to byte "
+            f"{offsets + 8 * count}",
             "It is truncated; copy it again.",
             path,
         )

@@ -37,7 +37,7 @@ _LOSSLESS = frozenset(
 # with loss or without, and the stream does not say
 _EITHER = frozenset(("jpeg2000", "jpegls", "vp9", "av1", "webp", "jpegxl", "dirac", "cfhd"))
 _X264_LOSSLESS = re.compile(rb"x264 - core.{0,2000}?(?<![a-z_])(qp|crf)=0(\.0+)?[\s\0]", re.DOTALL)
-_COPY_AGAIN = "It is truncated or damaged; copy it again."
+_COPY_AGAIN = "It is truncated or damaged. Copy it again."
 # Luma among other things in plane 0: first item and stride, in items of a sample.
 _PACKED = {"yuyv422": (0, 2), "yvyu422": (0, 2), "uyvy422": (1, 2)}
 _PACKED |= dict.fromkeys(("ya8", "ya16le", "ya16be"), (0, 2))
@@ -145,7 +145,8 @@ class ContainerReader(VideoReader):
                 ) from None
         if count == 0 or (count < self._least and self._packets < self._least):
             raise broken(
-                f"The video holds {count} frames, by its header at least {max(self._least, 1)}",
+                f"The video contains {count} frames, but its header states at least "
+                f"{max(self._least, 1)}",
                 _COPY_AGAIN,
                 self.path,
             )
@@ -165,7 +166,7 @@ def _opened(path: Path) -> av.container.InputContainer:
         reason = getattr(error, "strerror", None) or "unreadable text in its header"
         raise broken(
             f"FFmpeg cannot open the video ({reason})",
-            "Take a format that FFmpeg reads, a folder of images, a TIFF stack, .cine or .mraw, "
+            "Use a format that FFmpeg reads, a folder of images, a TIFF stack, .cine or .mraw, "
             "and check that the copy is complete.",
             path,
         ) from None
@@ -180,7 +181,7 @@ def _opened(path: Path) -> av.container.InputContainer:
 def _check_stream(container: av.container.InputContainer, path: Path) -> None:
     """Refuse what cannot be decoded, before memory is taken for it."""
     if not container.streams.video:
-        raise broken("The file holds no video stream", "Check the file.", path)
+        raise broken("The file contains no video stream", "Check the file.", path)
     codec: av.VideoCodecContext | None = container.streams.video[0].codec_context
     if codec is None:
         raise broken(
@@ -190,7 +191,7 @@ def _check_stream(container: av.container.InputContainer, path: Path) -> None:
         )
     if codec.width * codec.height > MOST_PIXELS:
         raise broken(
-            f"The video states frames of {codec.width} x {codec.height} px; read are up to "
+            f"The video states frames of {codec.width} x {codec.height} px; supported are up to "
             f"{MOST_PIXELS} pixels",
             _COPY_AGAIN,
             path,

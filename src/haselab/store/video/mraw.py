@@ -42,7 +42,9 @@ def _bytes(path: Path) -> bytes:
 def _read_cihx(path: Path) -> _Header:
     match = re.search(rb"<cih>.*</cih>", _bytes(path), re.DOTALL)
     if match is None:
-        raise broken("The header holds no <cih> section", "It is truncated; copy it again.", path)
+        raise broken(
+            "The header contains no <cih> section", "It is truncated; copy it again.", path
+        )
     root = ElementTree.fromstring(match.group().decode("utf-8", errors="replace"))
     depth = int(root.findtext("imageDataInfo/effectiveBit/depth", "0"))
     return _Header(
@@ -111,8 +113,8 @@ class MrawReader(VideoReader):
         header = _read_header(path)
         if header.bits not in (8, 12, 16) or header.format.lower() != "mraw":
             raise broken(
-                f"The recording is {header.format!r} with {header.bits} bits a pixel; read is "
-                "'Mraw' with 8, 12 or 16",
+                f"The recording is {header.format!r} with {header.bits} bits per pixel; supported "
+                "is 'Mraw' with 8, 12 or 16",
                 _SAVE_AGAIN,
                 path,
             )
@@ -120,12 +122,14 @@ class MrawReader(VideoReader):
         if min(header.width, header.height, header.count) < 1 or pixels > MOST_PIXELS:
             raise broken(
                 f"The header states {header.count} frames of {header.width} x {header.height} px; "
-                f"read are one and more, of up to {MOST_PIXELS} pixels",
+                f"supported is at least one, of up to {MOST_PIXELS} pixels",
                 "Copy it again from the camera's computer.",
                 path,
             )
         if not 0.0 <= header.rate_hz <= _FASTEST_HZ:
-            raise broken(f"The header states {header.rate_hz:g} frames a second", _SAVE_AGAIN, path)
+            raise broken(
+                f"The header states {header.rate_hz:g} frames per second", _SAVE_AGAIN, path
+            )
         depth = header.depth if 0 < header.depth <= header.bits else header.bits
         super().__init__(path, rate_hz=header.rate_hz or None, lossy=False, bit_depth=depth)
         self._header = header

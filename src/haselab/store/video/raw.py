@@ -131,15 +131,17 @@ def transcode(raw: Path) -> Path:
             images = images.reshape(last - first, *shape)
             for k, image in enumerate(images, first):
                 if frame_hash(image) != hashes[k]:
-                    raise InputError(f"Raw frame {k} is damaged; its hash does not hold. {raw}")
+                    raise InputError(
+                        f"Raw frame {k} is damaged: its hash does not match. Copy it again. {raw}"
+                    )
             writer.append(images, times_s[first:last])
     finally:
         writer.close()
     found = [frame_hash(image) for image in _decoded(video)]
     if found != hashes[:count]:
         raise DeviceError(
-            f"The video does not give the recorded frames back; the raw ones are kept. Try again "
-            f"on another disk. {video}"
+            f"The video differs from the recorded frames, so these are kept. Try again on another "
+            f"disk. {video}"
         )
     rows = [f"{k},{float(times_s[k])!r},{hashes[k]}" for k in range(count)]
     video.with_suffix(".csv").write_text("\n".join(["frame,time_s,hash", *rows]) + "\n")

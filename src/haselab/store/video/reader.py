@@ -5,13 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 
 __all__ = [
     "COLOUR_RULE",
@@ -70,7 +69,7 @@ def alike(items: Iterator[tuple[float, Frame]], path: Path) -> Iterator[tuple[fl
         if frame.shape != first.shape or frame.dtype != first.dtype:
             raise broken(
                 f"Frame {index} has {_size(frame)}, frame 0 has {_size(first)}",
-                "All frames of a clip must be alike; cut the clip there.",
+                "All frames of a video must be alike. Split the video there.",
                 path,
             )
         yield time_s, frame
@@ -80,7 +79,7 @@ def _size(frame: Frame) -> str:
     return f"{frame.shape[1]} x {frame.shape[0]} px of {8 * frame.itemsize} bit"
 
 
-class VideoReader(ABC):
+class VideoReader(Closing, ABC):
     """Frames `(H, W)`, uint8 or uint16, in order; a few in memory at a time.
 
     Iterating starts at the first frame each time. Also a context manager. Frames are for reading
@@ -146,14 +145,3 @@ class VideoReader(ABC):
     def close(self) -> None:
         """Give the file back; a no-op for readers that hold none open between frames."""
         return
-
-    def __enter__(self) -> VideoReader:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

@@ -34,7 +34,7 @@ TIFF = (".tif", ".tiff")
 IMAGES = (".png", ".bmp", ".pgm", ".pnm", ".ppm", ".jpg", ".jpeg", *TIFF)
 _READERS = 2
 _MOST_GAPS = 100  # recorded frames for each image that is left; beyond, names hold no count
-_COPY_AGAIN = "It is truncated or damaged; copy it again."
+_COPY_AGAIN = "It is truncated or damaged. Copy it again."
 _LOSSY_TIFF = (6, 7, 33003, 33004, 33005, 34712, 50001)
 
 
@@ -46,7 +46,7 @@ def _grey(image: NDArray[Any], path: Path) -> Frame:
         return luma_of_colour(np.moveaxis(image, 0, 2) if planar else image)
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise broken(
-            f"The image is {image.dtype} of shape {image.shape}; read are uint8 and uint16 of "
+            f"The image is {image.dtype} of shape {image.shape}; supported are uint8 and uint16 of "
             "shape (H, W) or (H, W, 3)",
             "Save it as 8 or 16 bit.",
             path,
@@ -59,7 +59,9 @@ def _check_size(page: Any, path: Path) -> None:
     pixels = math.prod(page.shape)
     if not 0 < pixels <= MOST_PIXELS:
         raise broken(
-            f"The image has {page.shape} pixels; read are 1 to {MOST_PIXELS}", _COPY_AGAIN, path
+            f"The image has {page.shape} pixels; supported are 1 to {MOST_PIXELS}",
+            _COPY_AGAIN,
+            path,
         )
 
 
@@ -257,11 +259,11 @@ class FolderReader(VideoReader):
         self._files = sorted(images, key=lambda file: natural_order(file.name))
         if not self._files:
             raise broken(
-                f"The folder holds no image ({', '.join(IMAGES)})", "Check the folder.", path
+                f"The folder contains no image ({', '.join(IMAGES)})", "Check the folder.", path
             )
         for file in self._files:
             if not file.is_file():  # reading a pipe would never end
-                raise broken("An image is not a file", "Take it out of the folder.", file)
+                raise broken("An image is not a file", "Remove it from the folder.", file)
         with _still(self._files[0]) as first:
             super().__init__(
                 path,

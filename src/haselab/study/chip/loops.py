@@ -1,4 +1,4 @@
-"""The step experiment on one twin by three controllers: two of the desktop, and the chip."""
+"""The step experiment on one twin with three loops: two on the desktop, one on the chip."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Run, SetReference, Status
 from haselab.models.plant import Plant
 from haselab.rig.chip import REFERENCE, CoSim, Firmware, calibrated_firmware
-from haselab.rig.twin.bench import TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.history import precondition
+from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.runner import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 
@@ -48,8 +48,8 @@ __all__ = [
     "step_experiment",
 ]
 
-# From the middle of the readings that count to their frame's end 7.5 slots of 125 us, and on to the
-# output 7 more.
+# 7.5 slots of 125 us from the middle of the samples that are used to the end of their frame, and 7
+# more to the output.
 CHIP_DELAY_S = 14.5 * 125e-6
 _CARRIER_V = 0.05
 _REFERENCE_BLOCKS = 50
@@ -70,7 +70,7 @@ class StepPlan:
         hold_s: time before the step, in s.
         last_s: time after it, in s.
         zero_length_m: length of the sheet at zero strain, in m.
-        precondition_v: drive that the sheet has been through before, see `precondition`.
+        precondition_v: highest drive before the step, see `precondition`.
     """
 
     before: float
@@ -83,7 +83,7 @@ class StepPlan:
 
 @dataclass(frozen=True)
 class LoopRun:
-    """What a loop did.
+    """The response of a loop.
 
     Args:
         name: of the controller.
@@ -104,7 +104,7 @@ class LoopRun:
 
 @dataclass(frozen=True)
 class ChipRun:
-    """What the chip did, and what it took.
+    """The response of the chip's loop, and its use of the processor.
 
     Args:
         loop: its response.
@@ -125,16 +125,16 @@ class ChipRun:
 
 @dataclass(frozen=True)
 class _Desk:
-    """How the desktop closes the loop.
+    """Rate and timing of a loop on the desktop.
 
     Args:
         rate_hz: updates a second.
         carrier_hz: of the sensing signal.
-        blank_s: from a new output until readings count.
+        blank_s: from a new output until samples are used.
         output_delay_s: from a block's end to the new output.
-        wait: blocks that an output waits beyond the first.
-        averaged: updates whose mean strain is taken.
-        limited: the chip's limit of the drive's change holds.
+        wait: blocks for which an output waits after the first one.
+        averaged: updates whose strain is averaged.
+        limited: whether the chip's limit for changes of the drive applies.
     """
 
     rate_hz: float
@@ -156,26 +156,26 @@ class _Desk:
         """Age of the mean strain when its output takes effect, in s.
 
         Args:
-            middle_s: of the readings that count, from their block's start.
+            middle_s: middle of the samples that are used, from the start of their block.
         """
         period_s = 1.0 / self.rate_hz
         older_s = 0.5 * (self.averaged - 1) * period_s
         return period_s - middle_s + older_s + self.wait * period_s + self.output_delay_s
 
 
-# The bench of the study; and the chip's own timing on the desktop's instruments: an update looks
-# at two milliseconds, and its output comes 1.8 ms after their middle.
+# The bench of the study, and the chip's timing on the desktop's instruments: an update uses 2 ms of
+# samples, and its output follows 1.8 ms after their middle.
 SLOW = _Desk(100.0, 2e3, BLANKING_S, 2e-3)
 FAST = _Desk(1000.0, 10e3, 5e-4, 1e-4, wait=1, averaged=2, limited=True)
 
 
 def controller_of(settings: ChipSettings) -> ChosenController:
-    """The chip's controller as it runs on the computer.
+    """Return the chip's controller for the desktop.
 
     Args:
         settings: of the chip.
     Raises:
-        InputError: somebody's own, of a kind that is not registered here.
+        InputError: the kind of the controller is not registered on this computer.
     """
     s, own = settings, settings.own
     if own is not None:
@@ -186,7 +186,7 @@ def controller_of(settings: ChipSettings) -> ChosenController:
 def desktop_loop(
     config: TwinConfig, seed: int, settings: ChipSettings, desk: _Desk, plan: StepPlan
 ) -> LoopRun:
-    """The desktop's loop in the twin's own time, by the core's functions.
+    """Run the desktop's loop in simulated time, with the functions of the core.
 
     Args:
         config: of the twin.
@@ -206,7 +206,7 @@ def desktop_loop(
     )  # fmt: skip
     share = _reference_share(bench, Lockin(sensing), desk.carrier_hz)
     lockin = Lockin(replace(sensing, scale_s=sensing.admittance_scale_s * share))
-    # As the chip begins: where its map meets 0 V.
+    # The chip starts where its map reaches 0 V.
     limits = ControllerSetting(1.0 / desk.rate_hz, s.strain_low, s.strain_high, s.strain_low)
     controller = controller_of(s).make()
     controller.start(limits)
@@ -240,14 +240,14 @@ def desktop_loop(
 
 
 def _sheet(config: TwinConfig, seed: int, plan: StepPlan) -> TwinBench:
-    """The twin with a sheet that has been through what the plan says."""
+    """Make the twin, preconditioned as the plan says."""
     bench = TwinBench(config, seed)
     precondition(bench, plan.precondition_v)
     return bench
 
 
 def _reference_share(bench: TwinBench, lockin: Lockin, carrier_hz: float) -> float:
-    """A reference capacitor over what is read of it."""
+    """Ratio of a reference capacitor to its measured capacitance."""
     bench.connect(*REFERENCE)
     bench.sine(carrier_hz, _CARRIER_V)
     found = [lockin.step(bench.read())[0] for _ in range(_REFERENCE_BLOCKS)]
@@ -257,7 +257,7 @@ def _reference_share(bench: TwinBench, lockin: Lockin, carrier_hz: float) -> flo
 
 
 def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: StepPlan) -> ChipRun:
-    """The same on the chip in co-simulation.
+    """Run the loop on the chip, in co-simulation.
 
     Args:
         program: of the co-simulation.
@@ -266,7 +266,7 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
         seed: of its noise.
         plan: of the step.
     Returns:
-        The response, and what it took.
+        The response, and the use of the processor.
     Raises:
         DeviceError: the chip refused a command.
     """
@@ -299,7 +299,7 @@ def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> dict[str, A
 
     Args:
         loop: its response.
-        gains: of its controller; None: it is no PID, and has no margins here.
+        gains: of its PID; None: it is not a PID, so no margins are computed.
         plant: as it was identified.
     """
     found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
@@ -319,11 +319,11 @@ def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> dict[str, A
 
 
 def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """What the report shows of them: from a second before the step.
+    """Section of analysis.json about the loops, from 1 s before the step.
 
     Args:
         runs: the loops.
-        rows: their numbers, in the same order.
+        rows: their metrics, in the same order.
     """
 
     def shown(run: LoopRun, values: NDArray[np.float64]) -> dict[str, Any]:
@@ -350,12 +350,12 @@ def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any
 
 @dataclass(frozen=True)
 class StepExperiment:
-    """The step by all three loops.
+    """The step with all three loops.
 
     Args:
-        runs: desktop at 100 Hz, desktop at the chip's rate, chip; the chip alone where its
-            controller has no counterpart on the computer.
-        chip: what it took there.
+        runs: desktop at 100 Hz, desktop at the chip's rate, chip; only the chip if its controller
+            is not registered on this computer.
+        chip: its use of the processor.
         built: the firmware with its calibration.
         correction: of the calibration.
     """
@@ -369,7 +369,7 @@ class StepExperiment:
 def step_experiment(
     settings: ChipSettings, config: TwinConfig, seed: int, plan: StepPlan
 ) -> StepExperiment:
-    """Build and calibrate the chip, and let it and the desktop's loops make one step.
+    """Build and calibrate the chip's program, and play one step with it and the desktop's loops.
 
     Args:
         settings: gains and maps.

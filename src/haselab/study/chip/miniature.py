@@ -1,4 +1,4 @@
-"""Row S28: the study's step on a miniature bench, scaled to what its supply reaches."""
+"""Row S28: the study's step on a miniature bench, scaled to the voltage of its supply."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from haselab.rig.chip import SupplyModel
 
 __all__ = ["RELAY_AGE_S", "MiniatureDesign", "design_miniature", "relay_setting"]
 
-# Parts of the supply's reach that hold the zero strain and the end of the step. The study's are 0.5
-# and 0.73 of its 10 kV; half of the reach would put the zero strain at the voltage map's lower end.
+# Shares of the supply's highest voltage at zero strain and at the end of the step. The study has
+# 0.5 and 0.73 of 10 kV; 0.5 here would put zero strain at the lower end of the voltage map.
 _BASELINE, _TOP = 0.6, 0.78
 _ROUND = 500.0  # a step is a multiple of 0.002
-_FALLS_BEHIND = 0.4  # of the supply's slew rate that the chip asks for at most
+_SLEW_SHARE = 0.4  # of the supply's slew rate that the chip requests at most
 _SEED = 20181002  # of the design's search
 _SPEC = DesignSpec(rise_time_s=2.0, overshoot=0.07, phase_margin_deg=50.0, frequency_spread=0.25)
-# Age of the chip's strain when the computer has its output code: half of the readings (7.5 slots
-# of 125 us), 45 bytes at 500,000 baud, half an update until the computer looks. The computer takes
-# the mean of all updates since its last command, whose age comes on top.
+# Age of the chip's strain when the computer has its output code: half of the samples (7.5 slots of
+# 125 us), 45 bytes at 500,000 baud, half an update until the computer reads it. The computer takes
+# the mean of all updates since its last command, which adds to the age.
 RELAY_AGE_S = 7.5 * 125e-6 + 45 * 10 / 500e3 + 0.5e-3
 
 
@@ -43,12 +43,12 @@ class MiniatureDesign:
         zero_length_m: length at the new zero strain.
         gains: of the PID.
         setting: rate, delay and saturation of its loop.
-        highest_v: high voltage that the supply reaches.
-        drive_high_v: the drive for it.
-        rise_v_per_s: fastest change of the drive that the chip asks for.
+        highest_v: highest voltage of the supply.
+        drive_high_v: the drive for that voltage.
+        rise_v_per_s: fastest change of the drive that the chip requests.
         step: of the strain.
-        zero_strain: of the study, at which the bench has its zero.
-        baseline_v: high voltage that holds the zero strain, by the model.
+        zero_strain: strain of the study that is zero strain on this bench.
+        baseline_v: high voltage at zero strain, from the model.
         top_v: the same at the end of the step.
     """
 
@@ -89,9 +89,9 @@ class MiniatureDesign:
 
 
 def relay_setting(supply: SupplyModel, saturation: Saturation | None = None) -> LoopSetting:
-    """Rate and delay of a loop whose output goes to the supply by commands on a serial line.
+    """Rate and delay of a loop whose output is sent to the supply over a serial line.
 
-    The supply's time constant counts as a delay.
+    The time constant of the supply is treated as a delay.
 
     Args:
         supply: its limits.
@@ -107,19 +107,19 @@ def relay_setting(supply: SupplyModel, saturation: Saturation | None = None) -> 
 def design_miniature(tables: ActuatorTables, supply: SupplyModel, gain: float) -> MiniatureDesign:
     """Scale the study's step to the supply, and design a PID for the loop with its delay.
 
-    The voltage that holds a strain follows from the plant with its slow branch: creep carries the
-    sheet beyond the strain that the voltage map names. Both maps are moved to the strain at the
-    baseline, which becomes the new zero.
+    The voltage for a lasting strain follows from the plant with its slow branch: with creep, the
+    strain exceeds that of the voltage map. Both maps are shifted to the strain at the baseline,
+    which becomes the new zero.
 
     Args:
         tables: the study's actuator file.
         supply: its limits.
-        gain: high voltage for one volt of drive.
+        gain: high voltage per volt of drive.
     Returns:
         Maps, gains and step.
     Raises:
         InputError: a map, the model or the length at zero strain is missing.
-        ResultError: the supply reaches no step, or no PID is stable.
+        ResultError: the supply is too weak for a step, or no PID is stable.
     """
     to_volt, plant = tables.voltage_map(), tables.plant()
     length_m = tables.actuator.geometry.zero_length_m
@@ -133,9 +133,9 @@ def design_miniature(tables: ActuatorTables, supply: SupplyModel, gain: float) -
     step = math.floor(_ROUND * _moved(plant.static_gain * top, zero)) / _ROUND
     if not lowest < zero < highest or step <= 0.0:
         raise ResultError(
-            f"A supply of {supply.highest_v:g} V holds strains of {zero:.3g} and more, and the "
-            f"voltage map goes from {lowest:.3g} to {highest:.3g} there, which leaves no step. Use "
-            "a supply with a higher voltage."
+            f"With a supply of {supply.highest_v:g} V, zero strain is at {zero:.3g} and the "
+            f"voltage map covers {lowest:.3g} to {highest:.3g} around it, which leaves no room for "
+            "a step. Use a supply with a higher voltage."
         )
     setting = relay_setting(supply, Saturation(_moved(lowest, zero), _moved(highest, zero)))
     found = design_pid(plant, replace(_SPEC, step=step), setting, rng=np.random.default_rng(_SEED))
@@ -149,7 +149,7 @@ def design_miniature(tables: ActuatorTables, supply: SupplyModel, gain: float) -
         setting=setting,
         highest_v=supply.highest_v,
         drive_high_v=reach_v,
-        rise_v_per_s=_FALLS_BEHIND * supply.slew_v_per_s / gain,
+        rise_v_per_s=_SLEW_SHARE * supply.slew_v_per_s / gain,
         step=step,
         zero_strain=zero,
         baseline_v=_BASELINE * supply.highest_v,
@@ -158,12 +158,12 @@ def design_miniature(tables: ActuatorTables, supply: SupplyModel, gain: float) -
 
 
 def _moved(strain: float, zero: float) -> float:
-    """A strain about another length: that at the strain `zero`."""
+    """Convert a strain to another zero length, that at the strain `zero`."""
     return (1.0 + strain) / (1.0 + zero) - 1.0
 
 
 def _rebased(to_volt: VoltageMap, zero: float) -> VoltageMap:
-    """The map about another zero: strain = zero + (1 + zero) new strain."""
+    """Shift a map to another zero: strain = zero + (1 + zero) new strain."""
     scale = 1.0 + zero
     return VoltageMap(
         to_volt.a1_v * math.exp(to_volt.b1 * zero),

@@ -1,4 +1,4 @@
-"""Rows S26 and S28 of a study: what the chip's recordings in its folder give."""
+"""Rows S26 and S28 of a study, from the chip's recordings in its folder."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ EXPERIMENTS = Path("firmware", "experiments.json")  # what is known besides the 
 _NAMES = {CHIP: "chip, 1000 Hz", MINIATURE: "chip and serial supply, 100 Hz"}
 _SHOWN_FROM_S = -1.0
 _NOT_HERE = (
-    "'haselab reproduce' alone plays it, and the folder {folder}/ with its recording is not beside "
-    "this session."
+    "only 'haselab reproduce' plays it, and this session has no folder {folder}/ with its "
+    "recording."
 )
 
 
 @dataclass(frozen=True)
 class ChipRows:
-    """What the chip's experiments of a study give.
+    """Results of the chip's experiments.
 
     Args:
         quantities: estimates by id.
-        notes: by id, what the reader should know.
-        figures: sections of analysis.json; one of an experiment that was left out says why.
+        notes: by id, remarks for the reader.
+        figures: sections of analysis.json; for an experiment that was left out, the reason.
     """
 
     quantities: dict[str, Estimate]
@@ -50,19 +50,19 @@ class ChipRows:
 
 
 def with_chip_rows(found: Findings, folder: Path | None) -> Findings:
-    """The findings of a study with those of the chip's experiments, if its folder holds any.
+    """Add the chip's experiments to the findings of a study, if its folder has any.
 
     Args:
         found: of the study.
         folder: of its run; None: the session is not in one.
     Returns:
-        The findings; what is missing has a section of analysis.json that says why.
+        The findings; for a missing experiment, a section of analysis.json gives the reason.
     """
     if folder is None:
         missing = {name: {"left_out": _NOT_HERE.format(folder=name)} for name in (CHIP, MINIATURE)}
         return replace(found, figures={**found.figures, **missing})
     dynamics = found.find(Dynamics)
-    if dynamics is None:  # no plant, no loop on a chip
+    if dynamics is None:  # without a plant there is no loop on a chip
         return found
     rows = chip_rows(folder, dynamics)
     return replace(
@@ -89,7 +89,7 @@ def chip_rows(folder: Path, dynamics: Dynamics) -> ChipRows:
                 _add(rows, name, folder / name, dynamics, known)
                 continue
             except InputError as error:
-                left_out = f"its recording gives no result. {error}"
+                left_out = f"no result from its recording. {error}"
         rows.figures[name] = {"left_out": left_out}
     return rows
 
@@ -114,9 +114,9 @@ def _add(
     trials = len(next(iter(found.groups.values())).strain)
     rows.notes[f"{row}.rise"] = _note(trials, known.get("notes", {}).get(name, ""))
     if math.isnan(found.quantities[f"{row}.settling"].value):
-        rows.notes[f"{row}.settling"] = "no number: a trial does not stay within 2 % of the step"
+        rows.notes[f"{row}.settling"] = "no value: a trial does not stay within 2 % of the step"
     section = _section(name, found, loop, margins["phase_margin"].value)
-    rows.figures[name] = _beside(section, known.get("desktops", {}).get(name))
+    rows.figures[name] = _after_desktop(section, known.get("desktops", {}).get(name))
 
 
 def _note(trials: int, known: str) -> str:
@@ -153,8 +153,8 @@ def _section(
     }
 
 
-def _beside(section: dict[str, Any], desktops: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The chip's response after those of the desktop."""
+def _after_desktop(section: dict[str, Any], desktops: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Put the chip's response after those of the desktop."""
     if desktops is None:
         return section
     return {

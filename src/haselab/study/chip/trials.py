@@ -1,4 +1,4 @@
-"""Step trials on a rig that closes its own loop: played, recorded, told as those of the desktop."""
+"""Step trials on a rig that closes its own loop, recorded and reported like the desktop's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from haselab.models.actuator.strain_map import StrainMap
 from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import FIDUCIALS
 from haselab.runtime.runner import Runner
-from haselab.sensing import sense_quarters
+from haselab.sensing import sense_quadrature
 from haselab.signals import constant
 from haselab.store.folder import write_json
 from haselab.store.session.writer import (
@@ -46,58 +46,58 @@ __all__ = [
 
 _GROUP = "chip"
 _FIGURES = ("fig6", "sensing")
-_REST_S, _REST_FRAMES = 0.5, 15  # at rest before a controller gets a reference
-_AGE_S = 7.5 * 125e-6  # of an update's strain at the end of its frame: the middle of its readings
+_REST_S, _REST_FRAMES = 0.5, 15  # at rest, before a controller gets a reference
+_AGE_S = 7.5 * 125e-6  # of an update's strain at the end of its frame, from its middle sample
 
 
 @dataclass(frozen=True)
 class Chip:
-    """What is known of a chip besides its rig.
+    """Settings of a chip that its rig file does not hold.
 
     Args:
-        settings: that are compiled in.
-        zero_length_m: of the sheet at zero strain, from the study that made the settings.
+        settings: compiled into the firmware.
+        zero_length_m: length at zero strain, from the study that made the settings.
     """
 
     settings: ChipSettings
     zero_length_m: float
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        told = asdict(self.settings)
+        """Convert to JSON types."""
+        settings = asdict(self.settings)
         correction = self.settings.front_end.correction
-        told["front_end"]["correction"] = [correction.real, correction.imag]
-        return {"settings": told, "zero_length_m": self.zero_length_m}
+        settings["front_end"]["correction"] = [correction.real, correction.imag]
+        return {"settings": settings, "zero_length_m": self.zero_length_m}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Chip:
-        """From what `to_dict` gave.
+        """Inverse of `to_dict`.
 
         Raises:
-            InputError: something is missing, or is no setting.
+            InputError: a setting is missing or invalid.
         """
         try:
             return cls(settings_from_dict(data["settings"]), float(data["zero_length_m"]))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
-                f"The session's header tells no chip ({error}); needed is a session that was "
-                "recorded on one. Name another one."
+                f"The session was not recorded on a microcontroller, or its header is damaged "
+                f"({error}). Name another session."
             ) from None
 
 
 def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Observation:
-    """Lengths by the camera, capacitances by the chip's own arithmetic, one an update."""
+    """Lengths from the camera, and capacitances as the chip computes them, one per update."""
     length_m = gauge_length(record.tracks, rig.scale_m_per_px)
     good = np.isfinite(length_m)
-    capacitance_f = sense_quarters(record.codes.reshape(-1, 2), chip.settings)
-    told = int(np.argmax(np.isfinite(record.reference)))  # before it the rig was at rest
+    capacitance_f = sense_quadrature(record.codes.reshape(-1, 2), chip.settings)
+    first = int(np.argmax(np.isfinite(record.reference)))  # the rig was at rest before it
     ends_s = record.block_start_s[0] + np.arange(1, capacitance_f.size + 1) / RATE_HZ
     return Observation(
         name=record.name,
         settings=record.settings,
-        block_start_s=record.block_start_s[told:],
-        drive_v=record.drive_v[told:],
-        reference=record.reference[told:],
+        block_start_s=record.block_start_s[first:],
+        drive_v=record.drive_v[first:],
+        reference=record.reference[first:],
         sensed_s=ends_s - _AGE_S,
         capacitance_f=capacitance_f,
         relative_capacitance=np.full(capacitance_f.size, np.nan),
@@ -111,12 +111,12 @@ def _observed(record: ExperimentRecord, chip: Chip, rig: RigDescription) -> Obse
 
 
 def chip_names(study: StepStudy) -> list[str]:
-    """Step trials of a rig that closes its own loop."""
+    """Names of the step trials of a rig that closes its own loop."""
     return [f"chip-{k + 1}" for k in range(study.step_trials.trials)]
 
 
 def _play_chip_steps(runner: Runner, study: StepStudy) -> None:
-    """Row S24 by the rig's own controller; at rest first, for the camera's reference."""
+    """Play row S24 with the rig's controller, at rest first for the camera's reference."""
     trials = study.step_trials
     lead_s = max(_REST_S, _REST_FRAMES / trials.frame_rate_hz)
     reference = np.concatenate([constant(np.nan, lead_s, UPDATE_HZ), step_reference(trials)])
@@ -131,7 +131,7 @@ def recorded_row(header: Mapping[str, Any]) -> str:
     Args:
         header: of the session.
     Returns:
-        "S28" where a serial supply gave the high voltage, else "S26".
+        "S28" if a serial supply provided the high voltage, else "S26".
     """
     simulator = header["rig_config"].get("simulator") or {}
     return "S28" if simulator.get("supply") else "S26"
@@ -165,14 +165,14 @@ def run_on_chip(
 
     Args:
         study: what is played.
-        rig: the bench; it ends at 0 V whatever happens.
-        chip: what is known of it.
+        rig: the bench; it always ends at 0 V.
+        chip: its settings.
         options: folder, video, the rig's configuration.
-        progress: told in rig seconds.
+        progress: in seconds of the rig.
     Returns:
-        What was found, and the session's header.
+        The findings, and the session's header.
     Raises:
-        DeviceError: disk or instrument failed; what was recorded is kept.
+        DeviceError: disk or instrument failed; the recorded data are kept.
         SafetyError: the chip or the bench protected itself.
     """
     trials = study.step_trials
@@ -194,14 +194,14 @@ def is_chip_session(header: Mapping[str, Any]) -> bool:
 
 
 def analyse_chip_session(session: SessionReader) -> tuple[Comparison, dict[str, Any]]:
-    """The same from the recorded session alone.
+    """Repeat the analysis of `run_on_chip` from the recorded session.
 
     Args:
         session: of `run_on_chip`.
     Returns:
-        What was found, and the session's header.
+        The findings, and the session's header.
     Raises:
-        InputError: a damaged session, or one without some trial.
+        InputError: the session is damaged, or a trial is missing.
     """
     try:
         study = StepStudy.model_validate(session.header["study"])
@@ -222,11 +222,11 @@ def write_chip_findings(
         folder: of the run.
         found: of its trials.
         header: of the session, for the provenance.
-        doubt: why the session could not be verified; empty where it could.
+        doubt: why the session could not be verified; empty if it was.
     Returns:
-        What results.json holds.
+        The content of results.json.
     Raises:
-        DeviceError: the disk refuses.
+        DeviceError: a file cannot be written.
     """
     results = {
         "quantities": quantity_rows(found.quantities, {}, header["rig_config"]),

@@ -1,4 +1,4 @@
-"""A chirp about the baseline: the plant as a transfer function (row S20)."""
+"""A chirp around the baseline, to identify the plant's transfer function (row S20)."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from haselab.study.tables import Chirp
 __all__ = ["ChirpTest"]
 
 _PER_VOLT = {"S20.gain_per_volt": Quantity("plant, gain from the drive voltage", "1/V")}
-_ABOUT = "strain for a volt ahead of the amplifier, about the baseline; no voltage map is known"
-_LEAD_S = 1.0  # recorded at the baseline before the chirp begins
+_ABOUT = "strain for a volt before the amplifier, about the baseline; no voltage map is known"
+_LEAD_S = 1.0  # recorded at the baseline before the chirp
 
 
 class ChirpTest(Experiment[Chirp]):
-    """The chirp, after creep at the baseline has faded."""
+    """The chirp, played after the creep at the baseline has faded."""
 
     table = "chirp"
     title = "Transfer function"
@@ -48,7 +48,7 @@ class ChirpTest(Experiment[Chirp]):
         return about_v + c.amplitude_v * sweep
 
     def drives(self, rig: RigDescription) -> list[Drive]:
-        """See `Experiment`; about the lowest and the highest baseline that may be found."""
+        """See `Experiment`; around the lowest and the highest possible baseline."""
         return [
             Drive("chirp", np.append(about_v, self._drive_v(about_v)), self.settings.stop_hz)
             for about_v in possible_baselines_v(self.study)
@@ -67,12 +67,9 @@ class ChirpTest(Experiment[Chirp]):
         player.play(self.table, drive_v, self.settings.frame_rate_hz)
 
     def fit(self, analysis: Analysis) -> Outcome:
-        """See `Experiment`; without steps or maps the second order alone."""
-        maps, seen, stop_hz = (
-            analysis.find(Maps),
-            analysis.observe(self.table),
-            self.settings.stop_hz,
-        )
+        """See `Experiment`; without steps or maps, only the second-order model."""
+        maps, seen = analysis.find(Maps), analysis.observe(self.table)
+        stop_hz = self.settings.stop_hz
         if maps is None:
             found = fit_chirp_of_voltage(seen, analysis.rig, _LEAD_S, stop_hz)
             return self._alone(*found, "needs the voltage map of [triangle], or of --actuator")

@@ -1,4 +1,4 @@
-"""Controllers for the plant that was identified: nothing is played (rows S21, S22 and S25)."""
+"""Design controllers for the identified plant; plays nothing (rows S21, S22 and S25)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from haselab.study.tables import Control
 
 __all__ = ["ControllerDesign"]
 
-_SEED = 20181001  # of the design's search; the data have their own seed
+_SEED = 20181001  # of the design's search
 
 
 class ControllerDesign(Experiment[Control]):
-    """The paper's PI scaled to the plant that was found, and a PID, for the step trials."""
+    """The paper's PI, scaled to the identified plant, and a PID, for the step trials."""
 
     table = "control"
     title = "Controllers"
@@ -42,7 +42,7 @@ class ControllerDesign(Experiment[Control]):
         return []
 
     def play(self, player: Player) -> None:
-        """See `Experiment`; the design is made when the closed loops ask for it."""
+        """See `Experiment`; the design is made when the closed loops need it."""
 
     def fit(self, analysis: Analysis) -> Outcome:
         """See `Experiment`."""

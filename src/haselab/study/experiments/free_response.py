@@ -1,4 +1,4 @@
-"""The mass lifted and dropped: natural frequency and decay (row S19)."""
+"""Lift and drop the mass, to find natural frequency and decay (row S19)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DIFFERENCE = "S19.chirp_difference"
 
 
 class FreeResponseTest(Experiment[FreeResponse]):
-    """Lift, wait, let go, at the baseline voltage."""
+    """Lift the mass, wait and drop it, at the baseline voltage."""
 
     table = "free_response"
     title = "Free response"
@@ -69,7 +69,7 @@ class FreeResponseTest(Experiment[FreeResponse]):
 
 
 def _against_chirp(free: Free, dynamics: Dynamics) -> dict[str, Estimate]:
-    """Natural frequency of the free response over that of the chirp, less 1."""
+    """Relative difference of the natural frequencies of free response and chirp."""
     swing, sweep = free.quantities["S19.omega_0"], dynamics.quantities["S20.omega_n"]
     ratio = swing.value / sweep.value
     std = ratio * float(np.hypot(swing.std / swing.value, sweep.std / sweep.value))

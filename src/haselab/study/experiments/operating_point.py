@@ -1,4 +1,4 @@
-"""The rig's own mass at some voltages: the voltage that centres the strain (row S18)."""
+"""Hold some voltages, to find the one that centres the strain (row S18)."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from haselab.study.tables import OperatingPoint
 
 __all__ = ["OperatingPointTest", "baseline_v", "hold_drives_v", "possible_baselines_v"]
 
-_HOLDS = 5  # voltages among which a baseline is found
-_HOLD_S = 0.5  # recorded of each
+_HOLDS = 5  # number of voltages that are held
+_HOLD_S = 0.5  # recorded at each
 
 
 def baseline_v(analysis: Analysis) -> float:
-    """Drive voltage of zero strain: found, given, or the middle of the triangle.
+    """Return the drive voltage of zero strain: found, given, or the middle of the triangle.
 
     Args:
         analysis: of the study.
     Returns:
-        That of the run that is repeated, where one is.
+        The voltage; if a run is repeated, the one of that run.
     Raises:
-        InputError: the study neither gives it nor holds what it could be found from.
+        InputError: the study neither states it nor has the experiments to find it.
     """
     point = analysis.repeated(Point) or analysis.find(Point)
     return analysis.study.nominal_baseline_v if point is None else point.baseline_v
 
 
 def hold_drives_v(study: Study) -> list[float]:
-    """Voltages at which the strain is measured at rest: the baseline, or those it is found among.
+    """Voltages at which the strain at rest is measured: the baseline, or candidates for it.
 
-    About each of them the chirp stays within the triangle.
+    Around each of them the chirp stays within the triangle.
     """
     given = study.operating_point.baseline_v
     if given is not None:
@@ -57,7 +57,7 @@ def hold_drives_v(study: Study) -> list[float]:
 
 
 def possible_baselines_v(study: Study) -> tuple[float, float]:
-    """The lowest and the highest baseline that a study may find, or the given one twice."""
+    """The lowest and the highest possible baseline of a study; twice the same if it is given."""
     if OperatingPointTest.of(study) is None:
         return study.nominal_baseline_v, study.nominal_baseline_v
     drives_v = hold_drives_v(study)
@@ -65,7 +65,7 @@ def possible_baselines_v(study: Study) -> tuple[float, float]:
 
 
 class OperatingPointTest(Experiment[OperatingPoint]):
-    """Some voltages held, where a study has a triangle and static loads to compare them with."""
+    """Hold some voltages, if the study has a triangle and static loads to compare with."""
 
     table = "operating_point"
     title = "Operating point"
@@ -74,7 +74,7 @@ class OperatingPointTest(Experiment[OperatingPoint]):
 
     @classmethod
     def of(cls, study: Study) -> Self | None:
-        """See `Experiment`; None where there is nothing to find the point from."""
+        """See `Experiment`; None if the study has no data to find the point from."""
         found = study.has("triangle") and study.has("static_load")
         return cls(study, study.operating_point) if found else None
 
@@ -100,7 +100,7 @@ class OperatingPointTest(Experiment[OperatingPoint]):
             player.settle(drive_v, s.settle_s)
             player.play(name, constant(drive_v, _HOLD_S, UPDATE_HZ), s.frame_rate_hz)
         player.settle(0.0, s.settle_s)
-        # Now, at 0 V: a triangle without a result ends the run here, before hours of other trials.
+        # Fit now, at 0 V: if the triangle has no result, the run ends before hours of other trials.
         player.analysis.find(Maps)
 
     def fit(self, analysis: Analysis) -> Outcome:

@@ -1,4 +1,4 @@
-"""Masses hung at 0 V: the law of the shell and its linear regions (rows S16 and S17)."""
+"""Hang masses at 0 V, to find the shell's law and linear regions (rows S16 and S17)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NAME = "static"
 
 
 class StaticLoadTest(Experiment[StaticLoad]):
-    """Each mass in turn at 0 V, then the rig's own again."""
+    """Hang each mass in turn at 0 V, then the rig's own again."""
 
     table = "static_load"
     title = "Static load"

@@ -31,23 +31,23 @@ __all__ = ["StepTest", "closed_names", "open_names", "step_reference"]
 _CLOSED = {
     "pi": "PI step",
     "pid": "PID step",
-    "printed": "PI step by the paper's sensing chain",
+    "printed": "PI step with the paper's sensing chain",
     "late": "PI step with extra delay",
     "saturating": "PI step that saturates",
 }
 
 
 def open_names(study: Study) -> list[str]:
-    """Recordings of the open-loop trials."""
+    """Names of the recordings of the open-loop trials."""
     return [f"open-{k + 1}" for k in range(study.steps.open_trials)]
 
 
 def closed_names(study: Study, group: str) -> list[str]:
-    """Recordings of a group of closed-loop trials.
+    """Names of the recordings of a group of closed-loop trials.
 
     Args:
         study: their numbers.
-        group: `pi`, `pid`, and beside the paper's `printed`, `late` and `saturating`; `OWN`.
+        group: `pi`, `pid`, `printed`, `late`, `saturating` or `OWN`.
     """
     if group == OWN:
         return own_names(study)
@@ -63,13 +63,13 @@ def closed_names(study: Study, group: str) -> list[str]:
 
 
 def step_reference(steps: Steps | StepTrials) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Desired strain of a trial: zero, then the step; one value a block."""
+    """Desired strain of a trial, one value per block: zero, then the step."""
     zero = constant(0.0, steps.zero_s, UPDATE_HZ)
     return np.concatenate([zero, constant(steps.step, steps.step_s, UPDATE_HZ)])
 
 
 class StepTest(Experiment[Steps]):
-    """Open loop by the voltage map alone, then closed loops with the controllers of [control]."""
+    """Open-loop steps with the voltage map, then closed loops with the controllers of [control]."""
 
     table = "steps"
     title = "Step trials"
@@ -84,21 +84,21 @@ class StepTest(Experiment[Steps]):
             for name in closed_names(self.study, group)
         }  # fmt: skip
         if own := own_names(self.study):
-            closed |= dict.fromkeys(own, f"step by {self.study.control.kind}")
+            closed |= dict.fromkeys(own, f"step with {self.study.control.kind}")
         return dict.fromkeys(open_names(self.study), "open-loop step") | closed
 
     def drives(self, rig: RigDescription) -> list[Drive]:
         """See `Experiment`.
 
-        The trials go to zero strain, which the study puts at its baseline voltage, and from there
-        to a voltage that only the map will give: the highest is taken.
+        The trials start at zero strain, the baseline voltage. The voltage of the step depends on
+        the map, which is not known yet, so the highest possible one is declared.
         """
         low_v, high_v = rig.drive_limits.low, rig.drive_limits.high
         highest_v = high_v if high_v >= -low_v else low_v
         values_v = np.array([0.0, self.study.nominal_baseline_v, highest_v])
         drives = [Drive("step trials", values_v)]
         if self.settings.printed_chain_trials:
-            name = "step trials by the paper's sensing chain"
+            name = "step trials with the paper's sensing chain"
             carrier_v = self.settings.printed_chain_carrier_v
             drives.append(Drive(name, values_v, carrier_v=carrier_v))
         return drives
@@ -123,7 +123,7 @@ class StepTest(Experiment[Steps]):
                 player.close_loop(name, reference, loop, steps.frame_rate_hz)
 
     def _loops(self, analysis: Analysis) -> dict[str, LoopSettings]:
-        """The closed loops by the group of trials that they play; the own one needs no design."""
+        """Settings of the closed loops, by group of trials; an own controller needs no design."""
         maps, steps = analysis.to_play(Maps), self.settings
         loops = analysis.repeated(Loops) or analysis.find(Loops)
         own, by_video = own_controller(self.study), steps.feedback == "video"
@@ -165,7 +165,7 @@ class StepTest(Experiment[Steps]):
         return found
 
     def fit(self, analysis: Analysis) -> Outcome:
-        """See `Experiment`; without a design the open loop, and the study's own controller."""
+        """See `Experiment`; without a design, the open loop and the study's own controller."""
         maps, scale = analysis.need(Maps), analysis.rig.scale_m_per_px
         opened = [analysis.observe(name) for name in open_names(self.study)]
         try:

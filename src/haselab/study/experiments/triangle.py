@@ -1,4 +1,4 @@
-"""Slow triangles of voltage: the maps between voltage, strain and capacitance (rows S13 to S15)."""
+"""Slow voltage triangles, for the maps of voltage, strain and capacitance (rows S13 to S15)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from haselab.study.tables import Triangle
 
 __all__ = ["TriangleTest"]
 
-_LEAD_S = 0.2  # at the lowest voltage, before the first rise
+_LEAD_S = 0.2  # recorded at the lowest voltage, before the first rise
 _SHEET = "particles"
 
 
 class TriangleTest(Experiment[Triangle]):
-    """Triangles from 0 V, with particles tracked over the whole sheet."""
+    """Triangles from 0 V, with particles tracked all over the sheet."""
 
     table = "triangle"
     title = "Maps"
@@ -87,7 +87,7 @@ class TriangleTest(Experiment[Triangle]):
 
 
 def _chain(cycles: Cycles, maps: Maps, analysis: Analysis) -> PrintedChain | None:
-    """The printed chain against the lock-in, over the cycles that count."""
+    """Compare the paper's sensing chain with the lock-in, over the cycles that are fitted."""
     seen, rig = cycles.seen, analysis.rig
     if seen.lockin is None or seen.printed is None:
         return None

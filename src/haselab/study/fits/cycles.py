@@ -1,4 +1,4 @@
-"""The triangle test, cycle by cycle: what repeats, and the length at a voltage (row S13)."""
+"""Cycles of the triangle test: repeatability, and the length at a voltage (row S13)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from haselab.study.fits.resolution import POSITION_PX, with_resolution
 
 __all__ = ["Cycles", "drive_at", "repeatability"]
 
-_NEAR_V = 0.06  # about a voltage, where length against voltage is a straight line
+_NEAR_V = 0.06  # around a voltage, where length is linear in voltage
 _LEAST_FRAMES = 8
 
 Floats = NDArray[np.float64]
 
 
 def drive_at(seen: Observation, time_s: Floats, rig: RigDescription) -> Floats:
-    """Drive voltage in effect at given times: the staircase, delayed by the output's delay."""
+    """Drive voltage at given times: the staircase, delayed by the output's delay."""
     starts_s = seen.block_start_s + rig.switch_sample / rig.rate_hz
     index = np.searchsorted(starts_s, time_s, side="right") - 1
     return np.asarray(seen.drive_v[np.clip(index, 0, None)])
@@ -31,12 +31,12 @@ def drive_at(seen: Observation, time_s: Floats, rig: RigDescription) -> Floats:
 
 @dataclass(frozen=True)
 class Cycles:
-    """A triangle test and where its cycles lie.
+    """A triangle test and the times of its cycles.
 
     Args:
         seen: the test.
         starts_s: start of each cycle and end of the last, by the clock, shape `(cycles + 1,)`.
-        left_out: first cycles that do not count.
+        left_out: number of first cycles that are not fitted.
         rig: for the output's delay.
     """
 
@@ -47,7 +47,7 @@ class Cycles:
 
     @classmethod
     def of(cls, seen: Observation, study: Study, rig: RigDescription) -> Cycles:
-        """The cycles of a study's triangle, counted back from the end of the record."""
+        """Find the cycles of a study's triangle, counted back from the end of the record."""
         t = study.triangle
         end_s = float(seen.block_start_s[-1]) + rig.block_s
         before = np.arange(t.cycles, -1, -1) / t.frequency_hz
@@ -55,17 +55,17 @@ class Cycles:
 
     @property
     def from_s(self) -> float:
-        """Where the cycles that count begin."""
+        """Start of the first cycle that is fitted."""
         return float(self.starts_s[self.left_out])
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """Frames of the cycles that count, shape `(F,)`."""
+        """Frames of the cycles that are fitted, shape `(F,)`."""
         time_s = self.seen.frame_time_s
         return np.asarray((time_s >= self.from_s) & (time_s <= self.starts_s[-1]))
 
     def ramp_at(self, time_s: Floats) -> Floats:
-        """The straight line behind the staircase: the triangle without its steps."""
+        """The triangle without the steps of the staircase."""
         seen, rig = self.seen, self.rig
         middle_s = seen.block_start_s + rig.switch_sample / rig.rate_hz + 0.5 * rig.block_s
         return np.interp(time_s, middle_s, seen.drive_v)
@@ -74,7 +74,7 @@ class Cycles:
         """Mean over both edges of the length at a voltage, in m.
 
         Raises:
-            ResultError: too few frames near the voltage.
+            ResultError: there are too few frames near the voltage.
         """
         kept = self.kept
         ramp_v, length_m = self.ramp_at(self.seen.frame_time_s[kept]), self.seen.length_m[kept]
@@ -84,7 +84,7 @@ class Cycles:
             near = edge & (np.abs(ramp_v - drive_v) < _NEAR_V)
             if near.sum() < _LEAST_FRAMES:
                 raise ResultError(
-                    f"Only {int(near.sum())} frames near the baseline of {drive_v:g} V, "
+                    f"Only {int(near.sum())} frames are near the baseline of {drive_v:g} V, but "
                     f"{_LEAST_FRAMES} are needed. Record faster, or a triangle that crosses the "
                     "baseline."
                 )
@@ -94,7 +94,7 @@ class Cycles:
 
 
 def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
-    """Residual strain after the first cycle, and how far the others drift.
+    """Residual strain after the first cycle, and drift of the others.
 
     Args:
         cycles: of the triangle test.
@@ -113,12 +113,12 @@ def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
     )
     finest = math.sqrt(2.0) * POSITION_PX * cycles.rig.scale_m_per_px / zero_length_m
 
-    def told(value: float) -> Estimate:
+    def estimate(value: float) -> Estimate:
         return with_resolution(Estimate.normal(float(value), 0.0, ""), finest)
 
     kept = peaks[cycles.left_out :]
     return {
-        "S13.residual_first": told(ends[1] - ends[0]),
-        "S13.peak_drift": told(kept[-1] - kept[0]),
-        "S13.residual_drift": told(ends[-1] - ends[cycles.left_out + 1]),
+        "S13.residual_first": estimate(ends[1] - ends[0]),
+        "S13.peak_drift": estimate(kept[-1] - kept[0]),
+        "S13.residual_drift": estimate(ends[-1] - ends[cycles.left_out + 1]),
     }

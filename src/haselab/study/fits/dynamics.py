@@ -1,4 +1,4 @@
-"""Chirp and steps to a transfer function: row S20."""
+"""Transfer function from chirp and steps: row S20."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from haselab.study.fits.observe import Observation
 __all__ = ["Dynamics", "fit_chirp", "fit_chirp_and_steps", "fit_chirp_of_voltage"]
 
 Floats = NDArray[np.float64]
-_UPDATE_HZ = 100.0  # one new output a block, row S5
-_BEFORE_STEP_S = 4.0  # of a step trial, so that its initial state is seen
+_UPDATE_HZ = 100.0  # one new output per block, row S5
+_BEFORE_STEP_S = 4.0  # of a step trial, to estimate its initial state
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What chirp and open-loop steps give.
+    """Results of the chirp and the open-loop steps.
 
     Args:
-        plant: fast mode from the chirp, slow branch from the steps: what `design` works on.
-        second_order: the printed structure, fitted to the chirp alone.
+        plant: fast mode from the chirp, slow branch from the steps; used by `design`.
+        second_order: the paper's structure, fitted to the chirp only.
         quantities: results by id.
         figures: section of analysis.json.
-        posterior: the plant's numbers with the covariance of both fits.
-        residual_std: root mean square of what the plant leaves of the chirp, in strain.
+        posterior: the plant's parameters with the covariance of both fits.
+        residual_std: rms residual of the plant in the chirp, in strain.
     """
 
     plant: Plant
@@ -49,7 +49,7 @@ class Dynamics:
 
 
 def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
-    """Corrected strain in, strain out, from a time after the start; the output's delay is known."""
+    """Record of corrected strain (input) and strain (output), from a time on."""
     first = round(from_s / rig.block_s)
     return _held(seen, maps.voltage_map.strain(seen.drive_v), maps.length_m, rig, first)
 
@@ -65,18 +65,18 @@ def _held(seen: Observation, u: Floats, length_m: float, rig: RigDescription, fi
 def fit_chirp_and_steps(
     chirp: Observation, steps: Sequence[Observation], maps: Maps, study: Study, rig: RigDescription
 ) -> Dynamics:
-    """Second order from the chirp, the slow branch from the steps, both together as one plant.
+    """Fit the second order to the chirp and the slow branch to the steps; join them to one plant.
 
     Args:
         chirp: the chirp.
         steps: the open-loop trials.
         maps: zero strain and the voltage map.
-        study: when the step comes.
+        study: time of the step.
         rig: for the output's delay.
     Returns:
         Results S20, the plant, data for the Bode plots.
     Raises:
-        ResultError: a fit without a result.
+        ResultError: a fit has no result.
     Source: reference study, row S20, eqs. 8 to 10.
     """
     sweep = _record(chirp, maps, rig, 0.0)
@@ -137,7 +137,7 @@ def fit_chirp_and_steps(
 def fit_chirp(
     chirp: Observation, maps: Maps, rig: RigDescription, stop_hz: float
 ) -> tuple[dict[str, Estimate], dict[str, Any]]:
-    """The printed second order from the chirp alone.
+    """Fit the paper's second-order model to the chirp.
 
     Args:
         chirp: the chirp.
@@ -145,7 +145,7 @@ def fit_chirp(
         rig: for the output's delay.
         stop_hz: highest frequency of the chirp.
     Returns:
-        Results S20 of eq. 8 alone, and the section of analysis.json.
+        Results S20 of eq. 8 without a slow branch, and the section of analysis.json.
     Raises:
         ResultError: the fit has no result.
     """
@@ -197,10 +197,10 @@ def _second_order_results(printed: TransferFit) -> dict[str, Estimate]:
 
 
 def _posterior(both: TransferFit, slow: TransferFit) -> PlantPosterior:
-    """Covariance of the plant: the slow branch's from the steps, all else from the chirp.
+    """Covariance of the plant: slow branch from the steps, the rest from the chirp.
 
-    The two experiments are independent; that the chirp's numbers depend on the slow branch which
-    was held in their fit is left out.
+    The two experiments are independent. The chirp was fitted with the slow branch held fixed; the
+    dependence of its parameters on the slow branch is neglected.
     """
     fast, steps = both.posterior, slow.posterior
     names = ("slow_time_constant_s", "slow_gain")

@@ -1,4 +1,4 @@
-"""Free response after a drop, as the paper fits it and beside a creep: row S19."""
+"""Free response after a drop, fitted as in the paper and with a creep term: row S19."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from haselab.study.fits.trials import normal_equivalent
 __all__ = ["Envelope", "Free", "PrintedFit", "fit_free", "fit_printed"]
 
 _LEAST_PEAKS = 2  # of one sign, through which an envelope is drawn
-_LEAST_PEAK = 0.03  # of the amplitude: smaller peaks drown in what eq. 6 leaves
+_LEAST_PEAK = 0.03  # of the amplitude: smaller peaks are below the residuals of eq. 6
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """An exponential through the peaks of one sign; the paper calls it hull curve.
+    """Exponential envelope of the peaks of one sign; the paper calls it hull curve.
 
     Args:
         decay: in 1/s.
-        moved: by which the decay changes without the last peak, in 1/s.
+        moved: change of the decay without the last peak, in 1/s.
         amplitude_m: at the first sample, in m, positive for either sign.
         peak_s: times of the peaks from the first sample, shape `(P,)`.
         peak_m: their distances from rest, in m, positive for either sign, shape `(P,)`.
@@ -54,17 +54,17 @@ class Envelope:
 
 @dataclass(frozen=True)
 class PrintedFit:
-    """Eq. 6 through one trial by plain least squares, and the envelopes through its peaks.
+    """Least-squares fit of eq. 6 to one trial, and the envelopes of its peaks.
 
     Args:
         omega_d: damped frequency, in rad/s.
         decay: decay rate, in 1/s.
         amplitude_m: at the first sample, in m.
-        rest_m: length about which it swings, in m.
-        envelopes: through the positive and the negative peaks; None where fewer than two of them
-            stand out.
+        rest_m: length around which it oscillates, in m.
+        envelopes: of the positive and the negative peaks; None if fewer than two peaks exceed the
+            residuals.
         modelled_m: eq. 6 at the trial's times, shape `(N,)`.
-        rms_m: root mean square of what it leaves, in m.
+        rms_m: rms residual, in m.
     """
 
     omega_d: float
@@ -83,11 +83,11 @@ class PrintedFit:
 
 @dataclass(frozen=True)
 class Free:
-    """What the free-response trials give.
+    """Results of the free-response trials.
 
     Args:
         quantities: results by id.
-        notes: by id, what the reader should know.
+        notes: by id, remarks for the reader.
         figures: section of analysis.json.
     """
 
@@ -97,12 +97,12 @@ class Free:
 
 
 def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
-    """Eq. 6 as printed, without a creep, through one trial.
+    """Fit eq. 6 as printed, without a creep term, to one trial.
 
     Args:
         trial: displacement after the drop.
-        omega_d: where the search starts, in rad/s.
-        decay: the same, in 1/s.
+        omega_d: start of the search, in rad/s.
+        decay: start of the search, in 1/s.
     Returns:
         The fit.
     Raises:
@@ -121,9 +121,9 @@ def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
     found = least_squares(lambda search: modelled(search) - trial.x, start, x_scale=scale)
     omega, cosine, sine, rate, rest_m = (float(value) for value in found.x)
     if not found.success or rate <= 0.0:
-        raise ResultError(f"Eq. 6 as printed has no fit (decay {rate:.3g} 1/s). Record longer.")
+        raise ResultError(f"Eq. 6 as printed does not fit (decay {rate:.3g} 1/s). Record longer.")
     amplitude_m = math.hypot(cosine, sine)
-    swings = t <= -math.log(_LEAST_PEAK) / rate  # later peaks are the creep's and the noise's
+    swings = t <= -math.log(_LEAST_PEAK) / rate  # later peaks are creep and noise
     positive, negative = (
         _envelope(t[swings], sign * (trial.x - rest_m)[swings], amplitude_m, abs(omega))
         for sign in (1.0, -1.0)
@@ -135,9 +135,9 @@ def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
 
 
 def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float) -> Envelope | None:
-    """The exponential through the peaks of one sign, by a straight line through their logarithms.
+    """Fit an exponential to the peaks of one sign: a straight line through their logarithms.
 
-    Eq. 6's own amplitude would not do: with the peaks' decay it misses the peaks.
+    The amplitude of eq. 6 is not used: with the decay of the peaks it misses them.
     """
     apart = max(1, round(0.7 * 2.0 * math.pi / omega / float(np.median(np.diff(time_s)))))
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)
@@ -145,24 +145,24 @@ def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float)
         return None
     at_s, logarithm = time_s[peaks], np.log(moved_m[peaks])
     slope, intercept = (float(value) for value in np.polyfit(at_s, logarithm, 1))
-    moved = 0.0  # with two peaks: what a third one would say is not known
+    moved = 0.0  # unknown with only two peaks
     if peaks.size > _LEAST_PEAKS:
         moved = abs(slope - float(np.polyfit(at_s[:-1], logarithm[:-1], 1)[0]))
     return Envelope(-slope, moved, math.exp(intercept), at_s, moved_m[peaks])
 
 
 def fit_free(trials: Sequence[Observation]) -> Free:
-    """Free response after the drop: eqs. 6 and 7 and both envelopes, as printed and beside a creep.
+    """Fit eqs. 6 and 7 and both envelopes, as printed and with a creep term.
 
-    Eq. 6 has no creep. Of an actuator that creeps it leaves much, and the creep alone makes the two
-    envelopes differ; so both fits are results.
+    Eq. 6 has no creep term. With an actuator that creeps it leaves large residuals, and creep makes
+    the two envelopes differ. Both fits are therefore reported.
 
     Args:
-        trials: one observation a trial.
+        trials: one observation per trial.
     Returns:
         Results S19, data for figure 5.
     Raises:
-        ResultError: no trial rings, or a fit has no result.
+        ResultError: no trial oscillates, or a fit has no result.
     Source: reference study, row S19.
     """
     records = [_trial(seen).moving() for seen in trials]
@@ -191,17 +191,17 @@ def fit_free(trials: Sequence[Observation]) -> Free:
             "S19.eq6_rms": _repeated(np.array([p.rms_m for p in printed]), "m"),
         },
         notes={
-            "S19.omega_0": "decaying oscillation plus exponential creep; the creep amounts to "
+            "S19.omega_0": "decaying oscillation with exponential creep; the creep is "
             f"{1e3 * _creep_m(fit):.2g} mm over the record, the rms residual is "
             f"{1e3 * float(np.sqrt(np.mean(left_m**2))):.2g} mm",
-            "S19.eq6_omega_0": "decaying oscillation alone, without creep" + _missing(printed),
+            "S19.eq6_omega_0": "decaying oscillation without a creep term" + _missing(printed),
         },
         figures={"free_response": _figure(trials, records, fit, printed)},
     )
 
 
 def _repeated(values: Floats, unit: str) -> Estimate:
-    """Mean of the trials; two of them agree by chance, which Student's interval knows."""
+    """Mean of the trials; Student's interval accounts for their small number."""
     return normal_equivalent(over_trials(values, unit))
 
 
@@ -219,13 +219,13 @@ def _envelope_decays(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
 
 
 def _missing(printed: Sequence[PrintedFit]) -> str:
-    """Which exponential through the peaks cannot be drawn; empty where both can."""
+    """Note about envelopes that cannot be fitted; empty if both can."""
     gone = [
         name
         for k, name in enumerate(("positive", "negative"))
         if any(p.envelopes[k] is None for p in printed)
     ]
-    return f"; too few {' and '.join(gone)} peaks stand out of the creep" if gone else ""
+    return f"; too few {' and '.join(gone)} peaks exceed the creep" if gone else ""
 
 
 def _trial(seen: Observation) -> FreeTrial:
@@ -234,7 +234,7 @@ def _trial(seen: Observation) -> FreeTrial:
 
 
 def _creep_m(fit: FreeResponseFit) -> float:
-    """How far the mean of the trials creeps while they are recorded."""
+    """Creep of the mean of the trials during the recording."""
     moved = []
     for k, modelled in enumerate(fit.modelled):
         alone = fit.trials[k] if fit.trials else fit
@@ -252,7 +252,7 @@ def _figure(
     fit: FreeResponseFit,
     printed: Sequence[PrintedFit],
 ) -> dict[str, Any]:
-    """Displacement as recorded, from where eq. 6 as printed comes to rest."""
+    """Measured displacement, relative to the final value of eq. 6 as printed."""
     drawn = []
     for k, (seen, record) in enumerate(zip(trials, records, strict=True)):
         thin = slice(None, None, max(1, record.time_s.size // 1200))

@@ -1,4 +1,4 @@
-"""Closed-loop trials besides the paper's: its sensing chain, extra delay, saturation."""
+"""Further closed-loop trials: the paper's sensing chain, extra delay, saturation."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from haselab.study.definition import Study
 from haselab.study.fits.loops import Loops
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
-from haselab.study.fits.trials import ONE_TRIAL, Trials, at_best, gather
+from haselab.study.fits.trials import ONE_TRIAL, Trials, gather, with_camera_resolution
 from haselab.study.tables import Steps
 
 __all__ = ["further_trials", "saturating_reference"]
 
-_UPDATE_HZ = 100.0  # one new output a block, row S5
+_UPDATE_HZ = 100.0  # one new output per block, row S5
 _SATURATED_PART = 0.4  # of step_s, at the strain that saturates
-_AT_LIMIT_V = 1e-3  # of the drive, beside the voltage of the upper limit
+_AT_LIMIT_V = 1e-3  # distance from the voltage of the upper limit
 _ROWS = {"printed": ("S10", "printed_chain"), "late": ("S24", "delayed")}
 
 
 def saturating_reference(steps: Steps) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Desired strain of a trial that saturates: zero, too much, the step; one value a block."""
+    """Desired strain of a trial that saturates, one value per block: zero, too much, the step."""
     much_s = _SATURATED_PART * steps.step_s
     return np.concatenate(
         [
@@ -46,11 +46,11 @@ def further_trials(
     study: Study,
     scale_m_per_px: float,
 ) -> tuple[dict[str, Estimate], dict[str, str], dict[str, Any]]:
-    """Results S10, S22 and S24 of the trials that were played, notes, and data for figure S7.
+    """Results S10, S22 and S24 of the further trials, notes, and data for figure S7.
 
     Args:
         observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.
-        pi: the paper's trials, whose scatter a single trial is given.
+        pi: the paper's trials, whose scatter is used for a single trial.
         maps: zero strain, strain to voltage.
         loops: the saturation.
         study: the steps.
@@ -70,11 +70,11 @@ def further_trials(
             for which in ("rise_time_s", "steady_state_error")
         )
         quantities |= {
-            f"{row}.rise_{name}": at_best(rise, steps, strain_per_px),
-            f"{row}.error_{name}": at_best(error, steps, strain_per_px),
+            f"{row}.rise_{name}": with_camera_resolution(rise, steps, strain_per_px),
+            f"{row}.error_{name}": with_camera_resolution(error, steps, strain_per_px),
         }
-        told = _scatter_note(len(trials.strain), len(pi.strain))
-        notes |= {f"{row}.rise_{name}": told, f"{row}.error_{name}": told}
+        note = _scatter_note(len(trials.strain), len(pi.strain))
+        notes |= {f"{row}.rise_{name}": note, f"{row}.error_{name}": note}
         drawn[group] = {
             "time_s": trials.time_s - steps.zero_s,
             "desired": trials.reference,
@@ -94,15 +94,19 @@ def further_trials(
 
 
 def _scatter_note(trials: int, pi_trials: int) -> str:
-    """What the interval of a few trials is made of."""
+    """Note about the interval of a few trials."""
     counted = "one trial" if trials == 1 else f"{trials} trials"
     if pi_trials > 1:
-        return f"{counted}, with the scatter of the {pi_trials} PI trials"
-    return ONE_TRIAL if trials == 1 else f"{counted}; the interval is the camera's resolution alone"
+        return f"{counted}; scatter taken from the {pi_trials} PI trials"
+    return (
+        ONE_TRIAL
+        if trials == 1
+        else f"{counted}; the interval only includes the camera's resolution"
+    )
 
 
 def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -> Estimate:
-    """Mean of a few trials with the scatter of the paper's, which are more."""
+    """Mean of a few trials, with the scatter of the paper's trials, which are more."""
     values, known = (
         np.array([getattr(numbers, name) for numbers in some]) for some in (trials, pi)
     )
@@ -110,7 +114,7 @@ def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -
 
 
 def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> dict[str, Estimate]:
-    """How long the output stood at its limit, and when it left it after the reference returned."""
+    """Time of the output at its limit, and time to leave it after the reference returned."""
     limit_v = float(maps.voltage_map.voltage_v(loops.setting.saturation.high))
     at_limit = seen.drive_v >= limit_v - _AT_LIMIT_V
     reference = saturating_reference(study.steps)
@@ -122,7 +126,7 @@ def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> di
     free = np.flatnonzero(~at_limit[back:])
     left_s = (float(free[0]) if free.size else math.nan) * block_s
     return {
-        # From the first block at the limit to the last one; each end is known to a block.
+        # From the first block at the limit to the last one; each end is known to one block.
         "S22.saturated_fraction": Estimate.normal(share, math.sqrt(2.0) / much.size, ""),
         "S22.recovery_time": Estimate(
             left_s + 0.5 * block_s, block_s / math.sqrt(12.0), (left_s, left_s + block_s), "s"

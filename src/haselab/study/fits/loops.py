@@ -1,4 +1,4 @@
-"""From the identified plant to controllers with margins at the loop's true delay."""
+"""Design controllers for the identified plant, with margins at the true delay of the loop."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ __all__ = [
 ]
 
 _UNITS = {"phase_margin": "deg", "gain_margin": "dB", "delay_margin": "s", "crossover": "rad/s"}
-_LATENCY_ROOM_S = 0.25e-3  # for the amplifier's rise
-_LEAST_DB = 2.0  # gain margin with which the printed PI is played; it has 2.8 to 3.6 on the twin
-_LOWERED_DB = 6.0  # that a lowered one has
-_SHARES = [0.01 * percent for percent in range(99, 0, -1)]  # of a gain, tried from the top
+_LATENCY_TOLERANCE_S = 0.25e-3  # for the rise time of the amplifier
+_LEAST_DB = 2.0  # gain margin for which the printed PI is played; 2.8 to 3.6 on the twin
+_LOWERED_DB = 6.0  # gain margin of a PI with reduced gains
+_SHARES = [0.01 * percent for percent in range(99, 0, -1)]  # of a gain, tried in this order
 _PID = DesignSpec(rise_time_s=0.8, overshoot=0.07, phase_margin_deg=50.0, frequency_spread=0.10)
 
 
@@ -53,13 +53,13 @@ class Loops:
     """Controllers of the study.
 
     Args:
-        pi: the paper's loop: its gains for a plant of gain 1/2, scaled to the plant found (D8).
-        pid: with a derivative on the filtered measurement, row S25.
+        pi: the paper's PI: its gains for a plant of gain 1/2, scaled to the identified plant (D8).
+        pid: with the derivative of the filtered measurement, row S25.
         setting: rate, delay, saturation.
-        delayed_pi: the PI for outputs that are held back, see `Steps.extra_delay_blocks`.
+        delayed_pi: the PI for delayed outputs, see `Steps.extra_delay_blocks`.
         quantities: results by id.
         figures: section of analysis.json.
-        notes: by id, what the reader should know.
+        notes: by id, remarks for the reader.
     """
 
     pi: PidGains
@@ -74,16 +74,16 @@ class Loops:
 def loop_setting(
     study: Study, rig: RigDescription, to_volt: VoltageMap, output_s: float | None = None
 ) -> LoopSetting:
-    """The delay that a loop on this rig really has, besides the hold, and its saturation.
+    """The true delay of a loop on this rig, without the hold, and its saturation.
 
-    From the middle of the samples that the lock-in counts to the block's end, and from there to
-    the new output.
+    The delay lasts from the middle of the samples that the lock-in uses to the end of the block,
+    and from there to the new output.
 
     Args:
         study: carrier and saturation.
         rig: nominal values.
         to_volt: corrected strain to drive voltage.
-        output_s: from a block's last sample to the new output, as measured; None: as the rig says.
+        output_s: measured time from a block's last sample to the new output; None: the rig's.
     """
     averaging_s = rig.block_s - lockin_of(rig, study.sensing.carrier_hz).middle_s
     return LoopSetting(
@@ -112,22 +112,26 @@ def _nominal_s(rig: RigDescription) -> float:
 
 
 def measured_latency(opened: Sequence[Observation], rig: RigDescription) -> Estimate | None:
-    """From a block's last sample to the new output, as the steps in open loop show it.
+    """Measure the time from a block's last sample to the new output, from open-loop steps.
 
     Raises:
-        ResultError: it is not what the rig says, so that no update is where it is blanked out.
+        ResultError: it differs from the rig's value, so blanking misses the updates.
     """
     found = latency(np.concatenate([seen.latency_s for seen in opened]), rig.rate_hz)
-    if found is not None and abs(found.value - _nominal_s(rig)) > _LATENCY_ROOM_S + 4.0 * found.std:
+    if (
+        found is not None
+        and abs(found.value - _nominal_s(rig)) > _LATENCY_TOLERANCE_S + 4.0 * found.std
+    ):
         raise ResultError(
-            f"The outputs took effect {1e3 * found.value:.3f} ms after their block had ended, the "
-            f"rig says {1e3 * _nominal_s(rig):.3f} ms. Correct output_delay_s or ahead_blocks."
+            f"The outputs took effect {1e3 * found.value:.3f} ms after the end of their block, but "
+            f"the rig states {1e3 * _nominal_s(rig):.3f} ms. Change output_delay_s or "
+            "ahead_blocks."
         )
     return found
 
 
 def printed_gains(study: Study, plant: Plant) -> PidGains:
-    """The printed PI, so scaled that the loop gain is the paper's (ADR 0004)."""
+    """The printed PI, scaled so that the loop gain is that of the paper (ADR 0004)."""
     factor = study.control.plant_gain / plant.gain
     return PidGains(study.control.kp * factor, study.control.ki * factor)
 
@@ -138,20 +142,20 @@ def _holds(plant: Plant, gains: PidGains, setting: LoopSetting, least_db: float)
 
 
 def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
-    """A PI that a bench may be given: the printed one needs a loop without much dead time.
+    """Reduce the gains of the PI if the delay of the loop requires it.
 
-    Outputs that wait in a device add a block each. Where that leaves less than 2 dB of gain margin
-    the proportional gain, which excites the resonance, is lowered until there are 6 dB. Where even
-    0 is not low enough, so is the integral gain: what is left is an integral controller.
+    Each output that waits in a device adds one block of delay. If this leaves less than 2 dB of
+    gain margin, the proportional gain, which excites the resonance, is reduced until the margin is
+    6 dB. If 0 is not low enough, the integral gain of the remaining controller is reduced, too.
 
     Args:
         plant: as it was identified.
         gains: of the study.
         setting: rate and delay.
     Returns:
-        The same gains where they hold, else lower ones.
+        The gains, unchanged or reduced.
     Raises:
-        ResultError: no gain holds.
+        ResultError: no gains reach the margin.
     """
     if _holds(plant, gains, setting, _LEAST_DB):
         return gains
@@ -161,18 +165,18 @@ def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
         if _holds(plant, trial, setting, _LOWERED_DB):
             return trial
     raise ResultError(
-        f"No PI holds {_LOWERED_DB:g} dB of gain margin with a delay of "
-        f"{1e3 * setting.measurement_delay_s:.3g} ms. Let fewer outputs wait (daq.ahead_blocks)."
+        f"No PI reaches a gain margin of {_LOWERED_DB:g} dB with a delay of "
+        f"{1e3 * setting.measurement_delay_s:.3g} ms. Queue fewer outputs (daq.ahead_blocks)."
     )
 
 
 def _loop_delay_s(setting: LoopSetting) -> float:
-    """Delay of a loop with half a hold, without the plant's own, in s."""
+    """Delay of a loop in s, including half a hold but not the plant's own delay."""
     return setting.measurement_delay_s + 0.5 / setting.rate_hz
 
 
 def _delay_text(setting: LoopSetting, plant: Plant) -> str:
-    """The whole delay that margins are computed with: the loop's and what the plant's fit found."""
+    """The total delay for the margins: that of the loop and that of the fitted plant."""
     loop_ms, own_ms = 1e3 * _loop_delay_s(setting), 1e3 * plant.delay_s
     if own_ms <= 0.0:
         return f"a delay of {loop_ms:.3g} ms"
@@ -183,27 +187,27 @@ def _delay_text(setting: LoopSetting, plant: Plant) -> str:
 
 
 def _lowered(printed: PidGains, played: PidGains, setting: LoopSetting, plant: Plant) -> str:
-    """What the reader should know of gains that are not the printed ones; empty where they are."""
+    """Note about reduced gains; empty if the gains are the printed ones."""
     if printed == played:
         return ""
     kind = ", an integral controller" if played.kp == 0.0 else ""
     return (
         f"kp {printed.kp:.3g} -> {played.kp:.3g}, ki {printed.ki:.3g} -> {played.ki:.3g}/s{kind}: "
-        f"with {_delay_text(setting, plant)} the scaled PI leaves less than {_LEAST_DB:g} dB of "
+        f"with {_delay_text(setting, plant)} the scaled PI has less than {_LEAST_DB:g} dB of "
         "gain margin"
     )
 
 
 def _margin_note(gains: PidGains, plant: Plant, setting: LoopSetting) -> str:
-    """With which delay a gain margin was computed, and what it is without the plant's part."""
-    told = f"with {_delay_text(setting, plant)}"
+    """Note about the delay of a gain margin, and the margin without the plant's part of it."""
+    delay = f"with {_delay_text(setting, plant)}"
     if plant.delay_s <= 0.0:
-        return told
+        return delay
     alone = margins(
         replace(plant, delay_s=0.0), gains,
         loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz,
     )  # fmt: skip
-    return f"{told}; with the loop's alone {alone.gain_margin_db:.3g} dB"
+    return f"{delay}; with the loop's delay only {alone.gain_margin_db:.3g} dB"
 
 
 def design_loops(
@@ -215,16 +219,16 @@ def design_loops(
     output: Estimate | None = None,
     given: Loops | None = None,
 ) -> Loops:
-    """The paper's PI on the plant found, and a PID of our own.
+    """Scale the paper's PI to the identified plant, and design a PID.
 
     Args:
         found: identified plant with covariance.
         to_volt: corrected strain to drive voltage.
         study: printed gains, saturation.
         rig: for the delay.
-        rng: of the search.
+        rng: random numbers of the search.
         output: measured latency of the output, see `measured_latency`.
-        given: controllers to judge on this plant instead of designing some.
+        given: controllers to evaluate on this plant instead of designing them.
     Returns:
         Gains, results S21, S22 and S25, data for figure 7.
     Source: reference study, rows S21 to S23 and S25.
@@ -265,7 +269,7 @@ def design_loops(
 def _played(
     pi: PidGains, pid: PidGains, setting: LoopSetting, found: Dynamics
 ) -> dict[str, Estimate]:
-    """Gains, delay and limits of the loops that are closed."""
+    """Gains, delay and limits of the closed loops."""
     share = found.quantities["S20.gain"].std / abs(found.plant.gain)
     return {
         "S21.kp": Estimate.normal(pi.kp, share * pi.kp, ""),
@@ -281,12 +285,11 @@ def _played(
 
 
 def _pid_notes(pid: PidGains, plant: Plant, setting: LoopSetting) -> dict[str, str]:
-    """What the reader should know of the study's own controller."""
+    """Notes about the PID."""
     notes = {"S25.gain_margin": _margin_note(pid, plant, setting)}
     if pid.kp == 0.0:
         notes["S25.kp"] = (
-            "the design leaves out the proportional term, which would lift the resonance: integral "
-            "and derivative action"
+            "integral and derivative action only: a proportional term would raise the resonance"
         )
     return notes
 
@@ -298,12 +301,12 @@ def _notes(
     settings: tuple[LoopSetting, LoopSetting],
     rig: RigDescription,
 ) -> dict[str, str]:
-    """What the reader should know of scaled, played and late gains, and of the limits."""
+    """Notes about scaled, played and delayed gains, and about the limits."""
     scaled, pi, delayed_pi = gains
     setting, late = settings
     scaling = (
-        f"kp and ki of [control] times {study.control.plant_gain:g} / {plant.gain:.4g}: the gain "
-        "of the plant that they were chosen for, over that of the identified one"
+        f"kp and ki of [control] times {study.control.plant_gain:g} / {plant.gain:.4g}, the ratio "
+        "of the gain of the plant that they were chosen for and the identified plant's gain"
     )
     lowered = _lowered(scaled, pi, setting, plant)
     late_lowered = _lowered(scaled, delayed_pi, late, plant)
@@ -312,7 +315,7 @@ def _notes(
         "S21.ki": scaling,
         "S21.phase_margin": f"with {_delay_text(setting, plant)}",
         "S21.gain_margin": _margin_note(pi, plant, setting),
-        "S21.delay_margin": f"beyond {_delay_text(setting, plant)}",
+        "S21.delay_margin": f"in addition to {_delay_text(setting, plant)}",
         "S21.printed_gain_margin": _margin_note(
             PidGains(study.control.kp, study.control.ki), plant, setting
         ),
@@ -323,7 +326,7 @@ def _notes(
     narrowed = limits.low > control.saturation_low or limits.high < control.saturation_high
     if narrowed:
         notes["S22.saturation_low"] = notes["S22.saturation_high"] = (
-            f"narrowed to the strains whose voltage lies in {rig.drive_limits.low:g} to "
+            f"narrowed to the strains whose voltage is within {rig.drive_limits.low:g} to "
             f"{rig.drive_limits.high:g} V by the voltage map"
         )
     if lowered:
@@ -334,14 +337,14 @@ def _notes(
 def margin_estimates(
     gains: PidGains, found: Dynamics, setting: LoopSetting, names: tuple[str, ...]
 ) -> dict[str, Estimate]:
-    """Margins with the spread that the plant's covariance leaves them.
+    """Margins with their uncertainty from the plant's covariance.
 
     Args:
         gains: of the controller.
         found: the plant with its covariance.
         setting: rate and delay.
-        names: of the wanted ones: `phase_margin`, `gain_margin`, `delay_margin`, `crossover` (the
-            upper one).
+        names: which margins: `phase_margin`, `gain_margin`, `delay_margin`, `crossover` (the upper
+            one).
     Returns:
         Estimates by name.
     """

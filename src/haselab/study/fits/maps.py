@@ -1,4 +1,4 @@
-"""Triangle test to maps: voltage from strain (eq. 4), strain from capacitance (eq. 5)."""
+"""Maps from the triangle test: voltage of strain (eq. 4), strain of capacitance (eq. 5)."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from haselab.study.paper.paper_check import EQ_4
 
 __all__ = ["Maps", "fit_maps"]
 
-_COMPARED = (-0.05, 0.10)  # strains of the printed saturation, where two maps are compared
+_COMPARED = (-0.05, 0.10)  # range of the printed saturation, where two maps are compared
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Maps:
-    """What the triangle test gives.
+    """Results of the triangle test.
 
     Args:
         length_m: of zero strain.
         voltage_map: corrected strain to drive voltage, eq. 4.
-        strain_map: capacitance (F) to strain with its band: what the loops use.
+        strain_map: capacitance (F) to strain with its band, for the loops.
         quantities: results by id.
-        notes: by id, what the reader should know.
+        notes: by id, remarks for the reader.
         figures: sections of analysis.json.
     """
 
@@ -47,7 +47,7 @@ class Maps:
 
 
 def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
-    """Both maps from one triangle test, its first cycles left out.
+    """Fit both maps to one triangle test, without its first cycles.
 
     Args:
         cycles: of the triangle test.
@@ -55,7 +55,7 @@ def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
     Returns:
         Maps, results S13 to S15, data for figure 3.
     Raises:
-        ResultError: too few frames, or a fit without a result.
+        ResultError: there are too few frames, or a fit has no result.
     Source: reference study, rows S13 to S15.
     """
     seen, kept = cycles.seen, cycles.kept
@@ -70,7 +70,7 @@ def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
     at_strain = fit_capacitance_map(seen.relative_capacitance[inside], strain_sensed[inside])
     in_time = _Edges.of(cycles, strain_sensed)
     to_strain = fit_strain_map(seen.capacitance_f[inside], strain_sensed[inside])
-    curve, told = _curve(to_volt, drive_v[kept])
+    curve, note = _curve(to_volt, drive_v[kept])
     maps = Maps(
         length_m=length_m,
         voltage_map=to_volt.map,
@@ -87,7 +87,7 @@ def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
             "S15.slope_at_strain": at_strain.estimates["slope"],
             "S15.offset_at_strain": at_strain.estimates["offset"],
         },
-        notes={"S14.rms_difference": told},
+        notes={"S14.rms_difference": note},
         figures={},
     )  # fmt: skip
     maps.figures.update(_figures(cycles, strain, drive_v, maps, in_time))
@@ -95,35 +95,35 @@ def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
 
 
 def _curve(fit: VoltageMapFit, drive_v: Floats) -> tuple[Estimate, str]:
-    """Root mean square of fitted less printed map, part of the drive's range; and where."""
+    """Rms difference of fitted and printed map as a fraction of the drive range, and a note."""
     low = max(_COMPARED[0], fit.map.strain_low)
     high = min(_COMPARED[1], fit.map.strain_high)
     strain = np.linspace(low, high, 151)
     fitted_v = fit.map.voltage_v(strain)
     off_v = fitted_v - EQ_4.voltage_v(strain)
     rms_v = float(np.sqrt(np.mean(off_v**2)))
-    # To first order: each point moves with the curve's own deviation, all of them together.
+    # To first order: all points move together, each by the standard deviation of the curve.
     std_v = float(np.mean(np.abs(off_v) * fit.curve_std(strain)) / max(rms_v, 1e-12))
     span_v = float(np.ptp(drive_v))
-    note = f"rms distance over strains of {low:g} to {high:g}, as a fraction of {span_v:g} V"
+    note = f"rms difference over strains of {low:g} to {high:g}, as a fraction of {span_v:g} V"
     seen = (fitted_v >= drive_v.min()) & (fitted_v <= drive_v.max())
     if seen.any() and not seen.all():
         part = float(np.sqrt(np.mean(off_v[seen] ** 2))) / span_v
         note += (
             f"; {part:.3g} over {strain[seen][0]:.3g} to {strain[seen][-1]:.3g}, where the fitted "
-            "map stays within the triangle's voltages"
+            "map is within the voltages of the triangle"
         )
     return Estimate.normal(rms_v / span_v, std_v / span_v, ""), note
 
 
 @dataclass(frozen=True)
 class _Edges:
-    """Rising and falling edge averaged over time, as the paper does it: equal times from the turn.
+    """Mean of the rising and the falling edge at equal times from the peak, as in the paper.
 
     Args:
-        relative_capacitance: means, shape `(cycles, half)`, NaN where a block was lost.
+        relative_capacitance: means, shape `(cycles, half)`, NaN for a lost block.
         strain: means, the same shape.
-        quantities: the straight line through all of them.
+        quantities: the straight line through the means.
     """
 
     relative_capacitance: Floats
@@ -132,11 +132,11 @@ class _Edges:
 
     @classmethod
     def of(cls, cycles: Cycles, strain: Floats) -> _Edges:
-        """Fold each cycle that counts at its peak.
+        """Average each fitted cycle about its peak.
 
         Args:
             cycles: of the triangle test.
-            strain: of the camera at each capacitance, shape `(B,)`.
+            strain: measured by the camera at each capacitance, shape `(B,)`.
         """
         seen = cycles.seen
         half_s = 0.5 * float(np.mean(np.diff(cycles.starts_s)))
@@ -155,7 +155,7 @@ class _Edges:
         good = np.isfinite(c) & np.isfinite(e)
         if good.sum() < 16:
             raise ResultError(
-                f"{int(good.sum())} averages of both edges hold a capacitance, 16 are needed."
+                f"Only {int(good.sum())} means of both edges have a capacitance, but 16 are needed."
             )
         middle, size = float(c[good].mean()), 0.5 * float(np.ptp(c[good]))
         columns = np.column_stack([(c[good] - middle) / size, np.ones(int(good.sum()))])

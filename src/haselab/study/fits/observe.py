@@ -1,4 +1,4 @@
-"""From what an experiment recorded to what an analysis needs: lengths and capacitances in time."""
+"""Convert a recording to physical units: lengths and capacitances over time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from haselab.study.tables import Sensing
 __all__ = ["TRIANGLE", "Observation", "Source", "gauge_length", "observe", "point_spread"]
 
 
-TRIANGLE = "triangle"  # the experiment that the printed chain reads too
+TRIANGLE = "triangle"  # the paper's sensing chain is computed for this experiment too
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Observation:
         name: of the experiment.
         settings: of the experiment.
         block_start_s: clock at each block's first sample, shape `(B,)`.
-        drive_v: asked for in each block, shape `(B,)`.
+        drive_v: requested in each block, shape `(B,)`.
         reference: desired strain, NaN in open loop, shape `(B,)`.
         sensed_s: time of each capacitance, shape `(B,)`.
         capacitance_f: shape `(B,)`, NaN where the carrier was lost.
@@ -41,11 +41,11 @@ class Observation:
         spread_m: standard deviation of the lower points' displacements from the first frame about
             their mean, shape `(F,)`; 0 with perfect lengths.
         mass_kg: hung at each frame, shape `(F,)`.
-        drop_s: when a lifted mass was let go, NaN if none was.
+        drop_s: time at which a lifted mass was dropped; NaN if none was.
         latency_s: from the last sample before a block to its output, for each clear step of the
             drive, shape `(n,)`.
-        lockin: the lock-in's numbers for each block.
-        printed: the same by the printed chain; None where they are not wanted.
+        lockin: values of the lock-in for each block.
+        printed: values of the paper's sensing chain; None if they are not needed.
     """
 
     name: str
@@ -66,12 +66,12 @@ class Observation:
     printed: Chain | None = None
 
 
-# Gives the observation of the experiment with a name; analyses know nothing else of the session.
+# Returns the observation with a name; an analysis has no other access to the session.
 Source = Callable[[str], Observation]
 
 
 def gauge_length(tracks: NDArray[np.void], scale_m_per_px: float) -> NDArray[np.float64]:
-    """Distance of the two rows of fiducials, in m.
+    """Distance between the two rows of fiducials, in m.
 
     Args:
         tracks: fields of `SessionWriter.track_dtype()`, shape `(F, 6)`: upper row, lower row.
@@ -86,10 +86,10 @@ def gauge_length(tracks: NDArray[np.void], scale_m_per_px: float) -> NDArray[np.
 
 
 def point_spread(tracks: NDArray[np.void], scale_m_per_px: float) -> NDArray[np.float64]:
-    """How far the three points at the lower clamp move apart, in m.
+    """Spread of the displacements of the three points at the lower clamp, in m.
 
     Args:
-        tracks: as of `gauge_length`.
+        tracks: as for `gauge_length`.
         scale_m_per_px: of the camera.
     Returns:
         Standard deviation of their displacements from the first frame, shape `(F,)`.
@@ -116,7 +116,7 @@ def observe(
     by_lockin = by_chain = None
     if len(record.codes):
         sensed = lockin.sense(record.codes)
-        # A block with a model of its own counts other samples, so that its middle differs.
+        # A block with its own model uses other samples, so its middle differs.
         since_first_s = rig.block_s * np.arange(len(record.codes))
         times_s = record.block_start_s + sensed.time_s - since_first_s
         by_lockin = read_chain(sensed, sensing, rig.volt_per_code)

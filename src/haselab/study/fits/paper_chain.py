@@ -1,4 +1,4 @@
-"""The printed sensing chain beside the lock-in (rows S6 to S9)."""
+"""Compare the paper's sensing chain with the lock-in (rows S6 to S9)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Chain:
-    """What the printed chain gives for each block of an experiment; NaN where it gives nothing.
+    """Values of the paper's sensing chain for each block; NaN where it has none.
 
     Args:
         capacitance_f: shape `(B,)`.
         relative_capacitance: eqs. 2 and 3, shape `(B,)`.
         phase_rad: between the monitors, shape `(B,)`.
-        v_pp_v: peak-to-peak voltage of the sensing component behind the low-pass, shape `(B,)`.
+        v_pp_v: peak-to-peak voltage of the sensing component after the low-pass, shape `(B,)`.
     """
 
     capacitance_f: Floats
@@ -43,11 +43,11 @@ class Chain:
 
     @classmethod
     def of(cls, rows: Floats) -> Chain:
-        """From what `rows` gave."""
+        """Inverse of `rows`."""
         return cls(*rows.T)
 
     def taken(self, blocks: NDArray[np.bool_]) -> Chain:
-        """Some of the blocks."""
+        """Select some of the blocks."""
         return Chain.of(self.rows()[blocks])
 
 
@@ -56,9 +56,9 @@ class PrintedChain:
     """Results of the comparison.
 
     Args:
-        strain_map: eq. 5 through the chain's own capacitances, for a loop that is closed by it.
+        strain_map: eq. 5 fitted to the chain's own capacitances, for loops that use it.
         quantities: results by id.
-        notes: by id, what the reader should know.
+        notes: by id, remarks for the reader.
         figures: section of analysis.json.
     """
 
@@ -69,7 +69,7 @@ class PrintedChain:
 
 
 def read_chain(sensed: Sensed, sensing: Sensing, volt_per_code: float) -> Chain:
-    """Numbers of blocks that the printed chain has read."""
+    """Collect the values of blocks that the paper's chain has sensed."""
     good = sensed.valid
     relative = relative_capacitance(
         np.where(good, sensed.v_pp, 1.0) * volt_per_code,
@@ -92,12 +92,12 @@ def compare_chain(
     periods: float,
     fitted_periods: float,
 ) -> PrintedChain:
-    """How far the printed chain is from the lock-in over the triangle's cycles that count.
+    """Compare the paper's chain with the lock-in over the fitted cycles of the triangle.
 
     Args:
-        printed: of the printed chain.
-        lockin: the same blocks by the lock-in.
-        strain: by the camera at these blocks, shape `(B,)`.
+        printed: values of the paper's chain.
+        lockin: values of the lock-in for the same blocks.
+        strain: measured by the camera at these blocks, shape `(B,)`.
         drive_v: of these blocks, shape `(B,)`.
         time_s: of these blocks, shape `(B,)`.
         periods: of the carrier in a block.
@@ -105,13 +105,13 @@ def compare_chain(
     Returns:
         Results S6 to S8, data for figure S6.
     Raises:
-        ResultError: fewer than 16 blocks with both.
+        ResultError: fewer than 16 blocks have both values.
     """
     both = np.isfinite(printed.capacitance_f) & np.isfinite(lockin.capacitance_f)
     if both.sum() < _LEAST_BLOCKS:
         raise ResultError(
-            f"The paper's sensing chain gives a capacitance in {int(both.sum())} blocks of the "
-            f"triangle, {_LEAST_BLOCKS} are needed. Look for a lost carrier."
+            f"The paper's sensing chain has a capacitance in only {int(both.sum())} blocks of the "
+            f"triangle, but {_LEAST_BLOCKS} are needed. Check whether the carrier was lost."
         )
     ratio = printed.capacitance_f[both] / lockin.capacitance_f[both]
     turned = np.abs(printed.phase_rad[both]) - np.abs(lockin.phase_rad[both])

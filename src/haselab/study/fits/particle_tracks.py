@@ -1,4 +1,4 @@
-"""Row S11: particles over the whole sheet: is the stretch homogeneous, where does it narrow."""
+"""Row S11: homogeneity and narrowing of the sheet, from particles tracked all over it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _BANDS = 8
 def sheet_figure(
     particles: ExperimentRecord, fiducials: ExperimentRecord, rig: RigDescription, picture: str
 ) -> dict[str, Any]:
-    """Tracks over the first frame, strain along the length, lateral motion off the mid-line.
+    """Data of figure 2: tracks, strain along the length, lateral motion from the mid-line.
 
-    The profiles compare the frame of greatest elongation with the first one.
+    The profiles compare the frame with the largest elongation with the first one.
 
     Args:
         particles: tracks of the sheet's particles.
@@ -30,7 +30,7 @@ def sheet_figure(
         rig: scale of the camera.
         picture: path of the first frame, relative to the folder of the run.
     Returns:
-        Section `tracks` of analysis.json; empty when too few particles were followed.
+        Section `tracks` of analysis.json; empty if too few particles were tracked.
     Source: reference study, fig. 2.
     """
     tracks = particles.tracks

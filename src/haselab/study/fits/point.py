@@ -18,7 +18,7 @@ from haselab.study.fits.static import GRAVITY_M_S2, Static
 
 __all__ = ["Point", "find_point"]
 
-_DIGIT_V = 0.01  # to which a baseline is set
+_DIGIT_V = 0.01  # resolution of a baseline
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Point:
     Args:
         baseline_v: drive voltage of zero strain, in V.
         quantities: results by id.
-        notes: by id, what the reader should know.
+        notes: by id, remarks for the reader.
         figures: part of the section `static` of analysis.json.
     """
 
@@ -40,7 +40,7 @@ class Point:
 
 @dataclass(frozen=True)
 class _Held:
-    """Stretch at rest over the voltages that were held, both rising."""
+    """Stretch at rest as a function of the held voltages, both increasing."""
 
     drive_v: tuple[float, ...]
     stretch: tuple[float, ...]
@@ -54,20 +54,20 @@ class _Held:
         if not (np.diff(stretch) > 0.0).all():
             shown = ", ".join(f"{value:.4f}" for value in stretch)
             raise ResultError(
-                f"The stretch at rest must rise with the voltage, but it is {shown}. Check the "
+                f"The stretch at rest must increase with the voltage, but is {shown}. Check the "
                 "amplifier and the hung mass, or increase static_load.settle_s."
             )
         return cls(drive_v, stretch)
 
     def at(self, drive_v: float) -> float:
-        """Stretch at a voltage between those that were held, or at the nearest of them."""
+        """Stretch at a voltage, interpolated between the held ones; outside, the nearest."""
         inside = float(np.clip(drive_v, self.drive_v[0], self.drive_v[-1]))
         if len(self.drive_v) == 1:
             return self.stretch[0]
         return float(PchipInterpolator(self.drive_v, self.stretch)(inside))
 
     def centring_v(self, stretch: float) -> float:
-        """Voltage with a stretch; the nearer end where none has it."""
+        """Voltage of a stretch; the nearer end of the range if no voltage reaches it."""
         inside = float(np.clip(stretch, self.stretch[0], self.stretch[-1]))
         return float(PchipInterpolator(self.stretch, self.drive_v)(inside))
 
@@ -78,7 +78,7 @@ class _Held:
 
 
 def _better_kg(held: _Held, static: Static, mass_kg: float) -> float | None:
-    """The mass whose strain would be centred at the middle one of the held voltages."""
+    """The mass whose strain is centred at the middle one of the held voltages."""
     drawn = static.figures["static"]
     at_middle = held.at(0.5 * (held.drive_v[0] + held.drive_v[-1]))
     loads = np.interp([static.centre.value, at_middle], drawn["stretch"], drawn["load_n"])
@@ -94,22 +94,22 @@ def find_point(
     rig: RigDescription,
     played_v: float | None = None,
 ) -> Point:
-    """The baseline that the study gives, or the one that centres the strain.
+    """Find the baseline that centres the strain, or use that of the study.
 
-    The weight is the rig's. The strain is that at rest, as in the static load test; in a triangle
-    it lags.
+    The hung mass is the rig's. The strain is measured at rest, as in the static load test; in a
+    triangle it lags.
 
     Args:
-        holds: the rig's weight at rest at some voltages.
-        cycles: of the triangle test, for the room on both sides.
+        holds: the rig's mass at rest at some voltages.
+        cycles: of the triangle test, for the range on both sides.
         static: of the static load test.
         study: baseline.
-        rig: weight, scale of the camera.
+        rig: hung mass, scale of the camera.
         played_v: baseline of another run that is repeated, instead of the one found here.
     Returns:
-        Baseline, results S18; the one found here stays in the results.
+        Baseline, results S18; these always report the baseline found here.
     Raises:
-        ResultError: the stretch does not rise with the voltage, or too few frames near it.
+        ResultError: the stretch does not increase with the voltage, or too few frames are near it.
     Source: reference study, row S18.
     """
     region, centre = static.region, static.centre
@@ -127,12 +127,12 @@ def find_point(
             better_kg = _better_kg(held, static, rig.mass_kg)
             advice = "use a stiffer actuator" if better_kg is None else f"hang about {better_kg} kg"
             notes["S18.baseline"] = (
-                f"the centre of the region, stretch {centre.value:.3f}, is not reached with "
-                f"{rig.mass_kg:g} kg and room for the chirp; {advice}"
+                f"the centre of the region, stretch {centre.value:.3f}, is out of reach with "
+                f"{rig.mass_kg:g} kg and the range of the chirp; {advice}"
             )
     else:
         found_v = given
-        notes["S18.baseline"] = "set by operating_point.baseline_v"
+        notes["S18.baseline"] = "set with operating_point.baseline_v"
     played_v = found_v if played_v is None else played_v
     stretch = held.at(played_v)
     half = 0.5 * (region.high.value - region.low.value)

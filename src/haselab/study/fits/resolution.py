@@ -1,4 +1,4 @@
-"""What repeats of an experiment do not show: the resolution of the camera."""
+"""The resolution of the camera, an error that repeated trials do not show."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from haselab.base.estimate import Z95
 
 __all__ = ["POSITION_PX", "with_resolution"]
 
-POSITION_PX = 0.01  # sub-pixel bias of a tracked length, the same in all trials
+POSITION_PX = 0.01  # sub-pixel bias of a tracked length, equal in all trials
 
 
 def with_resolution(estimate: Estimate, resolution: float) -> Estimate:
-    """The estimate with a further, independent standard deviation.
+    """Add a further, independent standard deviation to an estimate.
 
     Args:
-        estimate: with the scatter that was seen; NaN where a single trial shows none.
-        resolution: standard deviation that the scatter does not hold, in the estimate's unit.
+        estimate: with the observed scatter; NaN for a single trial.
+        resolution: standard deviation that the scatter does not include, in the same unit.
     Returns:
         The estimate, its interval centred on the value.
     Example:

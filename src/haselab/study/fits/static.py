@@ -27,13 +27,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Static:
-    """What the static load test gives.
+    """Results of the static load test.
 
     Args:
         free_length_m: between the clamps without load.
-        region: the longest linear one.
+        region: the longest linear region.
         quantities: results by id.
-        notes: by id, what the reader should know.
+        notes: by id, remarks for the reader.
         figures: section of analysis.json.
     """
 
@@ -52,24 +52,24 @@ class Static:
 
 
 def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
-    """Load against elongation of the whole actuator.
+    """Fit the load as a function of the elongation of the whole actuator.
 
     Stretch counts from the free length, where the shell itself is stretched by 1/sqrt(lateral).
 
     Args:
         seen: the static load test.
-        study: number of straight segments, None for that of BIC.
+        study: number of straight segments; None: chosen by BIC.
         rig: cross-section and lateral stretch of the shell.
     Returns:
         Results S16 and S17, data for figure 4.
     Raises:
-        ResultError: fewer than seven loads were seen, or the law could not be fitted.
+        ResultError: fewer than seven loads, or the law could not be fitted.
     Source: reference study, rows S16 and S17.
     """
     masses_kg = np.unique(seen.mass_kg)
     if masses_kg.size < LEAST_LOADS:
         raise ResultError(
-            f"{masses_kg.size} loads in the static test; at least {LEAST_LOADS} are needed."
+            f"The static test has {masses_kg.size} loads, but needs at least {LEAST_LOADS}."
         )
     levels = [seen.length_m[seen.mass_kg == mass] for mass in masses_kg]
     length_m = np.array([level.mean() for level in levels])
@@ -103,7 +103,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
             "S17.region_high": with_resolution(chosen.high, finest * chosen.high.value),
         },
         notes={
-            "S16.mu": "of the shell; electrodes are fitted beside it, with a cubic term",
+            "S16.mu": "of the shell; the electrodes are fitted in parallel, with a cubic term",
             "S17.region_low": _segments_note(regions, study),
         },
         figures={
@@ -129,12 +129,12 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
 def _segments_note(regions: RegionsFit, study: Study) -> str:
     count = len(regions.regions)
     if study.static_load.pieces is not None:
-        return f"{count} straight segments, as the study asks"
-    return " ".join([f"BIC prefers {count} straight segments.", *regions.notes]).rstrip(".")
+        return f"{count} straight segments, as set in the study"
+    return " ".join([f"{count} straight segments, chosen by BIC.", *regions.notes]).rstrip(".")
 
 
 def _fitted_load_n(law: HyperelasticFit, stretch: Floats, rig: RigDescription) -> Floats:
-    """Load of shell and electrodes together over the stretch from the free length."""
+    """Load of shell and electrodes as a function of the stretch from the free length."""
     natural = 1.0 / np.sqrt(rig.lateral_stretch)
     e = natural * (stretch - 1.0)
     spring, cubic = (

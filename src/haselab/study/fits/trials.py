@@ -1,4 +1,4 @@
-"""Step trials: what the camera saw, what self-sensing said, rise times and errors."""
+"""Step trials: strain from the camera and from self-sensing, rise times and errors."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ __all__ = [
     "ONE_TRIAL",
     "Comparison",
     "Trials",
-    "at_best",
     "compare_trials",
     "compared",
     "gather",
     "normal_equivalent",
+    "with_camera_resolution",
 ]
 
-ONE_TRIAL = "one trial: the interval is the camera's resolution alone, without scatter"
+ONE_TRIAL = "one trial: the interval only includes the camera's resolution, not the scatter"
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Trials:
 
     Args:
         time_s: from the start of a trial, shape `(N,)`.
-        strain: by the camera, shape `(trials, N)`.
+        strain: measured by the camera, shape `(trials, N)`.
         sensed: by self-sensing, shape `(trials, N)`.
         reference: desired strain, shape `(N,)`.
         metrics: of the camera's strain.
@@ -55,9 +55,9 @@ class Trials:
 
 
 def normal_equivalent(estimate: Estimate) -> Estimate:
-    """The same interval with the standard deviation that a normal error of that width has.
+    """Replace the standard deviation by that of a normal error with the same interval.
 
-    Few trials make a standard deviation that is itself uncertain; Student's interval knows it.
+    With few trials the standard deviation itself is uncertain; Student's interval includes this.
     """
     low, high = estimate.ci95
     return Estimate(estimate.value, (high - low) / (2.0 * Z95), estimate.ci95, estimate.unit)
@@ -69,7 +69,7 @@ def gather(
     to_strain: StrainMap,
     steps: Steps | StepTrials,
 ) -> Trials:
-    """Trials of one group at the times of the first one's frames, and their metrics.
+    """Collect the trials of one group at the frame times of the first one, with their metrics.
 
     Args:
         trials: as they were recorded.
@@ -78,8 +78,8 @@ def gather(
         steps: their times.
     """
     count = round((steps.zero_s + steps.step_s - 0.1) * steps.frame_rate_hz)
-    # At the frames themselves: half-way between them, interpolation takes out a third of a ringing
-    # of 5 Hz at 20 frames/s.
+    # At the frame times: interpolation half-way between frames at 20 frames/s attenuates ringing of
+    # 5 Hz by a third.
     first_s = (trials[0].frame_time_s[0] - trials[0].block_start_s[0]) % (1.0 / steps.frame_rate_hz)
     time_s = first_s + np.arange(count, dtype=np.float64) / steps.frame_rate_hz
     strain, sensed = [], []
@@ -108,8 +108,8 @@ class Comparison:
         groups: trials by group: "open loop", "PI", "PID".
         quantities: results by id.
         figures: sections of analysis.json.
-        sensing_error: rms of self-sensed against camera strain over all trials, part of the span.
-        notes: by id, what the reader should know.
+        sensing_error: rms difference of self-sensed and camera strain, fraction of the span.
+        notes: by id, remarks for the reader.
     """
 
     groups: dict[str, Trials]
@@ -122,7 +122,7 @@ class Comparison:
 def compare_trials(
     observed: dict[str, Sequence[Observation]], maps: Maps, study: Study, scale_m_per_px: float
 ) -> Comparison:
-    """Open loop against closed loop.
+    """Compare open loop and closed loop.
 
     Args:
         observed: trials by group: "open loop" and, if they were played, "PI", "PID" and `OWN`.
@@ -130,7 +130,7 @@ def compare_trials(
         study: the step.
         scale_m_per_px: of the camera, for its resolution.
     Returns:
-        Results S24 and S25, data for figure 6 and for self-sensing against the camera.
+        Results S24 and S25, data for figure 6 and for the comparison of self-sensing and camera.
     Source: reference study, rows S24 and S25.
     """
     groups = {
@@ -165,8 +165,8 @@ def compare_trials(
         key: ONE_TRIAL for key in quantities if len(groups[_group_of(key)].strain) == 1
     }  # fmt: skip
     for key in (key for key in quantities if _group_of(key) == OWN):
-        told = own_note(study.control)
-        notes[key] = f"{told}; {notes[key]}" if key in notes else told
+        note = own_note(study.control)
+        notes[key] = f"{note}; {notes[key]}" if key in notes else note
     named = {str(study.control.kind) if name == OWN else name: g for name, g in groups.items()}
     shown = "PI" if "PI" in named else list(named)[-1]
     found = compared(named, quantities, study.steps, scale_m_per_px / maps.length_m, shown)
@@ -180,15 +180,17 @@ def _group_of(key: str) -> str:
     return "open loop" if "_open" in key else "PI"
 
 
-def at_best(estimate: Estimate, steps: Steps | StepTrials, strain_per_px: float) -> Estimate:
-    """A metric with what the camera's resolution leaves of it, a time or a part of the step.
+def with_camera_resolution(
+    estimate: Estimate, steps: Steps | StepTrials, strain_per_px: float
+) -> Estimate:
+    """Add the camera's resolution to a metric, a time or a fraction of the step.
 
     Args:
         estimate: in s, or dimensionless.
         steps: the step, rate of the frames.
         strain_per_px: of the camera.
     Returns:
-        The estimate with the resolution in its interval; as it is where it has no value.
+        The estimate with the resolution in its interval; unchanged if it has no value.
     """
     if math.isnan(estimate.value):
         return estimate
@@ -204,24 +206,24 @@ def compared(
     strain_per_px: float,
     shown: str,
 ) -> Comparison:
-    """What the camera's resolution leaves of the results, and the figures.
+    """Add the camera's resolution to the results, and make the figures.
 
     Args:
         groups: trials by group.
         quantities: results by id, of metrics.
         steps: the step.
         strain_per_px: of the camera.
-        shown: the group whose first trial shows self-sensing beside the camera.
+        shown: the group whose first trial is used to compare self-sensing and camera.
     """
 
     def seen(estimate: Estimate) -> Estimate:
-        return at_best(normal_equivalent(estimate), steps, strain_per_px)
+        return with_camera_resolution(normal_equivalent(estimate), steps, strain_per_px)
 
     quantities = {key: seen(value) for key, value in quantities.items()}
     camera = np.concatenate([g.strain.ravel() for g in groups.values()])
     sensed = np.concatenate([g.sensed.ravel() for g in groups.values()])
     error = float(np.sqrt(np.mean((sensed - camera) ** 2)) / np.ptp(camera))
-    # One interval for a number, in the table of results and below a figure.
+    # The same interval in the table of results and below a figure.
     metrics = {
         name: {
             "rise_time_s": seen(g.metrics.rise_time_s),

@@ -1,4 +1,4 @@
-"""The reference study's printed numbers, recomputed: what agrees, what does not."""
+"""Recompute the printed numbers of the reference study, and check which are consistent."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ _TURN = 2.0 * math.pi
 
 @dataclass(frozen=True)
 class RecomputedRow:
-    """One printed claim beside what its own numbers give.
+    """One printed claim, and the value recomputed from the paper's own numbers.
 
     Args:
-        id: `A1` and on for what agrees, `D1` and on for what does not.
-        claim: what it is about.
-        paper: what is printed.
-        recomputed: what follows, in words and figures.
-        numbers: the same figures by name, SI, unit last.
+        id: `A1`, `A2` ... for claims that agree, `D1`, `D2` ... for those that do not.
+        claim: its subject.
+        paper: the printed value.
+        recomputed: the recomputed value, as text.
+        numbers: the recomputed numbers by name, SI, unit last.
         verdict: `agrees` or `disagrees`.
     """
 
@@ -74,16 +74,16 @@ class RecomputedRow:
 
 @dataclass(frozen=True)
 class ReconcilingRow:
-    """Step figures of a plant with one slow branch, for one reading of the frequency axis.
+    """Step metrics of a plant with one slow branch, for one unit of the frequency axis.
 
     Args:
         reading: `rad` or `hz`.
         plant: resonance and slow branch.
         rise_open_s: 10 to 90 %, ringing averaged out, in s.
         error_open: open-loop error, part of the step.
-        rise_closed_s: the same with the printed PI at 5 and 10 ms of measurement delay, in s.
+        rise_closed_s: closed loop with the printed PI at 5 and 10 ms of measurement delay, in s.
         limit_cycle_delay_s: smallest of the delays 5, 10, ... 25 ms at which the saturated loop
-            keeps oscillating; NaN for none.
+            oscillates; NaN: none.
     """
 
     reading: str
@@ -95,10 +95,10 @@ class ReconcilingRow:
 
 
 def recompute_paper() -> tuple[RecomputedRow, ...]:
-    """Every checked claim of the paper: first those that agree, then D1 to D17.
+    """Check the claims of the paper: first those that agree, then D1 to D17.
 
     Returns:
-        The rows, each computed now from the printed numbers.
+        The rows, computed from the printed numbers.
     Source: reference study, eqs. 2 to 13 and the text around them.
     Example:
         >>> {row.id: row.verdict for row in recompute_paper()}["D1"]
@@ -109,10 +109,10 @@ def recompute_paper() -> tuple[RecomputedRow, ...]:
 
 
 def recompute_steps() -> tuple[ReconcilingRow, ...]:
-    """Open and closed steps of the plants that reconcile the paper's rise times.
+    """Open- and closed-loop steps of plants that explain the paper's rise times.
 
     Returns:
-        Two slow branches, each under both readings of the frequency axis.
+        Two slow branches, each with both units of the frequency axis.
     """
     rows = []
     for fast, slow, tau_s in ((0.5, 0.4, 4.7), (0.4, 0.5, 4.1)):
@@ -147,16 +147,16 @@ def _step(plant: Plant, gains: PidGains | None, delay_s: float) -> StepNumbers:
 
 
 def paper_step(gains: PidGains | None) -> StepNumbers:
-    """Metrics of a step of 0.04 of eq. 8, held at 100 Hz, with the printed saturation.
+    """Metrics of a step of 0.04 with eq. 8, held at 100 Hz, with the printed saturation.
 
     Args:
-        gains: of the controller, which has 5 ms of measurement delay; None for the open loop.
+        gains: of the controller, with 5 ms of measurement delay; None: open loop.
     """
     return _step(_EQ8, gains, 0.0 if gains is None else 0.005)
 
 
 def _limit_cycle_delay_s(plant: Plant) -> float:
-    """Smallest tried delay at which the linear loop is unstable and so the clipped one cycles."""
+    """Smallest tested delay at which the linear loop is unstable, so the saturated one cycles."""
     for delay_s in (0.005, 0.010, 0.015, 0.020, 0.025):
         if not margins(plant, _PI, loop_delay_s=delay_s, rate_hz=100.0).stable:
             return delay_s
@@ -206,9 +206,9 @@ def _free_response() -> list[RecomputedRow]:
         _row("D2", "the free response validates the Bode plot", "damping ratio 0.09",
              f"{ratio[0]:.2f} and {ratio[1]:.2f}; in Hz {ratio_hz[0]:.2f} and {ratio_hz[1]:.2f}",
              _pairs("damping_ratio_rad", ratio) | _pairs("damping_ratio_hz", ratio_hz)),
-        _row("D3", "hull curves through several peaks", "peaks on both sides",
-             f"a cycle at 5.1 rad/s leaves {kept[0]:.1%} and {kept[1]:.1%}: no second peak; at "
-             f"5.1 Hz {kept_hz[0]:.0%} and {kept_hz[1]:.0%}",
+        _row("D3", "envelopes (hull curves) through several peaks", "peaks on both sides",
+             f"after one cycle at 5.1 rad/s {kept[0]:.1%} and {kept[1]:.1%} remain: no second "
+             f"peak; at 5.1 Hz {kept_hz[0]:.0%} and {kept_hz[1]:.0%}",
              _pairs("left_per_cycle_rad", kept) | _pairs("left_per_cycle_hz", kept_hz)),
     ]  # fmt: skip
 
@@ -227,7 +227,7 @@ def _exact_step(
 def _rise_and_settling_s(
     y: NDArray[np.float64], final: float, time_s: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Raw 10 to 90 % rise, and the times from which 5 % and 2 % are kept, in s."""
+    """Rise time 10 to 90 % with ringing, and settling times to 5 % and 2 %, in s."""
     first = [float(time_s[np.argmax(y >= part * final)]) for part in (0.1, 0.9)]
     away = np.abs(y / final - 1.0)
     kept = [float(time_s[np.flatnonzero(away > band)[-1]]) for band in (0.05, 0.02)]
@@ -274,15 +274,15 @@ def _loop() -> list[RecomputedRow]:
     loop = margins(_EQ8, _PI, loop_delay_s=0.0, rate_hz=None)
     at = [item.omega_rad_s for item in loop.crossovers]
     return [
-        _row("D6", "the P term shortens the rise", "Kp raises the cross-over",
+        _row("D6", "the P term shortens the rise time", "Kp raises the crossover",
              f"the slow real pole {real:.2f} 1/s ({-1.0 / real:.1f} s) comes from Ki; the pair's "
              f"damping falls from {_ZETA:.3f} to {damping:.3f}, through Ki ({i_alone:.3f} with Ki "
              f"alone, {p_alone:.3f} with Kp alone)",
              {"real_pole_per_s": real, "damping_ratio": damping,
               "damping_ratio_kp_alone": p_alone, "damping_ratio_ki_alone": i_alone}),
-        _row("D7", "the cross-over frequency rises", "at least kept",
-             f"the upper one falls from {plant.crossover_rad_s:.2f} to {at[-1]:.2f} rad/s (a new "
-             f"one appears at {at[0]:.2f}); phase margin {loop.phase_margin_deg:.1f} deg, gain "
+        _row("D7", "the crossover frequency increases", "at least unchanged",
+             f"the upper one decreases from {plant.crossover_rad_s:.2f} to {at[-1]:.2f} rad/s (a "
+             f"new one appears at {at[0]:.2f}); phase margin {loop.phase_margin_deg:.1f} deg, gain "
              f"margin {loop.gain_margin_db:.1f} dB, peak sensitivity {loop.peak_sensitivity:.1f}, "
              f"delay margin {loop.delay_margin_s * 1e3:.1f} ms",
              {"plant_crossover_rad_s": plant.crossover_rad_s, "crossover_rad_s": at[-1],
@@ -356,9 +356,9 @@ def _filter_row() -> RecomputedRow:
     phase_deg = math.degrees(float(np.angle(response[1])))
     phase_deg -= 360.0 if phase_deg > 0.0 else 0.0
     return _row("D13", "the low-pass removes noise", "4th-order Butterworth at 2,001 Hz",
-                f"it sits on the carrier: {gain_db[1]:.1f} dB, {phase_deg:.0f} deg, and "
+                f"its corner is at the carrier: {gain_db[1]:.1f} dB, {phase_deg:.0f} deg, and "
                 f"{gain_db[0]:.1f} and {gain_db[2]:.1f} dB 100 Hz to either side; equal on both "
-                f"channels, so capacitance survives",
+                f"channels, so the capacitance is unaffected",
                 {"carrier_db": float(gain_db[1]), "carrier_deg": phase_deg,
                  "lower_side_db": float(gain_db[0]), "upper_side_db": float(gain_db[2])},
                 )  # fmt: skip
@@ -369,7 +369,7 @@ def _stiffness_row() -> RecomputedRow:
     sag = [_MASS_KG * _GRAVITY_M_S2 / k for k in stiffness]
     square_per_v2 = _agreeing()[3].numbers["square_per_v2"] / _AMPLIFIER**2
     # F = V^2/2 dC/dx with d ln C / d strain = 2 and plates of W x L and gap t: the strain b V^2
-    # asks for k = 2 eps W / (2 b t L).
+    # requires k = 2 eps W / (2 b t L).
     electric = [3.0 * _EPSILON_0_F_M * width / (square_per_v2 * gap * length)
                 for width, gap, length in ((0.06, 3e-4, 0.10), (0.19, 1e-4, 0.04))]  # fmt: skip
     return _row("D14", "0.25 kg at the natural frequency", "5.1 rad/s",
@@ -401,7 +401,7 @@ def _delay_row() -> RecomputedRow:
     slow = margins(_EQ8, _PI, loop_delay_s=0.0, rate_hz=None).delay_margin_s
     least, most = 0.005 + 0.005 + 0.005, 0.005 + 0.005 + 0.010
     return _row("D16", "100 Hz loop", "updates every 10 ms",
-                f"block average, hold and input/output make {least * 1e3:.0f} to "
+                f"block average, hold and input/output add up to {least * 1e3:.0f} to "
                 f"{most * 1e3:.0f} ms; the delay margin is {slow * 1e3:.1f} ms at 5.1 rad/s, but "
                 f"{margin[0] * 1e3:.1f} to {margin[1] * 1e3:.1f} ms at 5.1 Hz",
                 {"delay_low_s": least, "delay_high_s": most, "delay_margin_rad_s": slow,
@@ -413,7 +413,7 @@ def _sensing_row() -> RecomputedRow:
     harmonic = _CARRIER_HZ / 100.0
     skew_s = 1.0 / 400e3
     skew_deg = 360.0 * _CARRIER_HZ * skew_s
-    return _row("D17", "sensing at 2 kHz beside a 100 Hz staircase", "separate signals",
+    return _row("D17", "sensing at 2 kHz with a 100 Hz staircase", "separate signals",
                 f"2 kHz is harmonic {harmonic:g} of the staircase: each step leaks into the "
                 f"carrier's bin; multiplexed channels are {skew_s * 1e6:.1f} us apart, "
                 f"{skew_deg:.1f} deg",

@@ -1,4 +1,4 @@
-"""The table of all results: name, unit, what the paper prints, what its own numbers give."""
+"""The table of all results: name, unit, printed value, recomputed value."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _PAPER_WN_RAD_S = math.sqrt(26.14)
 _PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
 _PAPER_PI = PidGains(0.85, 1.5)
 _CALIBRATED_ONCE = (
-    "The interval holds what differs between the trials, not the chip's calibration, which a run "
-    "makes once: 0.1 % of capacitance are 0.008 of a step of 0.04, 0.02 of one of 0.014"
+    "The interval includes differences between the trials, but not the error of the chip's "
+    "calibration, which a run makes once: 0.1 % of capacitance corresponds to 0.008 of a step of "
+    "0.04 and to 0.02 of one of 0.014"
 )
-_IN_HZ = "printed in rad/s; the same number read in Hz is {:.1f} rad/s"
+_IN_HZ = "printed in rad/s; the same number in Hz is {:.1f} rad/s"
 
 
 # Names without the paper's equations, for other studies.
@@ -44,7 +45,7 @@ _PLAIN = {
 
 @functools.cache
 def _paper_numbers() -> dict[str, float]:
-    """Margins and rise times of the printed plant and controller, and what eq. 4 reaches."""
+    """Margins and rise times of the printed plant and controller, and the range of eq. 4."""
     loop = margins(_PAPER, _PAPER_PI, loop_delay_s=0.0, rate_hz=None)
     plant = margins(_PAPER, PidGains(1.0, 0.0), loop_delay_s=0.0, rate_hz=None)
     opened, closed = (paper_step(gains) for gains in (None, _PAPER_PI))
@@ -67,7 +68,7 @@ def _paper_numbers() -> dict[str, float]:
 
 def _sensing() -> dict[str, Quantity]:
     eq_2 = "with the scale 2.5e3 in eq. 2 (D11b)"
-    trade = "the coefficients trade against each other; S14.rms_difference compares the curves"
+    trade = "the coefficients are correlated; S14.rms_difference compares the curves"
     loop = _paper_numbers()
     return {
         "S6.carrier_gain": Quantity(
@@ -89,21 +90,21 @@ def _sensing() -> dict[str, Quantity]:
         ),
         "S8.difference_rising": Quantity(
             "capacitance, relative difference of the paper's "
-            "sensing chain to the lock-in, rising drive",
+            "sensing chain from the lock-in, rising drive",
             "",
             reference_only=True,
         ),
         "S8.difference_falling": Quantity(
             "capacitance, relative difference of the paper's "
-            "sensing chain to the lock-in, falling drive",
+            "sensing chain from the lock-in, falling drive",
             "",
             reference_only=True,
         ),
         "S10.rise_printed_chain": Quantity(
             "rise time, PI with the paper's sensing chain",
             "s",
-            paper_note="the paper's 2.5 to 3 s stand at S24.rise_closed; a larger carrier, since "
-            "the steps of the output leak into a small one (D17)",
+            paper_note="the paper's 2.5 to 3 s are compared in S24.rise_closed; a larger carrier, "
+            "because the steps of the output leak into a small one (D17)",
         ),
         "S10.error_printed_chain": Quantity(
             "steady-state error, PI with the paper's sensing chain",
@@ -157,7 +158,8 @@ def _statics() -> dict[str, Quantity]:
             "baseline voltage", "V", 1.0, paper_note="at the DAQ output; 1 V is the paper's 5 kV"
         ),
         "S18.centre_offset": Quantity(
-            "operating point off the linear region's centre, fraction of its half-width",
+            "distance of the operating point from the linear region's centre, fraction of its "
+            "half-width",
             "",
             0.0,
             within=TOLERANCE,
@@ -215,7 +217,7 @@ def _dynamics() -> dict[str, Quantity]:
             "natural frequency, free response over chirp, minus 1",
             "",
             0.0,
-            paper_note="paper: the one validates the other (D2)",
+            paper_note="paper: the free response validates the chirp (D2)",
             within=TOLERANCE,
         ),
         "S20.gain": Quantity(
@@ -226,15 +228,15 @@ def _dynamics() -> dict[str, Quantity]:
         ),
         "S20.zeta": Quantity("plant, damping ratio", "", 0.09, _PAPER.damping_ratio),
         "S20.delay": Quantity(
-            "plant, delay of its own",
+            "plant, own delay",
             "s",
             paper_note="eq. 8 has none",
-            note="fitted beside the loop's, whose margins include it where it is above 0",
+            note="fitted in addition to the loop's delay; margins include it if it is above 0",
         ),
         "S20.slow_gain": Quantity(
             "plant, gain of the slow branch",
             "",
-            paper_note="a first-order term beside eq. 8: the creep that a step shows",
+            paper_note="a first-order term in addition to eq. 8: the creep in a step",
         ),
         "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s"),
         "S20.eq8_gain": Quantity(
@@ -272,7 +274,7 @@ def _loops() -> dict[str, Quantity]:
             paper_note="recomputed: without delay",
         ),
         "S21.delay": Quantity(
-            "delay of the loop with half a hold, without the plant's own (S20.delay)",
+            "delay of the loop including half a hold, without the plant's own delay (S20.delay)",
             "s",
             recomputed=(0.015, 0.020),
             paper_note="recomputed: D16",
@@ -284,18 +286,18 @@ def _loops() -> dict[str, Quantity]:
             paper_note="recomputed: without delay",
         ),
         "S21.crossover": Quantity(
-            "PI, upper cross-over",
+            "PI, upper crossover",
             "rad/s",
             recomputed=loop["crossover"],
             paper_note="paper: at least that of the plant alone (D7)",
         ),
         "S21.plant_crossover": Quantity(
-            "plant alone, upper cross-over", "rad/s", recomputed=loop["plant_crossover"]
+            "plant alone, upper crossover", "rad/s", recomputed=loop["plant_crossover"]
         ),
         "S21.printed_gain_margin": Quantity(
             "printed gains on this plant, gain margin",
             "dB",
-            paper_note="the printed gains as they are, not scaled (D8); negative: unstable",
+            paper_note="the printed gains, not scaled (D8); negative: unstable",
             reference_only=True,
         ),
         "S21.delayed_gain_margin": Quantity(
@@ -315,13 +317,11 @@ def _loops() -> dict[str, Quantity]:
             0.1,
             setting="limits of the study",
         ),
-        "S22.saturated_fraction": Quantity(
-            "saturating trial, fraction of the time at the limit", ""
-        ),
+        "S22.saturated_fraction": Quantity("saturating trial, fraction of time at the limit", ""),
         "S22.recovery_time": Quantity(
             "saturating trial, time to leave the limit",
             "s",
-            note="from the reference's return; anti-windup",
+            note="after the reference returns; shows the anti-windup",
         ),
         "S24.rise_open": Quantity(
             "rise time, open loop",
@@ -329,7 +329,7 @@ def _loops() -> dict[str, Quantity]:
             (6.0, 8.0),
             loop["rise_open"],
             "eq. 8 alone is then an ideal step, hence 0 s (D4)",
-            note="ringing averaged out: read from the response less its fast oscillation",
+            note="ringing averaged out: from the response without its fast oscillation",
         ),
         "S24.rise_open_raw": Quantity(
             "rise time, open loop, ringing included",
@@ -361,7 +361,7 @@ def _loops() -> dict[str, Quantity]:
         "S24.rise_delayed": Quantity(
             "rise time, PI with extra delay",
             "s",
-            paper_note="no trial of the paper",
+            paper_note="the paper has no such trial",
         ),
         "S24.error_delayed": Quantity("steady-state error, PI with extra delay", ""),
         "S25.kp": Quantity("PID, proportional gain", ""),
@@ -411,7 +411,7 @@ def quantities() -> dict[str, Quantity]:
 
 
 def paper_rows(*prefixes: str) -> dict[str, Quantity]:
-    """Some results of the reference study, by id.
+    """Select results of the reference study, by id.
 
     Args:
         prefixes: of the ids, such as `S19.`.

@@ -1,4 +1,4 @@
-"""The reference study row by row: what the paper does, what is done here, what differs."""
+"""The reference study row by row: the paper, this project, and the differences."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class StudyRow:
 
     Args:
         id: `S1` to `S30`, `D1` to `D17`.
-        paper: what the paper does, or says.
+        paper: what the paper does or states.
         here: what is done here.
-        where: results, figures and files that show it; "" for what is open.
-        differs: what differs and why; "" for nothing.
+        where: results, figures and files that show it; "" for an open row.
+        differs: what differs and why; "": nothing.
     """
 
     id: str
@@ -51,7 +51,7 @@ def study_rows() -> tuple[StudyRow, ...]:
 
 
 def markdown_table(rows: Iterable[StudyRow]) -> str:
-    """The rows as a table of docs/study.md."""
+    """Format the rows as the table in docs/study/study.md."""
     lines = ["| row | the paper | here | where | what differs |", "|---|---|---|---|---|"]
     lines += [f"| {r.id} | {r.paper} | {r.here} | {r.where} | {r.differs} |" for r in rows]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What a run holds of the reference study: results that it lacks, and where it was changed."""
+"""Differences of a run from the reference study: missing results and changed settings."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 from haselab.study.definition import Study, builtin_study
 from haselab.study.results import rows_of
-from haselab.study.simulated.truth import beside_default
+from haselab.study.simulated.truth import with_default_twin
 
 __all__ = ["changes_text", "not_played"]
 
 _MOST_SHOWN = 12  # changed settings in one sentence
-# Settings of the study, and the rows of the table that they are part of.
+# Settings of the study, and the rows of the table that they affect.
 _ROWS = {
     "sensing": "S3, S6 to S9",
     "operating_point": "S18",
@@ -23,7 +23,7 @@ _ROWS = {
     "steps": "S10, S21 to S25",
     "control": "S21, S22",
 }
-# Results of step trials that a study may leave out, and the setting that counts them.
+# Results of step trials that a study may leave out, and the setting for their number.
 _COUNTED = {
     "printed_chain_trials": ("S10.rise_printed_chain", "S10.error_printed_chain"),
     "extra_delay_trials": ("S24.rise_delayed", "S24.error_delayed"),
@@ -39,15 +39,15 @@ def not_played(
     study: Study,
     missing: Mapping[str, str] | None = None,
 ) -> list[dict[str, Any]]:
-    """Results of a study's experiments that a run does not have, and why.
+    """List results of a study's experiments that a run does not have, with the reasons.
 
     Args:
-        measured: ids of the results that it has.
-        figures: sections of analysis.json, which say why an experiment of the chip is missing.
-        study: that was played.
+        measured: ids of the results that the run has.
+        figures: sections of analysis.json, which state why a chip's experiment is missing.
+        study: the study that was played.
         missing: why a fit did not give a result, by id.
     Returns:
-        Section `not_played` of results.json: `ids` and `reason`, results with one reason together.
+        Section `not_played` of results.json: `ids` and `reason`, grouped by reason.
     """
     found: dict[str, list[str]] = {}
     known = missing or {}
@@ -63,18 +63,18 @@ def _reason(key: str, figures: Mapping[str, Any], study: Study) -> str:
     for name, on_chip in _ON_CHIP.items():
         if row == on_chip:
             section = figures.get(name)
-            told = section.get("left_out") if isinstance(section, Mapping) else ""
-            return str(told or "not played")
+            reason = section.get("left_out") if isinstance(section, Mapping) else ""
+            return str(reason or "not played")
     for setting, keys in _COUNTED.items():
         if key in keys and study.has("steps") and not getattr(study.steps, setting):
             return f"steps.{setting} is 0 in this study."
     if key.startswith("S19.eq6_decay_"):
-        return "too few peaks stand out of the creep (S19.eq6_omega_0)."
-    return "no result from what was recorded."
+        return "too few peaks exceed the creep (S19.eq6_omega_0)."
+    return "no result from the recorded data."
 
 
 def changes_text(header: Mapping[str, Any]) -> str:
-    """One sentence about where a run differs from the study that the table of rows describes.
+    """Describe in one sentence how a run differs from the study in the table of rows.
 
     Args:
         header: of the session.
@@ -88,7 +88,7 @@ def changes_text(header: Mapping[str, Any]) -> str:
         rows = [rows for name, rows in _ROWS.items() if any(c.startswith(name) for c in changed)]
         what = "the quick form of the study" if study == quick else "another study"
         parts.append(f"{what}, which changes rows {', '.join(rows) or '(none)'}: {_shown(changed)}")
-    twins = beside_default(header["rig_config"])
+    twins = with_default_twin(header["rig_config"])
     if twins is None:
         parts.append("another rig than the twin, which rows S1 and S4 describe")
     elif changed := list(_changed(*twins)):
@@ -97,7 +97,7 @@ def changes_text(header: Mapping[str, Any]) -> str:
 
 
 def _changed(default: Any, own: Any, name: str = "") -> Iterator[str]:
-    """Each setting that differs, with both values."""
+    """Yield each setting that differs, with both values."""
     if isinstance(default, Mapping) and isinstance(own, Mapping):
         for key in dict.fromkeys([*default, *own]):
             if key != "name":
@@ -108,7 +108,7 @@ def _changed(default: Any, own: Any, name: str = "") -> Iterator[str]:
 
 def _text(value: Any) -> str:
     if value is None:
-        return "left to the data"
+        return "found from the data"
     if isinstance(value, (list, tuple)):
         return f"{len(value)} values" if len(value) > 3 else str(list(value))
     return f"{value:g}" if isinstance(value, (int, float)) else str(value)

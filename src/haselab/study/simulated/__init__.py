@@ -1,1 +1,1 @@
-"""What is known of a simulated bench: true parameters and noise-free results."""
+"""Knowledge about a simulated bench: true parameters and noise-free results."""

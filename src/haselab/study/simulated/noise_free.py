@@ -1,8 +1,8 @@
-"""A study without noise: what the twin would give to instruments that make no error.
+"""Noise-free reference runs: the twin with ideal instruments.
 
-The truth of an experiment is what the same experiment and the same fit give on the same bench
-with all noise off: for a nonlinear bench that is the best approximation the fit can reach there.
-Nothing of this is read by an analysis of recorded data.
+The reference value of a result comes from the same experiment and the same fit on the same twin
+with all noise off. For a nonlinear bench this is the best approximation that the fit can reach. An
+analysis of recorded data never reads it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.rig import Rig
-from haselab.rig.twin.bench import TwinBench, rig_of
 from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.observer import Seen
 from haselab.runtime.runner import lockin_of, printed_chain_of
 from haselab.sensing import Lockin
@@ -22,13 +22,13 @@ from haselab.study.definition import Study
 from haselab.study.fits.observe import TRIANGLE, Observation
 from haselab.study.fits.paper_chain import Chain, read_chain
 
-__all__ = ["QuietBench"]
+__all__ = ["NoiseFreeBench"]
 
 _BLOCKS = 200
 
 
 class _Recording:
-    """What one experiment leaves in memory: sensed block by block, lengths as they truly are."""
+    """Recording of one experiment in memory: sensed blocks and true lengths."""
 
     def __init__(self) -> None:
         self.blocks: list[tuple[float, float, float]] = []
@@ -39,7 +39,7 @@ class _Recording:
         self.drop_s = float("nan")
 
 
-class QuietBench:
+class NoiseFreeBench:
     """A noise-free twin with a perfect camera: recorder, observer and rig in one.
 
     Args:
@@ -52,7 +52,7 @@ class QuietBench:
         self.rig: Rig = rig_of(self._bench, config)
         self._sensing = study.sensing
         lockin = lockin_of(self.rig.description, study.sensing.carrier_hz)
-        self._lockin = Lockin(lockin.config, models=False)  # rounding alone is no noise
+        self._lockin = Lockin(lockin.config, models=False)  # rounding is not noise
         self._chain = printed_chain_of(self.rig.description, study.sensing.carrier_hz)
         self._recordings: dict[str, _Recording] = {}
         self._name = ""
@@ -92,7 +92,7 @@ class QuietBench:
             self._recordings.setdefault(name, _Recording()).drop_s = time_s
 
     def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
-        """Remember what was really used."""
+        """Store the settings that were really used."""
         self._settings[name] = settings
 
     # Observer
@@ -124,8 +124,8 @@ class QuietBench:
     def observation(self, name: str) -> Observation:
         """See `haselab.study.fits.observe.Source`."""
         recording = self._recordings[name]
-        frames = np.concatenate(recording.frames)
-        blocks = np.array(recording.blocks).reshape(-1, 3)
+        frame_time_s, length_m, mass_kg = np.concatenate(recording.frames).T
+        block_start_s, drive_v, reference = np.array(recording.blocks).reshape(-1, 3).T
         lockin, printed = (
             Chain.of(np.concatenate(rows)) if rows else None
             for rows in (recording.sensed, recording.printed)
@@ -134,16 +134,16 @@ class QuietBench:
         return Observation(
             name=name,
             settings=self._settings.get(name, {}),
-            block_start_s=blocks[:, 0],
-            drive_v=blocks[:, 1],
-            reference=blocks[:, 2],
-            sensed_s=blocks[:, 0] + self._lockin.middle_s,
+            block_start_s=block_start_s,
+            drive_v=drive_v,
+            reference=reference,
+            sensed_s=block_start_s + self._lockin.middle_s,
             capacitance_f=none if lockin is None else lockin.capacitance_f,
             relative_capacitance=none if lockin is None else lockin.relative_capacitance,
-            frame_time_s=frames[:, 0],
-            length_m=frames[:, 1],
-            spread_m=np.zeros(len(frames)),
-            mass_kg=frames[:, 2],
+            frame_time_s=frame_time_s,
+            length_m=length_m,
+            spread_m=np.zeros(length_m.size),
+            mass_kg=mass_kg,
             drop_s=recording.drop_s,
             latency_s=np.empty(0),
             lockin=lockin,

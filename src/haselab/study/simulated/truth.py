@@ -1,4 +1,4 @@
-"""What is known of a bench that is simulated: its parameters, and what follows from them."""
+"""The parameters of a simulated bench, and the results that follow from them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pydantic import ValidationError
 from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig, twin_of_reading
 
 __all__ = [
-    "beside_default",
     "follows_from_twin",
     "is_simulated",
     "parameters",
     "set_in_twin",
     "twin_of",
+    "with_default_twin",
 ]
 
 _SAME = 0.02  # relative difference from the default twin within which a parameter is the same
 _STATIC = ("shell", "electrodes", "load", "dielectric")
-# What the default twin's numbers were chosen from (docs/adr/0003) and where they lie, by row.
+# Results that the default twin's parameters were chosen to give (ADR 3), and those parameters.
 _SET = {
     "S13.residual_first": ("stiffness of the virgin actuator", ("mullins",)),
     "S14": ("span of eq. 4 over the triangle", _STATIC),
@@ -29,15 +29,15 @@ _SET = {
     "S16": ("shell material of the open tensile record", ("shell",)),
     "S17": ("stiffening of the electrodes", ("shell", "electrodes")),
     "S18": ("stiffening of the electrodes, span of eq. 4", _STATIC),
-    "S19": ("frequency and damping of the reading", (*_STATIC, "viscosity")),
-    "S20.omega_n": ("frequency of the reading", _STATIC),
-    "S20.zeta": ("damping of the reading", (*_STATIC, "viscosity")),
-    "S20.eq8_omega_n": ("frequency of the reading", _STATIC),
-    "S20.eq8_zeta": ("damping of the reading", (*_STATIC, "viscosity")),
+    "S19": ("frequency and damping of the interpretation", (*_STATIC, "viscosity")),
+    "S20.omega_n": ("frequency of the interpretation", _STATIC),
+    "S20.zeta": ("damping of the interpretation", (*_STATIC, "viscosity")),
+    "S20.eq8_omega_n": ("frequency of the interpretation", _STATIC),
+    "S20.eq8_zeta": ("damping of the interpretation", (*_STATIC, "viscosity")),
     "S20.slow": ("viscoelastic branch for a rise of 6 to 8 s", ("viscosity",)),
     "S24.rise_open": ("viscoelastic branch for a rise of 6 to 8 s", ("viscosity",)),
 }
-# Results that follow from parameters of any twin, whatever their values, and from which.
+# Parameters of any twin that determine a result, whatever their values.
 _FOLLOWS = {
     "S13": "stiffness and viscosity",
     "S14": "stiffness and dielectric",
@@ -53,14 +53,14 @@ _FOLLOWS = {
     "S20.zeta": "mass, inertia, stiffness and damping",
     "S20.eq8_zeta": "mass, inertia, stiffness and damping",
     "S20.slow": "viscosity",
-    "S24.rise": "viscosity, and the gains that were scaled to the plant",
+    "S24.rise": "viscosity, and the gains scaled to the plant",
     "S24.rise_open": "viscosity",
     "S24.error_open": "viscosity",
 }
 
 
 def twin_of(rig_config: Mapping[str, Any]) -> TwinConfig | None:
-    """The twin of a session's header; None for another rig."""
+    """The twin in a session's header; None for another rig."""
     if "shell" not in rig_config or "electrodes" not in rig_config:
         return None
     try:
@@ -69,13 +69,15 @@ def twin_of(rig_config: Mapping[str, Any]) -> TwinConfig | None:
         return None
 
 
-def beside_default(rig_config: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]] | None:
-    """Numbers of the default twin of the same reading, and of the twin of a session's header.
+def with_default_twin(
+    rig_config: Mapping[str, Any],
+) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """Parameters of the default twin with the same reading, and of the twin of a session.
 
     Args:
         rig_config: of the header.
     Returns:
-        Both as JSON holds them; None for another rig.
+        Both as JSON types; None for another rig.
     """
     twin = twin_of(rig_config)
     if twin is None:
@@ -85,12 +87,12 @@ def beside_default(rig_config: Mapping[str, Any]) -> tuple[dict[str, Any], dict[
 
 
 def is_simulated(rig_config: Mapping[str, Any]) -> bool:
-    """Whether the bench of a session's header was a twin, or a chip beside one."""
+    """Whether the bench of a session was a twin, or a chip in co-simulation."""
     return twin_of(rig_config) is not None or bool(rig_config.get("simulator"))
 
 
 def parameters(twin: TwinConfig) -> dict[str, float]:
-    """Results that are parameters of the twin, by id; none of them is one of another law."""
+    """Results that are parameters of the twin, by id; other laws have none."""
     if twin.kind != PLANAR_HASEL:
         return {}
     return {
@@ -100,14 +102,14 @@ def parameters(twin: TwinConfig) -> dict[str, float]:
 
 
 def set_in_twin(twin: TwinConfig, key: str) -> str:
-    """What of the default twin was set to the paper's value of a result.
+    """What in the default twin was set to the paper's value of a result.
 
     Args:
         twin: of the session.
         key: id of the result.
     Returns:
-        The reason; empty for a result that was not put in, and where the twin has other numbers in
-        what the result depends on.
+        The reason; empty if the result was not set, or if the twin differs from the default one in
+        parameters that the result depends on.
     """
     name = _named(key, _SET)
     if name is None or twin.kind != PLANAR_HASEL:
@@ -122,27 +124,27 @@ def set_in_twin(twin: TwinConfig, key: str) -> str:
 
 
 def follows_from_twin(key: str) -> str:
-    """Which parameters of a twin give a result, so that no run on a twin can confirm the paper.
+    """Which parameters of a twin determine a result, so that no twin can confirm the paper.
 
-    A twin that was changed in one number still has the others, so this does not ask for values.
+    The answer does not depend on the values: a twin with one changed parameter has the others.
 
     Args:
         key: id of the result.
     Returns:
-        The parameters; empty for a result that no few of them determine.
+        The parameters; empty if no small set of them determines the result.
     """
     name = _named(key, _FOLLOWS)
     return "" if name is None else _FOLLOWS[name]
 
 
 def _named(key: str, names: Collection[str]) -> str | None:
-    """The longest name that an id or its beginning has."""
+    """The longest name that is the id or a prefix of it."""
     found = [name for name in names if key == name or key.startswith((f"{name}.", f"{name}_"))]
     return max(found, key=len, default=None)
 
 
 def _alike(one: Any, other: Any) -> bool:
-    """Whether all numbers are the same within 2 %."""
+    """Whether all numbers agree within 2 %."""
     if isinstance(one, dict):
         return all(_alike(one[name], other[name]) for name in one)
     if isinstance(one, (list, tuple)):

@@ -14,7 +14,7 @@ from haselab.tracking.options import Floats, Frame, TrackOptions
 from haselab.tracking.particles.detect import DotProfile, find_profile, locate_particles
 from haselab.tracking.particles.link import nearest_pairs
 from haselab.tracking.points import PointTracker
-from haselab.tracking.tracks import FrameTracks, Reason, TrackState
+from haselab.tracking.tracks import FrameTracks, LossReason, TrackState
 
 __all__ = ["ParticleState", "ParticleTracker", "lone_subset_px"]
 
@@ -202,9 +202,9 @@ class ParticleTracker:
         inner, made = self._tracker.step(start, frame)
         away = np.hypot(made.x_px - place[:, 0], made.y_px - place[:, 1])
         reason = np.zeros(len(place), np.uint8) if made.reason is None else made.reason.copy()
-        reason[(reason == 0) & ~(found & (away < _REFINED_PX))] = Reason.STRAYED
-        reason[near_px <= self._overlap_px] |= np.uint8(Reason.COVERED)
-        reason[~certain] = Reason.AMBIGUOUS
+        reason[(reason == 0) & ~(found & (away < _REFINED_PX))] = LossReason.STRAYED
+        reason[near_px <= self._overlap_px] |= np.uint8(LossReason.COVERED)
+        reason[~certain] = LossReason.AMBIGUOUS
         keep = reason == 0
         columns = (made.x_px, made.y_px, made.std_x_px, made.std_y_px)
         x, y, std_x, std_y = (np.where(keep, column, np.nan) for column in columns)

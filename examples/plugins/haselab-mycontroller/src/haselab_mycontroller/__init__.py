@@ -12,7 +12,7 @@ class MyController:
         self.gain_per_s, self.smoothing_s = gain_per_s, smoothing_s
 
     def start(self, setting: ControllerSetting) -> None:
-        """Begin at rest."""
+        """Reset the state for a new experiment."""
         self.setting = setting
         self.aim, self.integral = 0.0, setting.drive_start
 

@@ -38,20 +38,20 @@ class CreepSettings(Section):
 
 
 class CreepTest(Experiment[CreepSettings]):
-    """One voltage, held; the length approaches its end exponentially."""
+    """A constant voltage; the length approaches its final value exponentially."""
 
     table = "creep"
     title = "Creep"
     settings_type = CreepSettings
 
     def drives(self, rig: RigDescription) -> list[Drive]:
-        """A ramp to the voltage, which is then held."""
+        """A ramp to the voltage, and the constant voltage after it."""
         s = self.settings
         ramp_v = np.linspace(0.0, s.drive_v, round(s.ramp_s * UPDATE_HZ), endpoint=False)
         return [Drive("creep", np.append(ramp_v, constant(s.drive_v, s.hold_s, UPDATE_HZ)))]
 
     def play(self, player: Player) -> None:
-        """Rest at 0 V, then hold the voltage and record."""
+        """Wait at 0 V, then hold the voltage and record."""
         (drive,) = self.drives(player.rig)
         player.settle(0.0, self.settings.hold_s)
         player.play("creep", drive.values_v, self.settings.frame_rate_hz)
@@ -79,7 +79,7 @@ class CreepTest(Experiment[CreepSettings]):
         )
 
     def rows(self) -> Mapping[str, Quantity]:
-        """The results, as the report shows them."""
+        """Names and units of the results in the report."""
         return {
             "creep.time_constant": Quantity("creep, time constant", "s"),
             "creep.amplitude": Quantity("creep, amplitude", "m"),

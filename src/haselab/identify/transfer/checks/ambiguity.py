@@ -15,7 +15,7 @@ from haselab.base import Estimate
 from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
-from haselab.identify.transfer.problem import Found, Problem
+from haselab.identify.transfer.problem import Found, TransferProblem
 
 __all__ = ["Rival", "ambiguity", "rivals_of", "stands_alone", "whitened_energy"]
 
@@ -83,7 +83,7 @@ class Rival:
 
 def rivals_of(
     layout: Layout,
-    problem: Problem,
+    problem: TransferProblem,
     residuals: Sequence[Floats],
     others: Sequence[Found],
     estimates: dict[str, Estimate],

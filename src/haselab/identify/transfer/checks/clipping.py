@@ -16,7 +16,7 @@ from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.ambiguity import whitened_energy
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
-from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import delay_margin_s, richer_start
 
@@ -50,7 +50,7 @@ def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]
     """
     records = best.records
     count = sum(r.y.size for r in records)
-    whole = Problem(layout, records, delay_margin_s(records))
+    whole = TransferProblem(layout, records, delay_margin_s(records))
     y = np.concatenate([r.y for r in records])
     chosen: tuple[float, Best, float, float] | None = None
     for low, high in _rails(y):

@@ -17,7 +17,7 @@ from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.checks.ambiguity import whitened_energy
 from haselab.identify.transfer.checks.clipping import kept, richer_fits
 from haselab.identify.transfer.layout import Layout
-from haselab.identify.transfer.problem import Problem
+from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import delay_grid, delay_margin_s
 
@@ -345,7 +345,7 @@ def _places(
     # Without the free motion of the start, which a late part does not determine.
     found = replace(fit.found, own=[np.zeros_like(fit.found.own[0])])
     modelled = np.empty(wide_s.size)
-    modelled[inside] = Problem(layout, [grid], delay_margin_s([grid])).predict(found)[0]
+    modelled[inside] = TransferProblem(layout, [grid], delay_margin_s([grid])).predict(found)[0]
     modelled[~inside] = modelled[inside][0]
     modelled += float(np.mean((record.y - modelled[most : most + count])[keep]))
     base = np.concatenate([[0.0], np.cumsum((record.y - modelled[most : most + count]) ** 2)])

@@ -67,7 +67,7 @@ class NidaqBoard:
         self._monitor_gain = monitor_gain
         self._volts = np.empty((2, config.block_samples))
         self._one = np.empty((2, 1))
-        self._asked_v = 0.0  # by the last write
+        self._requested_v = 0.0  # by the last write
         self._queued_v = 0.0  # the last value that the device has been given
         self._coming: deque[float] = deque()  # known values of the blocks after those given
         self._early: deque[float] = deque()  # values that were given before their block was read
@@ -131,11 +131,11 @@ class NidaqBoard:
     def write(self, voltage_v: float) -> None:
         """See `haselab.rig.VoltageSource`: given to the device when the next block is read."""
         self._limits.check(voltage_v)
-        self._asked_v = float(voltage_v)
+        self._requested_v = float(voltage_v)
 
     def zero(self) -> None:
         """See `haselab.rig.VoltageSource`: what is queued is thrown away. Never raises."""
-        self._asked_v = self._queued_v = 0.0
+        self._requested_v = self._queued_v = 0.0
         self._forget()
         self._let_go()
         if quietly(lambda: self._put_out(0.0)) is not None:  # whoever holds the output loses it
@@ -182,7 +182,7 @@ class NidaqBoard:
 
     def pause(self) -> None:
         """The output stands at the last one asked for; blocks pass until the next one is read."""
-        self._stand_at(self._asked_v)
+        self._stand_at(self._requested_v)
 
     def _stand_at(self, voltage_v: float) -> None:
         self._forget()
@@ -259,10 +259,10 @@ class NidaqBoard:
         """Queue the output of the block that comes, and those of later ones that are known."""
         values: list[float] = []
         if self._early:
-            if self._early.popleft() != self._asked_v:
+            if self._early.popleft() != self._requested_v:
                 raise DeviceError(
                     f"NI board {self._config.device}: the queued output differs from the requested "
-                    f"one, {self._asked_v:g} V. This is a bug: report it."
+                    f"one, {self._requested_v:g} V. This is a bug: report it."
                 )
         else:
             if self._coming:
@@ -270,7 +270,7 @@ class NidaqBoard:
             if self._position < self._silent_until:
                 self.missed_outputs += 1
                 return
-            values.append(self._asked_v)
+            values.append(self._requested_v)
         room = _LEAD - len(self._early)
         following = self._position + (len(self._early) + 1) * self._config.block_samples
         some: list[float] = []
@@ -302,8 +302,8 @@ class NidaqBoard:
         self._stand_at(self._queued_v)
         if not self._kept:
             self._position = self._start_stream()
-            self._ahead.write_many_sample(np.array([self._asked_v]), self._config.timeout_s)
-            self._queued_v = self._asked_v
+            self._ahead.write_many_sample(np.array([self._requested_v]), self._config.timeout_s)
+            self._queued_v = self._requested_v
             return
         self._silent_until = self._start_stream()
         self._early, self._coming = early, coming

@@ -11,17 +11,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import LimitError, SafetyError
+from haselab.base import Closing, LimitError, SafetyError
 from haselab.rig import Frames
-from haselab.rig.twin.bench import GRAVITY_M_S2, TwinBench, describe
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.camera_faults import CameraFaults
 from haselab.rig.twin.serve.wiring import Wiring
+from haselab.rig.twin.twin_bench import GRAVITY_M_S2, TwinBench, describe
 
 __all__ = ["TICKS", "UNDERFLOW", "TwinHub"]
 
@@ -34,7 +33,7 @@ _RIGHT = Wiring()
 _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
 
 
-class TwinHub:
+class TwinHub(Closing):
     """The physics, and what the instruments of the bench are set to.
 
     Args:
@@ -462,9 +461,3 @@ class TwinHub:
             self.bench.off()
             self.bench.zero()
             self._lock.notify_all()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import Self, TypeVar
+from typing import TypeVar
 
-from haselab.base import InputError
+from haselab.base import Closing, InputError
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.faults import BenchFaults
 from haselab.rig.twin.serve.generator.scpi import IDENTITY, ScpiServer
@@ -65,7 +65,7 @@ def suited_to(config: TwinConfig, board: str) -> TwinConfig:
     return config.model_copy(update={"acquisition": daq.model_copy(update=changed)})
 
 
-class ServedTwin:
+class ServedTwin(Closing):
     """A twin behind NI's gRPC service, SCPI, a serial port and a socket. Use as a context.
 
     Args:
@@ -193,9 +193,3 @@ address = "{self.client.address}"
     def close(self) -> None:
         """Everything at 0 V, all ports closed."""
         self._opened.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -120,10 +120,10 @@ class SupplyServer:
         """Voltage of its converter, ahead of the output switch, in V: what `QVnow` measures."""
         with self._lock:
             left_v = self._remaining_v()
-            asked_v = self.firmware.converter_v + left_v
+            requested_v = self.firmware.converter_v + left_v
             if self._on:  # a load may be slower
-                asked_v = max(asked_v, self._hub.rail_v) if left_v else self._hub.rail_v
-            return max(asked_v, self.faults.stuck_v)
+                requested_v = max(requested_v, self._hub.rail_v) if left_v else self._hub.rail_v
+            return max(requested_v, self.faults.stuck_v)
 
     @property
     def _on(self) -> bool:
@@ -136,9 +136,9 @@ class SupplyServer:
 
     def _apply(self, before_v: float) -> None:
         """Put converter and output switch as the firmware has set them."""
-        asked_v = max(self.firmware.converter_v, self.faults.stuck_v)
-        self._left_v, self._since_s = max(0.0, before_v - asked_v), self._clock()
-        self._hub.rail(asked_v if self._on else 0.0)
+        requested_v = max(self.firmware.converter_v, self.faults.stuck_v)
+        self._left_v, self._since_s = max(0.0, before_v - requested_v), self._clock()
+        self._hub.rail(requested_v if self._on else 0.0)
 
     def press(self, down: bool) -> None:
         """Somebody presses its button, or lets go of it."""

@@ -1,0 +1,80 @@
+"""Options that several commands share: one name, one metavar and one meaning in all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+__all__ = ["shared_option"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# option: (metavar, None for click's own; what it does)
+_SHARED: dict[str, tuple[str | None, str]] = {
+    "--actuator": ("A.toml", "Use this actuator file."),
+    "--ampere-per-monitor-volt": (None, "Set the scale of the current monitor in A/V."),
+    "--at-rest": (None, "Assume that each record starts at rest."),
+    "--blank-s": (None, "Ignore this time after each step of the output, in s."),
+    "--block-s": (None, "Set the length of a block in s. Each block gives one capacitance."),
+    "--board": (None, "Choose the board."),
+    "--bootstrap": (None, "Set the number of bootstrap replicates for the confidence intervals."),
+    "--capacitance-f": (None, "Set the capacitance of the actuator in F."),
+    "--capacitor": (None, "State the capacitor connected in the actuator's place, in F."),
+    "--carrier-hz": (None, "Set the frequency of the sensing signal in Hz."),
+    "--carrier-v": (None, "Set the peak of the sensing signal before the amplifier, in V."),
+    "--controller": ("KIND", "Choose the controller."),
+    "--controller-source": ("FILE.c", "Compile this C file in place of the PID controller."),
+    "--current-limit-a": (None, "Set the current limit of the amplifier in A."),
+    "--delay-s": (None, "Set the age of a measurement when the controller uses it, in s."),
+    "--duration-s": (None, "Set the duration in s."),
+    "--experiment": ("NAME", "Name the experiment in the session."),
+    "--held-at-hz": (None, "State the update rate of the output converter in Hz."),
+    "--i": ("COLUMN", "Name the column of the current monitor, in V."),
+    "--input": ("COLUMN", "Name the column of the input."),
+    "--keep-means": (None, "Keep the means of the columns instead of subtracting them."),
+    "--keep-video": (None, "Choose which camera frames to keep."),
+    "--kind": (None, "Choose the kind of actuator."),
+    "--method": (None, "Choose the method."),
+    "--model": (None, "Choose the model."),
+    "--out": (None, "Write the result to this path."),
+    "--output": ("COLUMN", "Name the column of the output."),
+    "--quick": (None, "Play the short version of the study."),
+    "--rate-hz": (None, "Set the sampling rate in Hz."),
+    "--reading": (
+        None,
+        "Use the default twin of this interpretation of the paper's frequency axis: rad/s as "
+        "printed, or Hz.",
+    ),
+    "--rig": ("RIG.toml", "Read the bench from this rig file."),
+    "--seed": (None, "Set the seed of the random numbers."),
+    "--skew-s": (None, "Set the time from a voltage sample to its current sample, in s."),
+    "--slow-modes": (None, "Fit this many slow modes, 0 to 3."),
+    "--stretch-max": (None, "Leave out rows above this stretch."),
+    "--stretch-min": (None, "Leave out rows below this stretch."),
+    "--through-voltage-map": (None, "Convert the input from V to strain with [drive.voltage_map]."),
+    "--to": (None, "Choose the output format."),
+    "--twin": ("TWIN.toml", "Use the twin of this file."),
+    "--v": ("COLUMN", "Name the column of the voltage monitor, in V."),
+    "--volt-per-monitor-volt": (None, "Set the scale of the voltage monitor in V/V."),
+    "--yes": (None, "Skip the confirmation."),
+}
+
+
+def shared_option(
+    name: str, *declarations: str, detail: str = "", **settings: Any
+) -> Callable[[F], F]:
+    """Add an option that has the same meaning in every command.
+
+    Args:
+        name: of the option, such as `--rate-hz`.
+        declarations: further declarations of `click.option`, such as the parameter's name.
+        detail: what is particular to this command; follows the common help text.
+        settings: further settings of `click.option`.
+    Returns:
+        The decorator.
+    """
+    metavar, text = _SHARED[name]
+    settings.setdefault("metavar", metavar)
+    return click.option(name, *declarations, help=f"{text} {detail}".rstrip(), **settings)

@@ -47,10 +47,10 @@ FAULTS = {
 def closed(chip: CoSim, duration_s: float) -> None:
     chip.run(0.02)
     chip.arm()
-    chip.tell(Run(0.03))
+    chip.execute(Run(0.03))
     end_s = chip.time_s + duration_s
     while chip.time_s < end_s:
-        chip.tell(KeepAlive(), 0.045)
+        chip.execute(KeepAlive(), 0.045)
 
 
 def last_status(chip: CoSim) -> Status:
@@ -71,7 +71,7 @@ def budget(program: Path, built: Firmware, twin: TwinBench) -> list[Row]:
         known, start, asleep = len(chip.messages), chip.counts["cycle"], chip.counts["asleep"]
         begun = time.perf_counter()
         for _ in range(100):
-            chip.tell(KeepAlive(), 0.1)
+            chip.execute(KeepAlive(), 0.1)
         wall_s = time.perf_counter() - begun
         passed = chip.counts["cycle"] - start
         told = [m for m in chip.messages[known:] if isinstance(m, Status)]
@@ -146,7 +146,7 @@ def flip(program: Path, built: Firmware, twin: TwinBench, seed: int) -> tuple[st
         chip.command(f"flip {rng.randrange(*PLACES[place])} {rng.randrange(8)}")
         known = len(chip.messages)
         for _ in range(3):
-            chip.ask(KeepAlive(), 0.05)
+            chip.query(KeepAlive(), 0.05)
         held = max(out.code for out in chip.outputs) <= CODE_HIGH
         told = [m for m in chip.messages[known:] if isinstance(m, Status)]
         if chip.counts["resets"] > 0 or chip.counts["crashes"] > 0:

@@ -158,7 +158,7 @@ class Tally:
         bounds = bound(one)
         truth = one.truth()
         for name, value in truth.items():
-            estimate = fit.estimates[name]
+            estimate = fit.parameters[name]
             if not np.isfinite(estimate.std):
                 self.blind += 1
                 continue

@@ -13,7 +13,7 @@ from rows import Row, medians
 from scipy.optimize import curve_fit
 
 from haselab.base import Estimate
-from haselab.identify import LoopRecord, fit_creep, fit_hysteresis
+from haselab.identify import LoopRecord, Record, fit_creep, fit_hysteresis
 from haselab.identify.hysteresis.loops import band_widths
 from haselab.models import BoucWen, PrandtlIshlinskii, PronyCreep
 from haselab.rig.twin.config import twin_of_reading
@@ -87,7 +87,7 @@ def loop_rows() -> list[Row]:
             for k in range(RUNS)
         ]
         right = [fit for fit in fits if fit.verdict == kind]
-        told = [f.estimates for f in right]
+        told = [f.parameters for f in right]
 
         def seen(v: Sequence[float], make: Callable[..., object] = make) -> Floats:
             return make(v).simulate(DRIVE)[settled]  # type: ignore[attr-defined]
@@ -110,8 +110,8 @@ def creep_rows() -> list[Row]:
     values = np.array(list(CREEP.values()))
     clean = _creep(values)
     records = [clean + _noise(k, CREEP_NOISE, HELD.size) for k in range(RUNS)]
-    fits = [fit_creep(HELD, y, 50.0) for y in records]
-    told = [fit.estimates for fit in fits if fit.verdict == "prony"]
+    fits = [fit_creep(Record.sampled(HELD, y, 50.0)) for y in records]
+    told = [fit.parameters for fit in fits if fit.verdict == "prony"]
     wrong = sum(fit.verdict not in ("prony", "cannot tell") for fit in fits)
     bound = _bound(_with_offset, np.append(values, 0.0), CREEP_NOISE)[:-1]
 
@@ -121,8 +121,8 @@ def creep_rows() -> list[Row]:
         )
 
     our_s, one_s, their_s = medians(
-        lambda: fit_creep(HELD, records[0], 50.0),
-        lambda: fit_creep(HELD, records[0], 50.0, "prony"),
+        lambda: fit_creep(Record.sampled(HELD, records[0], 50.0)),
+        lambda: fit_creep(Record.sampled(HELD, records[0], 50.0), "prony"),
         theirs,
         rounds=3,
     )

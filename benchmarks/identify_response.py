@@ -144,7 +144,7 @@ def fit_rows(runs: int) -> list[Row]:
     for run in range(runs):
         y, std = drawn(30, run)
         found = estimate_frequency_response(CHIRP, y, RATE_HZ)
-        estimates = [found.fit().estimates[name] for name in NAMES]
+        estimates = [found.fit().parameters[name] for name in NAMES]
         ours.append(([e.value for e in estimates] - x[:4]) / best / std)
         held.append([e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, x, strict=False)])
         h1, ratio = scipy_h1(y, 2000), plain_ratio(y)

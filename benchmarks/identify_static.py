@@ -15,6 +15,7 @@ from scipy.optimize import OptimizeWarning, curve_fit
 
 from haselab.identify import (
     ArxOrders,
+    Record,
     find_regions,
     fit_arx,
     fit_hyperelastic,
@@ -61,7 +62,7 @@ def hyperelastic_rows() -> list[Row]:
     our_s, their_s = medians(ours, theirs)
     inside = []
     for e in noise:
-        told = fit_hyperelastic(STRETCH, clean + e, "arruda-boyce").best.estimates
+        told = fit_hyperelastic(STRETCH, clean + e, "arruda-boyce").best.parameters
         inside.append(_inside([told["mu_pa"].ci95, told["lambda_m"].ci95], [15.6e3, 3.95]))
     failed = 0
     for k in range(RUNS):
@@ -104,7 +105,8 @@ def region_rows() -> list[Row]:
         jobs.append(lambda: peer.fit(4))
     times = medians(*jobs, rounds=3)
     if len(times) > 1:
-        cost = float(find_regions(x, y, 4).residuals @ find_regions(x, y, 4).residuals)
+        (left,) = find_regions(x, y, 4).residuals
+        cost = float(left @ left)
         ratio = cost / peer.ssr
         note = f"pwlf {1e3 * times[1]:.3g}; cost ours / pwlf {ratio:.6f}"
     return [
@@ -121,7 +123,7 @@ def voltage_rows() -> list[Row]:
     inside = []
     for k in range(RUNS):
         e = 0.01 * np.random.default_rng([5, k]).normal(size=STRAIN.size)
-        told = fit_voltage_map(STRAIN, clean + e).estimates
+        told = fit_voltage_map(STRAIN, clean + e).parameters
         inside.append(_inside([told[name].ci95 for name in ("a1_v", "b1", "a2_v", "b2")], truth))
     y = clean + 0.01 * np.random.default_rng(6).normal(size=STRAIN.size)
 
@@ -185,7 +187,7 @@ def arx_rows() -> list[Row]:
     for k in range(RUNS):
         u, e = np.random.default_rng([9, k]).normal(size=(2, 1000))
         noise = ArxModel(model.a, [0.03], 0, 12.5).simulate(e)
-        fit = fit_arx(u, model.simulate(u) + noise, 12.5, ArxOrders(2, 2, 3))
+        fit = fit_arx(Record.sampled(u, model.simulate(u) + noise, 12.5), ArxOrders(2, 2, 3))
         inside.append(_inside([n.ci95 for n in (*fit.a, *fit.b)], truth))
     y = model.simulate(u) + noise
 
@@ -195,7 +197,9 @@ def arx_rows() -> list[Row]:
             np.column_stack([-y[k - 1], -y[k - 2], u[k - 3], u[k - 4]]), y[k], rcond=None
         )
 
-    our_s, their_s = medians(lambda: fit_arx(u, y, 12.5, ArxOrders(2, 2, 3)), theirs)
+    our_s, their_s = medians(
+        lambda: fit_arx(Record.sampled(u, y, 12.5), ArxOrders(2, 2, 3)), theirs
+    )
     return [
         Row("ARX, least coverage of 4 intervals", _covered(inside), "%", LEAST),
         Row("  time, with validation and whiteness", 1e3 * our_s, "ms",

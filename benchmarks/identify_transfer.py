@@ -68,7 +68,7 @@ class Tally:
         if not fit.succeeded:
             self.failures += 1
             return
-        found = [fit.estimates[name] for name, _ in zip(NAMES, bounds, strict=False)]
+        found = [fit.parameters[name] for name, _ in zip(NAMES, bounds, strict=False)]
         self.errors.append(np.array([e.value for e in found] - truth[: len(found)]) / bounds)
         self.inside.append(
             [bool(e.ci95[0] <= t <= e.ci95[1]) for e, t in zip(found, truth, strict=False)]
@@ -137,7 +137,7 @@ def colour_rows(runs: int) -> Iterator[Row]:
             white = np.random.default_rng([5, run]).normal(size=8000)
             noise = std * lfilter([np.sqrt(1 - 0.99**2)], [1, -0.99], white)[4000:]
             fit = fit_transfer([Record.sampled(CHIRP, clean + noise, RATE_HZ)])
-            found = [fit.estimates[name].ci95 for name in NAMES[:3]]
+            found = [fit.parameters[name].ci95 for name in NAMES[:3]]
             inside.append([low <= t <= high for (low, high), t in zip(found, truth, strict=True)])
         cover = 100.0 * np.mean(inside, axis=0)
         told = " / ".join(f"{value:.1f}" for value in cover)
@@ -225,7 +225,7 @@ def peer_table() -> Iterator[str]:
                                "start": START}  # fmt: skip
     yield f"{'peer, at rest, 30 dB':52s} {'n':>4s} {'fail %':>7s} {'rms / bound':>24s} {'time':>8s}"
     ours = np.array([
-        [fit_transfer([Record.sampled(CHIRP, y, RATE_HZ, 0.0)], AT_REST).estimates[n].value
+        [fit_transfer([Record.sampled(CHIRP, y, RATE_HZ, 0.0)], AT_REST).parameters[n].value
          for n in NAMES[:3]] for y in records["y"]
     ])  # fmt: skip
     yield line("haselab", ours, truth, bound(truth, std), None, "see above")

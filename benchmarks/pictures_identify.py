@@ -113,14 +113,14 @@ def draw_free_response():
         axes.plot(time_s, x_mm, ".", color=GREY, ms=2, label="record")
         axes.plot(fit.time_s[0], fit.modelled[0], color=RED, label="fit of eq. 6")
         hulls = (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s)
-        height = fit.estimates["amplitude"].value
+        height = fit.parameters["amplitude"].value
         for hull, sign, colour in zip(hulls, (1.0, -1.0), (BLUE, GREEN), strict=True):
             if hull is not None:
                 side = "positive" if sign > 0 else "negative"
                 axes.plot(time_s, sign * height * np.exp(-hull.value * time_s), color=colour,
                           ls="--", label=f"hull of {side} peaks: {hull.value:.2f} 1/s")  # fmt: skip
-        natural = fit.estimates["natural_frequency_rad_s"].value
-        zeta = fit.estimates["damping_ratio"].value
+        natural = fit.parameters["natural_frequency_rad_s"].value
+        zeta = fit.parameters["damping_ratio"].value
         axes.set_title(f"{name}: natural {natural:.2f} rad/s, damping {zeta:.2f}", loc="left")
         axes.set(xlabel="time / s", ylabel="displacement / mm")
         axes.legend(loc="upper right")
@@ -153,7 +153,7 @@ def draw_hyperelastic(data):
     error.set_title("B  what the laws leave", loc="left")
     curve.legend(loc="upper left")
     for candidate in fit.candidates:
-        numbers = {n: f"{e.value:.5g} +- {e.std:.2g}" for n, e in candidate.estimates.items()}
+        numbers = {n: f"{e.value:.5g} +- {e.std:.2g}" for n, e in candidate.parameters.items()}
         print(f"{candidate.model:20s} AIC {candidate.aic:8.0f} {numbers}")
     return figure
 
@@ -190,7 +190,7 @@ def count_transfer(runs):
             start_s = time.perf_counter()
             fit = fit_transfer([Record(SWEEP, 400.0, clean + noise, TIME_S)])
             spent_s.append(time.perf_counter() - start_s)
-            got = [fit.estimates[name] for name in truth]
+            got = [fit.parameters[name] for name in truth]
             errors.append([e.value - t for e, t in zip(got, truth.values(), strict=True)])
             inside += [
                 e.ci95[0] <= t <= e.ci95[1] for e, t in zip(got, truth.values(), strict=True)
@@ -219,7 +219,7 @@ def count_random_plants(runs):
             failed += 1
             continue
         truth = {"natural_frequency_rad_s": omega, "damping_ratio": zeta, "delay_s": plant.delay_s}
-        ranges = [(fit.estimates[name].ci95, value) for name, value in truth.items()]
+        ranges = [(fit.parameters[name].ci95, value) for name, value in truth.items()]
         inside.append([low <= value <= high for (low, high), value in ranges])
     print(f"{runs} random plants: {failed} failed, inside {np.mean(inside, axis=0)}")
 

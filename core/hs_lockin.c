@@ -1,7 +1,7 @@
 /* Takes: readings of one channel and a table of the carrier. Gives: sums, phasors, impedance. */
 #include "hs.h"
 
-/* Fixed lanes fix the order of the additions, so vector units change no bit. */
+/* Fixed lanes fix the order of the additions, so vector units give the same bits. */
 #define HS_LANES 16
 
 #define HS_KEPT 4 /* of them are added last */
@@ -114,7 +114,7 @@ hs_impedance hs_impedance_of(const hs_impedance_config *config, const hs_phasor 
     ratio_im = (i->im * v->re - i->re * v->im) / v2;
     y_re = config->scale_re * ratio_re - config->scale_im * ratio_im - config->stray_re;
     y_im = config->scale_re * ratio_im + config->scale_im * ratio_re - config->stray_im;
-    /* Admittances are small numbers: squares would leave the range of float. */
+    /* Admittances are small: their squares would underflow a float. */
     x = y_re / y_im;
     y2 = y_im * (1.0f + x * x);
     if (!(y_im > 0.0f && y_re > -HS_LEAD * y_im && y2 > 0.0f && y2 <= HS_LARGEST)) {

@@ -36,10 +36,10 @@ float hs_voltage_from_strain(const hs_voltage_map *map, float strain)
 
 float hs_strain_from_capacitance(const hs_strain_map *map, float capacitance_f)
 {
-    /* 0 times an infinite capacitance would be no number, and no strain that is out of range */
+    /* 0 times an infinite capacitance would be NaN instead of a strain out of range */
     const float cubic = map->cubic_per_f3 == 0.0f ? 0.0f : map->cubic_per_f3 * capacitance_f;
-    const float bent = cubic + map->curvature_per_f2;
-    return (bent * capacitance_f + map->slope_per_f) * capacitance_f + map->offset;
+    const float quadratic = cubic + map->curvature_per_f2;
+    return (quadratic * capacitance_f + map->slope_per_f) * capacitance_f + map->offset;
 }
 
 float hs_table_at(const hs_table *table, float x)

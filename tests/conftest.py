@@ -120,7 +120,7 @@ def installed() -> Callable[[str, str], str]:
     def find(program: str, package: str) -> str:
         path = shutil.which(program)
         if path is None:
-            pytest.skip(f"{program} is not installed. Type:  sudo apt-get install -y {package}")
+            pytest.skip(f"{program} is not installed. Run:  sudo apt-get install -y {package}")
         return path
 
     return find

@@ -239,6 +239,33 @@ def test_numbers_with_a_dimension_name_their_si_unit(path: Path) -> None:
     assert not faults, f"{path.relative_to(ROOT)}: {faults}"
 
 
+def public_annotations(body: list[ast.stmt]) -> Iterator[ast.expr]:
+    """Types of all arguments, results and fields that users of a module see."""
+    for node in body:
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            if node.name.startswith("_") and node.name != "__init__":
+                continue
+            given = node.args
+            each = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
+            yield from (one.annotation for one in each if one is not None and one.annotation)
+            if node.returns is not None:
+                yield node.returns
+        elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from public_annotations(node.body)
+        elif isinstance(node, ast.AnnAssign):
+            yield node.annotation
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
+def test_tables_in_signatures_are_json_objects_not_anything(path: Path) -> None:
+    vague = [
+        f"line {annotation.lineno}"
+        for annotation in public_annotations(tree_of(path).body)
+        if "dict[str, Any]" in ast.unparse(annotation)
+    ]
+    assert not vague, f"{path.relative_to(ROOT)}: dict[str, Any] in {vague}; use JsonObject"
+
+
 def test_imports_only_point_downward() -> None:
     """The contract of pyproject.toml, by import-linter's own command."""
     code = "import sys; from importlinter.cli import lint_imports_command as c; sys.exit(c())"
@@ -261,7 +288,16 @@ def package_of(path: Path) -> str:
 
 @pytest.mark.parametrize("path", MODULES, ids=IDS)
 def test_only_permitted_packages_draw_or_touch_files(path: Path) -> None:
-    for node in ast.walk(tree_of(path)):
+    tree = tree_of(path)
+    for_checkers = {
+        id(node)
+        for branch in ast.walk(tree)
+        if isinstance(branch, ast.If) and ast.unparse(branch.test) == "TYPE_CHECKING"
+        for node in ast.walk(branch)
+    }
+    for node in ast.walk(tree):
+        if id(node) in for_checkers:
+            continue
         if isinstance(node, ast.Import):
             roots = {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

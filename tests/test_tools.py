@@ -124,7 +124,7 @@ def test_make_installs_every_package_that_a_skipped_test_names() -> None:
 REPORTED = """
 import pytest
 
-@pytest.mark.skipif(True, reason="h5dump is not installed. Type:  apt-get install hdf5-tools")
+@pytest.mark.skipif(True, reason="h5dump is not installed. Run:  apt-get install hdf5-tools")
 @pytest.mark.parametrize("number", range(3))
 def test_one(number):
     pass
@@ -152,7 +152,7 @@ def test_the_end_of_a_run_lists_what_was_skipped_and_why(tmp_path: Path) -> None
 
     *_, heading, first, where, second, _, advice, last = end_of("-n", "2")
     assert " 4 skipped " in heading
-    assert first == "3 skipped: h5dump is not installed. Type:  apt-get install hdf5-tools"
+    assert first == "3 skipped: h5dump is not installed. Run:  apt-get install hdf5-tools"
     assert where == "    in test_some.py"
     assert second == "1 skipped: no data here"
     assert advice == "To install what apt provides:  make tools"

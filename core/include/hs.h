@@ -1,4 +1,4 @@
-/* haselab core: what runs at every update, on the desktop and on the microcontroller alike.
+/* haselab core: the code of every update, the same on the desktop and on the microcontroller.
  *
  * Rules of this folder: C99, float only, no heap, no globals, no libm, no recursion. The caller
  * owns every context; a configuration is constant while it runs; a step is
@@ -16,23 +16,23 @@ extern "C" {
 
 /* ---- demodulation ------------------------------------------------------------------------- */
 
-/* Why a result does not count; bits, 0 where it does. */
+/* Why a result is not valid; bits, 0 if it is. */
 #define HS_AMPLITUDE_LOST 1u /* no carrier on one of the monitors */
 #define HS_PHASE_OUT 2u      /* no capacitor shows such a phase: channels swapped, wire broken */
 #define HS_CLIPPED 4u        /* a reading at the end of the converter's range */
 #define HS_CURRENT_LIMIT 8u  /* the amplifier limits its current */
-#define HS_UPDATE 16u        /* the drive jumped where samples count */
+#define HS_UPDATE 16u        /* the drive changed within the samples that are used */
 #define HS_NOT_FINITE 32u    /* a reading is not a number */
 #define HS_CARRIER_OFF 64u   /* the carrier has another frequency */
 
 #define HS_LARGEST 3.0e38f
-#define HS_LEAD 0.25f /* tangent of the lead beyond 90 degrees that a monitor's lag explains */
+#define HS_LEAD 0.25f /* tangent of the phase lead beyond 90 degrees due to a monitor's lag */
 
-/* What least squares needs to know of one channel in one piece of a block: sums over its samples
- * less the first, against the carrier's table, against 1 and against the sample's number. They are
- * all of it: pieces are added up, left out or weighted later without a second look at the samples. */
+/* Sums for least squares over one channel in one piece of a block, of its samples minus the first:
+ * with the carrier's table, with 1 and with the sample number. Pieces can be added, skipped or
+ * weighted later without reading the samples again. */
 typedef struct {
-    float first;  /* reading that was taken off */
+    float first;  /* reading that was subtracted */
     float cosine; /* sum of d cos */
     float sine;   /* sum of d sin */
     float level;  /* sum of d */
@@ -43,7 +43,7 @@ typedef struct {
 /* Sums of every piece of a block, the last of which may be shorter.
  * x:            n readings of one channel, in any unit; n is at least 1.
  * cosine, sine: `piece` values each of the carrier, from phase 0 at a piece's first sample.
- * out:          room for n / piece sums, rounded up.
+ * out:          n / piece sums, rounded up.
  */
 void hs_sum_pieces(const float *x, uint32_t n, const float *cosine, const float *sine,
                    uint16_t piece, hs_sums *out);
@@ -53,15 +53,15 @@ typedef struct {
     float re, im;
 } hs_phasor;
 
-/* Phasor of a piece that stands alone.
+/* Phasor of a single piece.
  * inverse: first two rows of (B'B)^-1, B the columns cos, sin, 1, k over the piece's samples. */
 hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums);
 
 /* Series capacitance and resistance from the phasors, without trigonometry:
  *     Y = scale I / V - stray,   1 / Y = R + 1 / (j omega C) */
 typedef struct {
-    float scale_re, scale_im; /* siemens for equal readings, turned back by the channels' skew */
-    float stray_re, stray_im; /* siemens beside the actuator: cables */
+    float scale_re, scale_im; /* siemens for equal readings, corrected for the channels' skew */
+    float stray_re, stray_im; /* siemens in parallel with the actuator: cables */
     float omega_rad_s;        /* carrier */
     float min_amplitude;      /* unit of the readings; below it the carrier counts as lost */
 } hs_impedance_config;
@@ -75,9 +75,9 @@ typedef struct {
 hs_impedance hs_impedance_of(const hs_impedance_config *config, const hs_phasor *v,
                              const hs_phasor *i);
 
-/* Four readings a carrier period (or one each period and a quarter: a slow converter may skip), two
- * periods in a row, from a converter of at most 12 bits. Whole numbers as far as they go. The output
- * steps where a period begins: its first reading is left out. A level and a ramp fall out. */
+/* Four readings per carrier period (or one every 1.25 periods, for a slow converter), two periods
+ * in a row, from a converter of at most 12 bits. Integers as far as possible. The output steps at
+ * the start of a period, so the period's first reading is not used. A level and a ramp cancel. */
 #define HS_QUADRATURE_SAMPLES 8
 
 /* In phase and in quadrature: four times the phasor. */
@@ -89,10 +89,10 @@ hs_quadrature hs_demodulate_quadrature(const int16_t x[HS_QUADRATURE_SAMPLES]);
 
 /* Capacitance in series with a resistance, with one division:
  *     omega Z = turn V / I,   C = -|I|^2 / Im(turn V conj(I))
- * What lies beside the actuator is not taken off: it belongs to the map of capacitance to strain. */
+ * Parallel capacitance is not subtracted: it is part of the map from capacitance to strain. */
 typedef struct {
     float turn_re, turn_im; /* 1/F for equal readings: omega over the scale of hs_impedance_config */
-    int32_t v_low, v_high;  /* squares of `re, im` that count; beyond: HS_AMPLITUDE_LOST */
+    int32_t v_low, v_high;  /* valid range of re^2 + im^2; outside: HS_AMPLITUDE_LOST */
     int32_t i_low;
 } hs_quadrature_config;
 
@@ -128,9 +128,9 @@ float hs_voltage_from_strain(const hs_voltage_map *map, float strain);
  * the largest float above 88, 0 for NaN. */
 float hs_exp(float x);
 
-/* Values at equal distances, straight lines between them. */
+/* Table with equal spacing and linear interpolation. */
 typedef struct {
-    float low;            /* where value[0] holds */
+    float low;            /* argument of value[0] */
     float steps_per_unit; /* 1 / distance */
     uint8_t steps;        /* value[] has steps + 1 entries */
     const float *value;
@@ -141,8 +141,8 @@ float hs_table_at(const hs_table *table, float x);
 
 /* ---- limits ------------------------------------------------------------------------------- */
 
-/* value inside [low, high], the nearer end outside, and 0 for NaN: the last line before the
- * output. Returns 1 in *limited when it had to act. */
+/* Limit value to [low, high]; 0 for NaN: the last check before the output. Sets *limited to 1 if
+ * the value was changed. */
 float hs_limit(float value, float low, float high, uint8_t *limited);
 
 /* ---- PI and PID --------------------------------------------------------------------------- */
@@ -164,11 +164,11 @@ typedef struct {
     uint8_t started; /* 0: the next step takes its measurement as the filter's start */
 } hs_pid_state;
 
-/* Start so that the first output with zero error is u (bumpless). */
+/* Start so that the first output for zero error is u (bumpless transfer). */
 void hs_pid_init(hs_pid_state *state, float u);
 
-/* One update. A measurement that is NaN leaves the state untouched and returns NaN: the caller's
- * hs_limit turns that into 0. */
+/* One update. If the measurement is NaN, the state is unchanged and the result is NaN, which the
+ * caller's hs_limit turns into 0. */
 float hs_pid_step(const hs_pid_config *config, hs_pid_state *state, float reference,
                   float measurement);
 

@@ -2,10 +2,10 @@
  *
  *     haselab firmware build RUN --controller-source my_controller.c
  *
- * It is compiled in place of the PID (firmware/app/controller_pid.c). The firmware calls it once an
- * update and keeps its limits around it: the drive stays within [u_low, u_high], changes at most at
- * the rate of the settings, and an update that comes late, a lost sensor, a silent computer or a
- * drive that is not a number take the output to 0 V.
+ * It is compiled in place of the PID (firmware/app/controller_pid.c). The firmware calls it once
+ * per update and applies its own limits: the drive stays within [u_low, u_high] and changes at most
+ * at the rate of the settings; a late update, a lost sensor, a lost link or a drive that is not a
+ * number takes the output to 0 V.
  *
  * Rules: C99, float only, no heap, no globals, no libm. An update has 16,000 cycles on the ATmega2560,
  * of which sensing and limits take about 6,000; a multiplication takes 150, a division 500.
@@ -29,7 +29,7 @@ typedef struct {
     } own;
 } hs_controller_setting;
 
-/* The firmware keeps it between the steps. */
+/* State that the firmware keeps between the steps. */
 typedef union {
     float x[HS_CONTROLLER_STATES];
     hs_pid_state pid;
@@ -38,12 +38,12 @@ typedef union {
 typedef struct {
     float strain;
     float capacitance_f;
-    float voltage_v; /* drive in force, ahead of the amplifier */
+    float voltage_v; /* present drive, at the amplifier's input */
     uint32_t update; /* number of the step since the start */
-    uint8_t valid;   /* 0: strain and capacitance do not count, and the output holds */
+    uint8_t valid;   /* 0: strain and capacitance are not valid, and the output is kept */
 } hs_measurement;
 
-/* A new run begins. */
+/* Start a new run. */
 void hs_controller_init(const hs_controller_setting *setting, hs_controller_state *state);
 
 /* One update: the new drive, in strain. The voltage table turns it into a voltage. */

@@ -1,4 +1,4 @@
-/* One step of the PI and PID, written once for every kind of number: float in core/hs_pid.c, double
+/* One step of the PI and PID, shared by all number types: float in core/hs_pid.c, double
  * and vectors of floats in native/loops. Include it once for each kind, after
  *     PID_NUMBER            a number, or many side by side
  *     PID_STEP              name of the function
@@ -20,7 +20,7 @@
 #define PID_CHOOSE(truth, a, b) ((truth) ? (a) : (b))
 #endif
 
-/* The output before it is limited. Without `valid` the state stays as it is. */
+/* The output before limiting. Without `valid` the state is unchanged. */
 PID_INLINE PID_NUMBER PID_STEP(const PID_CONFIG *config, PID_STATE *state, PID_NUMBER error,
                                PID_NUMBER measurement, PID_TRUTH valid)
 {

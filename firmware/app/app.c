@@ -1,4 +1,4 @@
-/* Takes: latched readings and one event. Gives: enable pin, output code, and what led to them. */
+/* Takes: latched readings and one event. Gives: enable pin, output code, intermediate values. */
 #include "app.h"
 
 void app_init(app_state *state, uint8_t fault)
@@ -23,7 +23,7 @@ static uint8_t is_inside(float x, float low, float high)
     return x >= low && x <= high; /* not for NaN */
 }
 
-/* The same for numbers above 0, whose bits are ordered as they are: a fifth of the cycles. */
+/* The same for positive numbers, whose bits have the same order: a fifth of the cycles. */
 static uint8_t is_inside_positive(float x, float low, float high)
 {
     union {
@@ -56,7 +56,7 @@ static void sense(const app_config *c, const app_inputs *in, app_outputs *out)
     out->strain = hs_strain_from_capacitance(&c->strain, farad.capacitance_f);
 }
 
-/* A lost conversion spoils the update in which it was lost and the next, whose window it is in. */
+/* A lost conversion invalidates this update and the next one, whose windows contain it. */
 static void judge_readings(app_state *s, const app_inputs *in, app_outputs *out)
 {
     if (in->alarms & HP_ALARM_SLIP) {
@@ -76,7 +76,7 @@ static void judge_readings(app_state *s, const app_inputs *in, app_outputs *out)
     }
 }
 
-/* The high voltage follows the output within an update: what is off for longer is a broken module. */
+/* The high voltage follows the output within one update; a longer deviation is a broken module. */
 static void judge_level(const app_config *c, app_state *s, const app_inputs *in)
 {
     const uint16_t expected = (uint16_t)(((uint32_t)s->code * c->level_share) >> 16);
@@ -154,7 +154,7 @@ static void take_event(const app_config *c, app_state *s, const app_inputs *in)
     }
 }
 
-/* What ends it, the most urgent last. Off and tripped stay what they are. */
+/* Reasons to stop, the most urgent last. Off and tripped do not change. */
 static void judge(const app_config *c, app_state *s, const app_inputs *in)
 {
     const uint8_t live = s->state != HP_STATE_OFF && s->state != HP_STATE_TRIPPED;
@@ -210,7 +210,7 @@ static void close_loop(const app_config *c, app_state *s, app_outputs *out)
     const float u = hs_controller_step(&c->controller, &s->controller, s->reference, &seen);
 
     if (!seen.valid) {
-        return; /* the output stays, for as long as the patience lasts */
+        return; /* keep the output for up to blind_updates */
     }
     out->corrected = u;
     s->drive_v = toward(s->drive_v, hs_table_at(&c->voltage, out->corrected), c->rise_v);
@@ -225,7 +225,7 @@ static void ramp_down(const app_config *c, app_state *s)
     }
 }
 
-/* The table stays within the drive's limits: what does not, or is no number, is a fault. */
+/* The table is within the drive's limits, so anything else, or NaN, is a fault. */
 static void put_out(const app_config *c, app_state *s, app_outputs *out)
 {
     uint8_t limited;

@@ -2,8 +2,8 @@
  *
  *     readings -> capacitance -> strain -> controller -> voltage table -> rate, clamp -> code
  *
- * around it the state machine off -> armed -> running -> stopping -> off, and tripped. A step is a
- * function of configuration, state and latched inputs; it takes no clock: time is counted in
+ * inside the state machine off -> armed -> running -> stopping -> off, and tripped. A step is a
+ * function of configuration, state and latched inputs; it reads no clock: time is counted in
  * updates. No heap, no recursion, no globals.
  */
 #ifndef APP_H
@@ -12,7 +12,7 @@
 #include "hs_controller.h"
 #include "hs_protocol.h"
 
-/* Kept out of its caller: one frame of the stack for all would be too large to reach quickly. */
+/* Not inlined: one stack frame for all functions would be too large for fast access. */
 #define APP_APART __attribute__((noinline))
 
 typedef struct {
@@ -21,24 +21,24 @@ typedef struct {
     hs_strain_map strain;
     hs_controller_setting controller;
     hs_table voltage;                    /* corrected strain to drive, V */
-    float reference_low, reference_high; /* strain that may be asked for */
+    float reference_low, reference_high; /* range of the desired strain */
     float drive_high_v;                  /* the lowest is 0 */
-    float rise_v;                        /* change of the drive in one update at most, V */
+    float rise_v;                        /* largest change of the drive in one update, V */
     float ramp_v;                        /* the same when ramping down */
     float codes_per_v;
     uint16_t code_high;      /* of the output converter */
-    uint16_t level_share;    /* codes of the level for one of the output, times 65536 */
-    int16_t level_off;       /* codes that the level may be off */
-    uint16_t link_updates;   /* without a sign of life, before the ramp */
+    uint16_t level_share;    /* level codes per output code, times 65536 */
+    int16_t level_off;       /* largest deviation of the level, in codes */
+    uint16_t link_updates;   /* without a message from the computer, before the ramp */
     uint16_t settle_updates; /* after arming, until the strain must be valid */
-    uint16_t token_updates;  /* that a token for arming holds */
-    uint8_t blind_updates;   /* without a strain that trip it */
-    uint8_t astray_updates;  /* with the level off that trip it */
+    uint16_t token_updates;  /* validity of an arming token */
+    uint8_t blind_updates;   /* without a strain, before a trip */
+    uint8_t astray_updates;  /* with a wrong level, before a trip */
     uint16_t rate_hz;
     uint32_t crc; /* of the settings, for the handshake */
 } app_config;
 
-/* Everything that an update knows of the world, taken at one instant. */
+/* All inputs of an update, latched at one instant. */
 typedef struct {
     /* Oldest first; the last four are new. The first reading of a frame does not count for the
      * carrier: in its place v[0] and v[4] are the level, the voltage monitor without a filter. */
@@ -53,14 +53,14 @@ typedef struct {
     uint32_t updates; /* since running began */
     float reference;
     float drive_v;
-    uint16_t silent;  /* updates since the last sign of life */
+    uint16_t silent;  /* updates since the last message from the computer */
     uint16_t settled; /* updates since arming */
     uint8_t state;    /* HP_STATE_ */
     uint8_t fault;    /* HP_FAULT_ */
     uint8_t blind;    /* updates in a row without a strain */
     uint16_t code;    /* of the last update */
-    uint8_t astray;   /* updates in a row with the level off */
-    uint8_t slipped;  /* updates whose window holds a lost conversion */
+    uint8_t astray;   /* updates in a row with a wrong level */
+    uint8_t slipped;  /* updates whose window contains a lost conversion */
 } app_state;
 
 typedef struct {
@@ -70,7 +70,7 @@ typedef struct {
     uint8_t enable; /* of the high-voltage module */
 } app_outputs;
 
-/* fault: HP_FAULT_NONE starts off, any other one tripped. */
+/* fault: HP_FAULT_NONE starts in off, any other one in tripped. */
 void app_init(app_state *state, uint8_t fault);
 
 /* One update; the budget on the ATmega2560 is 9,600 cycles with all interrupts. */

@@ -10,7 +10,7 @@ float hs_controller_step(const hs_controller_setting *setting, hs_controller_sta
                          float reference, const hs_measurement *measurement)
 {
     if (!measurement->valid) {
-        return setting->u_low; /* not used: the output holds */
+        return setting->u_low; /* not used: the output is kept */
     }
     return hs_pid_step(&setting->own.pid, &state->pid, reference, measurement->strain);
 }

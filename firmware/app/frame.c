@@ -1,4 +1,4 @@
-/* Takes: bytes. Gives: frames, and bytes of frames that are whole. */
+/* Takes: bytes. Gives: frames, and the bytes of valid frames. */
 #include "frame.h"
 
 uint16_t frame_crc(uint16_t crc, const uint8_t *bytes, uint8_t n)

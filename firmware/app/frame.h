@@ -6,15 +6,15 @@
 
 #define FRAME_LONGEST 64u /* bytes with their CRC: COBS then adds one byte and the 0 */
 
-/* CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF) of n bytes, going on from crc. */
+/* CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF) of n bytes, continued from crc. */
 uint16_t frame_crc(uint16_t crc, const uint8_t *bytes, uint8_t n);
 
-/* n bytes, room for two more behind them, into a frame with its 0; n + 4 bytes of it.
- * Gives how many, 0 where n + 2 is beyond FRAME_LONGEST. */
+/* Encode n bytes, with space for two more after them, into a frame with its 0 of up to n + 4 bytes.
+ * Returns its length, or 0 if n + 2 exceeds FRAME_LONGEST. */
 uint8_t frame_encode(uint8_t *bytes, uint8_t n, uint8_t *frame);
 
-/* The n bytes of a frame ahead of its 0, in place. Gives how many remain without the CRC; 0 for
- * what is no whole frame. */
+/* Decode the n bytes of a frame before its 0, in place. Returns their number without the CRC, or 0
+ * for a damaged frame. */
 uint8_t frame_decode(uint8_t *frame, uint8_t n);
 
 #endif

@@ -1,4 +1,4 @@
-/* Takes: bytes of the wire and results of updates. Gives: events and frames. */
+/* Takes: received bytes and results of updates. Gives: events and frames. */
 #include "link.h"
 
 #define HEADER 3u /* code, sequence */
@@ -6,7 +6,7 @@
 void link_init(link_state *link)
 {
     link->count = 0;
-    link->greeted = 0;
+    link->connected = 0;
     link->every = 10;
     link->trace = 0;
     link->until_status = 10;
@@ -65,16 +65,16 @@ static uint8_t has_size(const link_state *link, uint8_t size)
 
 static uint8_t request(link_state *link, const app_config *c, const app_state *s, uint16_t update)
 {
-    if (!link->greeted) {
-        return HP_VERDICT_BAD_VERSION;
+    if (!link->connected) {
+        return HP_RESULT_BAD_VERSION;
     }
     if (s->state != HP_STATE_OFF) {
-        return HP_VERDICT_BAD_STATE;
+        return HP_RESULT_BAD_STATE;
     }
-    /* Another number each time, never 0: the point is that a repeated frame does not hold it. */
+    /* A different number each time, never 0, so that a repeated frame does not contain it. */
     link->token = (uint16_t)((update * 40503u) | 1u);
     link->token_left = c->token_updates;
-    return HP_VERDICT_ACCEPTED;
+    return HP_RESULT_ACCEPTED;
 }
 
 static uint8_t confirm(link_state *link, const app_state *s, app_inputs *in)
@@ -84,13 +84,13 @@ static uint8_t confirm(link_state *link, const app_state *s, app_inputs *in)
     hp_get_confirm_arming(link->bytes + HEADER, &m);
     link->token = 0; /* one attempt */
     if (s->state != HP_STATE_OFF) {
-        return HP_VERDICT_BAD_STATE;
+        return HP_RESULT_BAD_STATE;
     }
     if (token == 0 || link->token_left == 0 || m.token != token) {
-        return HP_VERDICT_BAD_TOKEN;
+        return HP_RESULT_BAD_TOKEN;
     }
     in->event = HP_EVENT_ARM;
-    return HP_VERDICT_ACCEPTED;
+    return HP_RESULT_ACCEPTED;
 }
 
 static uint8_t drive(link_state *link, const app_config *c, const app_state *s, app_inputs *in)
@@ -99,17 +99,17 @@ static uint8_t drive(link_state *link, const app_config *c, const app_state *s, 
     hp_run m; /* set_reference has the same fields */
     hp_get_run(link->bytes + HEADER, &m);
     if (s->state != (runs ? HP_STATE_ARMED : HP_STATE_RUNNING)) {
-        return HP_VERDICT_BAD_STATE;
+        return HP_RESULT_BAD_STATE;
     }
     if (!(m.reference >= c->reference_low && m.reference <= c->reference_high)) {
-        return HP_VERDICT_BAD_VALUE;
+        return HP_RESULT_BAD_VALUE;
     }
     if (runs && !app_is_ready(c, s)) {
-        return HP_VERDICT_NOT_READY;
+        return HP_RESULT_NOT_READY;
     }
     in->reference = m.reference;
     in->event = runs ? HP_EVENT_RUN : HP_EVENT_SET_REFERENCE;
-    return HP_VERDICT_ACCEPTED;
+    return HP_RESULT_ACCEPTED;
 }
 
 static uint8_t set_telemetry(link_state *link)
@@ -117,12 +117,12 @@ static uint8_t set_telemetry(link_state *link)
     hp_set_telemetry m;
     hp_get_set_telemetry(link->bytes + HEADER, &m);
     if (m.trace > 1) {
-        return HP_VERDICT_BAD_VALUE;
+        return HP_RESULT_BAD_VALUE;
     }
     link->every = m.every;
     link->trace = m.trace;
     link->until_status = m.every;
-    return HP_VERDICT_ACCEPTED;
+    return HP_RESULT_ACCEPTED;
 }
 
 static uint8_t obey(link_state *link, const app_config *c, const app_state *s, uint16_t update,
@@ -130,16 +130,16 @@ static uint8_t obey(link_state *link, const app_config *c, const app_state *s, u
 {
     switch (link->bytes[0]) {
     case HP_HELLO:
-        return HP_VERDICT_BAD_STATE;
+        return HP_RESULT_BAD_STATE;
     case HP_REQUEST_ARMING:
-        return has_size(link, 0) ? request(link, c, s, update) : HP_VERDICT_UNKNOWN;
+        return has_size(link, 0) ? request(link, c, s, update) : HP_RESULT_UNKNOWN;
     case HP_CONFIRM_ARMING:
-        return has_size(link, HP_CONFIRM_ARMING_SIZE) ? confirm(link, s, in) : HP_VERDICT_UNKNOWN;
+        return has_size(link, HP_CONFIRM_ARMING_SIZE) ? confirm(link, s, in) : HP_RESULT_UNKNOWN;
     case HP_RUN:
     case HP_SET_REFERENCE:
-        return has_size(link, HP_RUN_SIZE) ? drive(link, c, s, in) : HP_VERDICT_UNKNOWN;
+        return has_size(link, HP_RUN_SIZE) ? drive(link, c, s, in) : HP_RESULT_UNKNOWN;
     case HP_SET_TELEMETRY:
-        return has_size(link, HP_SET_TELEMETRY_SIZE) ? set_telemetry(link) : HP_VERDICT_UNKNOWN;
+        return has_size(link, HP_SET_TELEMETRY_SIZE) ? set_telemetry(link) : HP_RESULT_UNKNOWN;
     case HP_KEEP_ALIVE:
         in->event = has_size(link, 0) ? HP_EVENT_ALIVE : HP_EVENT_NONE;
         break;
@@ -148,23 +148,23 @@ static uint8_t obey(link_state *link, const app_config *c, const app_state *s, u
         break;
     case HP_CLEAR_FAULT:
         if (s->state != HP_STATE_TRIPPED) {
-            return HP_VERDICT_BAD_STATE;
+            return HP_RESULT_BAD_STATE;
         }
         in->event = has_size(link, 0) ? HP_EVENT_CLEAR : HP_EVENT_NONE;
         break;
     default:
-        return HP_VERDICT_UNKNOWN;
+        return HP_RESULT_UNKNOWN;
     }
-    return in->event == HP_EVENT_NONE ? HP_VERDICT_UNKNOWN : HP_VERDICT_ACCEPTED;
+    return in->event == HP_EVENT_NONE ? HP_RESULT_UNKNOWN : HP_RESULT_ACCEPTED;
 }
 
-static uint8_t greet(link_state *link, const app_config *c, uint16_t sequence, uint8_t *frame)
+static uint8_t connect_link(link_state *link, const app_config *c, uint16_t sequence, uint8_t *frame)
 {
     uint8_t bytes[HEADER + HP_IDENTITY_SIZE + 2u];
     const hp_identity identity = {HP_VERSION, c->crc, c->rate_hz, link->supply};
     hp_hello m;
     hp_get_hello(link->bytes + HEADER, &m);
-    link->greeted = m.version == HP_VERSION;
+    link->connected = m.version == HP_VERSION;
     link->sequence = sequence;
     hp_put_identity(bytes + HEADER, &identity);
     return finish(link, bytes, HP_IDENTITY, HP_IDENTITY_SIZE, frame);
@@ -180,12 +180,12 @@ uint8_t link_take(link_state *link, const app_config *config, const app_state *s
     uint8_t length = 0;
 
     if (link->bytes[0] == HP_HELLO && has_size(link, HP_HELLO_SIZE) && is_off(state)) {
-        length = greet(link, config, sequence, frame);
-    } else if (link->greeted && ahead >= 1u && ahead <= LINK_AHEAD) {
+        length = connect_link(link, config, sequence, frame);
+    } else if (link->connected && ahead >= 1u && ahead <= LINK_AHEAD) {
         link->sequence = sequence;
         ack.command = link->bytes[0];
         ack.answered = sequence;
-        ack.verdict = obey(link, config, state, update, in);
+        ack.result = obey(link, config, state, update, in);
         ack.token = ack.command == HP_REQUEST_ARMING ? link->token : 0;
         hp_put_ack(bytes + HEADER, &ack);
         length = finish(link, bytes, HP_ACK, HP_ACK_SIZE, frame);
@@ -204,7 +204,7 @@ static APP_APART uint8_t report_trace(link_state *link, const app_state *state,
     hp_trace m;
     uint8_t k;
     m.update = update;
-    for (k = 0; k < 8; ++k) { /* what is new of the window, as it was converted */
+    for (k = 0; k < 8; ++k) { /* the new readings of the window, in the order of conversion */
         const uint8_t at = (uint8_t)(HS_QUADRATURE_SAMPLES / 2u + k / 2u);
         if (k % 2u) {
             m.codes[k] = in->i[at];

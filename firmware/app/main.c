@@ -1,11 +1,11 @@
-/* The firmware: one update a frame of readings. What comes over the link takes part in the next
- * update, so the time from a reading to its output does not depend on the traffic. */
+/* The firmware: one update per frame of readings. A command takes effect in the next update, so the
+ * delay from a reading to its output does not depend on the link's traffic. */
 #include "app.h"
 #include "board.h"
 #include "link.h"
 #include "settings.h" /* generated: static const app_config settings */
 
-#define MOST_BYTES 32u /* of the link in one update: a flood cannot take the update's time */
+#define MOST_BYTES 32u /* of the link per update, so that heavy traffic cannot delay the update */
 #define FRAME_CYCLES 16000u
 
 static app_state state;
@@ -23,12 +23,12 @@ static void listen(void)
         if (link_feed(&link, byte)) {
             const uint8_t n = link_take(&link, &settings, &state, update, &in, bytes);
             board_send(bytes, n);
-            return; /* one command an update */
+            return; /* one command per update */
         }
     }
 }
 
-static void tell(uint16_t start)
+static void send_report(uint16_t start)
 {
     const uint8_t n =
         link_report(&link, &state, &in, &out, update, bytes);
@@ -57,7 +57,7 @@ int main(void)
         app_step(&settings, &state, &in, &out);
         board_output(out.code, out.enable);
         board_done(update);
-        tell(start);
+        send_report(start);
         listen();
     }
 }

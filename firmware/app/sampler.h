@@ -1,6 +1,7 @@
-/* What the sampling interrupt does with a reading, apart from registers: eight slots make a frame,
- * the first one the level of the high voltage, the other even ones voltage, odd ones current. The slot is told by a timer, not counted: a lost conversion
- * cannot turn the reference of the lock-in. Three frames: one is written, two are read. */
+/* Processing of a reading in the sampling interrupt, without registers. Eight slots make a frame:
+ * the first is the level of the high voltage, the other even ones voltage, odd ones current. A
+ * timer gives the slot, so a lost conversion cannot shift the phase of the lock-in. Of three frames
+ * one is written while two are read. */
 #ifndef SAMPLER_H
 #define SAMPLER_H
 
@@ -9,7 +10,7 @@
 
 #define SAMPLER_SLOTS 8u
 #define SAMPLER_FRAMES 3u
-#define SAMPLER_LATE 4u /* frames that no update took, before the output goes off */
+#define SAMPLER_LATE 4u /* frames without an update before the output is switched off */
 
 typedef struct {
     int16_t code[SAMPLER_FRAMES * SAMPLER_SLOTS];
@@ -21,7 +22,7 @@ typedef struct {
     uint8_t alarms;  /* HP_ALARM_ bits */
 } sampler;
 
-/* Returns HP_ALARM_LATE where no update has taken the last frames. */
+/* Returns HP_ALARM_LATE if no update has used the last frames. */
 static inline uint8_t sampler_end_frame(sampler *s)
 {
     const uint8_t next = (uint8_t)(s->start + SAMPLER_SLOTS);
@@ -31,7 +32,7 @@ static inline uint8_t sampler_end_frame(sampler *s)
 }
 
 /* code: of a converter with readings 0 to `highest`. fall: codes of level that may be lost in a
- * frame, five times what the output may fall. Returns not 0 when the output has to go off now. */
+ * frame, five times the largest fall of the output. Nonzero: switch the output off now. */
 static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint16_t highest,
                                    uint16_t fall, uint8_t enabled)
 {
@@ -45,7 +46,7 @@ static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint
         }
     }
     at = (uint8_t)(s->start + slot);
-    if (at < SAMPLER_FRAMES * SAMPLER_SLOTS) { /* also where memory was damaged */
+    if (at < SAMPLER_FRAMES * SAMPLER_SLOTS) { /* safe even if memory was damaged */
         s->code[at] = (int16_t)code;
     }
     if (slot == 0) {
@@ -63,7 +64,7 @@ static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint
     return alarms & (HP_ALARM_RAIL | HP_ALARM_LATE);
 }
 
-/* The two complete frames, oldest first, while the frame from `start` on is written. */
+/* The two complete frames, oldest first, while the frame at `start` is written. */
 static inline void sampler_window(const sampler *s, uint8_t start, int16_t v[HS_QUADRATURE_SAMPLES],
                                   int16_t i[HS_QUADRATURE_SAMPLES])
 {

@@ -60,7 +60,7 @@ def c_struct(message: Row) -> list[str]:
 
 
 def c_codec(message: Row, verb: str) -> list[str]:
-    """hp_put_NAME for what the chip sends, hp_get_NAME for what it receives."""
+    """Make hp_put_NAME for messages that the firmware sends, hp_get_NAME for received ones."""
     put = verb == "put"
     kind = f"{'const ' if put else ''}hp_{message['name']} *m"
     bytes_ = f"{'' if put else 'const '}uint8_t *bytes"
@@ -246,9 +246,9 @@ def page(table: Row) -> str:
         "",
         "A frame is COBS(code u8, sequence u16, fields, CRC-16/CCITT-FALSE u16), then one byte 0,",
         "in both directions. Numbers are little endian; the link has 500,000 baud, 8 bits, no",
-        "parity. The computer numbers its frames. The chip accepts a command whose sequence number",
-        "is 1 to 16 beyond that of the last accepted one, and ignores all others without an",
-        "answer. Incomplete or damaged frames are counted in `bad_frames`.",
+        "parity. The computer numbers its frames. The microcontroller accepts a command whose",
+        "sequence number is 1 to 16 above that of the last accepted one, and ignores all others",
+        "without a reply. Incomplete or damaged frames are counted in `bad_frames`.",
         "",
     ]
     for title, group in (("Commands", "command"), ("Telemetry", "telemetry")):

@@ -43,14 +43,14 @@
 
 /* Why it tripped; latched until clear_fault. */
 #define HP_FAULT_NONE 0u
-#define HP_FAULT_BREAKDOWN 1u /* a monitor at its range end, or a collapsed level; from the interrupt */
+#define HP_FAULT_BREAKDOWN 1u /* a monitor at the end of its range, or a collapsed level */
 #define HP_FAULT_SENSING 2u /* no plausible strain in too many updates */
 #define HP_FAULT_LINK 3u /* no message from the computer; the output was ramped down */
 #define HP_FAULT_LATE 4u /* updates not completed; detected in the sampling interrupt */
-#define HP_FAULT_NOT_FINITE 5u /* the drive was NaN or beyond its limits: memory was damaged */
-#define HP_FAULT_WATCHDOG 6u /* the watchdog reset the chip */
+#define HP_FAULT_NOT_FINITE 5u /* the drive was NaN or outside its limits: memory was damaged */
+#define HP_FAULT_WATCHDOG 6u /* the watchdog reset the microcontroller */
 #define HP_FAULT_BROWN_OUT 7u /* the supply dipped */
-#define HP_FAULT_ASTRAY 9u /* the high voltage does not follow its set point */
+#define HP_FAULT_ASTRAY 9u /* the high voltage differs from the requested one */
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */
 
 /* Bits that the sampling interrupt sets. */
@@ -58,7 +58,7 @@
 #define HP_ALARM_SLIP 2u /* a conversion was lost or late */
 #define HP_ALARM_LATE 4u /* updates are not completed */
 
-/* Why there is no strain; bits of core/include/hs.h, and two that only the chip has. */
+/* Why there is no strain; bits of core/include/hs.h and two of the firmware. */
 #define HP_REASON_AMPLITUDE_LOST 1u /* no carrier on one of the monitors */
 #define HP_REASON_PHASE_OUT 2u /* the phase is not that of a capacitor */
 #define HP_REASON_CLIPPED 4u /* a sample at the end of the converter's range */
@@ -75,13 +75,13 @@
 #define HP_EVENT_CLEAR 6u
 
 /* Result of a command. */
-#define HP_VERDICT_ACCEPTED 0u
-#define HP_VERDICT_UNKNOWN 1u /* no such command, or wrong length */
-#define HP_VERDICT_BAD_VERSION 2u /* send hello with this version first */
-#define HP_VERDICT_BAD_STATE 3u /* not in this state */
-#define HP_VERDICT_BAD_TOKEN 4u /* wrong token, or too late */
-#define HP_VERDICT_BAD_VALUE 5u /* outside the limits that were compiled in */
-#define HP_VERDICT_NOT_READY 6u /* no valid strain yet */
+#define HP_RESULT_ACCEPTED 0u
+#define HP_RESULT_UNKNOWN 1u /* unknown command, or wrong length */
+#define HP_RESULT_BAD_VERSION 2u /* send hello with this version first */
+#define HP_RESULT_BAD_STATE 3u /* not possible in this state */
+#define HP_RESULT_BAD_TOKEN 4u /* wrong or expired token */
+#define HP_RESULT_BAD_VALUE 5u /* outside the compiled-in limits */
+#define HP_RESULT_NOT_READY 6u /* no valid strain yet */
 
 static inline void hp_put_u8(uint8_t *bytes, uint8_t value) { bytes[0] = value; }
 
@@ -173,9 +173,9 @@ static inline void hp_get_set_telemetry(const uint8_t *bytes, hp_set_telemetry *
 
 typedef struct {
     uint16_t version; /* of this table */
-    uint32_t settings; /* CRC-32 of the settings that were compiled in */
+    uint32_t settings; /* CRC-32 of the compiled-in settings */
     uint16_t rate_hz; /* updates per second */
-    uint16_t supply; /* code of the chip's 1.1 V reference relative to its supply, 10 bits; 0: not measured */
+    uint16_t supply; /* code of the 1.1 V reference relative to the supply, 10 bits; 0: not measured */
 } hp_identity;
 
 static inline void hp_put_identity(uint8_t *bytes, const hp_identity *m)
@@ -187,9 +187,9 @@ static inline void hp_put_identity(uint8_t *bytes, const hp_identity *m)
 }
 
 typedef struct {
-    uint8_t command; /* its code */
-    uint16_t answered; /* its sequence */
-    uint8_t verdict; /* see verdicts */
+    uint8_t command; /* code of the command */
+    uint16_t answered; /* sequence number of the command */
+    uint8_t result; /* see results */
     uint16_t token; /* for confirm_arming; else 0 */
 } hp_ack;
 
@@ -197,7 +197,7 @@ static inline void hp_put_ack(uint8_t *bytes, const hp_ack *m)
 {
     hp_put_u8(bytes + 0, m->command);
     hp_put_u16(bytes + 1, m->answered);
-    hp_put_u8(bytes + 3, m->verdict);
+    hp_put_u8(bytes + 3, m->result);
     hp_put_u16(bytes + 4, m->token);
 }
 
@@ -205,13 +205,13 @@ typedef struct {
     uint16_t update; /* number of the update, modulo 65536 */
     uint8_t state; /* see states */
     uint8_t fault; /* why it tripped, see faults */
-    uint8_t reason; /* why there is no strain, see reasons; 0: strain is valid */
+    uint8_t reason; /* why there is no strain, see reasons; 0: the strain is valid */
     float strain; /* measured strain; 0 without one */
     float capacitance_f; /* measured capacitance, in F; 0 without one */
     uint16_t code; /* of the output converter, 0.5 mV each */
     uint16_t busy_cycles; /* longest update since the last status, in CPU cycles */
     uint8_t overruns; /* updates that were not ready in time, modulo 256 */
-    uint8_t bad_frames; /* incomplete or damaged frames, modulo 256 */
+    uint8_t bad_frames; /* damaged frames, modulo 256 */
 } hp_status;
 
 static inline void hp_put_status(uint8_t *bytes, const hp_status *m)

@@ -1,25 +1,24 @@
 /* SPDX-License-Identifier: GPL-3.0-or-later (linked with libsimavr; see LICENSE.md)
  *
- * The chip, instruction by instruction, against the twin's physics.
- *     cosim FIRMWARE.elf PHYSICS.bin      commands on stdin, answers on stdout
+ * Co-simulation of the microcontroller, instruction by instruction, with the twin's physics.
+ *     cosim FIRMWARE.elf PHYSICS.bin      commands on stdin, replies on stdout
  *     cosim --sizes                       bytes of the twin's parameters and state
  *
- * A slot of 2,000 cycles, 125 us, is 20 steps of the twin. Where timer 1 starts a conversion the
- * twin is stepped up to that instant, and what the converter holds then is what the chip reads
- * later.
+ * A slot of 2,000 cycles, 125 us, is 20 steps of the twin. When timer 1 starts a conversion, the
+ * twin is stepped up to that instant, and the converter samples its present value.
  *
- * Commands, one a line; each is answered by lines and then "ok ...":
+ * Commands, one per line; the reply to each is lines and then "ok ...":
  *     run CYCLES            out CYCLE CODE ENABLE | uart HEX | track CYCLE LENGTH_M HIGH_V
- *     send HEX              bytes to the chip, at 500,000 baud
- *     track SLOTS           a track line every so many slots; 0: none
+ *     send HEX              bytes to the microcontroller, at 500,000 baud
+ *     track SLOTS           a track line every SLOTS slots; 0: none
  *     fault NAME            hang | hang_blind | carrier | wire_v | wire_i | level | stuck |
  *                           breakdown | stall | brown_out | none
  *     flip ADDRESS BIT      in the data memory: registers, I/O, RAM
  *     peek ADDRESS COUNT    hex
- *     connect FARAD OHM     a reference in the actuator's place; 0 0: the actuator
+ *     connect FARAD OHM     a reference in place of the actuator; 0 0: the actuator
  *     load NEWTON
- *     rail VOLT ...         drive of the coming slots by a supply of its own instead of the output
- *                           converter; the last value holds; the enable pin still cuts it
+ *     rail VOLT ...         drive of the next slots by a separate supply instead of the output
+ *                           converter; the last value is kept; the enable pin still switches it off
  *     quit
  */
 #include <math.h>
@@ -41,7 +40,7 @@
 #define SLOT_CYCLES 2000
 #define STEP_CYCLES 100
 #define CONVERSION_CYCLES 1728
-#define BYTE_CYCLES 352 /* the simulator reckons 11 bits a byte */
+#define BYTE_CYCLES 352 /* the simulator uses 11 bits per byte */
 #define PORTB_ADDRESS 0x25
 #define DDRB_ADDRESS 0x24
 #define MCUSR_ADDRESS 0x54
@@ -52,7 +51,7 @@
 #define DATA 0x04
 #define ENABLE 0x10
 #define DAC_V 2.048
-#define CARRIER_V 0.05    /* peak, ahead of the high-voltage module */
+#define CARRIER_V 0.05    /* peak, at the high-voltage module's input */
 #define CARRIER_HZ 5000.0
 #define V_STAGE 50.0      /* analogue stages: band-pass about the middle of 5 V */
 #define I_STAGE 0.8
@@ -80,7 +79,7 @@ typedef struct {
     int no_carrier, no_v, no_i, no_level, stall, stuck;
     stage v, i;
     uint32_t held_mv;
-    /* a supply of its own: the drive slot by slot */
+    /* separate supply: the drive slot by slot */
     double rail_v[MOST_RAIL];
     unsigned rail_count, rail_at; /* no count: the output converter drives the module */
     /* book-keeping */
@@ -92,7 +91,7 @@ typedef struct {
     unsigned track_every, slots;
 } bench;
 
-static bench *the_bench; /* the simulator's sleep callback has no argument of ours */
+static bench *the_bench; /* the simulator's sleep callback has no user argument */
 
 static void on_sleep(avr_t *avr, avr_cycle_count_t cycles)
 {
@@ -100,7 +99,7 @@ static void on_sleep(avr_t *avr, avr_cycle_count_t cycles)
     the_bench->asleep += cycles + 1;
 }
 
-static void quiet(avr_t *avr, const int level, const char *format, va_list arguments)
+static void ignore_log(avr_t *avr, const int level, const char *format, va_list arguments)
 {
     (void)avr, (void)level, (void)format, (void)arguments;
 }
@@ -139,7 +138,7 @@ static double next_rail(bench *b)
     return b->enable ? v : 0.0;
 }
 
-/* One slot of the twin, with the output as it was and became. */
+/* One slot of the twin, with the output at its start and at its end. */
 static void step_plant(bench *b)
 {
     int16_t codes[2 * TWIN_SUB];
@@ -169,7 +168,7 @@ static void step_plant(bench *b)
     }
 }
 
-/* What the converter holds of a channel. */
+/* Sampled value of a channel. */
 static uint32_t hold(const bench *b, int channel)
 {
     const double level = b->no_level ? 0.0 : 1000.0 * b->v.input;
@@ -183,8 +182,8 @@ static uint32_t hold(const bench *b, int channel)
     }
 }
 
-/* The simulator reads the pin when the result is fetched, with the channel chosen by then; the chip
- * holds both at the start and shows the result at the end. So from then on all pins are held. */
+/* The simulator reads the pin when the result is fetched, with the channel selected by then; real
+ * hardware latches both at the start. So from the start on all pins are held. */
 static avr_cycle_count_t on_converted(avr_t *avr, avr_cycle_count_t when, void *context)
 {
     bench *b = context;
@@ -220,7 +219,7 @@ static void on_carrier(avr_irq_t *irq, uint32_t value, void *context)
     ++((bench *)context)->toggles;
 }
 
-/* ---- the chip's pins ---- */
+/* ---- pins of the microcontroller ---- */
 
 static void output_changed(bench *b)
 {
@@ -266,7 +265,7 @@ static void look_at_pins(bench *b)
 {
     const uint8_t *data = b->avr->data;
     const uint8_t pins = data[PORTB_ADDRESS] & data[DDRB_ADDRESS];
-    const uint8_t enable = (pins & ENABLE) != 0; /* pulled down where it is no output */
+    const uint8_t enable = (pins & ENABLE) != 0; /* pulled down if it is not an output */
     const uint16_t sp = stack_of(b->avr);
     if (pins != b->pins) {
         look_at_converter(b, pins);
@@ -350,8 +349,8 @@ static void run(bench *b, avr_cycle_count_t cycles)
         const int state = avr_run(a);
         if (state == cpu_Crashed || state == cpu_Done || stack_of(a) > a->ramend ||
             a->pc >= a->flashend) {
-            /* Silicon would run on through whatever comes; a chip that stands still is the harder
-             * case, since only the watchdog ends it. */
+            /* Real hardware would keep executing; stopping is the harder case, since only the
+             * watchdog ends it. */
             ++b->crashes;
             a->pc = before < a->flashend ? before : a->flashend - 1;
             a->data[SP_ADDRESS] = (uint8_t)(a->ramend & 0xff);
@@ -460,13 +459,13 @@ static int start(bench *b, const char *elf, uint32_t supply_mv)
     uint32_t flags = 0;
     uint8_t *data;
     memset(&firmware, 0, sizeof firmware);
-    avr_global_logger_set(quiet);
+    avr_global_logger_set(ignore_log);
     if (elf_read_firmware(elf, &firmware) != 0 ||
         !(b->avr = avr_make_mcu_by_name("atmega2560"))) {
         return 0;
     }
     avr_init(b->avr);
-    /* The simulator tells of a write beyond the RAM, and then does it all the same. */
+    /* The simulator reports a write beyond the RAM, then does it anyway. */
     if (!(data = calloc(1, 0x10100))) {
         return 0;
     }

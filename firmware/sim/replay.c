@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: BSD-3-Clause
  *
- * The chip's updates again, on this machine: app_step on latched inputs.
+ * Replays the microcontroller's updates on this machine: app_step with latched inputs.
  *
- * In, a line an update: 8 codes (V I V I ...), event, alarms, reference as the hex of its bits.
- * Out, a line each: state, fault, reason, code, enable, and the bits of strain, corrected strain
- * and drive in hex.
+ * Input, one line per update: 8 codes (V I V I ...), event, alarms, bits of the reference in hex.
+ * Output, one line each: state, fault, reason, code, enable, and the bits of strain, corrected
+ * strain and drive in hex.
  */
 #include <inttypes.h>
 #include <stdint.h>

@@ -64,7 +64,7 @@ void capacitances_from_quadrature(const hs_quadrature_config &config, Codes code
 
 NB_MODULE(_core, m)
 {
-    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
+    nb::set_leak_warnings(false); // objects that exist until the interpreter ends are not leaks
     m.doc() = "The C core shared with the microcontroller";
     m.def("exp", &hs_exp);
     m.def("voltage_from_strain", [](float a1_v, float b1, float a2_v, float b2, float strain) {

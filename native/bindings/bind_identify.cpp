@@ -269,7 +269,7 @@ std::tuple<OutVector, OutMatrix, bool> oscillate(Vector u, double input_rate_hz,
 }  // namespace
 
 NB_MODULE(_identify, m) {
-    nb::set_leak_warnings(false);  // objects that live to the end of the interpreter are no fault
+    nb::set_leak_warnings(false);  // objects that exist until the interpreter ends are not leaks
     m.doc() = "Fits that are too slow in Python";
     nb::class_<Record>(m, "Record")
         .def(nb::init<Vector, double, double, bool, Vector, Vector, double>(), nb::arg("u"),

@@ -192,7 +192,7 @@ class Bunch {
                 to[k * lanes] = from[k];
             }
         }
-        for (size_t i = count_; i % lanes != 0; ++i) { // lanes that nobody reads
+        for (size_t i = count_; i % lanes != 0; ++i) { // unused lanes
             float *to = rows(i / lanes, 0) + i % lanes;
             for (size_t k = 0; k < chunk; ++k) {
                 to[k * lanes] = 0.0f;
@@ -404,7 +404,7 @@ class Loops {
 
 NB_MODULE(_loops, m)
 {
-    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
+    nb::set_leak_warnings(false); // objects that exist until the interpreter ends are not leaks
     m.doc() = "Closed loops with the core's controller, many at a time";
     m.attr("LOOP") = dtype_of<Row>(
         {FIELD(Row, free), FIELD(Row, push), FIELD(Row, feed), FIELD(Row, slow_decay),

@@ -92,7 +92,7 @@ void invert_bouc_wen(double sharpness, double sigma, double exponent, double gai
 
 NB_MODULE(_models, m)
 {
-    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
+    nb::set_leak_warnings(false); // objects that exist until the interpreter ends are not leaks
     m.doc() = "Hysteresis operators, sample by sample";
     nb::class_<Plays>(m, "Plays")
         .def(nb::init<In, In, double, double, double, double>())

@@ -311,7 +311,7 @@ void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<si
 
 NB_MODULE(_sense, m)
 {
-    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
+    nb::set_leak_warnings(false); // objects that exist until the interpreter ends are not leaks
     m.doc() = "Sensing on the desktop: the core's sums, what follows from them, and the paper's chain";
     m.attr("PIECES") = SENSE_PIECES;
     m.attr("ROOM") = SENSE_ALL;

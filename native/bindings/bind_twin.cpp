@@ -159,7 +159,7 @@ class Bench {
 
 NB_MODULE(_twin, m)
 {
-    nb::set_leak_warnings(false); // objects that live to the end of the interpreter are no fault
+    nb::set_leak_warnings(false); // objects that exist until the interpreter ends are not leaks
     m.doc() = "Stepping of the simulated bench";
     nb::class_<Bench>(m, "Bench")
         .def(nb::init<const nb::dict &, Values, Values, Values, double, uint64_t>())

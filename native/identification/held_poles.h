@@ -1,8 +1,8 @@
 /* Poles driven by a held input: states and sensitivities at the times of an output, exact.
  *
  * x' = p x + u(t), u held from edge to edge (zero order) or drawn straight between the edges
- * (first order). The input of an edge is that less the input before t = 0, so everything starts
- * from rest. Desktop only, double precision; the caller owns all memory.
+ * (first order). Inputs are relative to the input before t = 0, so all states start at 0. Desktop
+ * only, double precision; the caller owns all memory.
  */
 #ifndef HELD_POLES_H
 #define HELD_POLES_H
@@ -17,13 +17,13 @@ typedef struct {
     double re, im;
 } held_complex;
 
-/* One experiment. An output at time t lies `phase[group]` of a period after edge `edge`. */
+/* One experiment. An output at time t is `phase[group]` of a period after edge `edge`. */
 typedef struct {
     const double *u; /* n_edges inputs less `before`; the last one repeated to the end */
     int32_t n_edges;
     int32_t first_order; /* 1: straight between the edges, 0: held */
     double period_s;
-    double before;     /* input since ever before t = 0 */
+    double before;     /* constant input before t = 0 */
     const double *y;   /* n outputs */
     int32_t n;
     const int32_t *edge, *group; /* n each */

@@ -1,4 +1,4 @@
-/* What residuals tell about their noise. Desktop only; the caller owns all memory. */
+/* Noise models of residuals. Desktop only; the caller owns all memory. */
 #ifndef NOISE_H
 #define NOISE_H
 

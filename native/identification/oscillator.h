@@ -1,4 +1,4 @@
-/* One resonance with a nonlinear spring behind a delay, and what its motion owes to each number.
+/* One resonance with a nonlinear spring and a delay, with the sensitivities of its motion.
  *
  * x'' + 2 zeta w x' + w^2 (x + q2 x^2 + q3 x^3) = gain w^2 u(t - delay), u held from edge to edge
  * or drawn straight between the edges. Runge-Kutta steps of fourth order end at each edge and each
@@ -36,8 +36,8 @@ typedef struct {
     int32_t n;
 } oscillator_record;
 
-/* Motion and its derivatives by the numbers, number after number: `x` has n values, `by_number`
- * OSCILLATOR_NUMBERS times n. Returns 0 where the motion goes beyond `largest`. */
+/* Motion and its derivatives by the parameters, one after the other: `x` has n values, `by_number`
+ * OSCILLATOR_NUMBERS times n. Returns 0 if the motion exceeds `largest`. */
 int32_t oscillator_simulate(const oscillator_record *record, const double *numbers, double largest,
                             double *x, double *by_number);
 

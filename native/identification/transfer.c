@@ -8,7 +8,7 @@
 #include "identification/vectors.h"
 
 #define SMALLEST_STEP 1e-9
-#define CRAWL 1e-6 /* of the cost: so many steps of less are the floor of a flat valley */
+#define CRAWL 1e-6 /* of the cost: several steps of less mean the bottom of a flat valley */
 #define CRAWLING 20
 
 void transfer_project(const transfer_problem *problem, transfer_solution *solution)
@@ -92,7 +92,7 @@ typedef struct {
     int32_t cut;    /* whether a bound shortened it */
 } bounded_step;
 
-/* A step inside the bounds; a number that stands on one and would leave it is held there. */
+/* A step inside the bounds; a number at a bound that would leave it is fixed there. */
 static bounded_step step_inside(const normal_equations *normal, const double *low,
                                 const double *high, double damping, const double *at)
 {

@@ -1,4 +1,4 @@
-/* Long columns of doubles: what least squares needs of them. Desktop only. */
+/* Operations on long columns of doubles for least squares. Desktop only. */
 #ifndef VECTORS_H
 #define VECTORS_H
 

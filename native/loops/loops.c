@@ -17,7 +17,7 @@ size_t loops_line_size(uint32_t delay)
     return size;
 }
 
-/* Output that arrives `delay` samples later; then the plant stands where the next sample finds it. */
+/* Output that arrives `delay` samples later; then the plant is advanced to the next sample. */
 static float plant_step(const struct loops_plant *plant, struct loops_state *x, unsigned slow,
                         double u)
 {

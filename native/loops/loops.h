@@ -46,8 +46,8 @@ struct loops_loop {
     uint32_t noise_key;  /* distinct for each loop, mixed */
 };
 
-/* What is left of the samples of a stretch. The error is the reference less the output that
- * arrives, before the noise. */
+/* Summary of the samples of a segment. The error is the reference minus the output that arrives,
+ * without the noise. */
 struct loops_summary {
     float error_sum; /* of sizes */
     float top, bottom;
@@ -66,7 +66,7 @@ struct loops_task {
     uint32_t noise_seed; /* common to all loops */
 };
 
-/* Where a run is put: traces of every sample, or (where `u` is null) a summary each stretch. */
+/* Results of a run: traces of every sample, or (if `u` is null) a summary of each segment. */
 struct loops_traces {
     float *measured, *u;
 };
@@ -111,7 +111,7 @@ void loops_run_exact(const struct loops_exact *loop, const double *reference, co
 #define LOOPS_ALIGNED
 #endif
 
-/* Lane by lane what a loop is and where it stands. */
+/* Parameters and state of each loop, lane by lane. */
 struct LOOPS_ALIGNED loops_group {
     double a11[LOOPS_LANES], a12[LOOPS_LANES], a21[LOOPS_LANES], a22[LOOPS_LANES];
     double b1[LOOPS_LANES], b2[LOOPS_LANES], feed[LOOPS_LANES];
@@ -123,7 +123,7 @@ struct LOOPS_ALIGNED loops_group {
     /* as in struct loops_summary */
     float error_sum[LOOPS_LANES], top[LOOPS_LANES], bottom[LOOPS_LANES];
     float last_outside[LOOPS_LANES], limited[LOOPS_LANES];
-    int32_t back[LOOPS_LANES];           /* 16 delay - lane: how far behind a reading lies */
+    int32_t back[LOOPS_LANES];           /* 16 delay - lane: distance of a delayed reading */
     float noise_std[LOOPS_LANES];
     uint32_t noise_key[LOOPS_LANES];
     float period_s;                      /* common to all loops */

@@ -117,8 +117,8 @@ void play_invert(const struct play_parameters *p, double *state, size_t n, const
 /* dv/dz for rising input z = sharpness u, on the branch of negative or of positive v. */
 static double slope_of(const struct bouc_wen_parameters *p, double v, int negative)
 {
-    const double bent = p->exponent == 1.0 ? fabs(v) : pow(fabs(v), p->exponent);
-    return negative ? 1.0 + (2.0 * p->sigma - 1.0) * bent : 1.0 - bent;
+    const double power = p->exponent == 1.0 ? fabs(v) : pow(fabs(v), p->exponent);
+    return negative ? 1.0 + (2.0 * p->sigma - 1.0) * power : 1.0 - power;
 }
 
 static double kutta(const struct bouc_wen_parameters *p, double v, double h, int negative)
@@ -181,11 +181,11 @@ static double rise_exactly(const struct bouc_wen_parameters *p, double v, double
 {
     const double kappa = 2.0 * p->sigma - 1.0;
     if (v < 0.0) {
-        const double bent = kappa * -v;
-        const double zero = bent > 1e-12 ? log1p(bent) / kappa : -v;
+        const double scaled = kappa * -v;
+        const double zero = scaled > 1e-12 ? log1p(scaled) / kappa : -v;
         if (z <= zero) {
-            return kappa * z > 1e-12 ? v - (1.0 + bent) * expm1(-kappa * z) / kappa
-                                     : v + (1.0 + bent) * z;
+            return kappa * z > 1e-12 ? v - (1.0 + scaled) * expm1(-kappa * z) / kappa
+                                     : v + (1.0 + scaled) * z;
         }
         z -= zero;
         v = 0.0;

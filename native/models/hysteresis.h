@@ -1,6 +1,6 @@
 /* Hysteresis operators in time: play operators with thresholds that grow with the input's rate
  * (Prandtl-Ishlinskii) and the normalised Bouc-Wen oscillator's memory, both with their inverses.
- * The caller owns all memory; a state is what a function leaves behind and takes up again. */
+ * The caller owns all memory; functions read a state and write the new one back. */
 #ifndef HASELAB_HYSTERESIS_H
 #define HASELAB_HYSTERESIS_H
 

@@ -1,4 +1,4 @@
-/* Takes: level and slope of a block's pieces. Gives: the best cut into parts with a model each. */
+/* Takes: level and slope of a block's pieces. Gives: the best cut into parts, each with a model. */
 #include "sensing/parts.h"
 
 #include <math.h>

@@ -13,7 +13,7 @@ extern "C" {
 #define PARTS_SIZE 8    /* columns of a table */
 #define PARTS_KINDS 2   /* of models, at most */
 
-/* Nested models of a run of 1, 2 ... pieces: the first so many columns are one of them. */
+/* Nested models of a run of 1, 2 ... pieces: each uses the first columns. */
 typedef struct {
     const double *columns; /* 2 rows of PARTS_SIZE a piece: runs of 1 piece, then of 2 ... */
     size_t least;          /* columns of the smallest model */
@@ -24,11 +24,11 @@ typedef struct {
     size_t pieces;
     size_t kinds;
     parts_table tables[PARTS_KINDS];
-    size_t gap;       /* pieces that a step inside of the block spoils, at least */
-    size_t spare;     /* coordinates of a run that its parameters must leave */
+    size_t gap;       /* smallest number of pieces that a step inside the block affects */
+    size_t spare;     /* residual degrees of freedom of a run, at least */
     double price;     /* of a parameter, on both channels */
     double cut_price; /* of a step */
-    double left_out;  /* of a piece that does not count */
+    double left_out;  /* price of a piece that is not used */
 } parts_plan;
 
 typedef struct {
@@ -37,7 +37,7 @@ typedef struct {
 
 typedef struct {
     double score;  /* chi-square and prices */
-    double misfit; /* chi-square of what counts */
+    double misfit; /* chi-square of the pieces that are used */
     int32_t parts;
 } parts_result;
 

@@ -1,4 +1,4 @@
-/* Takes: readings of both monitors. Gives: sums of their pieces, and each piece's own fit. */
+/* Takes: readings of both monitors. Gives: sums of their pieces, and a fit of each piece. */
 #include "sensing/pieces.h"
 
 #include <string.h>

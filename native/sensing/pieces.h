@@ -1,4 +1,4 @@
-/* The pieces of a block: readings of any type into sums, and what each piece says on its own. */
+/* The pieces of a block: sums of readings of any type, and a fit of each piece. */
 #ifndef HASELAB_PIECES_H
 #define HASELAB_PIECES_H
 
@@ -12,10 +12,10 @@
 /* Pieces of one channel; sums over a block's basis about one reading, `first`. */
 typedef struct {
     double first;
-    double known_a, known_b; /* carrier that was taken off before */
+    double known_a, known_b; /* carrier that was subtracted before */
     double cosine[SENSE_ALL], sine[SENSE_ALL], level[SENSE_ALL], ramp[SENSE_ALL];
     double square[SENSE_ALL];
-    /* Each full piece on its own: phasor (a cos + b sin) from its first sample, level, residual. */
+    /* Fit of each full piece: phasor (a cos + b sin) from its first sample, level, residual. */
     double a[SENSE_ALL], b[SENSE_ALL], height[SENSE_ALL], rest[SENSE_ALL];
 } sense_channel;
 
@@ -25,7 +25,7 @@ typedef struct {
     double ramp[SENSE_ALL], square[SENSE_ALL];
 } sense_columns;
 
-/* A carrier that is taken off the readings before they are summed, from the block's first sample. */
+/* A carrier to subtract from the readings before they are summed, from the block's first sample. */
 typedef struct {
     double a, b; /* a cos + b sin */
 } sense_carrier;

@@ -110,7 +110,7 @@ HS_CLONES static float sum_products(const float *v, const float *i, size_t n, fl
     return sum;
 }
 
-/* The carrier's table a piece further on, the model's constants at sample `from` of piece p. */
+/* The carrier's table for piece p, and the model's constants at its sample `from`. */
 static void leave_strip(const sense_plan *plan, const sense_model *model, size_t p, size_t from,
                         double after, const float *x, size_t n, float *rest, strip_sums *out)
 {

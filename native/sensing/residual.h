@@ -1,18 +1,18 @@
-/* What the plain model of a block leaves: is it white noise? */
+/* Test whether the residuals of a block's plain model are white noise. */
 #ifndef HASELAB_RESIDUAL_H
 #define HASELAB_RESIDUAL_H
 
 #include "sensing/pieces.h"
 
-/* The plain model of one channel: carrier, level, slope, and a step where pieces are left out. */
+/* The plain model of one channel: carrier, level, slope, and a step at skipped pieces. */
 typedef struct {
     double a, b;          /* carrier, from the block's first sample */
     double level, slope;  /* in the block's middle, unit of the readings; per block */
     double step;          /* of the pieces after an update */
-    double turn;          /* rad a piece that the carrier runs ahead of its nominal frequency */
+    double turn;          /* phase advance of the carrier from its nominal frequency, rad per piece */
 } sense_model;
 
-/* Sums over the residual r of the samples that count. */
+/* Sums over the residual r of the samples that are used. */
 typedef struct {
     double square[2];      /* sum of r^2, voltage and current */
     double next[2];        /* sum of r[k] r[k + 1] */
@@ -23,7 +23,7 @@ typedef struct {
     double samples;
 } sense_residual;
 
-/* One more pass over the readings of the pieces that count. */
+/* One more pass over the readings of the pieces that are used. */
 void sense_sum_residual(const sense_plan *plan, sense_type type, const void *v, const void *i,
                         size_t stride, const sense_choice *choice, const sense_model model[2],
                         sense_residual *out);

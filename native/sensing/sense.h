@@ -1,9 +1,9 @@
-/* Lock-in over a block of pieces: phasors, noise, disturbances; the desktop's half of sensing.
+/* Lock-in over a block of pieces: phasors, noise, disturbances; sensing on the desktop.
  *
  * A block is cut into pieces of at least one carrier period. core/hs_lockin.c makes the sums of
- * each piece in one pass over the samples; everything else here works on these sums: least squares
- * over the pieces that count, noise from what each piece leaves on its own, and the search for an
- * output update that hit the block at an unknown time.
+ * each piece in one pass over the samples; everything else here uses these sums: least squares over
+ * the pieces that are used, noise from the residuals of each piece, and the search for an output
+ * update at an unknown time in the block.
  */
 #ifndef HASELAB_SENSE_H
 #define HASELAB_SENSE_H
@@ -25,23 +25,23 @@ enum { SENSE_COS, SENSE_SIN, SENSE_LEVEL, SENSE_RAMP, SENSE_STEP, SENSE_BASIS };
 
 typedef enum { SENSE_INT16, SENSE_FLOAT, SENSE_DOUBLE } sense_type;
 
-/* Which pieces count, which lie after an update, and the least squares that follow from it. */
+/* Which pieces are used, which are after an update, and the resulting least squares. */
 typedef struct {
     double used[SENSE_ALL];
     double after[SENSE_ALL];
     double inverse[SENSE_BASIS][SENSE_BASIS];
     double samples;     /* that count */
-    double full;        /* full pieces that count */
-    double after_share; /* of the samples that count, those after the update */
+    double full;        /* full pieces that are used */
+    double after_share; /* fraction of the used samples that is after the update */
 } sense_choice;
 
-/* All that is known before the first block; the owner fills it once. */
+/* Constants of all blocks; the owner fills it once. */
 typedef struct {
     sum_pieces_fn sum;
     size_t samples; /* a block */
     size_t piece;   /* samples of a full piece */
-    size_t pieces;  /* full ones; what is left over is one shorter piece more */
-    size_t start;   /* first piece that counts */
+    size_t pieces;  /* full ones; the remaining samples are one shorter piece */
+    size_t start;   /* first piece that is used */
     size_t padded;  /* pieces and rest, rounded up to a multiple of 8 for the vector units */
     const float *cosine, *sine;         /* of the carrier, `piece` values each */
     const float *cosine3, *sine3;       /* of its third harmonic */
@@ -56,13 +56,13 @@ typedef struct {
     size_t choice_count;                /* 1: no search */
 } sense_plan;
 
-/* What a block gives. */
+/* Results of a block. */
 typedef struct {
     double v_re, v_im, i_re, i_im; /* peak phasors at the block's first sample */
     double v_noise, i_noise;       /* variance of one reading */
-    double v_level, i_level;       /* mean over the samples that count, in the block's middle */
+    double v_level, i_level;       /* mean over the used samples, at the block's middle */
     double v_slope, i_slope;       /* per s */
-    double excess; /* scatter of the pieces' phasors over that of the noise, variances; 1: none */
+    double excess; /* variance of the pieces' phasors over that of the noise; 1: no excess */
     double offset_rad_s;           /* of the carrier from its nominal frequency */
     double v3_re, v3_im, i3_re, i3_im; /* third harmonic of the carrier, at the first sample */
     uint32_t choice;               /* index of the choice that was taken */
@@ -70,7 +70,7 @@ typedef struct {
     uint32_t suspicion;            /* SENSE_DRIVE and the like; 0: the plain model explains it all */
 } sense_result;
 
-/* What the plain model leaves; each is exceeded by noise in about one block of 10,000. */
+/* Misfits of the plain model; noise exceeds each in about one block of 10,000. */
 #define SENSE_DRIVE 1u  /* levels of the pieces about a straight line */
 #define SENSE_SCATTER 2u /* phasors of the pieces about a straight line */
 #define SENSE_COLOUR 4u /* one residual and the next */
@@ -82,8 +82,8 @@ typedef struct {
 size_t sense_room(const sense_plan *plan);
 
 /* One block of `plan->samples` readings a channel, `stride` apart. ahead: memory so many bytes
- * further on is asked for as the block is read; 0 where none follows. tested: whether what the
- * plain model leaves is looked at, which takes as long as the fit and more. */
+ * further on is prefetched as the block is read; 0 if none follows. tested: whether the residuals
+ * of the plain model are tested, which takes longer than the fit. */
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
                  size_t stride, size_t ahead, int tested, float *room, sense_result *out);
 

@@ -10,11 +10,11 @@
 extern "C" {
 #endif
 
-/* As hs_sum_pieces. ahead: memory so many bytes further on is asked for meanwhile, 0 for none. */
+/* As hs_sum_pieces. ahead: memory so many bytes further on is prefetched, 0 for none. */
 typedef void (*sum_pieces_fn)(const float *x, size_t n, const float *cosine, const float *sine,
                               size_t piece, size_t ahead, hs_sums *out);
 
-/* The widest vectors that this machine has, up to `bits`: 512, 256, 128, or 0 for none. */
+/* Widest vectors of this machine, up to `bits`: 512, 256, 128, or 0 for none. */
 int sum_pieces_bits(int bits);
 
 /* The sums by these vectors; by the core's own code for 0. */

@@ -1,4 +1,4 @@
-/* What the neighbours' displacements say about a point. Inside the tracker only.
+/* Estimates for a point from its neighbours' displacements. Inside the tracker only.
  *
  * `moved` holds the displacement x, y of every point's subset, px; `unusable` is not zero for the
  * points that do not count. A gradient is u_x, u_y, v_x, v_y.
@@ -8,7 +8,7 @@
 
 #include "tracking/track_step.h"
 
-enum { TRACK_FEWEST = 3 }; /* neighbours that a word on a point takes */
+enum { TRACK_FEWEST = 3 }; /* fewest neighbours for an estimate */
 
 /* Displacement gradient at point i from all its neighbours. */
 void track_full_gradient(const struct track_points *p, const double *moved, int i, double *g);

@@ -251,7 +251,7 @@ def test_a_collapse_takes_the_output_away_and_says_why():
         {"kind": "dea-stack", "actuator": {"shear_modulus_pa": 4e3}, "load": {"mass_kg": 0.1}}
     )
     bench = TwinBench(config, 0)
-    with pytest.raises(SafetyError, match=r"left the lengths of 8.75 to 140 mm .* Lower"):
+    with pytest.raises(SafetyError, match=r"left the range of 8.75 to 140 mm .* Lower"):
         for drive_v in np.arange(0.0, 2.0, 0.05):
             bench.write(drive_v)
             bench.wait(0.5)

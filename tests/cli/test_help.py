@@ -46,8 +46,8 @@ OPTIONS = [
 
 
 def _help(path: str) -> str:
-    result = CliRunner().invoke(cli, [*path.split(), "--help"], prog_name="haselab",
-                                terminal_width=COLUMNS)  # fmt: skip
+    runner = CliRunner(env={"COLUMNS": str(COLUMNS)})
+    result = runner.invoke(cli, [*path.split(), "--help"], prog_name="haselab")
     assert result.exit_code == 0
     return result.output
 
@@ -69,9 +69,13 @@ def _meaning(option: click.Option) -> str:
 
 @pytest.mark.parametrize("path", COMMANDS)
 def test_help_fits_80_columns_and_cuts_no_sentence(path: str) -> None:
-    for line in _help(path).splitlines():
+    usage, _, rest = _help(path).partition("\n\n")
+    for line in (*usage.splitlines(), *rest.splitlines()):
         assert len(line) <= COLUMNS, line
-        assert not line.rstrip().endswith(("...", "…")) or "Usage:" in line, line
+    assert "..." not in rest and "…" not in rest
+    _, _, commands = rest.partition("\nCommands:\n")
+    for entry in commands.splitlines():
+        assert entry.endswith("."), entry
 
 
 @pytest.mark.parametrize("path", COMMANDS)

@@ -1,4 +1,4 @@
-"""A signal that comes up where Python drops exceptions is neither lost nor told twice."""
+"""A signal during an exception that Python drops is neither lost nor reported twice."""
 
 import os
 import signal
@@ -46,7 +46,7 @@ def test_a_signal_inside_a_finaliser_ends_the_job_at_the_next_step_in_silence(nu
     assert done.stderr == ""
 
 
-def test_other_dropped_exceptions_are_still_told() -> None:
+def test_other_dropped_exceptions_are_still_printed() -> None:
     script = SCRIPT.replace("os.kill(os.getpid(), {number})", "1 / 0")
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
@@ -64,7 +64,7 @@ try:
     print("there", flush=True)
     time.sleep(300.0)
 except KeyboardInterrupt:
-    print("told", "to nobody", file=sys.stderr, flush=True)
+    print("printed", "to no one", file=sys.stderr, flush=True)
     open(sys.argv[1], "w").write("cleaned up")
     sys.exit(130)
 """

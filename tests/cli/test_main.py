@@ -116,7 +116,7 @@ def test_doctor_finds_the_extensions_and_the_twin(capsys: pytest.CaptureFixture[
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes break in another way on Windows")
 @pytest.mark.parametrize("arguments", [["--help"], ["sense", "--help"], ["doctor", "--json"]])
 @pytest.mark.parametrize("both", [False, True])
-def test_output_that_nobody_reads_ends_quietly(arguments: list[str], both: bool) -> None:
+def test_a_closed_output_pipe_ends_the_command_silently(arguments: list[str], both: bool) -> None:
     """`haselab ... | head -0`: 141, as a shell tells it of every program that SIGPIPE ends."""
     unread, end = os.pipe()
     os.close(unread)

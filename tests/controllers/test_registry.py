@@ -127,7 +127,11 @@ def test_a_package_that_does_not_import_is_named_only_when_it_is_asked_for(insta
 def test_doctor_names_what_loads_and_what_does_not(installed):
     installed(broken="no_such_module_at_all:KIND", foreign=f"{__name__}:FOREIGN")
     broken, foreign = controller_findings()
-    assert (broken.name, broken.found, broken.advice) == ("broken", False, "Correct that package.")
+    assert (broken.name, broken.found, broken.advice) == (
+        "broken",
+        False,
+        "Fix or uninstall that package.",
+    )
     assert "cannot be imported from no_such_module_at_all" in broken.detail
     assert foreign.found
     assert foreign.detail.endswith("; no C step; parameters: rate")

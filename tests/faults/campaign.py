@@ -264,11 +264,11 @@ def _overrun(trouble: Trouble) -> None:
 
 
 def _write_fails(trouble: Trouble) -> None:
-    trouble.writing = trouble.zeroing = DeviceError("The drive output does not answer.")
+    trouble.writing = trouble.zeroing = DeviceError("The drive output does not reply.")
 
 
 def _refused(trouble: Trouble) -> None:
-    trouble.refusing = DeviceError("The generator does not answer.")
+    trouble.refusing = DeviceError("The generator does not reply.")
 
 
 def _monitor_wrong(trouble: Trouble) -> None:
@@ -350,14 +350,14 @@ def _made_safe(trouble: Trouble) -> None:
 # fault: what happens, words of its reason, moments
 FAULTS: dict[str, tuple[Callable[[Trouble], None], str, tuple[str, ...]]] = {
     "device timeout, acquisition": (_read_fails, "No block within 1 s", MOMENTS),
-    "device timeout, drive": (_write_fails, "does not answer", MOMENTS[:3]),
+    "device timeout, drive": (_write_fails, "does not reply", MOMENTS[:3]),
     "drive refuses 0 V once": (_write_fails, "", MOMENTS[3:]),
-    "device timeout, generator": (_refused, "does not answer", MOMENTS[:1]),
+    "device timeout, generator": (_refused, "does not reply", MOMENTS[:1]),
     "generator refuses off once": (_refused, "", MOMENTS[3:]),
     "wrong read-back": (_monitor_wrong, "Output", MOMENTS),
     "garbage on the wire": (_garbage, "Output", MOMENTS),
-    "cut block": (_cut_block, r"Block of shape", MOMENTS),
-    "gap in acquisition": (_gap, "a gap in the recording", MOMENTS[:3]),
+    "cut block": (_cut_block, r"block of shape", MOMENTS),
+    "gap in acquisition": (_gap, "Gap in the recording", MOMENTS[:3]),
     "overrun": (_overrun, "Overrun", MOMENTS),
     "NaN from sensing": (_nan, "No strain in 5 blocks", MOMENTS[2:3]),
     "lost carrier": (_carrier_lost, "No strain in 5 blocks", MOMENTS[2:3]),

@@ -71,10 +71,10 @@ def _terminate(bench: ReplayBench) -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[ReplayBench], None], str, tuple[str, ...]]] = {
-    "replay: the recording is over": (_over, "recording is over", (ARM, RAMP, STEP)),
-    "replay: another drive than recorded": (_other_drive, "recorded was", (RAMP, STEP)),
+    "replay: the recording has ended": (_over, "recording ended", (ARM, RAMP, STEP)),
+    "replay: another drive than recorded": (_other_drive, "was recorded", (RAMP, STEP)),
     "replay: garbage for readings": (_damaged, "Output does not follow", (RAMP, STEP)),
-    "replay: another carrier than recorded": (_other_carrier, "recorded was one of", (ARM,)),
+    "replay: another carrier than recorded": (_other_carrier, "was recorded", (ARM,)),
     "replay: full disk": (_disk_full, "disk is full", (RAMP, STEP)),
     "replay: SIGTERM": (_terminate, "ended by KeyboardInterrupt", (RAMP, STEP, CLOSE)),
 }

@@ -58,7 +58,7 @@ def test_a_damaged_session_is_refused_before_anything_is_armed(
     copy = replay.damaged_file(recorded, tmp_path / "session.h5", how)
     with pytest.raises(
         InputError,
-        match=r"(The file is not a complete haselab session \(|The session was changed after).*session\.h5$",
+        match=r"(not a complete haselab session \(|The session was changed after).*session\.h5$",
     ):
         ReplayBench(copy)
 

@@ -52,7 +52,7 @@ def test_a_fault_on_the_wire_ends_at_zero_with_its_reason_and_all_blocks(
 ) -> None:
     given = wire.FAULTS[fault]
     outcome = _checked(wire.inside(tmp_path / "run", fault, moment, forks))
-    if outcome.highest_v == 0.0 and "does not answer" in outcome.told:
+    if outcome.highest_v == 0.0 and "does not reply" in outcome.told:
         # The machine was too busy to open the bench within the drivers' 0.5 s: nothing was struck.
         outcome = _checked(wire.inside(tmp_path / "again", fault, moment, forks))
     assert outcome.highest_v > 4500.0 or moment == "before arming"

@@ -259,14 +259,14 @@ class Fault:
 
 ARM, RAMP, STEP, CLOSE = MOMENTS
 FAULTS: dict[str, Fault] = {
-    "board: gRPC link cut": Fault(_board_cut, "does not answer", guardian=True),
-    "board: garbage on the gRPC link": Fault(_board_garbled, "does not answer", guardian=True),
+    "board: gRPC link cut": Fault(_board_cut, "does not reply", guardian=True),
+    "board: garbage on the gRPC link": Fault(_board_garbled, "does not reply", guardian=True),
     "board: gRPC link silent": Fault(
         _board_hushed, "no heartbeat from the program", (STEP,), guardian=True
     ),
     "board: gRPC link silent, server_patience_s = 0.2": Fault(
         _board_hushed,
-        "does not answer",
+        "does not reply",
         (RAMP, STEP),
         guardian=True,
         daq="timeout_s = 0.2\nserver_patience_s = 0.2\n",
@@ -291,7 +291,7 @@ FAULTS: dict[str, Fault] = {
     "supply: garbage": Fault(_serial_garbled, "supply", (RAMP, CLOSE), later=True),
     "supply: silent": Fault(_serial_hushed, "supply", (CLOSE,), later=True),
     "supply: not confirmed off": Fault(_unconfirmed, "supply is on", (CLOSE,)),
-    "camera: link cut": Fault(_hands_cut, "does not answer", (ARM, RAMP, STEP), later=True),
+    "camera: link cut": Fault(_hands_cut, "does not reply", (ARM, RAMP, STEP), later=True),
     "camera: link silent": Fault(
         _hands_hushed, "no heartbeat from the program", (RAMP,), guardian=True
     ),
@@ -302,11 +302,15 @@ FAULTS: dict[str, Fault] = {
     "guardian 1 ended": Fault(_guardian(signal.SIGTERM, 0), "received SIGTERM", (RAMP, STEP)),
     "guardian 1 stopped": Fault(_guardian(signal.SIGSTOP, 0), "(?i)guardian 1", (RAMP, STEP)),
     "guardian 2 stopped": Fault(_guardian(signal.SIGSTOP, 1), "(?i)guardian 2", (RAMP,)),
-    "other board": Fault(_other_serial("daq", "DEADBEEF"), "by the rig file", (ARM,), opening=True),
-    "other generator": Fault(
-        _other_serial("generator", "MY1"), "by the rig file", (ARM,), opening=True
+    "other board": Fault(
+        _other_serial("daq", "DEADBEEF"), "the rig file names", (ARM,), opening=True
     ),
-    "other supply": Fault(_other_serial("supply", "rev2"), "by the rig file", (ARM,), opening=True),
+    "other generator": Fault(
+        _other_serial("generator", "MY1"), "the rig file names", (ARM,), opening=True
+    ),
+    "other supply": Fault(
+        _other_serial("supply", "rev2"), "the rig file names", (ARM,), opening=True
+    ),
     "driver not installed": Fault(_no_driver, "is not installed", (ARM,), opening=True),
 }
 

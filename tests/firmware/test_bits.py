@@ -37,7 +37,7 @@ def latched(trace: Trace) -> str:
     return f"{' '.join(map(str, trace.codes))} {trace.event} {trace.alarms} {bits(trace.reference)}"
 
 
-def told(trace: Trace) -> list[str]:
+def reported(trace: Trace) -> list[str]:
     return [str(trace.state), str(trace.code), bits(trace.strain), bits(trace.corrected)]
 
 
@@ -51,24 +51,24 @@ def replayed(program: Path, lines: list[str]) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def traces(firmware: Firmware, cosim_program: Path, twin: TwinBench) -> list[Trace]:
-    """Arming, the loop closed, steps: every update of 10 s, as the chip told it."""
+    """Arming, the loop closed, steps: every update of 10 s, as the chip reported it."""
     with CoSim(cosim_program, firmware.elf, twin) as chip:
         chip.run(0.02)
-        chip.ask(Hello(VERSION))
-        chip.tell(SetTelemetry(0, 1))
+        chip.query(Hello(VERSION))
+        chip.execute(SetTelemetry(0, 1))
         chip.arm()
-        chip.tell(Run(0.0))
+        chip.execute(Run(0.0))
         while len(chip.messages) < UPDATES + 200:
-            chip.tell(SetReference(REFERENCES[int(chip.time_s) % len(REFERENCES)]), 0.1)
+            chip.execute(SetReference(REFERENCES[int(chip.time_s) % len(REFERENCES)]), 0.1)
         assert chip.bad_frames == 0
     found = [message for message in chip.messages if isinstance(message, Trace)]
     if os.environ.get("KEEP_TRACE"):
-        lines = [f"{latched(trace)} | {' '.join(told(trace))}\n" for trace in found[:KEPT]]
+        lines = [f"{latched(trace)} | {' '.join(reported(trace))}\n" for trace in found[:KEPT]]
         GOLDEN.write_text("".join(lines), encoding="ascii")
     return found
 
 
-def test_ten_thousand_updates_in_a_row_are_told(traces: list[Trace]) -> None:
+def test_ten_thousand_updates_in_a_row_are_traced(traces: list[Trace]) -> None:
     numbers = [trace.update for trace in traces]
     assert len(numbers) >= UPDATES
     assert all(b == (a + 1) % 65536 for a, b in itertools.pairwise(numbers))
@@ -83,7 +83,7 @@ def test_strain_controller_and_code_of_the_chip_are_this_machines_bit_by_bit(
     program = host(f"replay{len(flags)}{flags[0]}", REPLAY, *flags)
     rows = replayed(program, [latched(trace) for trace in traces])
     # The first window reaches back to readings from before the first trace.
-    different = [k for k, trace in enumerate(traces) if k > 0 and rows[k] != told(trace)]
+    different = [k for k, trace in enumerate(traces) if k > 0 and rows[k] != reported(trace)]
     assert len(rows) == len(traces)
     assert not different, (different[:5], traces[different[0]], rows[different[0]])
 
@@ -92,7 +92,7 @@ def test_strain_controller_and_code_of_the_chip_are_this_machines_bit_by_bit(
 def test_without_a_simulator_kept_traces_prove_the_same(
     flags: tuple[str, ...], host: Callable[..., Path]
 ) -> None:
-    """`data/trace.txt`: what the chip latched | what it told, of a co-simulation."""
+    """`data/trace.txt`: what the chip latched | what it reported, of a co-simulation."""
     kept = [line.split(" | ") for line in GOLDEN.read_text(encoding="ascii").splitlines()]
     program = host(f"golden{len(flags)}", REPLAY, *flags)
     rows = replayed(program, [line for line, _ in kept])

@@ -14,21 +14,21 @@ def test_pid_at_1_khz_takes_at_most_60_percent_of_the_cycles_with_telemetry_at_1
     chip: CoSim, firmware: Firmware
 ) -> None:
     chip.arm()
-    chip.tell(Run(0.0))
+    chip.execute(Run(0.0))
     start, asleep, conversions = (chip.counts[k] for k in ("cycle", "asleep", "conversions"))
     known = len(chip.messages)
     for k in range(10):
-        chip.tell(SetReference(0.005 * k), 0.1)
+        chip.execute(SetReference(0.005 * k), 0.1)
     passed = chip.counts["cycle"] - start
-    told = [m for m in chip.messages[known:] if isinstance(m, Status)]
+    reported = [m for m in chip.messages[known:] if isinstance(m, Status)]
     load = 1.0 - (chip.counts["asleep"] - asleep) / passed
-    updates = (told[-1].update - told[0].update) / (len(told) - 1)
-    assert told[-1].state == State.RUNNING
-    assert told[-1].overruns == 0
+    updates = (reported[-1].update - reported[0].update) / (len(reported) - 1)
+    assert reported[-1].state == State.RUNNING
+    assert reported[-1].overruns == 0
     assert updates == 10.0  # status at 100 Hz of updates at 1 kHz
-    assert abs(passed / UPDATE_CYCLES - 10.0 * len(told)) <= 10.0
+    assert abs(passed / UPDATE_CYCLES - 10.0 * len(reported)) <= 10.0
     assert load <= 0.60, f"{load:.4f}"
-    assert max(m.busy_cycles for m in told) < UPDATE_CYCLES
+    assert max(m.busy_cycles for m in reported) < UPDATE_CYCLES
     # 125 kHz converter clock, within the 50 to 200 kHz of full resolution: 8,000 a second.
     rate_hz = (chip.counts["conversions"] - conversions) / (passed / 16e6)
     assert abs(rate_hz - 8000.0) < 2.0

@@ -102,7 +102,7 @@ def test_build_takes_the_front_end_of_a_rig_file(
     assert "only kind 'mega' with board" in error
 
 
-def test_a_folder_that_is_no_run_is_told_in_one_line(
+def test_a_folder_without_a_run_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, _, error = run(capsys, "firmware", "build", tmp_path)
@@ -120,7 +120,7 @@ def test_a_tool_that_is_not_there_is_named_with_its_package() -> None:
         find_tool("no-such-tool", "pkg")
 
 
-def test_flash_asks_first_and_hands_the_programmers_fault_on(
+def test_flash_asks_first_and_passes_on_the_programmers_fault(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = tmp_path / "firmware.hex"
@@ -151,7 +151,7 @@ def test_an_image_for_another_chip_is_not_written(
     image.write_text(text, encoding="ascii")
     code, _, error = run(capsys, "firmware", "flash", image, "--port", "/dev/null", "--yes")
     assert code == 2
-    assert "Not a program for the ATmega2560" in error
+    assert "not a program for the ATmega2560" in error
 
 
 @pytest.mark.long

@@ -33,10 +33,10 @@ static uint8_t make(uint8_t *frame, uint8_t code, uint16_t sequence, const void 
     return frame_encode(bytes, (uint8_t)(3 + n), frame);
 }
 
-/* Feed bytes; the verdict of the answer, 255 where none came, 254 for an identity. */
+/* Feed bytes; the result of the answer, 255 where none came, 254 for an identity. */
 static uint8_t feed(bench *b, const uint8_t *bytes, uint8_t n)
 {
-    uint8_t k, verdict = 255;
+    uint8_t k, result = 255;
     b->in.event = HP_EVENT_NONE;
     for (k = 0; k < n; ++k) {
         if (link_feed(&b->link, bytes[k])) {
@@ -44,11 +44,11 @@ static uint8_t feed(bench *b, const uint8_t *bytes, uint8_t n)
             if (length > 0) {
                 length = frame_decode(b->answer, (uint8_t)(length - 1));
                 CHECK(length > 0, "the answer is no frame: %d", length);
-                verdict = b->answer[0] == HP_ACK ? b->answer[6] : 254;
+                result = b->answer[0] == HP_ACK ? b->answer[6] : 254;
             }
         }
     }
-    return verdict;
+    return result;
 }
 
 static uint8_t ask(bench *b, uint8_t code, uint16_t sequence, const void *payload, uint8_t n)
@@ -102,12 +102,12 @@ static void frames_come_back_whole_and_no_damaged_one_does(void)
 static void without_the_right_version_nothing_is_answered_or_done(void)
 {
     bench b = fresh();
-    CHECK(ask(&b, HP_REQUEST_ARMING, 1, "", 0) == 255, "%d", b.link.greeted);
-    CHECK(hello(&b, HP_VERSION + 1, 1) == 254 && !b.link.greeted, "%d", b.link.greeted);
-    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == 255, "%d", b.link.greeted);
-    CHECK(hello(&b, HP_VERSION, 1) == 254 && b.link.greeted, "%d", b.link.greeted);
+    CHECK(ask(&b, HP_REQUEST_ARMING, 1, "", 0) == 255, "%d", b.link.connected);
+    CHECK(hello(&b, HP_VERSION + 1, 1) == 254 && !b.link.connected, "%d", b.link.connected);
+    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == 255, "%d", b.link.connected);
+    CHECK(hello(&b, HP_VERSION, 1) == 254 && b.link.connected, "%d", b.link.connected);
     CHECK(hp_get_u16(b.answer + 3) == HP_VERSION, "%d", hp_get_u16(b.answer + 3));
-    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == HP_VERDICT_ACCEPTED, "%d", b.link.sequence);
+    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == HP_RESULT_ACCEPTED, "%d", b.link.sequence);
 }
 
 static void arming_takes_two_frames_and_their_token_once(void)
@@ -116,21 +116,21 @@ static void arming_takes_two_frames_and_their_token_once(void)
     uint8_t payload[2];
     hello(&b, HP_VERSION, 0);
     hp_put_u16(payload, 0);
-    CHECK(ask(&b, HP_CONFIRM_ARMING, 1, payload, 2) == HP_VERDICT_BAD_TOKEN, "without a request");
-    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == HP_VERDICT_ACCEPTED, "request");
+    CHECK(ask(&b, HP_CONFIRM_ARMING, 1, payload, 2) == HP_RESULT_BAD_TOKEN, "without a request");
+    CHECK(ask(&b, HP_REQUEST_ARMING, 2, "", 0) == HP_RESULT_ACCEPTED, "request");
     CHECK(token_of(&b) != 0 && b.in.event == HP_EVENT_NONE, "%d", token_of(&b));
     hp_put_u16(payload, (uint16_t)(token_of(&b) + 1u));
-    CHECK(ask(&b, HP_CONFIRM_ARMING, 3, payload, 2) == HP_VERDICT_BAD_TOKEN, "wrong token");
+    CHECK(ask(&b, HP_CONFIRM_ARMING, 3, payload, 2) == HP_RESULT_BAD_TOKEN, "wrong token");
     CHECK(b.in.event == HP_EVENT_NONE, "%d", b.in.event);
     hp_put_u16(payload, (uint16_t)((1000u * 40503u) | 1u));
-    CHECK(ask(&b, HP_CONFIRM_ARMING, 4, payload, 2) == HP_VERDICT_BAD_TOKEN, "second attempt");
-    CHECK(ask(&b, HP_REQUEST_ARMING, 5, "", 0) == HP_VERDICT_ACCEPTED, "request");
+    CHECK(ask(&b, HP_CONFIRM_ARMING, 4, payload, 2) == HP_RESULT_BAD_TOKEN, "second attempt");
+    CHECK(ask(&b, HP_REQUEST_ARMING, 5, "", 0) == HP_RESULT_ACCEPTED, "request");
     hp_put_u16(payload, token_of(&b));
     b.link.token_left = 0; /* too late */
-    CHECK(ask(&b, HP_CONFIRM_ARMING, 6, payload, 2) == HP_VERDICT_BAD_TOKEN, "late");
-    CHECK(ask(&b, HP_REQUEST_ARMING, 7, "", 0) == HP_VERDICT_ACCEPTED, "request");
+    CHECK(ask(&b, HP_CONFIRM_ARMING, 6, payload, 2) == HP_RESULT_BAD_TOKEN, "late");
+    CHECK(ask(&b, HP_REQUEST_ARMING, 7, "", 0) == HP_RESULT_ACCEPTED, "request");
     hp_put_u16(payload, token_of(&b));
-    CHECK(ask(&b, HP_CONFIRM_ARMING, 8, payload, 2) == HP_VERDICT_ACCEPTED, "confirm");
+    CHECK(ask(&b, HP_CONFIRM_ARMING, 8, payload, 2) == HP_RESULT_ACCEPTED, "confirm");
     CHECK(b.in.event == HP_EVENT_ARM, "%d", b.in.event);
 }
 
@@ -140,12 +140,12 @@ static void repeated_old_and_distant_frames_are_dropped(void)
     bench b = fresh();
     size_t k;
     hello(&b, HP_VERSION, 9);
-    CHECK(ask(&b, HP_KEEP_ALIVE, 10, "", 0) == HP_VERDICT_ACCEPTED, "%d", b.link.sequence);
+    CHECK(ask(&b, HP_KEEP_ALIVE, 10, "", 0) == HP_RESULT_ACCEPTED, "%d", b.link.sequence);
     for (k = 0; k < sizeof dropped / sizeof *dropped; ++k) {
         CHECK(ask(&b, HP_STOP, dropped[k], "", 0) == 255, "%d", dropped[k]);
         CHECK(b.in.event == HP_EVENT_NONE && b.link.sequence == 10, "%d", dropped[k]);
     }
-    CHECK(ask(&b, HP_STOP, 26, "", 0) == HP_VERDICT_ACCEPTED, "16 ahead");
+    CHECK(ask(&b, HP_STOP, 26, "", 0) == HP_RESULT_ACCEPTED, "16 ahead");
     CHECK(b.in.event == HP_EVENT_STOP, "%d", b.in.event);
 }
 
@@ -155,7 +155,7 @@ static void greeting_does_not_restart_the_count_while_the_output_may_be_on(void)
     hello(&b, HP_VERSION, 9);
     b.app.state = HP_STATE_RUNNING;
     CHECK(hello(&b, HP_VERSION, 0) == 255 && b.link.sequence == 9, "%d", b.link.sequence);
-    CHECK(hello(&b, HP_VERSION, 10) == HP_VERDICT_BAD_STATE, "in order");
+    CHECK(hello(&b, HP_VERSION, 10) == HP_RESULT_BAD_STATE, "in order");
 }
 
 static void what_is_outside_the_limits_is_refused(void)
@@ -169,20 +169,20 @@ static void what_is_outside_the_limits_is_refused(void)
     b.app.state = HP_STATE_RUNNING;
     for (k = 0; k < 3; ++k) {
         hp_put_f32(payload, values[k]);
-        CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 4) == HP_VERDICT_BAD_VALUE, "%g",
+        CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 4) == HP_RESULT_BAD_VALUE, "%g",
               (double)values[k]);
     }
     hp_put_u32(payload, 0x7fc00000u); /* NaN */
-    CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 4) == HP_VERDICT_BAD_VALUE, "NaN");
+    CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 4) == HP_RESULT_BAD_VALUE, "NaN");
     CHECK(b.in.event == HP_EVENT_NONE, "%d", b.in.event);
     hp_put_f32(payload, 0.02f);
-    CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 4) == HP_VERDICT_ACCEPTED, "good");
-    CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 3) == HP_VERDICT_UNKNOWN, "short");
-    CHECK(ask(&b, HP_RUN, sequence++, payload, 4) == HP_VERDICT_BAD_STATE, "runs already");
+    CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 4) == HP_RESULT_ACCEPTED, "good");
+    CHECK(ask(&b, HP_SET_REFERENCE, sequence++, payload, 3) == HP_RESULT_UNKNOWN, "short");
+    CHECK(ask(&b, HP_RUN, sequence++, payload, 4) == HP_RESULT_BAD_STATE, "runs already");
     b.app.state = HP_STATE_ARMED;
-    CHECK(ask(&b, HP_RUN, sequence++, payload, 4) == HP_VERDICT_NOT_READY, "no strain yet");
-    CHECK(ask(&b, 200, sequence++, payload, 4) == HP_VERDICT_UNKNOWN, "no such command");
-    CHECK(ask(&b, HP_CLEAR_FAULT, sequence++, "", 0) == HP_VERDICT_BAD_STATE, "not tripped");
+    CHECK(ask(&b, HP_RUN, sequence++, payload, 4) == HP_RESULT_NOT_READY, "no strain yet");
+    CHECK(ask(&b, 200, sequence++, payload, 4) == HP_RESULT_UNKNOWN, "no such command");
+    CHECK(ask(&b, HP_CLEAR_FAULT, sequence++, "", 0) == HP_RESULT_BAD_STATE, "not tripped");
 }
 
 /* Noise, pieces of frames, floods: nothing is written beside its place (the sanitizers look), and
@@ -207,7 +207,7 @@ static void status_comes_as_often_as_was_asked(void)
     int k, frames = 0;
     memset(&out, 0, sizeof out);
     hello(&b, HP_VERSION, 0);
-    CHECK(ask(&b, HP_SET_TELEMETRY, 1, payload, 2) == HP_VERDICT_ACCEPTED, "every third");
+    CHECK(ask(&b, HP_SET_TELEMETRY, 1, payload, 2) == HP_RESULT_ACCEPTED, "every third");
     for (k = 0; k < 30; ++k) {
         frames += link_report(&b.link, &b.app, &b.in, &out, b.update, b.answer) != 0;
     }
@@ -218,7 +218,7 @@ static void status_comes_as_often_as_was_asked(void)
     CHECK(frame_decode(b.answer, (uint8_t)(k - 1)) == 3 + HP_TRACE_SIZE, "%d bytes", k);
     CHECK(b.answer[0] == HP_TRACE, "%d", b.answer[0]);
     payload[1] = 2;
-    CHECK(ask(&b, HP_SET_TELEMETRY, 3, payload, 2) == HP_VERDICT_BAD_VALUE, "trace = 2");
+    CHECK(ask(&b, HP_SET_TELEMETRY, 3, payload, 2) == HP_RESULT_BAD_VALUE, "trace = 2");
 }
 
 int main(void)

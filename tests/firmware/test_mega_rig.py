@@ -23,7 +23,7 @@ from haselab import _core
 from haselab.base import DeviceError, InputError, LimitError, SafetyError
 from haselab.cli.main import main
 from haselab.firmware import ChipSettings
-from haselab.firmware.messages import Ack, Run, SetReference, Trace, Verdict
+from haselab.firmware.messages import Ack, Result, Run, SetReference, Trace
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
 from haselab.rig.chip import ChipBench, CoSim, Firmware, SerialChip
@@ -87,13 +87,13 @@ def bench(chip: CoSim, settings: ChipSettings) -> ChipBench:
 
 
 class Told(ChipBench):
-    """Keeps what the chip told, to compare with what was recorded."""
+    """Keeps what the chip reported, to compare with what was recorded."""
 
     def _append(self, trace: Trace) -> None:
-        self.told: list[Trace]
-        if not hasattr(self, "told"):
-            self.told = []
-        self.told.append(trace)
+        self.reported: list[Trace]
+        if not hasattr(self, "reported"):
+            self.reported = []
+        self.reported.append(trace)
         super()._append(trace)
 
 
@@ -128,10 +128,12 @@ def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
     codes = follow(rig, 0.02, 100)
     capacitance_f = sense_quadrature(codes, settings)
     rows = [tuple(map(int, row)) for row in codes.reshape(-1, 8)]
-    told = bench.told
-    first = next(k for k in range(len(told)) if [t.codes for t in told[k : k + len(rows)]] == rows)
+    reported = bench.reported
+    first = next(
+        k for k in range(len(reported)) if [t.codes for t in reported[k : k + len(rows)]] == rows
+    )
     compared = 0
-    for trace, farad in zip(told[first:], capacitance_f, strict=False):
+    for trace, farad in zip(reported[first:], capacitance_f, strict=False):
         if np.isfinite(farad):
             strain = _core.strain_from_capacitance(*settings.strain_map, farad)
             assert struct.pack("<f", strain) == struct.pack("<f", trace.strain)
@@ -142,7 +144,7 @@ def test_what_is_recorded_gives_the_chips_strain_bit_for_bit(
 def test_a_chip_with_another_firmware_is_refused(chip: CoSim, settings: ChipSettings) -> None:
     other = ChipSettings(**{**vars(settings), "kp": settings.kp * 1.01})
     with pytest.raises(
-        InputError, match=r"The chip holds settings .* needed are .* Build with 'haselab fir"
+        InputError, match=r"The microcontroller has settings .* needs .* Build with 'haselab fir"
     ):
         ChipBench(chip, other)
 
@@ -151,7 +153,7 @@ def test_a_drive_or_a_strain_that_the_chip_does_not_take_is_refused_before_it_is
     chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
-    with pytest.raises(LimitError, match=r"closes its own loop takes 0 V alone\. Ask it"):
+    with pytest.raises(LimitError, match=r"closes its own loop accepts only 0 V\. Ask it"):
         rig.source.write(0.5)
     with pytest.raises(LimitError, match=r"desired strain = 0\.5 is outside"):
         follow(rig, 0.5, 1)
@@ -178,7 +180,7 @@ def test_a_trip_of_the_chip_ends_the_loop_with_its_reason(
     rig = armed(bench, settings)
     follow(rig, 0.03, 100)
     at_s = chip.fault(fault)
-    with pytest.raises(SafetyError, match=rf"The chip tripped: {reason}"):
+    with pytest.raises(SafetyError, match=rf"The microcontroller tripped: {reason}"):
         follow(rig, 0.03, 10)
     off = next(out for out in chip.outputs if out.time_s > at_s and not out.enable)
     assert off.time_s - at_s < 5e-3
@@ -186,14 +188,14 @@ def test_a_trip_of_the_chip_ends_the_loop_with_its_reason(
     assert not chip.outputs[-1].on
 
 
-def test_a_trip_is_told_where_a_new_reference_meets_it(
+def test_a_trip_is_reported_when_a_new_reference_is_sent(
     chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
     follow(rig, 0.02, 50)
     chip.fault("breakdown")
     chip.run(3e-3)
-    with pytest.raises(SafetyError, match="The chip tripped: breakdown"):
+    with pytest.raises(SafetyError, match="The microcontroller tripped: breakdown"):
         follow(rig, 0.03, 10)
 
 
@@ -202,7 +204,7 @@ def test_a_chip_that_sees_no_carrier_says_so_when_it_is_armed(
 ) -> None:
     rig = armed(bench, settings)
     chip.fault("carrier")
-    with pytest.raises(SafetyError, match="The chip tripped: sensing"):
+    with pytest.raises(SafetyError, match="The microcontroller tripped: sensing"):
         follow(rig, 0.02, 1)
     assert not chip.outputs[-1].on
 
@@ -216,7 +218,7 @@ def test_one_bad_update_at_the_moment_of_running_is_no_fault(
         asked.append(message)
         if isinstance(message, Run) and sum(isinstance(m, Run) for m in asked) == 1:
             chip.run(1e-3)
-            return Ack(Run.CODE, 0, Verdict.NOT_READY, 0)
+            return Ack(Run.CODE, 0, Result.NOT_READY, 0)
         return plain(message, wait_s)
 
     monkeypatch.setattr(chip, "ask", once_blind)
@@ -243,7 +245,7 @@ def test_a_chip_that_is_reset_says_why(
     rig = armed(bench, settings)
     follow(rig, 0.03, 50)
     chip.fault("brown_out")
-    with pytest.raises(SafetyError, match="The chip tripped: brown_out"):
+    with pytest.raises(SafetyError, match="The microcontroller tripped: brown_out"):
         follow(rig, 0.03, 20)
     rig.safe()
     assert not chip.outputs[-1].on
@@ -260,7 +262,7 @@ def test_zero_comes_first_though_a_command_was_refused(
     assert not chip.outputs[-1].on
     follow(rig, 0.03, 50)
     chip.send(SetReference(5.0))
-    with pytest.raises(DeviceError, match="answered command 5 by bad_value"):
+    with pytest.raises(DeviceError, match="refused command 5: bad_value"):
         follow(rig, 0.03, 3)
 
 
@@ -271,7 +273,7 @@ def test_a_program_that_stops_reading_lets_the_chip_ramp_down_by_itself(
     follow(rig, 0.03, 100)
     CoSim.run(chip, 1.0)  # the program hangs; the chip goes on
     assert not chip.outputs[-1].on
-    with pytest.raises(SafetyError, match="The chip tripped: link"):
+    with pytest.raises(SafetyError, match="The microcontroller tripped: link"):
         follow(rig, 0.03, 200)
 
 
@@ -282,7 +284,7 @@ def test_lost_updates_are_a_gap_in_the_recording(
     follow(rig, 0.0, 10)
     chip.run(0.004)
     chip.messages.clear()  # lost on the way
-    with pytest.raises(DeviceError, match=r"a gap in the recording"):
+    with pytest.raises(DeviceError, match=r"Gap in the recording"):
         follow(rig, 0.0, 3)
     rig.safe()
     assert not chip.outputs[-1].on
@@ -310,7 +312,7 @@ def test_a_chip_that_tripped_is_cleared_by_whoever_arms_again(
 class _Raw(CoSim):
     """The chip's bytes as they are."""
 
-    def came(self, data: bytes) -> list[Any]:
+    def decoded(self, data: bytes) -> list[Any]:
         self.raw = getattr(self, "raw", b"") + data
         return []
 
@@ -364,8 +366,8 @@ def test_on_a_serial_port_it_is_the_same_bench(
             bench.close()
 
 
-def test_a_port_that_is_none_is_told_in_one_line() -> None:
-    with pytest.raises(DeviceError, match=r"serial port does not work .*correct port\. /dev/none"):
+def test_a_missing_port_is_reported_in_one_line() -> None:
+    with pytest.raises(DeviceError, match=r"serial port does not work .*change port\. /dev/none"):
         SerialChip("/dev/none")
 
 
@@ -403,14 +405,14 @@ def test_a_study_of_steps_runs_on_the_chip_and_reports(played: Path) -> None:
     assert "is left out" not in page
     with SessionReader(played / "session.h5") as session:
         record = session.experiment("chip-2")
-        told = [what for _, what in session.events()]
+        reported = [what for _, what in session.events()]
     assert record.codes.shape == (1050, 40, 2)
     assert record.drive_v.max() > 0.5
     lead = np.isnan(record.reference)
     assert lead.sum() == 50
     assert record.drive_v[lead].max() == 0.0  # the camera's reference is taken at rest
     assert abs(record.frame_time_s[0] - record.block_start_s[0]) < 2.0 / 40.0
-    assert told.count("end chip-2") == 1
+    assert reported.count("end chip-2") == 1
 
 
 def test_the_recording_alone_gives_the_same_numbers(played: Path, tmp_path: Path) -> None:
@@ -420,14 +422,14 @@ def test_the_recording_alone_gives_the_same_numbers(played: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ("[simulator]", "either port or a table simulator"),
         (f'run = "{DATA}"', "run: Field required"),
     ],
 )
 def test_a_rig_file_without_what_it_needs_is_one_line(
-    change: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    change: str, reported: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = MEGA.replace(change, "").replace('reading = "hz"\nseed = 3\n', "")
     (tmp_path / "mega.toml").write_text(text, encoding="utf-8")
@@ -436,7 +438,7 @@ def test_a_rig_file_without_what_it_needs_is_one_line(
     code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "mega.toml", "--out", out)
     assert code == 2
     said = capsys.readouterr().err
-    assert told in said
+    assert reported in said
     assert "Traceback" not in said
     assert not (tmp_path / "out").exists()
 
@@ -458,18 +460,18 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
 
 
 @pytest.mark.parametrize(
-    ("text", "wrong", "told"),
+    ("text", "wrong", "reported"),
     [
-        (MEGA + "[front_end]\ncorrection = [0.0, 0.0]\n", STEPS, "a tenth to ten times"),
+        (MEGA + "[front_end]\ncorrection = [0.0, 0.0]\n", STEPS, "must be between 0.1 and 10"),
         (MEGA + "[front_end]\ncarrier_high_v = inf\n", STEPS, "front_end.carrier_high_v"),
-        (MEGA + 'twin = "x.toml"\n', STEPS, "twin and reading both given"),
+        (MEGA + 'twin = "x.toml"\n', STEPS, "either twin or reading"),
         (MEGA, STEPS.replace("step = 0.03", "step = 0.0"), "step must not be 0"),
         (MEGA, STEPS.replace("step = 0.03", "step = nan"), "step_trials.step"),
         (MEGA, STEPS.replace("step = 0.03", "step = 0.3"), "desired strain = 0.3 is outside"),
     ],
 )
 def test_what_cannot_be_played_is_one_line_before_anything_is_armed(
-    text: str, wrong: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    text: str, wrong: str, reported: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     cosim_program: Path,
 ) -> None:  # fmt: skip
     del cosim_program
@@ -478,14 +480,14 @@ def test_what_cannot_be_played_is_one_line_before_anything_is_armed(
     out = tmp_path / "out"
     code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "mega.toml", "--out", out)
     assert code == 2
-    assert told in capsys.readouterr().err
+    assert reported in capsys.readouterr().err
     assert not (out / "session.h5").exists()
 
 
 def test_ctrl_c_in_a_terminal_stops_the_chip_before_it_ends(
     tmp_path: Path, cosim_program: Path
 ) -> None:
-    """A terminal sends it to the whole group; the simulated chip must live to be told to stop."""
+    """A terminal sends it to the whole group; the simulation must keep running to be stopped."""
     del cosim_program
     (tmp_path / "mega.toml").write_text(MEGA, encoding="utf-8")
     steps = STEPS.replace("zero_s = 6.0", "zero_s = 600.0")
@@ -502,8 +504,8 @@ def test_ctrl_c_in_a_terminal_stops_the_chip_before_it_ends(
         _, said = program.communicate(timeout=300.0)
     assert program.returncode == 130, said
     with SessionReader(tmp_path / "out" / "session.h5") as session:
-        told = [what for _, what in session.events()]
-    assert told[-1] == "ended by KeyboardInterrupt; output at 0 V"
+        reported = [what for _, what in session.events()]
+    assert reported[-1] == "ended by KeyboardInterrupt; output at 0 V"
 
 
 def _closed(path: Path) -> bool:

@@ -201,7 +201,7 @@ def test_without_a_section_the_c_file_gives_the_kind(tmp_path: Path) -> None:
     assert found.own == ControllerStep("mycontroller", (), C_FILE.read_text())
 
 
-def test_a_fault_in_the_c_file_is_told_with_its_line(
+def test_a_fault_in_the_c_file_is_reported_with_its_line(
     settings: ChipSettings, firmware: object, tmp_path: Path
 ) -> None:
     wrong = ControllerStep("wrong", (), WILD.replace("BODY", "return missing;"))
@@ -226,9 +226,9 @@ def wild(
     with CoSim(cosim_program, built.elf, twin) as chip:
         chip.run(0.02)
         chip.arm()
-        chip.tell(Run(0.03))
+        chip.execute(Run(0.03))
         for _ in range(4):
-            chip.ask(KeepAlive(), 0.05)  # no answer from one that hangs
+            chip.query(KeepAlive(), 0.05)  # no answer from one that hangs
         yield chip
 
 

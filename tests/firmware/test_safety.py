@@ -17,11 +17,11 @@ from haselab.firmware.messages import (
     Hello,
     KeepAlive,
     RequestArming,
+    Result,
     Run,
     SetReference,
     State,
     Status,
-    Verdict,
 )
 from haselab.rig.chip import CoSim, Firmware, Output, build_firmware
 from haselab.rig.twin.twin_bench import TwinBench
@@ -34,10 +34,10 @@ WATCHDOG_S = 2048 / 128e3  # nominal
 
 def close_loop(chip: CoSim, reference: float = 0.03, duration_s: float = 0.4) -> None:
     chip.arm()
-    chip.tell(Run(reference))
+    chip.execute(Run(reference))
     end_s = chip.time_s + duration_s
     while chip.time_s < end_s:
-        chip.tell(KeepAlive(), 0.05)
+        chip.execute(KeepAlive(), 0.05)
     assert status(chip).state == State.RUNNING
     assert chip.outputs[-1].on
 
@@ -58,9 +58,9 @@ def check_clamps(outputs: list[Output]) -> None:
 
 
 def test_power_up_leaves_the_output_off_and_no_single_command_changes_that(chip: CoSim) -> None:
-    chip.ask(Hello(1))
+    chip.query(Hello(1))
     for message in (Run(0.03), SetReference(0.03), KeepAlive(), RequestArming()):
-        chip.ask(message)
+        chip.query(message)
     chip.run(0.1)
     assert not [out for out in chip.outputs if out.enable or out.code]
     assert status(chip).state == State.OFF
@@ -120,7 +120,7 @@ def test_lost_sensing_takes_the_output_off_within_5_ms(fault: str, chip: CoSim) 
     at = chip.fault(fault)
     chip.run(0.05)
     assert off_s(chip) - at < 5e-3
-    # A wire that had 1.4 V on it throws its stage to the rail: that is told as a breakdown.
+    # A wire that had 1.4 V on it throws its stage to the rail: that is reported as a breakdown.
     expected = Fault.BREAKDOWN if fault == "wire_v" else Fault.SENSING
     assert status(chip).fault == expected
 
@@ -163,11 +163,11 @@ def test_a_fault_stays_until_it_is_cleared(chip: CoSim) -> None:
     chip.run(0.02)
     chip.fault("none")
     for message in (RequestArming(), Run(0.03), SetReference(0.01), KeepAlive()):
-        chip.ask(message)
+        chip.query(message)
     chip.run(0.05)
     assert status(chip).state == State.TRIPPED
     assert not chip.outputs[-1].enable
-    chip.tell(ClearFault())
+    chip.execute(ClearFault())
     chip.run(0.02)
     assert status(chip).state == State.OFF
     close_loop(chip, 0.0, 0.1)
@@ -191,14 +191,14 @@ def test_garbage_torn_and_replayed_frames_change_nothing(chip: CoSim) -> None:
     rng = random.Random(7)
     old = chip.send(SetReference(0.05))
     chip.run(0.01)
-    chip.tell(SetReference(0.0))
+    chip.execute(SetReference(0.0))
     before = len(chip.outputs)
     for _ in range(20):
         chip.command(f"send {old.hex()}")  # replayed
         chip.command(f"send {old[: rng.randrange(1, len(old) - 1)].hex()}00")  # torn
         chip.command(f"send {bytes(rng.randrange(256) for _ in range(40)).hex()}00")
         chip.run(0.005)
-        assert chip.tell(KeepAlive()).verdict == Verdict.ACCEPTED
+        assert chip.execute(KeepAlive()).result == Result.ACCEPTED
     codes = [out.code for out in chip.outputs[before:]]
     assert status(chip).state == State.RUNNING
     assert status(chip).bad_frames > 0
@@ -215,7 +215,7 @@ def test_a_flood_on_the_link_takes_no_update(chip: CoSim) -> None:
         chip.run(0.012)
         if k % 4 == 3:
             chip.command("send 00")
-            chip.tell(KeepAlive())
+            chip.execute(KeepAlive())
     assert status(chip).state == State.RUNNING
     assert status(chip).overruns == before.overruns
 

@@ -59,15 +59,15 @@ def test_the_table_is_the_map_in_single_precision(settings: ChipSettings) -> Non
     text = settings_header(settings)
     table = re.search(r"voltage_table\[33\] = \{(.*?)\}", text, re.DOTALL)
     assert table is not None
-    told = [float(np.float32(word.strip().rstrip("f"))) for word in table[1].split(",")]
-    assert told == expected
+    reported = [float(np.float32(word.strip().rstrip("f"))) for word in table[1].split(",")]
+    assert reported == expected
     # Straight lines between: the error of a chord is at most h^2 / 8 of the second derivative.
     a1, b1, a2, b2 = settings.voltage_map
     fine = np.linspace(settings.strain_low, settings.strain_high, 3201)
     exact = a1 * np.exp(b1 * fine) + a2 * np.exp(b2 * fine)
     bend = np.abs(a1 * b1**2 * np.exp(b1 * fine) + a2 * b2**2 * np.exp(b2 * fine)).max()
     h = strain[1] - strain[0]
-    assert np.abs(np.interp(fine, strain, told) - exact).max() <= bend * h**2 / 8.0 + 1e-6
+    assert np.abs(np.interp(fine, strain, reported) - exact).max() <= bend * h**2 / 8.0 + 1e-6
 
 
 def test_gains_are_those_of_an_update_as_the_unit_of_time(settings: ChipSettings) -> None:
@@ -147,11 +147,11 @@ def test_the_range_of_capacitance_covers_the_saturation(settings: ChipSettings) 
     assert strain == pytest.approx([settings.strain_low - 0.1, settings.strain_high + 0.1])
 
 
-def test_the_chip_tells_the_checksum_of_its_settings(settings: ChipSettings, chip: CoSim) -> None:
+def test_the_firmware_reports_its_checksum(settings: ChipSettings, chip: CoSim) -> None:
     text = settings_header(settings)
     crc = int(re.search(r"\.crc = (0x\w+)u", text)[1], 16)  # type: ignore[index]
     assert crc == zlib.crc32(re.sub(r"0x\w+u", "", text).encode("ascii"))
-    assert chip.ask(Hello(VERSION)) == Identity(VERSION, crc, 1000, 225)
+    assert chip.query(Hello(VERSION)) == Identity(VERSION, crc, 1000, 225)
     assert settings_header(replace(settings, kp=settings.kp * 1.01)) != text
 
 
@@ -178,11 +178,11 @@ def test_an_actuator_file_gives_settings_and_its_drive_limits_them(actuator: Pat
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"drive_high_v": 1.0}, "allowed is a rise within"),
-        ({"drive_high_v": 2.5}, "what the chip's converter reaches"),
+        ({"drive_high_v": 1.0}, "must rise within"),
+        ({"drive_high_v": 2.5}, "below the converter's"),
         ({"kp": math.nan}, "allowed are finite numbers"),
         ({"strain_low": 0.2}, "low end below its high end"),
-        ({"voltage_map": (1.0, -3.0, 0.0, 0.0)}, "allowed is a rise"),
+        ({"voltage_map": (1.0, -3.0, 0.0, 0.0)}, "must rise"),
     ],
 )
 def test_settings_that_cannot_be_meant_are_refused(
@@ -194,7 +194,7 @@ def test_settings_that_cannot_be_meant_are_refused(
 
 def test_a_map_that_does_not_cover_the_saturation_is_refused(settings: ChipSettings) -> None:
     flat = replace(settings, strain_map=(1e6, 0.0, -1e20, 0.0))
-    with pytest.raises(InputError, match="reaches no strain"):
+    with pytest.raises(InputError, match="does not reach a strain"):
         settings_header(flat)
 
 
@@ -205,7 +205,7 @@ def test_a_map_that_does_not_cover_the_saturation_is_refused(settings: ChipSetti
         ("[sensing.strain_map]", "[other]", r"no \[sensing\.strain_map\].*identify capacitance"),
         ("[controller.parameters]", "[other]", r"no \[controller\].*haselab design"),
         ('kind = "pid"', 'kind = "pi"', r"no controller of kind 'pid'; it holds pi"),
-        ("[controller.limits]", "[other]", "no limits, the range of its output"),
+        ("[controller.limits]", "[other]", "no limits of its output"),
         ("kp =", "kq =", r"\[controller\.parameters\] lacks kp"),
     ],
 )

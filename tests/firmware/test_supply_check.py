@@ -21,14 +21,14 @@ def started(program: Path, firmware: Firmware, twin: TwinBench, supply_v: float)
 
 
 @pytest.mark.parametrize("supply_v", [4.3, 4.75, 5.0, 5.5])
-def test_the_chip_tells_its_reference_in_parts_of_its_supply(
+def test_the_firmware_reports_its_reference_relative_to_its_supply(
     firmware, cosim_program, twin, supply_v
 ):
     with started(cosim_program, firmware, twin, supply_v) as chip:
-        told = chip.ask(Hello(VERSION))
-        assert isinstance(told, Identity)
+        reported = chip.query(Hello(VERSION))
+        assert isinstance(reported, Identity)
         # 1.1 V of the data sheet; the simulator scales to 1023 and rounds down.
-        assert told.supply == int(1100 * 1023 / round(1e3 * supply_v))
+        assert reported.supply == int(1100 * 1023 / round(1e3 * supply_v))
 
 
 def test_a_chip_on_a_weak_supply_is_not_opened(
@@ -36,7 +36,7 @@ def test_a_chip_on_a_weak_supply_is_not_opened(
 ) -> None:
     with started(cosim_program, firmware, twin, 4.2) as chip:
         with pytest.raises(
-            DeviceError, match=r"runs on about 4\.2. V .* needed are 5 V within 5 %.*not from USB"
+            DeviceError, match=r"supply is about 4\.2. V .* must be 5 V within 5 %.*not from USB"
         ):
             ChipBench(chip, settings)
         assert not any(output.on for output in chip.outputs)
@@ -44,7 +44,7 @@ def test_a_chip_on_a_weak_supply_is_not_opened(
         assert ChipBench(chip, settings).identity.endswith("supply 4.62 V to 9 %")
     with (
         started(cosim_program, firmware, twin, 4.6) as chip,
-        pytest.raises(DeviceError, match=r"runs on about 4\.6"),
+        pytest.raises(DeviceError, match=r"supply is about 4\.6"),
     ):
         ChipBench(chip, settings, bandgap_v=1.1)
 

@@ -41,7 +41,7 @@ def test_both_readings_reach_the_bound_with_honest_intervals(omega):
     errors, inside = [], np.zeros(2)
     for run in range(runs):
         fit = fit_free_response([noisy(motion(omega, decay), 7, run)])
-        estimates = [fit.estimates[name] for name in truth]
+        estimates = [fit.parameters[name] for name in truth]
         errors.append([e.value - t for e, t in zip(estimates, truth.values(), strict=True)])
         inside += [e.ci95[0] <= t <= e.ci95[1]
                    for e, t in zip(estimates, truth.values(), strict=True)]  # fmt: skip
@@ -53,7 +53,7 @@ def test_both_readings_reach_the_bound_with_honest_intervals(omega):
 
 def test_natural_frequency_and_damping_follow_equation_7():
     fit = fit_free_response([noisy(motion(5.1, 3.6), 1)])
-    e = fit.estimates
+    e = fit.parameters
     # D1: 5.1 rad/s and 3.6 give 6.24 rad/s, not 5.1; D2: damping 0.58.
     assert e["natural_frequency_rad_s"].value == pytest.approx(6.24, abs=4 * 0.03)
     assert (
@@ -85,7 +85,7 @@ def test_at_the_printed_reading_there_is_no_second_peak_and_no_hull():
 def test_creep_is_found_and_fitted_beside_the_oscillation(creep):
     clean = motion(32.0, 4.2, creep=creep)
     fit = fit_free_response([noisy(clean, 5)])
-    decay = fit.estimates["decay_rate_per_s"]
+    decay = fit.parameters["decay_rate_per_s"]
     assert abs(decay.value - 4.2) <= 4 * decay.std
     assert fit.residual_whiteness_p > 1e-3
     if creep:
@@ -97,11 +97,11 @@ def test_creep_is_found_and_fitted_beside_the_oscillation(creep):
 def test_the_spread_between_trials_widens_the_interval():
     trials = [noisy(motion(32.0, decay), 6, k) for k, decay in enumerate((3.6, 4.2))]
     fit = fit_free_response(trials)
-    decay = fit.estimates["decay_rate_per_s"]
+    decay = fit.parameters["decay_rate_per_s"]
     # Two trials 0.6 apart: standard deviation of their mean 0.3.
     assert decay.std == pytest.approx(0.3, rel=0.1)
     assert decay.ci95[0] < 3.6 < 4.2 < decay.ci95[1]
-    assert [round(t.estimates["decay_rate_per_s"].value, 1) for t in fit.trials] == [3.6, 4.2]
+    assert [round(t.parameters["decay_rate_per_s"].value, 1) for t in fit.trials] == [3.6, 4.2]
 
 
 def test_rest_before_the_drop_is_left_out():
@@ -109,7 +109,7 @@ def test_rest_before_the_drop_is_left_out():
     x = np.concatenate([np.zeros(300), fall])
     x = x + NOISE * np.random.default_rng(8).normal(size=x.size)
     fit = fit_free_response([FreeTrial(x, np.arange(x.size) / 400.0)])
-    omega = fit.estimates["damped_frequency_rad_s"]
+    omega = fit.parameters["damped_frequency_rad_s"]
     assert abs(omega.value - 32.0) <= 4 * omega.std
     assert fit.time_s[0][0] >= 0.74
 
@@ -142,7 +142,7 @@ def test_intervals_and_hulls_hold_in_coloured_noise(creep):
         fit = fit_free_response([FreeTrial(motion(32.0, 4.0, creep=creep) + noise, TIME_S)])
         truth = {"damped_frequency_rad_s": 32.0, "decay_rate_per_s": 4.0}
         inside += [
-            fit.estimates[n].ci95[0] <= t <= fit.estimates[n].ci95[1] for n, t in truth.items()
+            fit.parameters[n].ci95[0] <= t <= fit.parameters[n].ci95[1] for n, t in truth.items()
         ]
         for hull in (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s):
             assert hull is not None
@@ -167,10 +167,10 @@ def test_coloured_noise_makes_no_hull_where_no_second_peak_stands_out():
 
 def test_frequencies_are_rad_per_s_by_name_and_unit():
     fit = fit_free_response([noisy(motion(2 * np.pi * 5.1, 4.0), 12)])
-    for name, estimate in fit.estimates.items():
+    for name, estimate in fit.parameters.items():
         assert ("frequency" in name) == (estimate.unit == "rad/s")
         assert not name.endswith("_hz")
-    omega = fit.estimates["damped_frequency_rad_s"].value
+    omega = fit.parameters["damped_frequency_rad_s"].value
     assert omega == pytest.approx(32.04, rel=1e-2)
 
 

@@ -46,7 +46,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(model, truth, kind):
         fit = fit_hysteresis([record(model, seed=seed)], kind)
         assert fit.verdict == kind
         for name, value in truth.items():
-            low, high = fit.estimates[name].ci95
+            low, high = fit.parameters[name].ci95
             inside[name] += low <= value <= high
     # Fewer than this in 24 has a probability below 1e-4 when 95 % are inside.
     assert min(inside.values()) >= binom.ppf(1e-4, runs, 0.95)
@@ -79,7 +79,7 @@ def test_records_at_several_rates_tell_the_rate_dependence():
     truth = PrandtlIshlinskii(1.0, (0.15, 0.5), (0.4, 0.3), 0.2, 0.1, 0.04)
     fit = fit_hysteresis([record(truth, f, seed=k) for k, f in enumerate((0.1, 0.5, 2.0))])
     assert fit.verdict == "prandtl-ishlinskii"
-    estimate = fit.estimates["rate_dependence_s"]
+    estimate = fit.parameters["rate_dependence_s"]
     assert abs(estimate.value - 0.1) <= 4.0 * estimate.std
     assert estimate.std < 0.002
     exact = band_widths([record(truth, f, noise=0.0) for f in (0.1, 0.5, 2.0)])
@@ -93,7 +93,7 @@ def test_one_rate_leaves_the_rate_dependence_open():
     u = np.tile(triangle(0.0, 2.0, 0.25, 1, 100.0), 3)
     y = PLAYS.simulate(u) + NOISE * np.random.default_rng(3).normal(size=u.size)
     fit = fit_hysteresis([LoopRecord(u, y, 100.0)])
-    estimate = fit.estimates["rate_dependence_s"]
+    estimate = fit.parameters["rate_dependence_s"]
     assert np.isnan(estimate.value)
     assert estimate.ci95 == (-np.inf, np.inf)
     assert "one rate of the input" in " ".join(fit.notes)
@@ -183,7 +183,7 @@ def test_odd_records_without_noise_have_an_answer_too(u, model):
 def test_the_callers_arrays_are_left_as_they_are():
     u, y = drive(), PLAYS.simulate(drive())
     kept = u.copy(), y.copy()
-    fit_hysteresis([LoopRecord(u, y, 100.0)], "prandtl-ishlinskii", 2)
+    fit_hysteresis([LoopRecord(u, y, 100.0)], "prandtl-ishlinskii", operators=2)
     assert np.array_equal(u, kept[0])
     assert np.array_equal(y, kept[1])
 
@@ -229,7 +229,7 @@ def test_a_butterfly_is_fitted_against_the_square_of_the_drive():
 def test_a_square_wave_of_both_signs_says_nothing_about_its_square():
     u = np.where(np.arange(400) % 40 < 20, 1.0, -1.0)
     y = 0.3 * u + 0.01 * np.random.default_rng(3).normal(size=400)
-    fit = fit_hysteresis([LoopRecord(u, y, 100.0)], "prandtl-ishlinskii", 2)
+    fit = fit_hysteresis([LoopRecord(u, y, 100.0)], "prandtl-ishlinskii", operators=2)
     assert fit.drive == "u"
 
 

@@ -56,7 +56,7 @@ def duffing(u, rate_hz, omega, zeta, gain, q2, q3, substeps=24):
 def is_right(fit, truth, most=5.0):
     assert fit.status == "ok"
     for name, value in truth.items():
-        estimate = fit.estimates[name]
+        estimate = fit.parameters[name]
         assert abs(estimate.value - value) < most * estimate.std, name
 
 
@@ -67,7 +67,7 @@ def test_the_square_of_a_voltage_is_a_curve_of_degree_two():
     fit = fit_hammerstein([Record.sampled(u, y + 0.02 * rng.normal(size=COUNT), RATE_HZ)])
     truth = {"natural_frequency_rad_s": 9.0, "damping_ratio": 0.1, "delay_s": 0.02}
     is_right(fit, truth | {"gain": 0.6 * u.mean(), "gain_2": 0.3})
-    assert fit.plant.gain == fit.estimates["gain"].value
+    assert fit.plant.gain == fit.parameters["gain"].value
     assert fit.operating_input == pytest.approx(u.mean())
     answer = fit.answer()["nonlinear"]
     assert answer["kind"] == "hammerstein-2"
@@ -105,7 +105,7 @@ def test_a_cubic_spring_is_found_with_its_numbers(q2):
     truth = {"natural_frequency_rad_s": 9.0, "damping_ratio": 0.1, "gain": 0.8, "delay_s": 0.0}
     is_right(fit, truth | {"stiffness_ratio_3": 1.5} | ({"stiffness_ratio_2": q2} if q2 else {}))
     assert fit.validation_fit_percent > 90.0
-    assert fit.linear.estimates.keys() == truth.keys()
+    assert fit.linear.parameters.keys() == truth.keys()
 
 
 def test_records_of_a_cubic_spring_share_its_numbers_and_keep_known_ones():
@@ -118,7 +118,7 @@ def test_records_of_a_cubic_spring_share_its_numbers_and_keep_known_ones():
     structure = TransferStructure(delay=0.0, fixed={"damping_ratio": 0.1})
     fit = fit_spring(records, structure)
     is_right(fit, {"natural_frequency_rad_s": 9.0, "gain": 0.8, "stiffness_ratio_3": 1.5})
-    assert fit.estimates["damping_ratio"].std == 0.0 == fit.estimates["delay_s"].value
+    assert fit.parameters["damping_ratio"].std == 0.0 == fit.parameters["delay_s"].value
 
 
 def test_a_curve_of_the_output_is_found():

@@ -45,7 +45,7 @@ def test_the_hair_dryer_has_the_published_singular_values_to_every_digit(dryer, 
     u, y = dryer
     path = shared_data / "identification/hair-dryer-slicot-IB01AD.res"
     lines = printed(path, "singular values are", 2)
-    fit = fit_subspace(u, y, RATE_HZ, remove_means=False, bootstrap=0)
+    fit = fit_subspace(Record.sampled(u, y, RATE_HZ), remove_means=False, bootstrap=0)
     assert fit.singular_values == pytest.approx(lines, abs=1.01 * HALF_DIGIT)
     # The largest gap is after the order that SLICOT finds.
     assert fit.plant.b.size == 4
@@ -53,7 +53,7 @@ def test_the_hair_dryer_has_the_published_singular_values_to_every_digit(dryer, 
 
 def test_the_hair_dryer_has_the_published_poles_within_their_rounding(dryer, published):
     u, y = dryer
-    poles = fit_subspace(u, y, RATE_HZ, remove_means=False, bootstrap=0).plant.poles
+    poles = fit_subspace(Record.sampled(u, y, RATE_HZ), remove_means=False, bootstrap=0).plant.poles
     values, right = np.linalg.eig(published.a)
     left = np.linalg.inv(right)
     # First order: the condition of a pole times the size of half a digit in 16 elements.
@@ -72,7 +72,7 @@ def test_ours_explain_the_hair_dryer_no_worse_than_the_published_model(dryer, pu
     columns = np.column_stack([free, np.ones(u.size)])
     state = np.linalg.lstsq(columns, y - forced, rcond=None)[0]
     known = fit_percent([y], [forced + columns @ state])
-    fit = fit_subspace(u, y, RATE_HZ, 4, bootstrap=0)
+    fit = fit_subspace(Record.sampled(u, y, RATE_HZ), 4, bootstrap=0)
     assert fit.fit_percent >= known
     # Two poles and a delay, in continuous time, against four states.
     transfer = fit_transfer([Record.sampled(u, y, RATE_HZ)], TransferStructure(poles=2))
@@ -89,12 +89,16 @@ def test_ours_explain_the_hair_dryer_no_worse_than_the_published_model(dryer, pu
 
 def test_a_record_without_noise_gives_its_equation():
     u = np.random.default_rng(1).normal(size=400)
-    fit = fit_subspace(u, lfilter(TOP, BOTTOM, u), RATE_HZ, remove_means=False, bootstrap=0)
+    fit = fit_subspace(
+        Record.sampled(u, lfilter(TOP, BOTTOM, u), RATE_HZ), remove_means=False, bootstrap=0
+    )
     assert np.poly(fit.plant.a) == pytest.approx(BOTTOM, abs=1e-9)
     assert fit.plant.static_gain == pytest.approx(sum(TOP) / sum(BOTTOM), rel=1e-9)
     assert fit.fit_percent == pytest.approx(100.0, abs=1e-6)
     in_motion = fit_subspace(
-        u[100:], lfilter(TOP, BOTTOM, u)[100:], RATE_HZ, remove_means=False, bootstrap=0
+        Record.sampled(u[100:], lfilter(TOP, BOTTOM, u)[100:], RATE_HZ),
+        remove_means=False,
+        bootstrap=0,
     )
     assert in_motion.fit_percent == pytest.approx(100.0, abs=1e-6)
 
@@ -108,7 +112,9 @@ def test_intervals_of_poles_and_gain_cover_the_truth():
     for run in range(runs):
         u, e = np.random.default_rng([41, run]).normal(size=(2, 600))
         y = lfilter(TOP, BOTTOM, u) + 0.1 * e
-        fit = fit_subspace(u, y, RATE_HZ, 3, remove_means=False, block_rows=8, seed=run)
+        fit = fit_subspace(
+            Record.sampled(u, y, RATE_HZ), 3, remove_means=False, block_rows=8, seed=run
+        )
         (mode,) = [m for m in fit.modes if "damping_ratio" in m]
         told = [fit.static_gain, mode["natural_frequency_rad_s"], mode["damping_ratio"]]
         inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(told, truth, strict=True)]
@@ -120,26 +126,26 @@ def test_intervals_of_poles_and_gain_cover_the_truth():
 def test_without_repeats_the_intervals_are_open():
     u = np.random.default_rng(2).normal(size=300)
     y = lfilter(TOP, BOTTOM, u) + 0.01 * np.random.default_rng(3).normal(size=300)
-    fit = fit_subspace(u, y, RATE_HZ, 3, bootstrap=0)
+    fit = fit_subspace(Record.sampled(u, y, RATE_HZ), 3, bootstrap=0)
     assert fit.static_gain.std == np.inf and np.isfinite(fit.static_gain.value)
 
 
 def test_too_many_states_give_no_result_and_bad_records_are_refused():
     u = np.random.default_rng(4).normal(size=300)
     y = lfilter(TOP, BOTTOM, u)
-    fit = fit_subspace(u, y, RATE_HZ, 8, remove_means=False)
+    fit = fit_subspace(Record.sampled(u, y, RATE_HZ), 8, remove_means=False)
     assert fit.status.startswith("no result: the record tells no 8 states")
     with pytest.raises(ResultError, match="tells no 8 states"):
         _ = fit.plant
     with pytest.raises(InputError, match="order = 15; allowed is 1 to 10"):
-        fit_subspace(u, y, RATE_HZ, 15)
+        fit_subspace(Record.sampled(u, y, RATE_HZ), 15)
     with pytest.raises(InputError, match="120 samples or more"):
-        fit_subspace(u[:100], y[:100], RATE_HZ)
+        fit_subspace(Record.sampled(u[:100], y[:100], RATE_HZ))
     with pytest.raises(InputError, match="excites nothing"):
-        fit_subspace(np.zeros(300), y, RATE_HZ)
+        fit_subspace(Record.sampled(np.zeros(300), y, RATE_HZ))
     with pytest.raises(InputError, match="equal lengths"):
-        fit_subspace(u[:200], y, RATE_HZ)
+        fit_subspace(Record.sampled(u[:200], y, RATE_HZ))
     with pytest.raises(InputError, match="finite"):
-        fit_subspace(u, np.where(np.arange(300) == 5, np.nan, y), RATE_HZ)
+        fit_subspace(Record.sampled(u, np.where(np.arange(300) == 5, np.nan, y), RATE_HZ))
     with pytest.raises(InputError, match="state model has shapes"):
         StateSpaceModel(np.eye(2), [1.0], [1.0], 0.0, 1.0)

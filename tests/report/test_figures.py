@@ -118,7 +118,7 @@ def test_a_missing_section_leaves_out_its_panels_alone_and_says_so(run, section)
         ("fig2", ("tracks", "y_px"), [[1.0]], "'tracks.y_px' in analysis.json has shape (1, 1)"),
     ],
 )
-def test_a_damaged_section_is_told_in_one_sentence(run, name, path, value, note):
+def test_a_damaged_section_is_reported_in_one_sentence(run, name, path, value, note):
     analysis = copy.deepcopy(dict(run.analysis))
     analysis[path[0]][path[1]] = value
     drawing = draw_figure(plan_of(name), RunFolder(run.path, run.results, analysis))
@@ -141,7 +141,7 @@ def test_the_upper_frequency_axis_is_the_lower_one_over_two_pi(run, name):
     assert [2 * math.pi * low_hz, 2 * math.pi * high_hz] == pytest.approx(axes[0].get_xlim())
 
 
-def test_the_resonance_stands_at_5_11_rad_per_s_in_the_plots_of_plant_and_loop(run):
+def test_the_plots_of_plant_and_loop_show_the_resonance_at_5_11_rad_per_s(run):
     loop, _ = drawn_axes(run, "fig7")
     chirp, _ = drawn_axes(run, "bode-plantA")
     for line in (curve(loop[0], "open loop (plant)"), curve(chirp[0], "measured ± 1 st. dev.")):
@@ -224,7 +224,7 @@ def test_tracks_are_drawn_without_the_frame_where_the_folder_has_none(run):
     assert not drawing.notes
 
 
-def test_a_name_from_the_file_is_shown_as_it_stands(run):
+def test_a_name_from_the_file_is_shown_unchanged(run):
     analysis = copy.deepcopy(dict(run.analysis))
     groups = analysis["steps"]["groups"]
     groups["_costs $1 & $2"] = groups.pop("PI")

@@ -49,9 +49,9 @@ def test_results_that_cannot_be_read_give_one_clear_line(tmp_path, text, message
     (tmp_path / "results.json").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         write_report(tmp_path)
-    told = str(caught.value)
-    assert "\n" not in told
-    assert told.endswith(str(tmp_path / "results.json"))
+    printed = str(caught.value)
+    assert "\n" not in printed
+    assert printed.endswith(str(tmp_path / "results.json"))
     assert not (tmp_path / "report.html").exists()
 
 
@@ -62,7 +62,7 @@ def test_an_analysis_that_is_broken_is_refused_not_skipped(tmp_path):
         write_report(tmp_path)
 
 
-def test_null_stands_for_a_number_that_is_not_finite(make_run, documents):
+def test_null_means_a_number_that_is_not_finite(make_run, documents):
     results, analysis = copy.deepcopy(documents)
     results["quantities"][0]["measured"]["ci95"][1] = None
     row = read_folder(make_run(results, analysis)).results.quantities[0]
@@ -78,7 +78,7 @@ def test_a_picture_outside_the_folder_is_refused(run_folder):
     assert run.picture("video/first.png").shape == (480, 480)
 
 
-def test_a_picture_that_is_none_is_told(make_run, documents):
+def test_a_file_that_is_not_a_picture_is_reported(make_run, documents):
     folder = make_run(*documents)
     (folder / "video" / "first.png").write_bytes(json.dumps({}).encode())
     with pytest.raises(LeftOutError, match=r"first\.png cannot be read"):

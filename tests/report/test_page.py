@@ -81,7 +81,7 @@ def test_every_reference_inside_the_page_has_its_target(read):
     assert {name for name in read.references if name.startswith("#")} <= targets
 
 
-def test_every_quantity_stands_in_the_table_with_its_interval(read, documents):
+def test_the_table_has_every_quantity_with_its_interval(read, documents):
     results, _ = documents
     rows = {cells[0].split()[-1]: cells for cells in read.rows if len(cells) == 8}
     for quantity in results["quantities"]:
@@ -109,7 +109,7 @@ def test_the_summary_counts_verdicts_and_values_without_noise(page):
     assert "10 of 10 intervals contain the noise-free value." in lead
 
 
-def test_a_simulated_bench_stands_in_the_title_and_beside_its_rows(make_run, documents):
+def test_a_simulated_bench_is_marked_in_the_title_and_in_its_rows(make_run, documents):
     results, analysis = copy.deepcopy(documents)
     results["simulated"] = True
     results["verdict_rule"] = "Agrees: by a rule."

@@ -55,16 +55,16 @@ def test_the_page_is_whole_without_the_net_and_the_same_every_time(report):
     assert "the video is compressed with loss" in page
 
 
-def test_the_page_tells_the_strain_of_gauge_and_field(report):
+def test_the_page_shows_the_strain_of_gauge_and_field(report):
     page = track_page(report)
     best = np.argmax(report.strain.strain)
-    told = 100 * report.strain.strain[best]
-    assert f"0.000 to {told:.3f} %" in page
+    printed = 100 * report.strain.strain[best]
+    assert f"0.000 to {printed:.3f} %" in page
     # the field is that of the same uniform stretch, without noise
-    assert f"median {told:.3f} %" in page
+    assert f"median {printed:.3f} %" in page
 
 
-def test_lost_positions_are_told_with_their_reason_and_share(report):
+def test_lost_positions_are_shown_with_their_reason_and_share(report):
     page = track_page(report)
     assert re.search(r"covered</th><td>0\.4 %", page)  # 10 of 40 x 63
     assert "99.6 % of the positions found" in page

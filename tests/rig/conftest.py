@@ -57,7 +57,7 @@ def fake_v4l2(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[
         pytest.skip("V4L2 is Linux's")
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
-        pytest.skip("cc is not installed. Type:  sudo apt-get install -y gcc libc6-dev")
+        pytest.skip("cc is not installed. Run:  sudo apt-get install -y gcc libc6-dev")
     folder = tmp_path_factory.mktemp("v4l2")
     source, library = Path(__file__).with_name("fake_v4l2.c"), folder / "fake.so"
     flags = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]

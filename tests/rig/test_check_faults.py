@@ -80,7 +80,7 @@ def steps(bench: Bench, served: ServedTwin, gate: type) -> Iterator[CheckResult]
         yield from live_checks(rig, bench.plan)
 
 
-def told(bench: Bench, gate: type) -> tuple[str, int]:
+def reported(bench: Bench, gate: type) -> tuple[str, int]:
     """What the first check that fails says and advises, empty if none does; how many passed."""
     config = twin_of_reading("hz").model_dump()
     for section, values in bench.twin.items():
@@ -107,50 +107,50 @@ NAMED = {
     "monitors-swapped": "Swap the cables of the two monitors",
     "voltage-monitor-reversed": "Swap the two wires of the voltage monitor",
     "current-monitor-reversed": "Swap the two wires of the current monitor",
-    "voltage-monitor-scale": "Correct amplifier.volt_per_monitor_volt",
-    "current-monitor-scale": "Correct amplifier.ampere_per_monitor_volt: 2 times what it is",
+    "voltage-monitor-scale": "Change amplifier.volt_per_monitor_volt",
+    "current-monitor-scale": "Multiply amplifier.ampere_per_monitor_volt by 2",
     "output-off": "Connect daq.output to the summing input",
     "output-reversed": "Use the amplifier's non-inverting input",
-    "output-scale": "Correct the gain of the summing stage at daq.output",
+    "output-scale": "Change the gain of the summing stage at daq.output",
     "generator-off": "Connect the generator's output",
-    "generator-load": "Correct generator.load",
-    "generator-scale": "Correct generator.volt_per_volt",
+    "generator-load": "Set generator.load",
+    "generator-scale": "Set generator.volt_per_volt",
     "amplifier-off": "switch it and its high voltage on",
-    "input-floats": "the input floats: tie its negative side to ground",
+    "input-floats": "the input floats: connect its negative side to ground",
     "mains-hum": "Connect the shields at one end only",
     "actuator-off": "and the actuator to the amplifier",
     "actuator-shorted": "the actuator is shorted, or its capacitance is too large",
-    "route-refused": "board: block clock: NI board Dev1: the device cannot route a signal",
+    "route-refused": "board: block clock: NI board Dev1: the device cannot route a required signal",
     "tasks-orphaned": "haselab rig safe RIG.toml",
     "usb-slow": "outputs came after their block. Raise daq.ahead_blocks",
     "second-program": "close other programs that are connected to it",
-    "supply-on-at-boot": "would put out up to 2000 V as soon as it gets power",
-    "supply-jack-out": "its power jack is out",
+    "supply-on-at-boot": "would put out up to 2000 V at power-on",
+    "supply-jack-out": "its power jack is unplugged",
     "supply-stays-on": "its meter shows 80",
     "supply-firmware": "Load firmware 8",
-    "supply-switchboard": "a switchboard, whose relays are open",
+    "supply-switchboard": "this port is a switchboard",
     "network-lossy": "5 lost",
     "camera-slow": "31 Hz found, 0 lost, times to 0.05 us. The camera does not reach this rate",
     "camera-ticks": "Set camera.tick_hz",
     "exposure-line-off": "Check the wire of the exposure signal",
-    "exposure-line-inverted": "Set exposure.edge to the other one",
+    "exposure-line-inverted": "Set exposure.edge to the other edge",
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_that_a_served_twin_can_have_is_named(name, permitted):
     known = LivePlan(500e-12) if name == "current-monitor-scale" else LivePlan()
-    assert NAMED[name] in told(Bench(FAULTS[name], plan=known), permitted)[0]
+    assert NAMED[name] in reported(Bench(FAULTS[name], plan=known), permitted)[0]
 
 
 RIG_FILE_FAULTS = {
     "gain": (Bench(changes={"amplifier": {"gain": 1000.0}}), "amplifier.gain"),
     "skew": (Bench(changes={"daq": {"skew_s": 40e-6}}), r"Set daq.skew_s = 2.5e-06"),
     "serial": (Bench(changes={"generator": {"serial_number": "MY9"}}), "Connect that one"),
-    "channel": (Bench(changes={"daq": {"i_monitor": "ai99"}}), "Correct the channels"),
-    "counter": (Bench(changes={"daq": {"counter": "ctr3"}}), "Correct the channels"),
-    "rate": (Bench(changes={"daq": {"rate_hz": 250e3}}), "Lower daq.rate_hz"),
-    "load": (Bench(changes={"generator": {"load": "50"}}), "Correct generator.load"),
+    "channel": (Bench(changes={"daq": {"i_monitor": "ai99"}}), "Change the channels"),
+    "counter": (Bench(changes={"daq": {"counter": "ctr3"}}), "Change the channels"),
+    "rate": (Bench(changes={"daq": {"rate_hz": 250e3}}), "Lower it to 200000 or less"),
+    "load": (Bench(changes={"generator": {"load": "50"}}), "Set generator.load"),
     "monitor": (Bench(changes={"amplifier": {"volt_per_monitor_volt": 1e4}}), "volt_per_monitor"),
 }
 
@@ -158,11 +158,11 @@ RIG_FILE_FAULTS = {
 @pytest.mark.parametrize("name", RIG_FILE_FAULTS)
 def test_a_rig_file_that_is_not_that_of_the_bench_is_named(name, permitted):
     bench, advice = RIG_FILE_FAULTS[name]
-    assert advice in told(bench, permitted)[0]
+    assert advice in reported(bench, permitted)[0]
 
 
 def test_somebody_who_sets_the_generator_to_burst_meanwhile_is_noticed(permitted):
-    found = told(Bench(meanwhile=lambda s: s.generator.answer("BURS:STAT ON")), permitted)[0]
+    found = reported(Bench(meanwhile=lambda s: s.generator.answer("BURS:STAT ON")), permitted)[0]
     assert "burst mode is on" in found
 
 
@@ -170,7 +170,7 @@ def test_a_supply_whose_main_switch_is_off_is_named(permitted):
     def switch_off(served: ServedTwin) -> None:
         served.supply.firmware.enabled = False
 
-    assert "switch its main switch on" in told(Bench(meanwhile=switch_off), permitted)[0]
+    assert "switch its main switch on" in reported(Bench(meanwhile=switch_off), permitted)[0]
 
 
 W = Wiring
@@ -180,7 +180,7 @@ HARDER = {
     "output 0.95": (Bench(BenchFaults(W(output_gain=0.95))), "gain of the summing stage"),
     "hum of 100 Hz": (Bench(BenchFaults(W(hum_v=0.04, hum_hz=100.0))), "0.04 V at 100 Hz"),
     "hum and a fault": (
-        Bench(BenchFaults(W(hum_v=0.015, carrier_gain=0.5))), "Correct generator.load"
+        Bench(BenchFaults(W(hum_v=0.015, carrier_gain=0.5))), "Set generator.load"
     ),
     "swapped in a small range": (
         Bench(BenchFaults(W(swapped_monitors=True)), {"daq": {"drive_high_v": 0.2}}),
@@ -210,17 +210,19 @@ HARDER = {
 @pytest.mark.parametrize("name", HARDER)
 def test_what_an_adversary_planted_is_named(name, permitted):
     bench, advice = HARDER[name]
-    assert advice in told(bench, permitted)[0]
+    assert advice in reported(bench, permitted)[0]
 
 
 def test_the_starts_of_the_output_are_seen_over_a_loop_back_wire(permitted):
     plan = LivePlan(loop_back=True, daq=NidaqConfig())
     wired = Bench(BenchFaults(Wiring(loop_back=True)), plan=plan)
-    assert told(wired, permitted)[0] == ""
+    assert reported(wired, permitted)[0] == ""
     below = {"daq": {"drive_low_v": -2.0, "drive_high_v": 0.0}}
-    assert told(Bench(BenchFaults(Wiring(loop_back=True)), below, plan=plan), permitted)[0] == ""
+    assert (
+        reported(Bench(BenchFaults(Wiring(loop_back=True)), below, plan=plan), permitted)[0] == ""
+    )
     late = BenchFaults(Wiring(loop_back=True), board=BoardFaults(usb_lag_samples=3000))
-    assert "0 of 50 steps seen" in told(Bench(late, plan=plan), permitted)[0]
+    assert "0 of 50 steps seen" in reported(Bench(late, plan=plan), permitted)[0]
 
 
 KNOWN = BenchFaults(at_amplifier_f=500e-12)
@@ -255,6 +257,6 @@ HEALTHY = {
 
 @pytest.mark.parametrize("name", HEALTHY)
 def test_a_healthy_bench_is_not_accused(name, permitted):
-    found, passed = told(HEALTHY[name], permitted)
+    found, passed = reported(HEALTHY[name], permitted)
     assert not found
     assert passed >= 15

@@ -79,7 +79,7 @@ FAULTS = {
         lambda s: replace(s, v_carrier=2.5 * s.v_carrier, v_step=2.5 * s.v_step),
         "amplifier.volt_per_monitor_volt",
     ),
-    "generator told 50 ohm": (
+    "generator reported 50 ohm": (
         lambda s: replace(s, v_carrier=2 * s.v_carrier / _carrier(s), i_carrier=2 * s.i_carrier),
         "generator.load",
     ),

@@ -30,7 +30,7 @@ FAULTS = {
         "test_opening_switches_off_what_was_left_on|test_off_is_off|test_shut_down",
     ),
     "is_off repeats what was requested": (
-        'return self._connection.ask("OUTP?") == "0"',
+        'return self._connection.query("OUTP?") == "0"',
         "return True",
         "test_it_reports_that_it_is_on",
     ),

@@ -116,7 +116,7 @@ def test_a_rig_file_names_an_instrument_of_another_package(packages: Packages) -
     ("supply", "message"),
     [
         ('kind = "yours"\nhighest_v = 1.0', r"supply: no supply of kind 'yours'; use one of "
-         r"'petapicovoltron', 'mine', or install the package that offers it"),
+         r"'petapicovoltron', 'mine', or install the package that provides it"),
         ('kind = "aravis"\nhighest_v = 1.0', r"supply: no supply of kind 'aravis'"),
         ('kind = 3\nhighest_v = 1.0', r"supply: no supply of kind '3'"),
         (ON_THE_SHELF + "\nplaice = 1",
@@ -146,7 +146,11 @@ def test_a_fault_in_its_section_is_named_with_its_place(
         ("class Mine", "1 / 0\nclass Mine", r"does not load \(ZeroDivisionError: division by zero"),
         ('kind = "mine"\n    config', 'kind = "his"\n    config', r"'mine', but .* kind is 'his'"),
         ("config = Config", "config = dict", r"attribute config is not derived from SupplyConfig"),
-        ("Mine(SupplyInstrument[Config])", "Mine", r"it is no class derived from one of DaqInstr"),
+        (
+            "Mine(SupplyInstrument[Config])",
+            "Mine",
+            r"not a class derived from one of DaqInstr",
+        ),
         ("class Mine", "class His", r"does not load \(AttributeError"),
     ],
 )
@@ -162,14 +166,14 @@ def test_an_incomplete_driver_is_refused_while_the_file_is_read(
 
 def test_no_package_replaces_a_driver_of_this_one(packages: Packages) -> None:
     packages.install(COMPLETE.replace('"mine"', '"petapicovoltron"'), kind="petapicovoltron")
-    with pytest.raises(DeviceError, match=r"offered by haselab and plug_in 1\.0"):
+    with pytest.raises(DeviceError, match=r"more than one package: haselab and plug_in 1\.0"):
         load_rig(packages.rig('port = "/dev/ttyACM0"\nhighest_v = 1000.0'))
 
 
 def test_two_packages_with_one_kind_are_refused(packages: Packages) -> None:
     packages.install(COMPLETE)
     packages.install(COMPLETE, name="other")
-    with pytest.raises(DeviceError, match=r"offered by other 1\.0 and plug_in 1\.0"):
+    with pytest.raises(DeviceError, match=r"more than one package: other 1\.0 and plug_in 1\.0"):
         load_rig(packages.rig())
 
 

@@ -34,24 +34,22 @@ def test_the_recorded_blocks_come_again_in_their_order(recording: Path) -> None:
             np.testing.assert_array_equal(rig.acquisition.read(), codes)
             assert rig.acquisition.time_s == start_s + rig.description.block_s
         assert replay.next_output_v is None
-        with pytest.raises(DeviceError, match=r"The recording is over after 48 blocks\. Play no"):
+        with pytest.raises(DeviceError, match=r"The recording ended after 48 blocks\. Play at"):
             rig.acquisition.read()
 
 
-def test_another_output_than_the_recorded_one_is_told(recording: Path) -> None:
+def test_another_output_than_the_recorded_one_is_reported(recording: Path) -> None:
     with ReplayBench(recording, ("steps",)) as replay:
         replay.rig.source.write(0.6)
-        with pytest.raises(
-            DeviceError, match=r"Output = 0.6 V in block 0 of 'steps', recorded was 0.5"
-        ):
+        with pytest.raises(DeviceError, match=r"output in block 0 of 'steps' is 0.6 V, but 0.5"):
             replay.rig.acquisition.read()
         replay.rig.source.write(0.5)
         assert replay.rig.acquisition.read().shape == (2000, 2)
 
 
-def test_another_carrier_than_the_recorded_one_is_told(recording: Path) -> None:
+def test_another_carrier_than_the_recorded_one_is_reported(recording: Path) -> None:
     with ReplayBench(recording) as replay:
-        with pytest.raises(DeviceError, match=r"Sine of 1000 Hz, 0.02 V, recorded was one of 2000"):
+        with pytest.raises(DeviceError, match=r"sine is 1000 Hz, 0.02 V, but 2000"):
             replay.rig.generator.sine(1000.0, 0.02)
         with pytest.raises(LimitError, match=r"Sine of .* is outside"):
             replay.rig.generator.sine(-1.0, 0.02)

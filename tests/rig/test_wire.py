@@ -1,4 +1,4 @@
-"""The shipped drivers against the served twin: what goes wrong on a wire, told in one line."""
+"""The shipped drivers against the served twin: what goes wrong on a wire, reported in one line."""
 
 from __future__ import annotations
 
@@ -65,22 +65,29 @@ def bench(served: ServedTwin, permitted) -> Iterator[RealBench]:
 
 
 @pytest.mark.parametrize(
-    ("section", "key", "value", "told"),
+    ("section", "key", "value", "reported"),
     [
         (
             "daq",
             "serial_number",
             "DEADBEEF",
-            r"Serial number of Dev1 = [0-9A-F]{8}, expected DEADBEEF",
+            r"Dev1 has the serial number [0-9A-F]{8}, but the rig file names DEADBEEF",
         ),
-        ("generator", "serial_number", "MY99", r"Serial number of the function generator = MY00"),
-        ("supply", "serial_number", "other", r"Name of the high-voltage supply = 'haselab-twin'"),
-        ("supply", "highest_v", 6000.0, r"supply.highest_v = 6000 V, this supply reaches 5000 V"),
+        ("generator", "serial_number", "MY99", r"generator has the serial number MY00"),
+        ("supply", "serial_number", "other", r"supply's name is 'haselab-twin'"),
+        (
+            "supply",
+            "highest_v",
+            6000.0,
+            r"highest_v is 6000 V, but this supply reaches only 5000 V",
+        ),
     ],
 )
-def test_another_instrument_than_the_rig_file_names_is_refused(served, section, key, value, told):
+def test_another_instrument_than_the_rig_file_names_is_refused(
+    served, section, key, value, reported
+):
     with (
-        pytest.raises(InputError, match=told),
+        pytest.raises(InputError, match=reported),
         RealBench(changed(served, **{section: {key: value}}), Gate()),
     ):
         pass
@@ -93,23 +100,28 @@ def closed_port() -> int:
 
 
 @pytest.mark.parametrize(
-    ("section", "key", "value", "told"),
+    ("section", "key", "value", "reported"),
     [
-        ("daq", "server", "127.0.0.1:{port}", r"NI board Dev1 does not answer .*daq\.server"),
-        ("daq", "device", "Dev7", r"NI board Dev7: no such device \(status -200220\)\. Correct"),
-        ("daq", "v_monitor", "ai99", r"no such channel on this device \(status -200170\)"),
-        ("daq", "v_monitor", "ai9", r"beyond what the device can do \(status -200077\)"),
-        ("daq", "rate_hz", 250e3, r"limit of 200000 Hz for two .* Lower .* 200000"),
-        ("generator", "address", "TCPIP::127.0.0.1::{port}::SOCKET", r"generator does not answer"),
-        ("generator", "address", "nowhere", r"generator does not answer .*nowhere"),
-        ("supply", "port", "/dev/none", r"supply does not answer as it should .*/dev/none"),
-        ("stand", "address", "127.0.0.1:{port}", r"The served twin does not answer"),
+        ("daq", "server", "127.0.0.1:{port}", r"NI board Dev1 does not reply .*daq\.server"),
+        (
+            "daq",
+            "device",
+            "Dev7",
+            r"Dev7: the device does not exist \(status -200220\)\. Set",
+        ),
+        ("daq", "v_monitor", "ai99", r"has no such channel \(status -200170\)"),
+        ("daq", "v_monitor", "ai9", r"outside the device's limits \(status -200077\)"),
+        ("daq", "rate_hz", 250e3, r"limit of 200000 Hz for two .* Lower it to 200000"),
+        ("generator", "address", "TCPIP::127.0.0.1::{port}::SOCKET", r"generator does not reply"),
+        ("generator", "address", "nowhere", r"generator does not reply .*nowhere"),
+        ("supply", "port", "/dev/none", r"supply does not reply correctly .*/dev/none"),
+        ("stand", "address", "127.0.0.1:{port}", r"The served twin does not reply"),
     ],
 )
-def test_an_instrument_that_is_not_there_is_one_line(served, section, key, value, told):
+def test_an_instrument_that_is_not_there_is_one_line(served, section, key, value, reported):
     if isinstance(value, str):
         value = value.format(port=closed_port())
-    with pytest.raises(DeviceError, match=told) as caught:
+    with pytest.raises(DeviceError, match=reported) as caught:
         RealBench(changed(served, **{section: {key: value}}), Gate())
     assert "\n" not in str(caught.value)
 
@@ -192,7 +204,7 @@ def test_an_output_that_comes_too_late_passes_blocks_over_where_they_may_be(serv
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
 
 
-def test_foreseen_outputs_wait_in_the_device_and_each_comes_in_its_own_block(served, bench):
+def test_queued_outputs_are_each_put_out_in_their_own_block(served, bench):
     """As long as the computer is not later than the values that wait."""
     d = bench.rig.description
     values = np.r_[np.tile([0.0, 0.1], 60), np.zeros(60)]
@@ -214,7 +226,7 @@ def test_foreseen_outputs_wait_in_the_device_and_each_comes_in_its_own_block(ser
         assert switched_at(part, d, values[k - 1], values[k]) - 200 in range(4, 14)
 
 
-def test_a_foreseen_drive_that_runs_out_stands_and_then_goes_on_in_its_own_blocks(served, bench):
+def test_a_queued_drive_that_runs_out_is_held_and_then_continues_in_its_own_blocks(served, bench):
     d = bench.rig.description
     values = 0.002 * np.arange(200)
     bench.rig.camera.start(50.0)
@@ -252,7 +264,7 @@ def test_a_task_that_holds_the_output_does_not_keep_it_from_zero(served, bench):
         bench.rig.acquisition.read()
     other = bench.board._link.task()
     other.ao_channels.add_ao_voltage_chan("Dev1/ao0", min_val=-10.0, max_val=10.0)
-    bench.board._let_go()
+    bench.board._end_stream()
     bench.board._link.writer(other, auto_start=True).write_one_sample(1.0)
     served.hub.readings(served.hub.acquired, 4000, 1.0)
     assert served.hub.output_v > 4500.0
@@ -261,7 +273,7 @@ def test_a_task_that_holds_the_output_does_not_keep_it_from_zero(served, bench):
     assert served.hub.output_v == pytest.approx(0.0, abs=1.0)
 
 
-def test_what_was_foreseen_is_forgotten_at_zero_and_another_output_is_refused(served, bench):
+def test_queued_outputs_are_discarded_at_zero_and_another_output_is_refused(served, bench):
     bench.rig.camera.start(50.0)
     bench.rig.source.preload(np.full(100, 0.1))
     for _ in range(3):
@@ -282,7 +294,7 @@ def test_blocks_that_come_too_late_are_an_overrun(served, bench):
     bench.rig.acquisition.read()
     served.hub.queue_output([0.0] * 1200)  # so that the output does not run dry first
     served.hub.readings(served.hub.acquired + 11 * 200_000, 2000, 1.0)
-    with pytest.raises(DeviceError, match=r"overwritten before they were fetched.*status -200279"):
+    with pytest.raises(DeviceError, match=r"overwritten before they were read.*status -200279"):
         bench.rig.acquisition.read()
 
 
@@ -301,7 +313,7 @@ def test_a_lost_server_is_one_line_and_zero_does_not_raise(served, bench):
     bench.rig.source.write(1.0)
     bench.rig.acquisition.read()
     served.daq.close()
-    with pytest.raises(DeviceError, match=r"NI board Dev1 does not answer"):
+    with pytest.raises(DeviceError, match=r"NI board Dev1 does not reply"):
         bench.rig.acquisition.read()
     bench.rig.safe()
 
@@ -316,7 +328,7 @@ def test_a_server_that_falls_silent_is_one_line(served, monkeypatch):
             answered.set()
 
         monkeypatch.setattr(served.hub, "readings", readings)
-        with pytest.raises(DeviceError, match=r"Dev1 does not answer \(.*Deadline Exceeded"):
+        with pytest.raises(DeviceError, match=r"Dev1 does not reply \(.*Deadline Exceeded"):
             bench.rig.acquisition.read()
         assert not answered.is_set()  # the board gave up while the server was still silent
         silence.set()
@@ -394,22 +406,22 @@ class Liar:
 
 
 @pytest.mark.parametrize(
-    ("question", "answer", "told"),
+    ("question", "answer", "reported"),
     [
-        ("SOUR1:VOLT?", b"+5.0E-01\n", r"amplitude in Vpp reads back as 0.5, set was 0.04"),
-        ("SOUR1:FREQ?", b"+1.0E+03\n", r"frequency in Hz reads back as 1000, set was 2000"),
-        ("SOUR1:VOLT?", b"\xff\x00garbage\n", r"does not answer"),
-        ("OUTP1?", b"0\n", r"output is off, set was on"),
-        ("SOUR1:FREQ?", b"", r"does not answer"),
+        ("SOUR1:VOLT?", b"+5.0E-01\n", r"amplitude in Vpp was set to 0.04 but reads back as 0.5"),
+        ("SOUR1:FREQ?", b"+1.0E+03\n", r"frequency in Hz was set to 2000 but reads back as 1000"),
+        ("SOUR1:VOLT?", b"\xff\x00garbage\n", r"does not reply"),
+        ("OUTP1?", b"0\n", r"output was switched on but is off"),
+        ("SOUR1:FREQ?", b"", r"does not reply"),
     ],
 )
-def test_a_wrong_read_back_of_the_generator_switches_it_off(served, question, answer, told):
+def test_a_wrong_read_back_of_the_generator_switches_it_off(served, question, answer, reported):
     with contextlib.closing(Liar(served, {})) as liar:
-        patience_s = 0.3 if "does not answer" in told else 30.0
+        patience_s = 0.3 if "does not reply" in reported else 30.0
         config = generator_config(served, address=liar.address, timeout_s=patience_s)
         generator = KeysightGenerator(config)
         liar.lies[question] = answer
-        with pytest.raises(DeviceError, match=told):
+        with pytest.raises(DeviceError, match=reported):
             generator.sine(2000.0, 0.02)
         assert served.hub.bench._native.carrier_v == 0.0
         generator.close()
@@ -450,22 +462,22 @@ def test_the_supplys_rail_is_seen_by_the_voltage_monitor(served, bench):
 @pytest.mark.parametrize("voltage_v", [-1.0, 5001.0, float("nan")])
 def test_a_supply_voltage_outside_the_file_is_refused(bench, voltage_v):
     bench.rig.supply.set_voltage(100.0)
-    with pytest.raises(LimitError, match=r"Supply voltage = .* is outside \[0, 5000\] V"):
+    with pytest.raises(LimitError, match=r"supply voltage is .* must be within \[0, 5000\] V"):
         bench.rig.supply.set_voltage(voltage_v)
     assert bench.rig.supply.read_voltage() == pytest.approx(100.0, abs=METER_V)
 
 
 @pytest.mark.parametrize(
-    ("command", "answer", "told"),
+    ("command", "answer", "reported"),
     [
         ("SVset 700", "70", r"SVset 700 is echoed as 70"),
         ("SVset 700", "Err", r"SVset 700: Err"),
         ("SSwMode 1", "\x00??", r"SSwMode 1: "),
-        ("SVset 700", "7" * 200, r"no end of line"),
+        ("SVset 700", "7" * 200, r"without an end of line"),
     ],
 )
-def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, told, monkeypatch):
-    patience_s = 0.3 if told == "no end of line" else 30.0
+def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, reported, monkeypatch):
+    patience_s = 0.3 if reported == "without an end of line" else 30.0
     supply = PetaPicoVoltron(changed(served).supply.model_copy(update={"timeout_s": patience_s}))
     real = served.supply.answer
 
@@ -474,7 +486,7 @@ def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, tol
         return answer if line == command else told_truly
 
     monkeypatch.setattr(served.supply, "answer", lying)
-    with pytest.raises(DeviceError, match=told):
+    with pytest.raises(DeviceError, match=reported):
         supply.set_voltage(700.0)
     assert served.hub.rail_v == 0.0
     supply.close()
@@ -483,7 +495,7 @@ def test_a_wrong_echo_of_the_supply_switches_it_off(served, command, answer, tol
 # ---- client --------------------------------------------------------------------------------------
 
 
-def test_a_request_that_is_none_is_told(served):
+def test_a_line_that_is_not_a_request_is_reported(served):
     assert b"Not a request" in served.client.answer("jump")
     assert b"Not a request" in served.client.answer('{"do": "jump"}')
     assert b"Not a request" in served.client.answer('{"do": "hang"}')
@@ -501,7 +513,7 @@ def test_meters_see_the_bench(served, bench):
 # ---- breakdown ----------------------------------------------------------------------------------
 
 
-def test_a_breakdown_leaves_both_monitors_dead_and_the_reason_told(permitted):
+def test_after_a_breakdown_both_monitors_read_zero_and_the_reason_is_reported(permitted):
     config = twin_of_reading("hz")
     weak = config.model_copy(
         update={"dielectric": config.dielectric.model_copy(update={"breakdown_v_per_m": 3e6})}
@@ -596,7 +608,7 @@ def test_a_program_that_vanished_leaves_no_board_reserved(served):
     vanished.close()
 
 
-def test_on_a_twin_in_lock_step_nobody_is_late(served):
+def test_on_a_twin_in_lock_step_nothing_is_late(served):
     file = changed(served)
     assert file.stand.lock_step
     assert not safety_of(file, {}, Path("rig.toml")).real_time

@@ -75,9 +75,9 @@ def test_other_threads_run_while_it_computes(aside):
     assert len(ticks) > 5
 
 
-def test_a_process_that_dies_is_told_in_one_line(aside):
+def test_a_process_that_dies_is_reported_in_one_line(aside):
     os.kill(aside.call(os.getpid), signal.SIGKILL)
-    with pytest.raises(DeviceError, match=r"that helps a loop in real time is gone .*run again\."):
+    with pytest.raises(DeviceError, match=r"helper process of the .* loop has ended .*run again\."):
         aside.call(math.hypot, 3.0, 4.0)
 
 
@@ -98,7 +98,7 @@ def test_it_ends_with_the_program_however_that_ends(number):
     assert gone(pid)
 
 
-def test_favoured_is_put_back_afterwards_also_where_it_is_not_allowed(monkeypatch):
+def test_the_priority_is_restored_even_if_it_was_not_allowed(monkeypatch):
     switch_s, nice = sys.getswitchinterval(), os.getpriority(os.PRIO_PROCESS, 0)
     with pytest.raises(KeyError, match="ended"), with_priority() as allowed:
         assert sys.getswitchinterval() < 1e-3
@@ -116,13 +116,13 @@ def test_favoured_is_put_back_afterwards_also_where_it_is_not_allowed(monkeypatc
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX's")
-def test_one_that_was_stopped_is_an_error_and_not_waited_for_for_ever() -> None:
+def test_a_stopped_process_is_an_error_and_not_waited_for_forever() -> None:
     aside = HelperProcess(["math"])
     assert aside.call(math.hypot, 3.0, 4.0) == 5.0
     aside._patience_s = 0.2
     os.kill(aside._process.pid, signal.SIGSTOP)
-    with pytest.raises(DeviceError, match=r"has not answered for 0\.2 s"):
+    with pytest.raises(DeviceError, match=r"has not replied for 0\.2 s"):
         aside.call(math.hypot, 3.0, 4.0)
-    with pytest.raises(DeviceError, match="is gone"):
+    with pytest.raises(DeviceError, match="has ended"):
         aside.call(math.hypot, 3.0, 4.0)
     aside.close()

@@ -1,4 +1,4 @@
-"""Outputs that are known early wait in the device; those that came too late are told."""
+"""Outputs that are known early wait in the device; those that came too late are reported."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_outputs_left_out_in_a_row_trip_a_bench_of_the_wall_clock(tmp_path: Path
     assert twin.output_v == 0.0
 
 
-def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: Path) -> None:
+def test_a_whole_drive_is_queued_and_late_outputs_are_recorded(tmp_path: Path) -> None:
     source, rig = bench({30: 1, 31: 1, 70: 1})
     drive_v = np.minimum(0.02 * np.arange(80), 1.0)
     samples = rig.description.block_samples
@@ -92,7 +92,7 @@ def test_a_whole_drive_is_foreseen_and_what_came_too_late_is_recorded(tmp_path: 
         recorded = session.experiment("x").drive_v
     np.testing.assert_array_equal(source.preloaded[0], drive_v)
     np.testing.assert_array_equal(source.preloaded[1], np.full(40, 0.5))
-    assert events.count("1 outputs came too late and were left out") == 3
+    assert events.count("1 outputs came too late and were skipped") == 3
     # What stood is what is recorded, so that no fit takes a drive that never was.
     stood_v = drive_v.copy()
     stood_v[[30, 31]] = drive_v[29]
@@ -111,7 +111,7 @@ def test_after_outputs_were_left_out_the_rise_is_held_against_what_stands() -> N
     rig.safe()
 
 
-def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:
+def test_nothing_is_queued_unless_armed_and_within_the_limits() -> None:
     source, rig = bench(rate_limit_v_per_s=10.0)
     with pytest.raises(SafetyError, match="Arm the bench before"):
         rig.preload(np.full(5, 0.1))
@@ -125,7 +125,7 @@ def test_nothing_is_foreseen_unless_armed_and_within_the_limits() -> None:
     rig.safe()
 
 
-def test_a_rig_that_cannot_wait_is_told_nothing() -> None:
+def test_a_rig_that_cannot_queue_gets_nothing() -> None:
     config = twin_of_reading("hz")
     rig = guard(rig_of(TwinBench(config, 5), config))
     rig.preload(np.full(5, 9.0))
@@ -149,7 +149,7 @@ def test_what_waits_in_the_device_may_come_so_much_later() -> None:
     assert "3 deadlines missed" in [tick(k, 0.03) for k in range(5, 8)][-1]
 
 
-def test_a_drive_that_ends_on_the_move_is_no_fault_though_its_last_outputs_are_skipped(
+def test_a_drive_that_ends_while_changing_is_no_fault(
     tmp_path: Path,
 ) -> None:
     pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")

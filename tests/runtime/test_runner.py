@@ -38,7 +38,7 @@ Faults = dict[str, tuple[int, BaseException]]  # method: the call from which on 
 
 
 class Watched:
-    """Stands before a part of the rig or its observers, keeps a log, fails where it is told to."""
+    """Wraps a part of the rig or its observers, keeps a log, and fails on request."""
 
     def __init__(self, part: Any, log: list[str], faults: Faults) -> None:
         self._part, self._log, self._faults = part, log, faults
@@ -152,7 +152,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("act", [play, release, close_loop])
 @pytest.mark.parametrize(("method", "error"), FAULTS.values(), ids=list(FAULTS))
-def test_any_fault_in_any_experiment_ends_at_zero_and_is_the_error_told(
+def test_any_fault_in_any_experiment_ends_at_zero_and_is_reported(
     tmp_path: Path, act: Callable[[Runner], None], method: str, error: BaseException
 ) -> None:
     scene = Scene(tmp_path, {method: (3, error)})

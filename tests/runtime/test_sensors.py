@@ -27,7 +27,7 @@ CODES = np.zeros((2000, 2), dtype=np.int16)
 
 
 class Eyes:
-    """An observer that sees what it is told to."""
+    """An observer that returns the given lengths."""
 
     def __init__(self, seen: Iterable[Seen | None]) -> None:
         self._seen = iter(seen)
@@ -110,7 +110,7 @@ def test_a_covered_lens_trips_the_loop(tmp_path):
         loop = LoopSettings(
             pid_controller(0.3, 1.5), Saturation(-0.05, 0.06), EQ4, StrainMap(1.0, 0.0), zero_px
         )
-        with pytest.raises(SafetyError, match="A fiducial is not seen"):
+        with pytest.raises(SafetyError, match="A fiducial is not visible"):
             runner.close_loop("loop", np.zeros(200), loop, 100.0, 0.25)
     assert bench.twin.output_v == 0.0
 

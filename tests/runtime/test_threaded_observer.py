@@ -52,7 +52,7 @@ def ended(side: ThreadedObserver, scripted: Scripted) -> None:
     side.finish()
 
 
-def test_the_last_thing_seen_is_told_once_and_without_waiting():
+def test_the_last_result_is_returned_once_and_without_waiting():
     plain = Scripted()
     side = ThreadedObserver(plain, every_s=1e-3)
     plain.answers = iter([Seen(1.0, 5.0), None, Seen(2.0, 6.0), Seen(3.0, 7.0)])
@@ -110,15 +110,15 @@ def test_no_thread_is_left_and_each_experiment_starts_anew():
     assert plain.calls.count("finish") == 3
 
 
-def test_an_observer_that_hangs_is_left_behind_and_told():
+def test_an_observer_that_hangs_is_abandoned_and_reported():
     plain = Scripted()
     side = ThreadedObserver(plain, every_s=1e-3, patience_s=0.05)
     side.start("x", 50.0, 0.1)
     assert plain.asked.acquire(timeout=WAIT_S)  # it hangs in its look from here on
-    with pytest.raises(DeviceError, match=r"camera has not let go for 0\.05 s"):
+    with pytest.raises(DeviceError, match=r"camera has not returned for 0\.05 s"):
         side.finish()
-    side.finish()  # told once, and no way out waits for it again
+    side.finish()  # reported once, and no way out waits for it again
     assert "finish" not in plain.calls  # whoever hangs is not asked from two sides
-    with pytest.raises(DeviceError, match="has not let go"):
+    with pytest.raises(DeviceError, match="has not returned"):
         side.start("y", 50.0, 0.1)
     plain.go.release()

@@ -54,7 +54,7 @@ class StickyBoard:
     def _fail(self, name: str) -> None:
         if name in self.fails:
             self.fails.discard(name)
-            raise DeviceError(f"The board does not answer ({name}).")
+            raise DeviceError(f"The board does not reply ({name}).")
 
     def write(self, voltage_v: float) -> None:
         self._fail("write")

@@ -157,7 +157,7 @@ class Hanging:
         return True
 
 
-def test_an_instrument_that_never_returns_is_left_behind_and_told(
+def test_an_instrument_that_never_returns_is_abandoned_and_reported(
     twin: TwinBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutdown, "_LONGEST_S", 0.01)
@@ -195,15 +195,15 @@ def test_zero_is_tried_again_and_the_others_too_when_a_driver_breaks_its_word(
     assert abs(twin.output_v) < 1.0
 
 
-def test_an_output_that_stays_is_told_and_recorded(twin: TwinBench, tmp_path: Path) -> None:
+def test_an_output_that_stays_is_reported_and_recorded(twin: TwinBench, tmp_path: Path) -> None:
     config = twin_of_reading("hz")
     rig = rig_of(twin, config)
     events: list[str] = []
     with SessionWriter(tmp_path / "s.h5", [ExperimentPlan("x", "t", 6, {})], 2000, {}) as session:
         camera_recorder = CameraRecorder(rig.camera, session, tmp_path, "none")
         runner = Runner(rig, session, camera_recorder, 2000.0, 0.02, SilentProgress())
-        told = r"Output not at 0 V: 25\d\d V remain at the output.*by hand"
-        with pytest.raises(SafetyError, match=told), runner:
+        reported = r"Output not at 0 V: 25\d\d V remain at the output.*by hand"
+        with pytest.raises(SafetyError, match=reported), runner:
             runner.play("x", np.full(20, 0.5), 50.0, 0.25)
             twin.zero = lambda: None  # type: ignore[method-assign]
         events = [what for _, what in session.events()]

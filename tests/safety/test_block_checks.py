@@ -55,10 +55,10 @@ def test_outputs_that_are_queued_are_expected_when_they_take_effect() -> None:
         codes = block(requested_v[k - 1])
         codes[:400] = block(requested_v[k - 2])[:400]
         assert honest.fault(codes, requested_v[k]) == ""
-    told = [early.fault(block(value), value) for value in requested_v]
+    reported = [early.fault(block(value), value) for value in requested_v]
     # Shown a block too early, all changes above a tenth of the range of 2 V are found.
     changes = np.flatnonzero(np.abs(np.diff(requested_v, prepend=0.0)) > 0.2)
-    assert [k for k, text in enumerate(told) if text] == changes.tolist()
+    assert [k for k, text in enumerate(reported) if text] == changes.tolist()
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ class Wall:
 
 def test_ticks_are_counted_by_their_delay() -> None:
     wall = Wall()
-    told = [wall.tick(delay_s) for delay_s in (0.001, 0.004, 0.006, 0.011, 0.002)]
-    assert told == [""] * 5
+    reported = [wall.tick(delay_s) for delay_s in (0.001, 0.004, 0.006, 0.011, 0.002)]
+    assert reported == [""] * 5
     ticks = wall.deadlines.ticks
     assert (ticks.count, ticks.late, ticks.missed) == (5, 2, 1)
     assert abs(ticks.worst_s - 0.011) < 1e-9
@@ -37,9 +37,9 @@ def test_ticks_are_counted_by_their_delay() -> None:
 def test_a_backlog_counts_although_each_answer_is_quick() -> None:
     wall = Wall()
     wall.tick(0.001)
-    told = [wall.tick(0.031, arrival_s=0.030) for _ in range(5)]
-    assert told[:4] == [""] * 4
-    assert told[4].startswith("Lost deadline: 5 deadlines missed in a row (missed_limit = 5)")
+    reported = [wall.tick(0.031, arrival_s=0.030) for _ in range(5)]
+    assert reported[:4] == [""] * 4
+    assert reported[4].startswith("Lost deadline: 5 deadlines missed in a row (missed_limit = 5)")
 
 
 def test_one_good_tick_ends_a_row_and_late_ones_are_limited_in_a_hundred() -> None:

@@ -86,12 +86,12 @@ def test_one_program_owns_a_bench_and_another_bench_is_free(tmp_path: Path) -> N
     assert second.owner_pid == os.getpid()
 
 
-def _owns_and_is_killed(folder: Path, told: Any, armed: bool) -> None:
+def _owns_and_is_killed(folder: Path, reported: Any, armed: bool) -> None:
     interlock = Interlock(KEY, folder)
     interlock.own("a run")
     if armed:
         interlock.set_live(True)
-    told.set()
+    reported.set()
     signal.pause()
 
 
@@ -99,10 +99,10 @@ def _owns_and_is_killed(folder: Path, told: Any, armed: bool) -> None:
 @pytest.mark.parametrize("armed", [True, False])
 def test_a_program_that_vanishes_while_armed_leaves_a_latch(tmp_path: Path, armed: bool) -> None:
     fork = multiprocessing.get_context("fork")
-    told = fork.Event()
-    process = fork.Process(target=_owns_and_is_killed, args=(tmp_path, told, armed))
+    reported = fork.Event()
+    process = fork.Process(target=_owns_and_is_killed, args=(tmp_path, reported, armed))
     process.start()
-    assert told.wait(60.0)
+    assert reported.wait(60.0)
     process.kill()
     process.join()
     interlock = Interlock(KEY, tmp_path)
@@ -111,13 +111,13 @@ def test_a_program_that_vanishes_while_armed_leaves_a_latch(tmp_path: Path, arme
     assert not interlock.live
 
 
-def _is_inside(folder: Path, told: Any) -> None:
+def _is_inside(folder: Path, reported: Any) -> None:
     interlock = Interlock(KEY, folder)
     interlock.own("a run", call_s=0.2)
 
     def pause(acquired: bool) -> None:
         assert acquired
-        told.set()
+        reported.set()
         signal.pause()
 
     interlock.holding_output(pause, 0.0)
@@ -126,10 +126,10 @@ def _is_inside(folder: Path, told: Any) -> None:
 @POSIX
 def test_a_program_that_hangs_in_a_driver_is_killed_and_the_act_done_twice(tmp_path: Path) -> None:
     fork = multiprocessing.get_context("fork")
-    told = fork.Event()
-    process = fork.Process(target=_is_inside, args=(tmp_path, told))
+    reported = fork.Event()
+    process = fork.Process(target=_is_inside, args=(tmp_path, reported))
     process.start()
-    assert told.wait(60.0)
+    assert reported.wait(60.0)
     os.kill(process.pid or 0, signal.SIGSTOP)  # as one that hangs in a driver, it holds its lock
     interlock = Interlock(KEY, tmp_path)
     acts: list[int] = []
@@ -219,7 +219,7 @@ def test_a_pause_of_the_whole_computer_is_not_silence() -> None:
 
 @POSIX
 @pytest.mark.parametrize("damage", ["emptied", "removed", "garbage", "folder removed"])
-def test_a_damaged_file_ends_every_permission_and_harms_nobody(tmp_path: Path, damage: str) -> None:
+def test_a_damaged_file_ends_every_permission_and_nothing_else(tmp_path: Path, damage: str) -> None:
     interlock = Interlock(KEY, tmp_path / "shared")
     interlock.own("a run")
     interlock.set_live(True)
@@ -262,15 +262,15 @@ def test_a_fork_of_the_program_has_no_permission_and_ends_nothing(tmp_path: Path
     gate.interlock.own("a run")
     gate.permit(gate.interlock.revision)
     fork = multiprocessing.get_context("fork")
-    told = fork.Queue()
+    reported = fork.Queue()
 
     def child() -> None:
-        told.put(gate.permitted)
+        reported.put(gate.permitted)
         gate.release()
 
     process = fork.Process(target=child)
     process.start()
-    assert told.get(timeout=60.0) is False
+    assert reported.get(timeout=60.0) is False
     process.join(60.0)
     assert gate.permitted and gate.interlock.live
     with pytest.raises(InterlockBusyError, match="a run"):
@@ -319,7 +319,7 @@ def test_a_file_written_anew_gives_no_permission_back(tmp_path: Path, content: b
     assert "damaged" in gate.interlock.reason
 
 
-def test_an_interlock_that_was_closed_permits_nothing_and_tells_its_reason(tmp_path: Path) -> None:
+def test_a_closed_interlock_permits_nothing_and_reports_its_reason(tmp_path: Path) -> None:
     interlock = Interlock(KEY, tmp_path)
     interlock.own("a run")
     interlock.revoke("Smoke.")
@@ -356,12 +356,12 @@ def test_an_interrupt_at_any_place_leaves_no_lock_behind(tmp_path: Path) -> None
 def test_a_process_that_only_the_file_names_is_not_killed(tmp_path: Path) -> None:
     """Every user may write the file; the system knows who has the lock."""
     fork = multiprocessing.get_context("fork")
-    told = fork.Event()
-    holder = fork.Process(target=_is_inside, args=(tmp_path, told))
+    reported = fork.Event()
+    holder = fork.Process(target=_is_inside, args=(tmp_path, reported))
     innocent = fork.Process(target=signal.pause)
     for process in (holder, innocent):
         process.start()
-    assert told.wait(60.0)
+    assert reported.wait(60.0)
     interlock = Interlock(KEY, tmp_path)
     interlock._put(interlock_module._HOLDER, innocent.pid or 0)
     assert interlock.make_safe(lambda: True, wait_s=0.01)

@@ -55,12 +55,12 @@ def bench(tmp_path: Path) -> Bench:
 
 
 @pytest.mark.parametrize("ended_by", [None, KeyboardInterrupt(), DeviceError("the disk is full.")])
-def test_an_output_that_is_left_is_told_whatever_ended_the_run(
+def test_a_remaining_output_is_reported_whatever_ended_the_run(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, ended_by: BaseException | None
 ) -> None:
     monkeypatch.setattr(TwinBench, "zero", lambda self: None)
-    told = r"Output not at 0 V: .*Switch the high voltage off by hand\."
-    with pytest.raises(SafetyError, match=told) as caught, bench.runner() as runner:
+    reported = r"Output not at 0 V: .*Switch the high voltage off by hand\."
+    with pytest.raises(SafetyError, match=reported) as caught, bench.runner() as runner:
         runner.play("x", np.full(30, 1.5), 100.0, 0.25)
         if ended_by is not None:
             raise ended_by
@@ -128,7 +128,7 @@ def test_a_breakdown_ends_at_zero(tmp_path: Path) -> None:
     with pytest.raises(SafetyError, match="Dielectric breakdown"), bench.runner() as runner:
         runner.play("x", np.linspace(0.0, 2.0, 100), 100.0, 0.25)
     assert bench.twin.output_v == 0.0
-    with pytest.raises(SafetyError, match="the output is at 0 V"):
+    with pytest.raises(SafetyError, match="The output is at 0 V"):
         bench.twin.read()  # a broken actuator stays off
 
 
@@ -144,7 +144,7 @@ class Charged:
 
     def __init__(self, time_constant_s: float) -> None:
         self._tau_s, self._off_s = time_constant_s, 0.0
-        self.told: list[float] = []
+        self.reported: list[float] = []
 
     def set_voltage(self, voltage_v: float) -> None: ...
 
@@ -156,25 +156,25 @@ class Charged:
 
     def read_voltage(self) -> float:
         passed_s = time.monotonic() - self._off_s if self._off_s else 0.0
-        self.told.append(1500.0 * math.exp(-passed_s / self._tau_s))
-        return self.told[-1]
+        self.reported.append(1500.0 * math.exp(-passed_s / self._tau_s))
+        return self.reported[-1]
 
 
 def test_a_supply_that_runs_down_slowly_is_waited_for(bench: Bench) -> None:
     bench.rig.supply = supply = Charged(0.05)  # below 50 V after 0.17 s
     with bench.runner() as runner:
         runner.play("x", np.full(30, 1.5), 100.0, 0.25)
-    assert supply.told[0] > 50.0 > supply.told[-1]
+    assert supply.reported[0] > 50.0 > supply.reported[-1]
     bench.assert_safe()
 
 
-def test_a_supply_that_does_not_run_down_is_told(
+def test_a_supply_that_does_not_discharge_is_reported(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(at_rest, "_DISCHARGE_S", 0.2)
     bench.rig.supply = Charged(1e6)
     with (
-        pytest.raises(SafetyError, match=r"supply shows 1500 V 0\.2 s after .* off by hand"),
+        pytest.raises(SafetyError, match=r"off by hand.* supply still shows 1500 V, 0\.2 s after"),
         bench.runner() as runner,
     ):
         runner.play("x", np.full(30, 1.5), 100.0, 0.25)
@@ -186,5 +186,5 @@ def test_a_supplys_own_meter_may_be_off_by_its_tolerance(bench: Bench) -> None:
     supply.tolerance_v = 1600.0
     with bench.runner() as runner:
         runner.play("x", np.full(30, 1.5), 100.0, 0.25)
-    assert supply.told[-1] > 1400.0
+    assert supply.reported[-1] > 1400.0
     bench.assert_safe()

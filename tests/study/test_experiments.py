@@ -109,7 +109,7 @@ def test_each_experiment_alone_declares_its_drives(table: str) -> None:
     assert rating_of_twin(TwinConfig(), study).stretch > 1.0
 
 
-def test_a_drive_about_a_baseline_that_nobody_gives_is_refused_before_anything_moves() -> None:
+def test_a_drive_about_an_unknown_baseline_is_refused_before_anything_moves() -> None:
     with pytest.raises(InputError, match=r"no \[triangle\].*Give operating_point.baseline_v"):
         study_drives(part("chirp"), describe(TwinConfig()))
 

@@ -100,7 +100,7 @@ def test_a_run_whose_fit_refuses_its_data_exits_with_3_and_keeps_them(
     with pytest.raises(SystemExit) as stop:
         main(["run", str(tmp_path / "study.toml"), "--rig", str(tmp_path / "rig.toml"), "--quick",
               "--keep-video", "none", "--out", str(tmp_path / "out")])  # fmt: skip
-    told = capsys.readouterr().err
-    assert stop.value.code == 3, told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert stop.value.code == 3, printed
+    assert printed.count("\n") == 1
     assert (tmp_path / "out" / "session.h5").is_file()

@@ -27,7 +27,7 @@ def study() -> Study:
     return Study.model_validate({"name": "a triangle", "triangle": TRIANGLE})
 
 
-def test_a_stack_that_stands_the_study_is_rated_by_its_law(study):
+def test_a_stack_that_withstands_the_study_is_rated_by_its_law(study):
     twin = stack()
     rating = rating_of_twin(twin, study)
     assert judge_study(study, describe(twin), rating).ok

@@ -100,7 +100,7 @@ def test_each_result_has_its_row_and_the_note_says_where_margins_come_from():
     )
 
 
-def test_an_own_pid_stands_beside_the_designed_one_and_never_in_its_place(tmp_path):
+def test_an_own_pid_is_an_alternative_and_never_replaces_the_designed_one(tmp_path):
     """The designed one has margins; firmware is built from it unless the own one is named."""
     study = study_with(tmp_path, 'kind = "pid"\nkp = 0.2\nki = 0.7')
     margin = Estimate.normal(50.0, 1.0, "deg")

@@ -66,7 +66,7 @@ def play(config, drive_v):
 
 
 @pytest.mark.parametrize("reading", ["rad", "hz"])
-def test_the_papers_chirp_tells_the_reading(reading):
+def test_the_papers_chirp_decides_the_frequency_axis(reading):
     sweep = 1.0 + 0.6 * linear_chirp(0.1, 10.0, 10.0, RATE_HZ)
     record = play(bench_of(reading, "mechanical"), np.concatenate([np.ones(100), sweep]))
     found = compare(reading_hypotheses(slew_v_s=SLEW_V_S), [record])
@@ -74,7 +74,7 @@ def test_the_papers_chirp_tells_the_reading(reading):
 
 
 @pytest.mark.parametrize("creep", ["mechanical", "electrical"])
-def test_alternating_polarity_tells_the_creep_and_the_papers_step_does_not(creep):
+def test_alternating_polarity_identifies_the_creep_and_the_papers_step_does_not(creep):
     config = bench_of("hz", creep)
     held, turns = constant(1.5, 8.0, RATE_HZ), 1.5 * square(0.5, 8.0, RATE_HZ)
     rest = constant(1.0, 8.0, RATE_HZ)

@@ -35,11 +35,11 @@ class Connection:
 
     def fault(self, error: object) -> DeviceError:
         return DeviceError(
-            f"The supply does not answer ({error}). Switch it on, check its cable, or correct "
+            f"The supply does not reply ({error}). Switch it on, check its cable, or change "
             f"supply.host and supply.port. {self._config.host}:{self._config.port}"
         )
 
-    def ask(self, question: str) -> str:
+    def query(self, question: str) -> str:
         try:
             self._stream.write(question.encode("ascii") + b"\n")
             self._stream.flush()
@@ -51,25 +51,25 @@ class Connection:
         return answer.decode("ascii", errors="replace").strip()
 
     def number(self, question: str) -> float:
-        answer = self.ask(question)
+        answer = self.query(question)
         try:
             return float(answer)
         except ValueError:
-            raise self.fault(f"{question} is answered by {answer!r}") from None
+            raise self.fault(f"the reply to {question} is {answer!r}") from None
 
     def check_identity(self) -> str:
-        identity = self.ask("*IDN?")
+        identity = self.query("*IDN?")
         wanted = self._config.serial_number
         if wanted is not None and wanted not in identity.split(","):
             raise InputError(
                 f"The supply identifies as {identity!r}, but supply.serial_number is {wanted}. "
-                "Connect that supply, or correct the rig file."
+                "Connect that supply, or change the rig file."
             )
         return identity
 
     def switch_off(self) -> None:
         """Switch off, confirmed by the instrument's own report."""
-        if self.ask("OUTP OFF;:VOLT 0;:OUTP?") != "0" or self.number("VOLT?") != 0.0:
+        if self.query("OUTP OFF;:VOLT 0;:OUTP?") != "0" or self.number("VOLT?") != 0.0:
             raise self.fault("the output is not off after OUTP OFF")
 
     def switch_off_and_discharge(self) -> None:
@@ -103,9 +103,9 @@ class MySupplyDevice:
     def set_voltage(self, voltage_v: float) -> None:
         if not 0.0 <= voltage_v <= self._config.highest_v:  # also refuses NaN
             raise LimitError(
-                f"Supply voltage = {voltage_v:g} V is outside [0, {self._config.highest_v:g}] V."
+                f"The supply voltage is {voltage_v:g} V, outside [0, {self._config.highest_v:g}] V."
             )
-        found = self._connection.ask(f"VOLT {voltage_v:.1f};:OUTP ON;:VOLT?")
+        found = self._connection.query(f"VOLT {voltage_v:.1f};:OUTP ON;:VOLT?")
         if found != f"{voltage_v:.1f}":
             self.off()
             raise self._connection.fault(f"VOLT? is {found} after VOLT {voltage_v:.1f}")
@@ -114,7 +114,7 @@ class MySupplyDevice:
         return self._connection.number("MEAS:VOLT?")
 
     def is_off(self) -> bool:
-        return self._connection.ask("OUTP?") == "0"
+        return self._connection.query("OUTP?") == "0"
 
     def off(self) -> None:
         """Switch off. Never raises: the shutdown must continue, and then calls `is_off`."""

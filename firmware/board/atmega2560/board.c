@@ -1,9 +1,9 @@
 /* ATmega2560 at 16 MHz, registers only. One frame is 1 ms:
  *
  *   timer 1  every 2,000 cycles: compare B starts a conversion by hardware; compare A, when it
- *            holds its reading, is the sampling interrupt (pin OC1B toggles: a scope's trigger)
+ *            holds its reading, is the sampling interrupt (pin OC1B toggles to trigger a scope)
  *   timer 3  carrier: square wave of 5 kHz on OC3A, filtered to a sine outside
- *   timer 5  16,000 cycles: says which of the eight slots of a frame it is
+ *   timer 5  16,000 cycles: gives the slot, one of eight in a frame
  *   ADC      125 kHz clock, 8,000 conversions a second at 10 bits (data sheet: 50 to 200 kHz for
  *            full resolution); ADC0 voltage, ADC1 current, each every 1.25 periods of the carrier;
  *            ADC2 level of the high voltage, in the first slot of a frame
@@ -13,8 +13,8 @@
  *   watchdog 15 ms
  *
  * Measured in co-simulation: the sampling interrupt takes 165 cycles of the 2,000 from one to the
- * next, 330 where it puts the output out; a byte to the link 50. The budget of each is 500: beyond
- * it two in a row could hold the sampling one up for a whole slot.
+ * next, 330 if it writes the output; sending a byte takes 50. The budget of each is 500: beyond it,
+ * two in a row could delay the sampling interrupt by a whole slot.
  */
 #include "board.h"
 
@@ -29,12 +29,12 @@
 #define SLOT_CYCLES 2000u
 #define FRAME_CYCLES 16000u
 #define HALF_CARRIER_CYCLES 1600u
-#define START_CYCLES 1700u /* of a conversion: two clocks of the converter ahead of compare A */
+#define START_CYCLES 1700u /* of a conversion: two clocks of the converter before compare A */
 #define LEVEL 2u           /* channel */
 #define HIGHEST_CODE 1023
-#define REFERENCE 0x1eu    /* channel: the chip's own 1.1 V (data sheet, MUX5:0 = 011110) */
-#define SETTLING 4u        /* conversions of it that do not count, 104 us each: it starts in 70 us */
-#define COUNTING 4u        /* and that do */
+#define REFERENCE 0x1eu    /* channel: internal 1.1 V reference (data sheet, MUX5:0 = 011110) */
+#define SETTLING 4u        /* conversions of it to discard, 104 us each: it starts in 70 us */
+#define COUNTING 4u        /* conversions of it to use */
 
 #define CS _BV(PB0)
 #define CLOCK _BV(PB1)
@@ -52,7 +52,7 @@
 
 static volatile sampler samples;
 static volatile uint16_t pending; /* output code of the last update */
-static volatile uint8_t dropped; /* an interrupt has taken the enable pin down */
+static volatile uint8_t dropped; /* an interrupt has cleared the enable pin */
 static volatile uint8_t received[RECEIVE_BYTES], receive_put;
 static volatile uint8_t to_send[SEND_BYTES], send_put, send_got;
 static uint8_t receive_got;
@@ -82,8 +82,8 @@ static inline void dac_byte(uint8_t byte)
     dac_bit(byte & 0x01u);
 }
 
-/* Shifted out by hand, 150 cycles: the same on silicon and in the simulator, whose SPI unit takes
- * 1,600 cycles a byte whatever its clock. */
+/* Shifted out bit by bit, 150 cycles: the same on silicon and in the simulator, whose SPI unit
+ * takes 1,600 cycles per byte whatever its clock. */
 static inline void dac_write(uint16_t code)
 {
     const uint16_t word = DAC_ACTIVE | code;
@@ -93,8 +93,8 @@ static inline void dac_write(uint16_t code)
     PORTB |= CS;
 }
 
-/* Ahead of main and of the memory's initialisation: enable pin inactive, output 0, and the watchdog
- * kept at 15 ms (after a reset by it, it runs on). */
+/* Before main and the initialisation of memory: enable pin inactive, output 0, and the watchdog
+ * kept at 15 ms (after a watchdog reset it keeps running). */
 void board_early(void) __attribute__((naked, used, section(".init3")));
 void board_early(void)
 {
@@ -117,17 +117,17 @@ static inline void drop(void)
 
 /* Early in a conversion: the result of the one before it, the channel of the one after it, and the
  * trigger's flag. In the last slot of a frame the output of the update changes here, as far
- * as can be from the readings that count: the first of each channel in a frame does not. */
+ * as possible from the readings that are used: the first of each channel in a frame is not. */
 ISR(TIMER1_COMPA_vect)
 {
-    sampler *s = (sampler *)&samples; /* nobody else runs while this does */
+    sampler *s = (sampler *)&samples; /* nothing else runs meanwhile */
     const uint16_t code = ADC;
     const uint8_t low = TCNT5L, at = TCNT5H; /* in this order */
-    /* Timer 5 stands 1,060 to 1,400 cycles into the slot: 256 / 33 of its high byte are one. */
+    /* Timer 5 is 1,060 to 1,400 cycles into the slot; a slot is 256 / 33 of its high byte. */
     const uint8_t slot = (uint8_t)(((uint16_t)(at * 33u) >> 8) & (SAMPLER_SLOTS - 1u));
     (void)low;
     if (!(ADCSRA & _BV(ADIF))) {
-        s->alarms |= HP_ALARM_SLIP; /* not finished, or never begun */
+        s->alarms |= HP_ALARM_SLIP; /* not finished or not started */
     }
     /* The next one but one. */
     ADMUX = (uint8_t)(_BV(REFS0) | (slot == SAMPLER_SLOTS - 2u ? LEVEL : slot & 1u));
@@ -159,7 +159,7 @@ ISR(USART0_UDRE_vect)
     }
 }
 
-/* ---- what board.h promises ---- */
+/* ---- functions of board.h ---- */
 
 static uint8_t fault_of_reset(void)
 {
@@ -179,8 +179,8 @@ static uint16_t convert(uint8_t channel)
     return ADC;
 }
 
-/* The chip's reference against its supply, which is the range of all readings: 1 ms once. The very
- * first conversion takes twice as long, and falls among those that do not count. */
+/* The internal reference relative to the supply, which scales all readings: 1 ms, once. The first
+ * conversion takes twice as long, and is among those that are discarded. */
 static void init_converter(void)
 {
     uint8_t k;
@@ -215,14 +215,14 @@ static void start_timers(void)
 
 uint8_t board_init(void)
 {
-    UCSR0A = _BV(U2X0); /* ahead of the divider: the simulator looks then */
+    UCSR0A = _BV(U2X0); /* before the divider, because the simulator reads it then */
     UBRR0 = 3;
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
     UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
     samples.slot = SAMPLER_SLOTS - 1u;
     init_converter();
     start_timers();
-    SMCR = _BV(SE); /* idle: every clock but the CPU's goes on */
+    SMCR = _BV(SE); /* idle: all clocks except the CPU's continue */
     sei();
     return fault_of_reset();
 }

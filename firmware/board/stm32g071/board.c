@@ -1,19 +1,19 @@
-/* STM32G071 (Cortex-M0+, no hardware for floats) at 16 MHz, its own oscillator as after reset: no
+/* STM32G071 (Cortex-M0+, no floating-point unit) at 16 MHz, internal oscillator as after reset: no
  * flash wait states, cycles of an update count as on the ATmega2560. One frame is 1 ms:
  *
  *   timer 3   every 2,000 cycles: starts a conversion by hardware, and 400 cycles later, when it is
- *             done, the sampling interrupt (pin PA7 toggles at the start: a scope's trigger)
+ *             done, the sampling interrupt (pin PA7 toggles at the start to trigger a scope)
  *   timer 14  carrier: square wave of 5 kHz on PB1, filtered to a sine outside
- *   timer 2   16,000 cycles: says which of the eight slots of a frame it is
+ *   timer 2   16,000 cycles: gives the slot, one of eight in a frame
  *   ADC       8 MHz clock, 12 bits, 11.5 us a conversion; a sequence of eight, one a trigger: PA4
  *             level of the high voltage first, then PA1 current and PA0 voltage in turns
  *   SPI 1     MCP4921, on 3.3 V: PB0 select, PB3 clock, PB5 data; 12 bits, 2.048 V
  *   PB4       enable of the high-voltage module, active high, pulled down outside
  *   USART 2   PA2 out, PA3 in, 500,000 baud
- *   watchdog  15 ms, of its own oscillator
+ *   watchdog  15 ms, with a separate oscillator
  *
  * Counted in an emulator, cycles by the processor's manual: the sampling interrupt takes 175 cycles
- * of the 2,000 from one to the next, 290 where it puts the output out. Nothing was flashed.
+ * of the 2,000 from one to the next, 290 if it writes the output. Not tested on hardware.
  */
 #include "board.h"
 
@@ -43,15 +43,15 @@
 
 #define BAUD_CYCLES 32u /* 500,000 baud */
 #define WATCHDOG_TICKS 120u /* of 8 kHz: 15 ms */
-#define MOST_LOOKS 2000u /* at a flag of the hardware, before going on without it */
+#define MOST_LOOKS 2000u /* readings of a hardware flag before continuing without it */
 
 #define RECEIVE_BYTES 64u
 #define SEND_BYTES 128u
-#define RAN 0x52414e21u /* in memory that outlives a short dip of the supply */
+#define RAN 0x52414e21u /* in memory that survives a short dip of the supply */
 
 static volatile sampler samples;
 static volatile uint16_t pending; /* output code of the last update */
-static volatile uint8_t dropped;  /* an interrupt has taken the enable pin down */
+static volatile uint8_t dropped;  /* an interrupt has cleared the enable pin */
 static volatile uint8_t received[RECEIVE_BYTES], receive_put;
 static volatile uint8_t to_send[SEND_BYTES], send_put, send_got;
 static uint8_t receive_got;
@@ -65,8 +65,8 @@ static void look_for(const volatile uint32_t *unit, uint32_t bits, uint32_t valu
     }
 }
 
-/* 16 bits at 8 MHz, 32 cycles; a unit that hangs is left after some more, and the converter takes
- * no word whose bits are not all there. */
+/* 16 bits at 8 MHz, 32 cycles; a unit that hangs is abandoned, and the converter ignores an
+ * incomplete word. */
 static inline void dac_write(uint16_t code)
 {
     uint8_t left = 32;
@@ -78,7 +78,7 @@ static inline void dac_write(uint16_t code)
     GPIOB.odr |= SELECT;
 }
 
-/* Ahead of main and of the memory's initialisation: enable pin inactive, output 0, and a watchdog
+/* Before main and the initialisation of memory: enable pin inactive, output 0, and a watchdog
  * of 15 ms. Pins of port B: 0 select, 1 carrier, 3 clock, 4 enable, 5 data. */
 APP_APART void board_early(void)
 {
@@ -99,7 +99,7 @@ APP_APART void board_early(void)
     IWDG.kr = IWDG_BEGIN; /* its divider is 4 after reset */
     IWDG.kr = IWDG_OPEN;
     IWDG.rlr = WATCHDOG_TICKS - 1u;
-    look_for(&IWDG.sr, 0xffffffffu, 0); /* the new length has gone over to its clock */
+    look_for(&IWDG.sr, 0xffffffffu, 0); /* until the new length is in its clock domain */
     IWDG.kr = IWDG_KICK;
 }
 
@@ -112,8 +112,8 @@ void board_drop(void)
     pending = 0;
 }
 
-/* The converter's sequence has to end with the frame, as timer 2 tells it. Where it does not it is
- * stopped, and begins anew with a frame: until then no reading counts. */
+/* The converter's sequence must end with the frame given by timer 2. Otherwise it is stopped and
+ * restarted with a frame; until then no reading is valid. */
 static inline uint8_t keep_in_step(uint32_t flags, uint8_t slot)
 {
     const uint8_t ends = (flags & ADC_SEQUENCE_END) != 0;
@@ -128,11 +128,11 @@ static inline uint8_t keep_in_step(uint32_t flags, uint8_t slot)
 }
 
 /* The reading of this slot, finished 200 cycles ago. After the last one of a frame the output of
- * the update changes, as far as can be from the readings that count: the first of each channel in a
- * frame does not. */
+ * the update changes, as far as possible from the readings that are used: the first of each channel
+ * in a frame is not. */
 void board_sample(void)
 {
-    sampler *s = (sampler *)&samples; /* nobody else runs while this does */
+    sampler *s = (sampler *)&samples; /* nothing else runs meanwhile */
     const uint32_t flags = ADC1.isr;
     const uint16_t code = (uint16_t)ADC1.dr;
     /* At 400 of the slot's 2,000 cycles: 2^22 / 2097 = 2,000.1. */
@@ -171,10 +171,10 @@ void board_link(void)
     }
 }
 
-/* ---- what board.h promises ---- */
+/* ---- functions of board.h ---- */
 
-/* The chip tells power-up and brown-out by one bit: a dip after which memory holds still what this
- * leaves in it is a brown-out. */
+/* Power-up and brown-out share one flag: a reset after which memory still contains this value is a
+ * brown-out. */
 static uint8_t fault_of_reset(void)
 {
     const uint8_t was_running = ran == RAN;
@@ -189,7 +189,7 @@ static uint8_t fault_of_reset(void)
 static void init_pins(void)
 {
     GPIOA.afrl = GPIO_FOUR(2u, 1u) | GPIO_FOUR(3u, 1u) | GPIO_FOUR(7u, 1u);
-    GPIOA.pupdr |= GPIO_TWO(3u, GPIO_UP); /* an open line is silent */
+    GPIOA.pupdr |= GPIO_TWO(3u, GPIO_UP); /* an open line idles */
     GPIOA.moder &= ~(GPIO_TWO(2u, 1u) | GPIO_TWO(3u, 1u) | GPIO_TWO(7u, 1u));
     GPIOB.moder &= ~GPIO_TWO(1u, 1u);
 }

@@ -24,7 +24,7 @@ typedef struct {
 #define RCC_SPI_1 0x1000u /* apbenr2 */
 #define RCC_TIMER_14 0x8000u
 #define RCC_ADC 0x100000u
-#define RCC_FORGET 0x800000u /* csr: take the causes of a reset away */
+#define RCC_FORGET 0x800000u /* csr: clear the causes of a reset */
 #define RCC_BY_POWER 0x8000000u
 #define RCC_BY_WATCHDOG 0x20000000u
 
@@ -50,7 +50,7 @@ typedef struct {
 #define GPIO_PIN(pin) (1u << (pin))
 
 typedef struct {
-    uint32_t isr; /* bits go away where 1 is written */
+    uint32_t isr; /* write 1 to clear a bit */
     uint32_t ier;
     uint32_t cr;
     uint32_t cfgr1;
@@ -85,7 +85,7 @@ typedef struct {
     uint32_t cr2;
     uint32_t gap0;
     uint32_t dier;
-    uint32_t sr; /* 0x10; bits go away where 0 is written */
+    uint32_t sr; /* 0x10; write 0 to clear a bit */
     uint32_t gap1;
     uint32_t ccmr1;
     uint32_t gap2;
@@ -137,7 +137,7 @@ typedef struct {
 #define USART_SEND 0x8u
 #define USART_TELLS_RECEIVED 0x20u
 #define USART_TELLS_EMPTY 0x80u
-#define USART_OVERWRITE 0x1000u /* cr3: a byte that nobody took does not hold the interrupt */
+#define USART_OVERWRITE 0x1000u /* cr3: an unread byte does not block the interrupt */
 #define USART_RECEIVED 0x20u    /* isr */
 #define USART_EMPTY 0x80u
 

@@ -1,6 +1,6 @@
-/* From reset to main, and the vectors. A fault takes the enable pin down and waits for the watchdog.
- * The stack lies below all variables: where it outgrows its room nothing is written into them, but
- * the core faults without a stack to serve it: it locks up, and the watchdog alone does the rest. */
+/* From reset to main, and the vectors. A fault clears the enable pin and waits for the watchdog.
+ * The stack is below all variables: if it overflows, no variable is overwritten, but the core
+ * faults without a stack and locks up, and the watchdog resets it. */
 #include "cpu.h"
 
 #define TABLE __attribute__((section(".vectors"), used))
@@ -32,8 +32,8 @@ void cpu_sleep(void)
     __asm__ volatile("wfi" : : : "memory");
 }
 
-/* A fault, an interrupt that nobody asked for, or the end of main: the watchdog resets, and what
- * comes first then is the output at 0. */
+/* A fault, an unexpected interrupt, or the end of main: the watchdog resets, and the first action
+ * after reset is output 0. */
 void fault(void)
 {
     cpu_lock();
@@ -58,7 +58,7 @@ void reset(void)
 
 typedef void (*handler)(void);
 
-/* The core's sixteen, then the 31 of the chip; what is reserved faults too. */
+/* The core's sixteen, then the device's 31; reserved ones fault too. */
 typedef struct {
     uint32_t *stack;
     handler entry[46];
@@ -68,7 +68,7 @@ TABLE const vectors vector_table = {
     stack_end,
     {reset, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault,
      fault, fault,
-     /* 0 to 15 of the chip */
+     /* 0 to 15 of the device */
      fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault,
      fault, fault, fault,
      board_sample, /* 16: timer 3 */

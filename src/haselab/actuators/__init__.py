@@ -1,4 +1,4 @@
-"""Actuators as physical laws: energy, capacitance, masses and losses in one object."""
+"""Physical laws of actuators: energy, capacitance, masses and losses in one object."""
 
 from haselab.actuators.dea_stack import DeaStack
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, Parameter, parameter

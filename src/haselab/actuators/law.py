@@ -1,4 +1,4 @@
-r"""What a law of an actuator states, and what follows from it.
+r"""The base class of an actuator's physical law, and what follows from such a law.
 
 An actuator has one length, and its free energy at a voltage states everything that is reversible:
 
@@ -37,7 +37,7 @@ _KEY = "haselab"
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a law: what a file may set and a fit may estimate.
+    """One parameter of a law, which a file may set and a fit may estimate.
 
     Args:
         name: of the field of the law.
@@ -45,7 +45,7 @@ class Parameter:
         unit: SI; empty for a ratio.
         low: smallest permitted value.
         high: largest permitted value.
-        description: for people.
+        description: short text for people.
     """
 
     name: str
@@ -68,11 +68,11 @@ def parameter(
     """A field of a law with its unit and limits.
 
     Args:
-        default: value that a file may leave out; a tuple where the number of values is free.
+        default: value if a file does not set one; a tuple if the number of values is free.
         unit: SI; empty for a ratio.
         low: smallest permitted value.
         high: largest permitted value.
-        description: for people.
+        description: short text for people.
         key: in TWIN.toml; empty: the name of the field in the table `actuator`.
     Returns:
         The dataclass field.
@@ -112,7 +112,7 @@ class ActuatorLaw(abc.ABC):
     @property
     @abc.abstractmethod
     def free_length_m(self) -> float:
-        """Length without load and voltage."""
+        """Length without load or voltage."""
 
     @property
     @abc.abstractmethod

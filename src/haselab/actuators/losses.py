@@ -1,4 +1,4 @@
-"""What an actuator does not give back, and its electrical side."""
+"""Energy losses of an actuator, and its electrical circuit."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Losses:
-    r"""What an actuator does not give back.
+    r"""Losses of an actuator: damping, viscoelasticity, softening and charge creep.
 
     Viscoelastic branches act on the elastic force $F_e$: $\dot b = g\,\dot F_e - b/\tau$. Softening
-    (Mullins effect) makes the elastic force of a new actuator larger, until the length has been
-    reached once. Charge creep makes a share of the voltage act late.
+    (Mullins effect) makes the elastic force of a new actuator larger until the length has been
+    reached once. Charge creep delays the effect of a fraction of the voltage.
 
     Args:
         damping_n_s_per_m: linear damper beside the actuator.
@@ -32,7 +32,7 @@ class Losses:
         charge_share: part of the voltage that acts with a delay; 0: none.
         charge_relaxation_s: time constant of that part.
     Raises:
-        LimitError: branches without their time constant, or a share or time that cannot be.
+        LimitError: A branch has no time constant, or a share or time is not positive.
     """
 
     damping_n_s_per_m: float = 0.1

@@ -18,13 +18,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ActuatorState:
-    """Everything that an actuator remembers. All shapes may have any number of leading axes.
+    """State of an actuator. All shapes may have any number of leading axes.
 
     Args:
         length_m: present length.
         speed_m_s: its rate.
         branch_n: force of each viscoelastic branch. Shape `(..., B)`.
-        slow_v: the part of the voltage that acts late, as it is now.
+        slow_v: present value of the delayed part of the voltage.
         longest_m: largest length so far, for the softening.
         elastic_n: elastic force one step before.
     """
@@ -38,7 +38,7 @@ class ActuatorState:
 
     @classmethod
     def new(cls, law: ActuatorLaw, length_m: ArrayLike | None = None) -> Self:
-        """A new actuator at rest.
+        """Create the state of a new, relaxed actuator.
 
         Args:
             law: of the actuator.
@@ -109,7 +109,7 @@ def advance(
     mass_kg: ArrayLike,
     step_s: float,
 ) -> ActuatorState:
-    """The state one step later: the scheme of native/twin/twin.c, any number at once.
+    """Compute the state one step later, by the scheme of native/twin/twin.c.
 
     Branches go by backward Euler, speed before length (symplectic Euler). A step is valid where
     the fastest motion has at least 12 of them in a period.
@@ -153,7 +153,7 @@ def simulate(
     step_s: float,
     start: ActuatorState | None = None,
 ) -> tuple[Floats, ActuatorState]:
-    """Lengths under a voltage that changes every step.
+    """Simulate the lengths under a voltage that changes every step.
 
     Args:
         law: of the actuators.
@@ -165,7 +165,7 @@ def simulate(
     Returns:
         Lengths after each step, in m, shape `(N, ...)`, and the state at the end.
     Raises:
-        InputError: no voltage.
+        InputError: There is no voltage.
     Example:
         >>> from haselab.actuators import DeaStack
         >>> rest = np.zeros(3)

@@ -1,4 +1,4 @@
-"""Where an actuator rests under a voltage and a load, and how it moves about that point."""
+"""Equilibria of an actuator under voltage and load, and linear models about them."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _FAR = 1e9  # a zero farther than that many times the fastest pole is one at inf
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    r"""A linear model about a point of rest: $\dot z = A z + b\,u,\ y = c z + d\,u$.
+    r"""A linear model about an equilibrium: $\dot z = A z + b\,u,\ y = c z + d\,u$.
 
     The input is the change of the actuator's voltage in V, the output that of its length in m. The
     states are length, speed, the force of each viscoelastic branch and, with charge creep, the slow
     voltage.
 
     Args:
-        length_m: at rest.
-        voltage_v: at rest.
-        load_n: at rest.
+        length_m: at equilibrium.
+        voltage_v: at equilibrium.
+        load_n: at equilibrium.
         a: Shape `(n, n)`.
         b: Shape `(n,)`.
         c: Shape `(n,)`.
@@ -62,7 +62,7 @@ class OperatingPoint:
 
     @property
     def gain_m_per_v(self) -> float:
-        """Change of the length at rest over that of the voltage."""
+        """Change of the equilibrium length per change of the voltage."""
         return float(self.d - self.c @ np.linalg.solve(self.a, self.b))
 
 
@@ -77,7 +77,7 @@ def _net_force_n(
 def _next_rest_m(
     law: ActuatorLaw, start_m: float, voltage_v: float, load_n: float, longest_m: float
 ) -> float | None:
-    """First length at which the forces balance, on the way that they move the actuator."""
+    """First length at which the forces balance, in the direction of motion."""
     limits = law.length_limits_m
     pushed = float(_net_force_n(law, np.array(start_m), voltage_v, load_n, longest_m))
     if pushed == 0.0:
@@ -99,7 +99,7 @@ def _next_rest_m(
 def equilibrium_m(
     law: ActuatorLaw, voltage_v: float, load_n: float, *, longest_m: float | None = None
 ) -> float:
-    """Length at rest: loaded first, then the voltage rises slowly.
+    """Equilibrium length: loaded first, then the voltage rises slowly.
 
     Args:
         law: of the actuator.
@@ -109,7 +109,7 @@ def equilibrium_m(
     Returns:
         Length, in m, with all branches relaxed.
     Raises:
-        LimitError: the load or the voltage takes the actuator out of the limits of its law, for
+        LimitError: The load or the voltage moves the actuator outside the limits of its law, for
             example because the layers collapse.
     Example:
         >>> from haselab.actuators import DeaStack
@@ -139,18 +139,18 @@ def linearise(
     *,
     longest_m: float | None = None,
 ) -> OperatingPoint:
-    """The linear model about the length at rest, for motion within the lengths reached before.
+    """Linearise about the equilibrium, for motion within the lengths reached before.
 
     Args:
         law: of the actuator.
-        voltage_v: at rest.
-        load_n: at rest.
-        mass_kg: that moves with the end, without the actuator's own.
-        longest_m: largest length that the actuator has had; None: that at rest.
+        voltage_v: at equilibrium.
+        load_n: at equilibrium.
+        mass_kg: mass that moves with the end, without the actuator's own.
+        longest_m: largest length that the actuator has had; None: the equilibrium length.
     Returns:
         Length, state-space matrices, poles, zeros and gain.
     Raises:
-        LimitError: there is no equilibrium.
+        LimitError: There is no equilibrium.
     Example:
         >>> from haselab.actuators import PlanarHasel
         >>> point = linearise(PlanarHasel(), 5000.0, 2.45, 0.25)

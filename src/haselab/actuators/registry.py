@@ -1,4 +1,4 @@
-"""Kinds of actuators: built-in ones, and those that installed packages bring as entry points."""
+"""The registry of actuator kinds: built-in ones, and entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def actuator_kind(kind: str) -> type[ActuatorLaw]:
     Args:
         kind: as in `kind = "dea-stack"` of TWIN.toml.
     Returns:
-        The class; the package that brings it is imported now.
+        The class; its package is imported now.
     Raises:
-        InputError: no such kind, two packages with the same name, or a package that does not load.
+        InputError: The kind is unknown, registered twice, or its package does not load.
     """
     found = [point for point in _entry_points() if point.name == kind]
     if len(found) + (kind in _BUILT_IN) > 1:
@@ -50,21 +50,21 @@ def actuator_kind(kind: str) -> type[ActuatorLaw]:
     if not found:
         raise InputError(
             f"No actuator of kind {kind!r} is registered. Known kinds: "
-            f"{', '.join(actuator_kinds())}. Install the package that brings it, or change kind."
+            f"{', '.join(actuator_kinds())}. Install the package that provides it, or change kind."
         )
     return _loaded(found[0])
 
 
 def actuator_law(kind: str, values: Mapping[str, float | tuple[float, ...]]) -> ActuatorLaw:
-    """A law with its numbers.
+    """Create a law with its parameters.
 
     Args:
         kind: of the actuator.
-        values: by the names of the fields; those left out take their defaults.
+        values: by the names of the fields; missing ones take their defaults.
     Returns:
         The law.
     Raises:
-        InputError: an unknown kind or name, or a value outside its limits.
+        InputError: A kind or name is unknown, or a value is outside its limits.
     Example:
         >>> actuator_law("dea-stack", {"layers": 40.0}).free_length_m
         0.028
@@ -80,7 +80,7 @@ def actuator_law(kind: str, values: Mapping[str, float | tuple[float, ...]]) -> 
         default = getattr(law, name)
         if isinstance(default, tuple) != isinstance(value, tuple):
             wanted = "a list of numbers" if isinstance(default, tuple) else "a number"
-            raise InputError(f"actuator.{name} = {value} is not {wanted}. Correct it in the file.")
+            raise InputError(f"actuator.{name} is {value}, but it must be {wanted}. Change it.")
     try:
         return law(**values)
     except LimitError as error:
@@ -94,14 +94,14 @@ def _entry_points() -> importlib.metadata.EntryPoints:
 def _loaded(point: importlib.metadata.EntryPoint) -> type[ActuatorLaw]:
     try:
         law = point.load()
-    except Exception as error:  # somebody else's package: whatever it raises
+    except Exception as error:  # another package may raise anything
         raise InputError(
             f"The actuator kind {point.name!r} cannot be imported from {point.value}: "
-            f"{type(error).__name__}: {error}. Correct that package."
+            f"{type(error).__name__}: {error}. Fix or uninstall that package."
         ) from error
     if not (isinstance(law, type) and issubclass(law, ActuatorLaw)) or law.kind != point.name:
         raise InputError(
-            f"{point.value} is not an ActuatorLaw with kind = {point.name!r}. Correct the entry "
-            "point of that package."
+            f"{point.value} is not an ActuatorLaw with kind = {point.name!r}. Fix the entry point "
+            "of that package."
         )
     return law

@@ -1,4 +1,4 @@
-"""A law as numbers on a grid, which the compiled twin interpolates."""
+"""Sample a law on a grid, which the compiled twin interpolates."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
     Returns:
         The table.
     Raises:
-        InputError: the law gives a value that is not finite, a capacitance or gap of 0 or less, or
-            is not smooth enough to be interpolated.
+        InputError: The law gives a value that is not finite, a capacitance or gap of 0 or less, or
+            is not smooth enough to interpolate.
     Example:
         >>> from haselab.actuators import DeaStack
         >>> law_table(DeaStack(), 1e4).pull_n_v2.shape
@@ -99,17 +99,17 @@ def _check_values(law: ActuatorLaw, table: LawTable) -> None:
         if not np.isfinite(values).all():
             raise InputError(
                 f"The law {law.kind} gives a value that is not finite ({name}) within its length "
-                "limits. Correct the law, or narrow length_limits_m."
+                "limits. Fix the law, or narrow length_limits_m."
             )
         if name in ("gap_m", "capacitance_f") and not (values > 0.0).all():
             raise InputError(
                 f"The law {law.kind} gives {name} = {values.min():g} within its length limits. It "
-                "must be above 0. Correct the law, or narrow length_limits_m."
+                "must be above 0. Fix the law, or narrow length_limits_m."
             )
 
 
 def _check_smooth(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
-    """The cubic between the knots against the law itself, midway between them."""
+    """Compare the cubic interpolation with the law, midway between the knots."""
     middles_m = 0.5 * (lengths_m[1:-2] + lengths_m[2:-1])
     weights = np.array([-1.0, 9.0, 9.0, -1.0]) / 16.0
     highest_v = table.step_v * (table.capacitance_f.shape[0] - 1) or 1.0
@@ -131,7 +131,7 @@ def _check_smooth(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
 
 
 def motion_substeps(law: ActuatorLaw, table: LawTable, step_s: float, mass_kg: float) -> int:
-    """Steps in which the motion must be cut so that the fastest one is followed.
+    """Compute the number of substeps needed to resolve the fastest motion.
 
     Args:
         law: of the actuator.
@@ -141,7 +141,7 @@ def motion_substeps(law: ActuatorLaw, table: LawTable, step_s: float, mass_kg: f
     Returns:
         Number of substeps, at least 1.
     Raises:
-        InputError: the actuator is too stiff for its mass.
+        InputError: The actuator is too stiff for its mass.
     """
     losses = law.losses
     taut = (1.0 + sum(losses.branch_share)) * (1.0 + losses.softening_share)

@@ -10,6 +10,7 @@ from haselab.base.errors import (
     SafetyError,
 )
 from haselab.base.estimate import Estimate
+from haselab.base.json import Json, JsonObject, table_at
 from haselab.base.limits import Limits
 from haselab.base.plain import to_plain
 from haselab.base.progress import Progress, SilentProgress
@@ -20,11 +21,14 @@ __all__ = [
     "Estimate",
     "HaselabError",
     "InputError",
+    "Json",
+    "JsonObject",
     "LimitError",
     "Limits",
     "Progress",
     "ResultError",
     "SafetyError",
     "SilentProgress",
+    "table_at",
     "to_plain",
 ]

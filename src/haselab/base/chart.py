@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Chart", "Curve", "Panel"]
 
@@ -68,3 +71,13 @@ class Chart:
     title: str
     panels: Sequence[Panel]
     shared_x: bool = True
+
+    def plot(self) -> Figure:
+        """Draw the chart.
+
+        Returns:
+            A matplotlib figure: a notebook shows it, and `savefig` writes it.
+        """
+        from haselab.report.chart_file import ChartFigure  # matplotlib is loaded when one draws
+
+        return ChartFigure.of(self)

@@ -1,4 +1,4 @@
-"""What is open and closes itself at the end of a `with` block."""
+"""A base class for objects that are closed at the end of a `with` block."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ __all__ = ["Closing"]
 
 
 class Closing:
-    """A context whose end is `close`, whatever ended the block."""
+    """A context manager that calls `close` at its end."""
 
     def close(self) -> None:
-        """Give back what is open."""
+        """Release the resources."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+
+from haselab.base.json import JsonObject
 
 __all__ = ["Z95", "Estimate"]
 
@@ -50,7 +52,7 @@ class Estimate:
         low, high = sorted((self.ci95[0] * factor, self.ci95[1] * factor))
         return Estimate(self.value * factor, self.std * abs(factor), (low, high), unit)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Convert to a dictionary: value, std, ci95, unit."""
         return {
             "value": self.value,
@@ -60,9 +62,16 @@ class Estimate:
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Estimate:
+    def from_dict(cls, data: JsonObject) -> Estimate:
         """Inverse of `to_dict`."""
-        low, high = data["ci95"]
-        return cls(
-            float(data["value"]), float(data["std"]), (float(low), float(high)), data["unit"]
-        )
+        ends = data["ci95"]
+        if not isinstance(ends, Sequence):
+            raise TypeError(f"ci95 is {ends!r}, but must be a pair of numbers")
+        low, high = (_number(end) for end in ends)
+        return cls(_number(data["value"]), _number(data["std"]), (low, high), str(data["unit"]))
+
+
+def _number(value: object) -> float:
+    if not isinstance(value, (int, float)):
+        raise TypeError(f"{value!r} is no number")
+    return float(value)

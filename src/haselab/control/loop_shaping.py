@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import math
 from dataclasses import dataclass
 
@@ -24,6 +25,7 @@ from haselab.models.plant import Plant
 
 __all__ = ["Design", "Prediction", "design_pi", "design_pid", "design_task", "predict"]
 
+_NAME_WIDTH = 28
 _MEMBERS = 12  # candidates a generation and unknown
 _GENERATIONS = 45
 _MOST_DELAY = 50  # updates; beyond, a search takes minutes
@@ -68,6 +70,33 @@ class Design:
     spread: tuple[Prediction, ...]
     shortfalls: tuple[str, ...]
     plausible: PlausibleMargins | None = None
+
+    def summary(self) -> str:
+        """Gains, margins and the predicted step, as a table of plain text.
+
+        Returns:
+            Lines for `print`.
+        """
+        margins, step = self.nominal.margins, self.nominal.step
+        rows = {
+            "kp": (self.gains.kp, ""),
+            "ki": (self.gains.ki, "1/s"),
+            "kd": (self.gains.kd, "s"),
+            "derivative_filter_s": (self.gains.derivative_filter_s, "s"),
+            "phase_margin_deg": (margins.phase_margin_deg, "deg"),
+            "gain_margin_db": (margins.gain_margin_db, "dB"),
+            "delay_margin_s": (margins.delay_margin_s, "s"),
+            "peak_sensitivity": (margins.peak_sensitivity, ""),
+            "crossover_rad_s": (margins.crossover_rad_s, "rad/s"),
+            "rise_time_s": (step.rise_time_s, "s"),
+            "overshoot": (step.overshoot, ""),
+            "settling_time_s": (step.settling_time_s, "s"),
+        }
+        lines = [f"{n:{_NAME_WIDTH}s} {v:12.6g}  {unit}".rstrip() for n, (v, unit) in rows.items()]
+        return "\n".join([*lines, *(f"Demand not met: {text}" for text in self.shortfalls)])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(self.summary())}</pre>"
 
 
 def design_pi(

@@ -1,4 +1,4 @@
-"""Controllers as an extension point: the protocol, declared parameters, and the registry."""
+"""The extension point for controllers: protocol, declared parameters, and registry."""
 
 from haselab.controllers.builtin import OpenLoop, PidController, pid_controller
 from haselab.controllers.kind import ChosenController, ControllerKind, Parameter

@@ -14,7 +14,7 @@ _GAIN = 1e9
 
 
 class PidController:
-    """The PID of the C core, in the bits of the microcontroller.
+    """The PID of the C core, with the same bits as on the microcontroller.
 
     Args:
         kp: proportional gain, dimensionless.
@@ -77,7 +77,7 @@ BUILTIN = {
 def pid_controller(
     kp: float, ki: float, kd: float = 0.0, derivative_filter_s: float = 0.0
 ) -> ChosenController:
-    """A PID with its gains.
+    """Create a PID with its gains.
 
     Args:
         kp: proportional gain, dimensionless.
@@ -87,7 +87,7 @@ def pid_controller(
     Returns:
         The controller, ready to be started.
     Raises:
-        InputError: a gain is negative or not finite.
+        InputError: A gain is negative or not finite.
     """
     gains = {"kp": kp, "ki": ki, "kd": kd, "derivative_filter_s": derivative_filter_s}
     return BUILTIN["pid"].choose(gains)

@@ -1,4 +1,4 @@
-"""A kind of controller declares its parameters; a chosen controller is a kind with values."""
+"""Kinds of controllers with declared parameters, and controllers with values for them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Parameter:
     Args:
         name: keyword of the controller's class and key of the section `[controller]`.
         unit: in SI, "" where it has none.
-        default: value where the section does not give one; None: it has to.
+        default: value if the section does not give one; None: the section must give one.
         low: lowest value that is accepted.
         high: highest one.
     """
@@ -40,10 +40,10 @@ class ControllerKind:
 
     Args:
         name: in `kind = "..."`.
-        make: class or function that takes the parameters by name and gives a `Controller`.
+        make: class or function that takes the parameters by name and returns a `Controller`.
         parameters: in the order in which the C step gets them.
         c_source: file with `hs_controller_init` and `hs_controller_step` for the microcontroller;
-            None: the kind runs on the computer alone.
+            None: the kind runs only on the computer.
     """
 
     name: str
@@ -54,15 +54,15 @@ class ControllerKind:
     def choose(
         self, values: Mapping[str, object] | None = None, source: object = ""
     ) -> ChosenController:
-        """Check values of the parameters.
+        """Check the values of the parameters.
 
         Args:
-            values: by name; a parameter that is left out takes its default.
-            source: file that they come from, for the message.
+            values: by name; a missing parameter takes its default.
+            source: file of the values, for the message.
         Returns:
             The controller, ready to be started.
         Raises:
-            InputError: unknown or missing parameters, values out of range; all in one line.
+            InputError: Parameters are unknown or missing, or values out of range; all in one line.
         Example:
             >>> kind = ControllerKind("gain", lambda k: None, (Parameter("k", "", 1.0, 0.0, 9.0),))
             >>> kind.choose({"k": 2}).values
@@ -91,7 +91,7 @@ class ControllerKind:
 
 
 def _fault(parameter: Parameter, value: object) -> str:
-    """What is wrong with a value; empty where it is good."""
+    """Return what is wrong with a value, or an empty text."""
     name = parameter.name
     unit = f" {parameter.unit}" if parameter.unit else ""
     if value is None:
@@ -116,7 +116,7 @@ class ChosenController:
     values: tuple[tuple[str, float], ...]
 
     def make(self) -> Controller:
-        """A new controller for one experiment."""
+        """Create a new controller for one experiment."""
         return self.kind.make(**dict(self.values))
 
     def table(self) -> dict[str, str | dict[str, float]]:

@@ -1,4 +1,4 @@
-"""What a controller gets and what it returns, once a block."""
+"""The protocol of a controller, which is called once per block."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["Controller", "ControllerSetting", "LinearisableController", "Measure
 
 @dataclass(frozen=True)
 class ControllerSetting:
-    """The loop that a controller is started in.
+    """Period and limits of the loop in which a controller is started.
 
     Args:
         period_s: time between two steps, in s.
@@ -28,17 +28,17 @@ class ControllerSetting:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What the sensors say at the end of a block.
+    """Measurement at the end of a block.
 
     Args:
         strain: measured strain; NaN where `valid` is False.
-        capacitance_f: that gave the strain, in F; NaN where the camera is the sensor.
-        voltage_v: drive voltage in force during the block, ahead of the amplifier, in V.
-        time_s: end of the block on the clock of the rig, in s.
-        valid: whether the strain can be used. While it is False, the output holds and what the
-            step returns is ignored; five such blocks in a row stop the run.
+        capacitance_f: from which the strain was computed, in F; NaN with the camera as sensor.
+        voltage_v: drive voltage in force during the block, at the amplifier's input, in V.
+        time_s: end of the block on the rig's clock, in s.
+        valid: whether the strain can be used. While it is False, the output is kept and the
+            result of the step is ignored; five such blocks in a row stop the run.
         in_range: whether the strain map was fitted at this capacitance. While it is False, the
-            strain is extrapolated and the map's band does not hold.
+            strain is extrapolated and the map's band is not valid.
     """
 
     strain: float
@@ -52,7 +52,7 @@ class Measurement:
 class Controller(Protocol):
     """One controller in one loop.
 
-    The drive is a strain: the static strain of the voltage that is put out. The voltage map of the
+    The drive is a strain: the static strain of the voltage to put out. The voltage map of the
     loop turns it into a voltage, so a controller that returns the reference is an open loop.
     """
 

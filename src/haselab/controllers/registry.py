@@ -1,4 +1,4 @@
-"""The registry: built-in kinds, and those that installed packages bring as entry points."""
+"""The registry of controllers: built-in kinds, and entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def controller_names() -> list[str]:
 
 
 def installed_controllers() -> list[tuple[str, str]]:
-    """Kinds that other packages have registered, without importing them.
+    """List the kinds of other packages without importing them.
 
     Returns:
         Name of the kind, and name and version of its package.
@@ -51,9 +51,9 @@ def controller_kind(name: str) -> ControllerKind:
     Args:
         name: as in `kind = "..."`.
     Returns:
-        The kind; the package that brings it is imported now.
+        The kind; its package is imported now.
     Raises:
-        InputError: no such kind, two packages with the same name, or a package that does not load.
+        InputError: The kind is unknown, registered twice, or its package does not load.
     """
     found = [point for point in _entry_points() if point.name == name]
     if len(found) + (name in BUILTIN) > 1:
@@ -67,7 +67,8 @@ def controller_kind(name: str) -> ControllerKind:
     if not found:
         raise InputError(
             f"No controller of kind {name!r} is registered. Known kinds: "
-            f"{', '.join(controller_names())}. Install the package that brings it, or change kind."
+            f"{', '.join(controller_names())}. Install the package that provides it, or change "
+            "kind."
         )
     return _loaded(found[0])
 
@@ -77,11 +78,11 @@ def chosen_controller(table: Mapping[str, object], source: object = "") -> Chose
 
     Args:
         table: its keys `kind` and `parameters`; without the latter, all other keys are parameters.
-        source: file that it comes from, for the message.
+        source: file of the section, for the message.
     Returns:
         The controller with all values checked.
     Raises:
-        InputError: no kind, an unknown one, or parameters that the kind does not accept.
+        InputError: The kind is missing or unknown, or does not accept the parameters.
     Example:
         >>> chosen_controller({"kind": "pi", "kp": 0.85, "ki": 1.5}).summary()
         'pi, kp = 0.85, ki = 1.5 1/s'
@@ -96,12 +97,12 @@ def chosen_controller(table: Mapping[str, object], source: object = "") -> Chose
 
 
 def parameters_of(table: Mapping[str, object]) -> dict[str, object]:
-    """The parameters in a section `[controller]`, not checked.
+    """Read the parameters in a section `[controller]` without checking them.
 
     Args:
         table: of the section.
     Returns:
-        Those of its table `parameters` where it has one, else all keys but `kind`.
+        The table `parameters` if there is one, else all keys except `kind`.
     Example:
         >>> parameters_of({"kind": "pi", "parameters": {"kp": 1.0}, "margins": {}})
         {'kp': 1.0}
@@ -119,14 +120,14 @@ def _entry_points() -> importlib.metadata.EntryPoints:
 def _loaded(point: importlib.metadata.EntryPoint) -> ControllerKind:
     try:
         kind = point.load()
-    except Exception as error:  # somebody else's package: whatever it raises
+    except Exception as error:  # another package may raise anything
         raise InputError(
             f"Controller {point.name!r} cannot be imported from {point.value}: "
-            f"{type(error).__name__}: {error}. Correct that package."
+            f"{type(error).__name__}: {error}. Fix or uninstall that package."
         ) from error
     if not isinstance(kind, ControllerKind) or kind.name != point.name:
         raise InputError(
             f"{point.value} is {getattr(kind, 'name', type(kind).__name__)!r}, not a "
-            f"ControllerKind with the name {point.name!r}. Correct the package's entry point."
+            f"ControllerKind with the name {point.name!r}. Fix the package's entry point."
         )
     return kind

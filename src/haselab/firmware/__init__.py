@@ -1,4 +1,4 @@
-"""The microcontroller's side: messages of its wire, frames, and what is compiled into it."""
+"""The microcontroller's messages, frames, and compiled-in settings."""
 
 from haselab.firmware.frames import (
     FrameReader,

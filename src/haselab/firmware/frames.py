@@ -1,4 +1,4 @@
-"""Frames of the wire: COBS, CRC-16 and the messages of the table in between."""
+"""Encode and decode frames: COBS, CRC-16 and the messages inside."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["FrameReader", "decode_message", "encode_message", "stuff", "unstuff"
 
 _HEADER = struct.Struct("<BH")
 _CRC = struct.Struct("<H")
-_LONGEST_RUN = 254  # bytes without a 0 that one COBS code tells
+_LONGEST_RUN = 254  # longest run of bytes without a 0 for one COBS code
 _KINDS = {kind.CODE: kind for kind in (*COMMANDS, *TELEMETRY)}
-_MOST_WAITING = 4096  # bytes without an end of frame, before they are given up
+_MOST_WAITING = 4096  # bytes without an end of frame before they are dropped
 
 
 def stuff(data: bytes) -> bytes:
-    """Bytes without a 0 among them: consistent overhead byte stuffing.
+    """Encode bytes without a 0: consistent overhead byte stuffing (COBS).
 
     Args:
         data: any bytes.
     Returns:
-        One byte more for each 254, no 0; the end of the frame is not put behind it.
+        One byte more for each 254, without a 0; the end of the frame is not appended.
     Source: Cheshire and Baker, IEEE/ACM Transactions on Networking 7 (1999), section 4.
     Example:
         >>> stuff(bytes([0x11, 0x22, 0x00, 0x33])).hex(" ")
@@ -42,12 +42,12 @@ def stuff(data: bytes) -> bytes:
 
 
 def unstuff(data: bytes) -> bytes | None:
-    """What `stuff` was given.
+    """Decode what `stuff` encoded.
 
     Args:
-        data: bytes of one frame, ahead of its 0.
+        data: bytes of one frame, before its 0.
     Returns:
-        The bytes, or None for what no `stuff` gives.
+        The bytes, or None if `stuff` cannot have encoded them.
     Example:
         >>> unstuff(bytes([3, 0x11, 0x22, 2, 0x33])).hex(" ")
         '11 22 00 33'
@@ -66,7 +66,7 @@ def unstuff(data: bytes) -> bytes | None:
 
 
 def encode_message(message: Any, sequence: int) -> bytes:
-    """A message as a frame with its end.
+    """Encode a message as a frame with its end.
 
     Args:
         message: one of `haselab.firmware.messages`.
@@ -74,7 +74,7 @@ def encode_message(message: Any, sequence: int) -> bytes:
     Returns:
         COBS(code, sequence, fields, CRC) and a 0.
     Raises:
-        InputError: a field does not fit its type.
+        InputError: A field does not fit its type.
     Example:
         >>> from haselab.firmware.messages import Hello
         >>> encode_message(Hello(1), 1).hex(" ")
@@ -87,19 +87,20 @@ def encode_message(message: Any, sequence: int) -> bytes:
         body = struct.pack(message.LAYOUT, *values)
     except (struct.error, OverflowError) as error:
         raise InputError(
-            f"{type(message).__name__}: {error}; allowed is what its types hold. Correct the value."
+            f"A field of {type(message).__name__} does not fit its type ({error}). Change its "
+            "value."
         ) from None
     data = _HEADER.pack(message.CODE, sequence & 0xFFFF) + body
     return stuff(data + _CRC.pack(binascii.crc_hqx(data, 0xFFFF))) + b"\0"
 
 
 def decode_message(frame: bytes) -> tuple[Any, int] | None:
-    """The message of a frame.
+    """Decode the message of a frame.
 
     Args:
-        frame: its bytes ahead of the 0.
+        frame: its bytes before the 0.
     Returns:
-        `(message, sequence)`, or None for what is not whole or not in the table.
+        `(message, sequence)`, or None if the frame is damaged or the message unknown.
     """
     data = unstuff(frame)
     if data is None or len(data) < _HEADER.size + _CRC.size:
@@ -116,7 +117,7 @@ def decode_message(frame: bytes) -> tuple[Any, int] | None:
 
 
 def _build(kind: type[Any], values: tuple[Any, ...]) -> Any:
-    """Values into fields; a field of many takes what the others leave."""
+    """Assign values to fields; an array field takes the remaining values."""
     own = fields(kind)
     many = len(values) - len(own) + 1
     parts: list[Any] = []
@@ -131,19 +132,19 @@ def _build(kind: type[Any], values: tuple[Any, ...]) -> Any:
 
 
 class FrameReader:
-    """Bytes as they come to messages; what is not whole is counted and dropped."""
+    """Decodes messages from received bytes; damaged frames are counted and dropped."""
 
     def __init__(self) -> None:
         self._waiting = bytearray()
         self.bad_frames = 0
 
     def feed(self, data: bytes) -> list[tuple[Any, int]]:
-        """Take bytes.
+        """Decode received bytes.
 
         Args:
-            data: from the wire.
+            data: received bytes.
         Returns:
-            `(message, sequence)` of each frame that they end.
+            `(message, sequence)` of each frame that they complete.
         """
         self._waiting += data
         *whole, rest = bytes(self._waiting).split(b"\0")

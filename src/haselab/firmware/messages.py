@@ -21,6 +21,7 @@ __all__ = [
     "KeepAlive",
     "Reason",
     "RequestArming",
+    "Result",
     "Run",
     "SetReference",
     "SetTelemetry",
@@ -28,7 +29,6 @@ __all__ = [
     "Status",
     "Stop",
     "Trace",
-    "Verdict",
 ]
 
 VERSION = 2
@@ -48,14 +48,14 @@ class Fault(IntEnum):
     """Why it tripped; latched until clear_fault."""
 
     NONE = 0
-    BREAKDOWN = 1  # a monitor at its range end, or a collapsed level; from the interrupt
+    BREAKDOWN = 1  # a monitor at the end of its range, or a collapsed level
     SENSING = 2  # no plausible strain in too many updates
     LINK = 3  # no message from the computer; the output was ramped down
     LATE = 4  # updates not completed; detected in the sampling interrupt
-    NOT_FINITE = 5  # the drive was NaN or beyond its limits: memory was damaged
-    WATCHDOG = 6  # the watchdog reset the chip
+    NOT_FINITE = 5  # the drive was NaN or outside its limits: memory was damaged
+    WATCHDOG = 6  # the watchdog reset the microcontroller
     BROWN_OUT = 7  # the supply dipped
-    ASTRAY = 9  # the high voltage does not follow its set point
+    ASTRAY = 9  # the high voltage differs from the requested one
     LOST_STATE = 8  # the state machine's memory was damaged
 
 
@@ -68,7 +68,7 @@ class Alarm(IntFlag):
 
 
 class Reason(IntFlag):
-    """Why there is no strain; bits of core/include/hs.h, and two that only the chip has."""
+    """Why there is no strain; bits of core/include/hs.h and two of the firmware."""
 
     AMPLITUDE_LOST = 1  # no carrier on one of the monitors
     PHASE_OUT = 2  # the phase is not that of a capacitor
@@ -89,22 +89,22 @@ class Event(IntEnum):
     CLEAR = 6
 
 
-class Verdict(IntEnum):
+class Result(IntEnum):
     """Result of a command."""
 
     ACCEPTED = 0
-    UNKNOWN = 1  # no such command, or wrong length
+    UNKNOWN = 1  # unknown command, or wrong length
     BAD_VERSION = 2  # send hello with this version first
-    BAD_STATE = 3  # not in this state
-    BAD_TOKEN = 4  # wrong token, or too late
-    BAD_VALUE = 5  # outside the limits that were compiled in
+    BAD_STATE = 3  # not possible in this state
+    BAD_TOKEN = 4  # wrong or expired token
+    BAD_VALUE = 5  # outside the compiled-in limits
     NOT_READY = 6  # no valid strain yet
 
 
 @dataclass(frozen=True)
 class Hello:
-    """States the version of this table that the computer uses; answered by identity. Only while
-    the output is off: it restarts the sequence numbers.
+    """Connects with a version of this table; the reply is identity. Only while the output is off:
+    it restarts the sequence numbers.
 
     Args:
         version: of this table.
@@ -154,7 +154,7 @@ class Run:
 
 @dataclass(frozen=True)
 class SetReference:
-    """New desired strain while the loop is closed; also counts as keep_alive.
+    """New desired strain while the loop is closed; also keeps the link alive.
 
     Args:
         reference: desired strain.
@@ -168,7 +168,7 @@ class SetReference:
 
 @dataclass(frozen=True)
 class KeepAlive:
-    """The program is still running: without this message the output is ramped down."""
+    """Keeps the link alive; without it the output is ramped down."""
 
     CODE: ClassVar[int] = 6
     LAYOUT: ClassVar[str] = "<"
@@ -192,7 +192,7 @@ class ClearFault:
 
 @dataclass(frozen=True)
 class SetTelemetry:
-    """How often status is sent, and whether every update is reported in full.
+    """Sets how often status is sent, and whether every update is traced.
 
     Args:
         every: updates from one status to the next; 0: none.
@@ -208,13 +208,13 @@ class SetTelemetry:
 
 @dataclass(frozen=True)
 class Identity:
-    """Answer to hello.
+    """Reply to hello.
 
     Args:
         version: of this table.
-        settings: CRC-32 of the settings that were compiled in.
+        settings: CRC-32 of the compiled-in settings.
         rate_hz: updates per second.
-        supply: code of the chip's 1.1 V reference relative to its supply, 10 bits; 0: not measured.
+        supply: code of the 1.1 V reference relative to the supply, 10 bits; 0: not measured.
     """
 
     CODE: ClassVar[int] = 65
@@ -228,12 +228,12 @@ class Identity:
 
 @dataclass(frozen=True)
 class Ack:
-    """Answer to every other command.
+    """Reply to every other command.
 
     Args:
-        command: its code.
-        answered: its sequence.
-        verdict: see verdicts.
+        command: code of the command.
+        answered: sequence number of the command.
+        result: see results.
         token: for confirm_arming; else 0.
     """
 
@@ -242,25 +242,25 @@ class Ack:
 
     command: int
     answered: int
-    verdict: int
+    result: int
     token: int
 
 
 @dataclass(frozen=True)
 class Status:
-    """The state at regular times.
+    """The state, sent at regular times.
 
     Args:
         update: number of the update, modulo 65536.
         state: see states.
         fault: why it tripped, see faults.
-        reason: why there is no strain, see reasons; 0: strain is valid.
+        reason: why there is no strain, see reasons; 0: the strain is valid.
         strain: measured strain; 0 without one.
         capacitance_f: measured capacitance, in F; 0 without one.
         code: of the output converter, 0.5 mV each.
         busy_cycles: longest update since the last status, in CPU cycles.
         overruns: updates that were not ready in time, modulo 256.
-        bad_frames: incomplete or damaged frames, modulo 256.
+        bad_frames: damaged frames, modulo 256.
     """
 
     CODE: ClassVar[int] = 67
@@ -280,7 +280,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Trace:
-    """One update in full: all its inputs and results.
+    """One update in full: its latched inputs and its results.
 
     Args:
         update: number of the update, modulo 65536.

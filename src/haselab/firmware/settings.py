@@ -1,4 +1,4 @@
-"""What is compiled into the chip: gains, maps, limits, as a C header with its own checksum."""
+"""Settings compiled into the firmware: gains, maps and limits, as a C header with a checksum."""
 
 from __future__ import annotations
 
@@ -35,25 +35,24 @@ OUTPUT_V_PER_CODE = _OUTPUT_V / _OUTPUT_CODES
 _TABLE_STEPS = 32
 _PARAMETERS = 8  # HS_CONTROLLER_PARAMETERS of core/include/hs_controller.h
 _BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
-_FALLS = 5.0  # of the fastest drive that the level may lose in a frame
-_MARGIN = 0.1  # strain beyond the saturation that is still plausible: rest at 0 V, creep
+_FALLS = 5.0  # largest fall of the level per frame, relative to the fastest drive
+_MARGIN = 0.1  # plausible strain beyond the saturation: 0 V, creep
 
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """From the high voltage to codes, and from the output's code to the high voltage.
+    """Analogue front end: from high voltage to codes, and from the output's code to high voltage.
 
     Args:
         gain: of the high-voltage module, V of its output for one of its input.
         volt_per_monitor_volt: of its voltage monitor.
         ampere_per_monitor_volt: of its current monitor.
-        v_stage: gain of the band-pass stage ahead of the voltage channel, at mid-band.
-        i_stage: the same of the current channel.
+        v_stage: mid-band gain of the band-pass stage before the voltage channel.
+        i_stage: the same for the current channel.
         carrier_high_v: expected peak amplitude of the carrier at the actuator, in V.
-        correction: measured admittance over the one that these numbers give, complex; from a
-            reference capacitor.
-        converter_v: range of the chip's converter, in V.
-        converter_codes: of it; the readings are 0 to one less.
+        correction: complex ratio of measured to computed admittance, from a reference capacitor.
+        converter_v: range of the microcontroller's converter, in V.
+        converter_codes: number of its codes.
     """
 
     gain: float = 5000.0
@@ -68,7 +67,7 @@ class FrontEnd:
 
     @property
     def admittance_scale_s(self) -> complex:
-        """Admittance, in S, for equal phasors of both channels, turned back by their skew."""
+        """Admittance, in S, for equal phasors of both channels, corrected for their skew."""
         ampere = self.ampere_per_monitor_volt / self.i_stage
         volt = self.volt_per_monitor_volt / self.v_stage
         turn = cmath.exp(-2j * math.pi * CARRIER_HZ * _SKEW_S)
@@ -76,18 +75,18 @@ class FrontEnd:
 
     @property
     def level_per_code(self) -> float:
-        """Codes of the level for one of the output."""
+        """Level codes per output code."""
         volt = _OUTPUT_V / _OUTPUT_CODES * self.gain / self.volt_per_monitor_volt
         return volt * self.converter_codes / self.converter_v
 
     @property
     def skew_s(self) -> float:
-        """From a reading of the voltage to the next one of the current, in s."""
+        """Time from a voltage reading to the next current reading, in s."""
         return _SKEW_S
 
     @property
     def volt_per_code(self) -> float:
-        """Of the converter that reads the monitors, in V."""
+        """Resolution of the converter that reads the monitors, in V."""
         return self.converter_v / self.converter_codes
 
     @property
@@ -97,7 +96,7 @@ class FrontEnd:
 
     @property
     def i_stage_at_carrier(self) -> float:
-        """The same of the current channel."""
+        """Gain of the current channel's stage at the carrier."""
         return self.i_stage * _BAND_PASS
 
     @property
@@ -109,14 +108,14 @@ class FrontEnd:
 
 @dataclass(frozen=True)
 class ControllerStep:
-    """A controller of one's own in C, compiled in place of the PID.
+    """A user's controller in C, compiled in place of the PID.
 
     Args:
         kind: its name.
         parameters: names and values, in the order in which the C step gets them.
         source: text of the C file, see core/include/hs_controller.h.
     Raises:
-        InputError: more parameters than the header has places for.
+        InputError: There are more parameters than the header can hold.
     """
 
     kind: str
@@ -133,7 +132,7 @@ class ControllerStep:
 
 @dataclass(frozen=True)
 class ChipSettings:
-    """Everything that `firmware/app` takes as constant.
+    """All constants of `firmware/app`.
 
     Args:
         kp: strain per strain.
@@ -149,14 +148,14 @@ class ChipSettings:
         drive_high_v: highest drive, in V.
         rise_v_per_s: fastest change of the drive, in V/s.
         ramp_v_per_s: the same when ramping down.
-        link_s: without a sign of life before the ramp, in s.
-        settle_s: after arming until the strain must be valid, in s.
+        link_s: longest time without a message from the computer before the ramp, in s.
+        settle_s: time after arming until the strain must be valid, in s.
         blind_updates: updates without a strain that trip it.
-        level_off: part of its range by which the high voltage may be off.
-        astray_updates: updates with more than that that trip it.
-        own: a controller of one's own in place of the PID, whose gains then do not count.
+        level_off: largest deviation of the high voltage, as a fraction of its range.
+        astray_updates: updates with a larger deviation that trip it.
+        own: a user's controller in place of the PID, whose gains are then not used.
         usable_f: capacitances for which the strain map may be used, in F, see
-            `StrainMap.usable_f`; None: not known.
+            `StrainMap.usable_f`; None: unknown.
     """
 
     kp: float
@@ -184,19 +183,19 @@ class ChipSettings:
                    *self.strain_map]  # fmt: skip
         if not np.isfinite(numbers).all() or not self.strain_low < self.strain_high:
             raise InputError(
-                f"Settings of the chip: {numbers}; allowed are finite numbers, the saturation's "
+                f"The microcontroller's settings {numbers} must be finite, and the saturation's "
                 "low end below its high end. Design the controller again."
             )
         if not 0.0 < self.drive_high_v < _OUTPUT_V:
             raise InputError(
-                f"drive_high_v = {self.drive_high_v:g} V, allowed is (0, {_OUTPUT_V:g}) V, what "
-                "the chip's converter reaches. Lower it."
+                f"drive_high_v is {self.drive_high_v:g} V, but it must be above 0 and below the "
+                f"converter's {_OUTPUT_V:g} V. Change drive_high_v."
             )
         table = self.table_v
         if not (np.diff(table) > 0.0).all() or table[0] < 0.0 or table[-1] > self.drive_high_v:
             raise InputError(
-                f"The voltage map goes from {table[0]:g} V to {table[-1]:g} V over the saturation; "
-                f"allowed is a rise within [0, {self.drive_high_v:g}] V. Narrow the saturation or "
+                f"The voltage map goes from {table[0]:g} V to {table[-1]:g} V over the saturation, "
+                f"but it must rise within [0, {self.drive_high_v:g}] V. Narrow the saturation, or "
                 "raise drive_high_v."
             )
 
@@ -208,7 +207,7 @@ class ChipSettings:
 
     @property
     def sensing(self) -> tuple[float, float, int, int, int]:
-        """Of `hs_quadrature_config`: the turn, in 1/F, and the squares of amplitudes that count."""
+        """Fields of `hs_quadrature_config`: the turn, in 1/F, and range of squared amplitudes."""
         turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
         v_low, v_high, i_low = (
             round((4.0 * share * self.front_end.carrier_codes) ** 2) for share in (0.6, 1.4, 0.2)
@@ -227,8 +226,8 @@ class ChipSettings:
             real = [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
             if not real:
                 raise InputError(
-                    f"The strain map reaches no strain of {strain:g}; allowed is one that covers "
-                    f"the saturation with {_MARGIN:g} beyond. Fit it over a wider range."
+                    f"The strain map does not reach a strain of {strain:g}, but it must cover the "
+                    f"saturation with a margin of {_MARGIN:g}. Fit it over a wider range."
                 )
             ends.append(min(real))
         usable_low_f, usable_high_f = self.usable_f or (0.0, math.inf)
@@ -243,7 +242,7 @@ class ChipSettings:
 
 
 def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
-    """Settings as JSON holds them.
+    """Read settings from their JSON form.
 
     Args:
         data: the fields of `ChipSettings`, those of its front end among them, `correction` as real
@@ -251,7 +250,7 @@ def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
     Returns:
         The settings.
     Raises:
-        InputError: a field is missing, unknown or out of range.
+        InputError: A field is missing, unknown or out of range.
     """
     fields = dict(data)
     try:
@@ -269,7 +268,7 @@ def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
         return ChipSettings(**fields, front_end=FrontEnd(**front))
     except (KeyError, TypeError) as error:
         raise InputError(
-            f"Settings of a chip: {error}; allowed are the fields of ChipSettings. Record again."
+            f"The recorded microcontroller settings are not valid ({error}). Record again."
         ) from None
 
 
@@ -282,20 +281,20 @@ def settings_header(settings: ChipSettings) -> str:
     """settings.h for firmware/app.
 
     Args:
-        settings: what it holds.
+        settings: its contents.
     Returns:
-        The text; its `crc` is the CRC-32 of all the rest, which the chip tells in its identity.
+        The text; its `crc` is the CRC-32 of the rest, which the firmware reports in its identity.
     """
     return _body(settings).replace("@CRC@", f"0x{settings_crc(settings):08x}u")
 
 
 def settings_crc(settings: ChipSettings) -> int:
-    """Checksum by which a chip and a computer know that they hold the same settings.
+    """Checksum by which microcontroller and computer check that they have the same settings.
 
     Args:
         settings: gains, maps and limits.
     Returns:
-        CRC-32 of settings.h without itself.
+        CRC-32 of settings.h without the checksum.
     """
     return zlib.crc32(_body(settings).replace("@CRC@", "").encode("ascii"))
 
@@ -305,7 +304,7 @@ def _row(*values: float) -> str:
 
 
 def _own_entries(s: ChipSettings, period_s: float) -> list[tuple[str, str]]:
-    """What the controller itself takes: gains of the PID, or parameters of somebody's own."""
+    """Parameters of the controller: gains of the PID, or those of a user's controller."""
     if s.own is not None:
         values = [value for _, value in s.own.parameters]
         return [("controller.own.parameter", _row(*(values or [0.0])))]
@@ -316,7 +315,7 @@ def _own_entries(s: ChipSettings, period_s: float) -> list[tuple[str, str]]:
 
 
 def _title(s: ChipSettings) -> str:
-    """The first line; the source of somebody's own controller is part of the checksum by it."""
+    """First line of the header, which includes a user's controller in the checksum."""
     if s.own is None:
         return "/* Generated by haselab firmware build: change the model or the controller. */"
     source = zlib.crc32(s.own.source.encode())

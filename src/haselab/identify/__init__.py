@@ -3,6 +3,7 @@
 from haselab.identify.creep.fit import CreepFit, fit_creep
 from haselab.identify.experiment_design.drives import BenchLimits
 from haselab.identify.experiment_design.plan import Accuracy, ExperimentPlan, plan_experiment
+from haselab.identify.fit import CurveFit, Fit, Prediction, RecordFit
 from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.identify.frequency.charts import BodeChart, NicholsChart, NyquistChart
 from haselab.identify.frequency.fit import ResponseFit, fit_response
@@ -28,6 +29,7 @@ from haselab.identify.model_comparison.voltage_plant import (
 from haselab.identify.nonlinear.hammerstein import fit_hammerstein
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
 from haselab.identify.nonlinear.oscillator import fit_output_curve, fit_spring
+from haselab.identify.prediction import predict
 from haselab.identify.record import Record
 from haselab.identify.sampled.arx import ArxFit, ArxOrders, fit_arx
 from haselab.identify.sampled.subspace import SubspaceFit, fit_subspace
@@ -57,7 +59,9 @@ __all__ = [
     "BodeChart",
     "CapacitanceMapFit",
     "CreepFit",
+    "CurveFit",
     "ExperimentPlan",
+    "Fit",
     "FreeResponseFit",
     "FreeTrial",
     "FrequencyResponse",
@@ -68,7 +72,9 @@ __all__ = [
     "NicholsChart",
     "NonlinearFit",
     "NyquistChart",
+    "Prediction",
     "Record",
+    "RecordFit",
     "Region",
     "RegionsFit",
     "ResponseFit",
@@ -109,5 +115,6 @@ __all__ = [
     "linear_mode_hypotheses",
     "mode_hypotheses",
     "plan_experiment",
+    "predict",
     "reading_hypotheses",
 ]

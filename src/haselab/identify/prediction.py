@@ -2,47 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.identify.noise import fit_percent
+from haselab.identify.fit import Prediction
 from haselab.identify.record import Record
 from haselab.models.plant import Plant
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 
-__all__ = ["Prediction", "predict"]
+__all__ = ["fitted_output", "predict"]
 
 Floats = NDArray[np.float64]
 _DRAWS = 100
 _HALF_WIDTH = 1.959963984540054  # standard deviations of a 95 % interval
 _SLOWEST = 10.0  # lengths of a record beyond which a free response is a straight line
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """A record beside what a model says of it.
-
-    Args:
-        fit_percent: NRMSE fit: 100 is perfect, 0 no better than the mean.
-        rms_error: root mean square of measured minus predicted, in the unit of the output.
-        inside_band: share of the samples inside the 95 % band; NaN where there is no band.
-        predicted: of all records, one after the other. Shape `(M,)`.
-        half_band: half the width of the band at each sample. Shape `(M,)`; empty without a band.
-        measured: of all records. Shape `(M,)`.
-    """
-
-    fit_percent: float
-    rms_error: float
-    inside_band: float
-    predicted: Floats
-    half_band: Floats
-    measured: Floats
 
 
 def predict(
@@ -81,33 +58,32 @@ def predict(
     """
     if not records:
         raise InputError("There is no record to predict. Name a file with one.")
-    modelled = [_fitted(model, record, free_start) for record in records]
-    measured = [record.y for record in records]
-    error = np.concatenate(measured) - np.concatenate(modelled)
-    half = np.zeros(0)
+    modelled = [fitted_output(model, record, free_start) for record in records]
+    half = None
     if posterior is not None:
         spread = [_spread(posterior, record, free_start, rng) for record in records]
         half = _HALF_WIDTH * np.sqrt(np.concatenate(spread) ** 2 + noise_std**2)
-    return Prediction(
-        fit_percent=fit_percent(measured, modelled),
-        rms_error=float(np.sqrt(np.mean(error**2))),
-        inside_band=float(np.mean(np.abs(error) <= half)) if half.size else math.nan,
-        predicted=np.concatenate(modelled),
-        half_band=half,
-        measured=np.concatenate(measured),
-    )
+    return Prediction.of([record.y for record in records], modelled, half)
 
 
 def _spread(
     posterior: PlantPosterior, record: Record, free_start: bool, rng: np.random.Generator
 ) -> Floats:
     """Standard deviation of the prediction over plausible plants. Shape `(M,)`."""
-    drawn = [_fitted(plant, record, free_start) for plant in posterior.draw(_DRAWS, rng)]
+    drawn = [fitted_output(plant, record, free_start) for plant in posterior.draw(_DRAWS, rng)]
     return np.asarray(np.std(drawn, axis=0, ddof=1))
 
 
-def _fitted(model: Plant | RationalModel, record: Record, free_start: bool) -> Floats:
-    """The model's output, with the initial state and constant that suit the record best."""
+def fitted_output(model: Plant | RationalModel, record: Record, free_start: bool = True) -> Floats:
+    """The model's output, with the initial state and constant that suit the record best.
+
+    Args:
+        model: that predicts.
+        record: its input is played, its output the state is fitted to.
+        free_start: fit them; False: the record starts at rest at 0.
+    Returns:
+        Output. Shape `(M,)`.
+    """
     # with a free start the constant takes up what the level before the record does
     level = float(record.u[0]) if free_start else 0.0
     output = model.simulate(record.u - level, record.input_rate_hz, record.output_time_s)

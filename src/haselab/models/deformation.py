@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, LimitError
+from haselab.base import InputError, JsonObject, LimitError
 
 __all__ = ["DEFORMATIONS", "Deformation"]
 
@@ -80,7 +80,7 @@ class Deformation:
         side = self.lateral_stretch if self.kind == "fixed_lateral" else 1.0
         return x, np.full(x.shape, side)
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> JsonObject:
         """Kind and the numbers that it needs."""
         needed = {"fixed_lateral": "lateral_stretch", "prestretched": "prestretch"}.get(self.kind)
         return {"kind": self.kind, **({needed: getattr(self, needed)} if needed else {})}

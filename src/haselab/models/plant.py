@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.models.held_input import HeldInput
 
 __all__ = ["Plant", "SlowMode"]
@@ -168,7 +168,7 @@ class Plant:
             total = total + value * np.exp(-time_s / mode.time_constant_s)
         return np.ascontiguousarray(total.real)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The form that `model.json` keeps under the key `plant`."""
         return {
             "gain": self.gain,

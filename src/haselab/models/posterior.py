@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.rational import RationalModel
 
@@ -233,7 +233,7 @@ class PlantPosterior:
         model = RationalModel(tuple(top[::-1].tolist()), tuple(bottom.tolist()), delay_s)
         return model.beside(slow)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The form that a model file keeps under the key `covariance`."""
         return {
             "names": list(self.names),

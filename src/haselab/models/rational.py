@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.models.held_input import HeldInput
 from haselab.models.plant import Plant, SlowMode
 
@@ -238,7 +238,7 @@ class RationalModel:
             )
         return np.asarray(fast, dtype=np.float64), real
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The general form in JSON."""
         return {
             "numerator": list(self.numerator),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.models.filters import lfilter
 from haselab.models.plant import Plant, SlowMode
 
@@ -225,7 +225,7 @@ class VoltagePlant:
         shapes = self.shapes(drive_v, rate_hz, time_s, slew_v_s)
         return np.asarray(shapes @ np.array(self.gains))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The form that a file keeps under the key `voltage_plant`."""
         return {
             "creep": self.creep,

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from haselab.base import InputError, ResultError
+from haselab.base import InputError, ResultError, table_at
 from haselab.sensing.calibration import Calibration, Reference, ReferenceReading, fit_calibration
 from haselab.store.folder import write_text
 from haselab.store.toml import read_toml, validated
@@ -124,8 +124,8 @@ def load_calibration(path: Path) -> Calibration:
         InputError: no such file, an error in it, or numbers that contradict its references.
     """
     data = read_toml(path, "calibration file")
-    if isinstance(data.get("sensing"), dict):
-        data = {key: data["sensing"][key] for key in _File.model_fields if key in data["sensing"]}
+    if sensing := table_at(data, "sensing"):
+        data = {key: sensing[key] for key in _File.model_fields if key in sensing}
         if "scale_s" not in data:
             raise InputError(
                 "[sensing] has no calibration. Add one with: haselab calibrate --actuator "

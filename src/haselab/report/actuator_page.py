@@ -1,4 +1,4 @@
-"""The page of one actuator: what its file knows, with intervals, and what is still missing."""
+"""The page of one actuator: the content of its file, with intervals, and what is missing."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ Row = tuple[str, str, str, str]  # name, unit, value, 95 % interval
 
 @dataclass(frozen=True)
 class ActuatorReport:
-    """What the page is made from.
+    """Input of the page.
 
     Args:
-        sections: of the actuator file, as they are.
+        sections: of the actuator file, unchecked.
         tables: the same, checked.
-        plant: of `[model]`; None: there is none yet.
-        posterior: numbers of the plant with their covariance; None: there is none.
+        plant: of `[model]`; None: there is no model yet.
+        posterior: parameters of the plant with their covariance; None: there is none.
     """
 
     sections: Mapping[str, Any]
@@ -85,10 +85,10 @@ class _Part:
 
 
 def missing_sections(report: ActuatorReport) -> dict[str, str]:
-    """Sections that the file does not have yet, and the command that writes each.
+    """List sections that the file does not have yet, and the command that writes each.
 
     Args:
-        report: what the page is made from.
+        report: input of the page.
     Returns:
         Commands by the name of the section.
     """
@@ -104,12 +104,12 @@ def missing_sections(report: ActuatorReport) -> dict[str, str]:
 
 
 def actuator_page(report: ActuatorReport) -> str:
-    """One self-contained HTML document.
+    """Compose one self-contained HTML document.
 
     Args:
-        report: what it shows.
+        report: input of the page.
     Returns:
-        The page; equal input gives equal bytes.
+        The page; the same input gives the same bytes.
     """
     absent = missing_sections(report)
     charts = _charts(report)
@@ -145,7 +145,7 @@ def _packaged(name: str) -> str:
 
 
 def _provenance(table: Any, name: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The tables of `[provenance]` by the section that they belong to."""
+    """The tables of `[provenance]` by section."""
     if not isinstance(table, Mapping):
         return
     if "command" in table:
@@ -178,7 +178,7 @@ def _rows_of(report: ActuatorReport, name: str) -> Iterator[Row]:
 
 
 def _flat(table: Mapping[str, Any], name: str = "") -> Iterator[tuple[str, Any]]:
-    """Values by their dotted names; a deviation follows the value that it belongs to."""
+    """Values by dotted name; a standard deviation follows its value."""
     for key, item in table.items():
         place = f"{name}.{key}" if name else str(key)
         if isinstance(item, Mapping):
@@ -208,7 +208,7 @@ def _unit(key: str) -> str:
 
 
 def _intervals(report: ActuatorReport, name: str) -> dict[str, Estimate]:
-    """Numbers of a section whose covariance the file holds."""
+    """Parameters of a section whose covariance is in the file."""
     tables = report.tables
     if name == "model" and report.posterior is not None:
         p = report.posterior
@@ -243,19 +243,19 @@ def _charts(report: ActuatorReport) -> dict[str, tuple[Chart, str]]:
     tables = report.tables
     if tables.sensing.strain_map is not None and tables.sensing.strain_map.range_f is not None:
         to_strain = tables.strain_map()
-        caption = "The map over the capacitances of the record that was fitted"
+        caption = "The map over the capacitances of the fitted record"
         if to_strain.band is not None:
             caption += f", with the band that contains {100 * to_strain.coverage:g} % of the record"
         found["sensing.strain_map"] = _strain_chart(to_strain), f"{caption}."
     if tables.drive.voltage_map is not None:
         found["drive.voltage_map"] = (
             _voltage_chart(tables.voltage_map()),
-            "The drive voltage, before the amplifier, that holds a strain.",
+            "The drive voltage, before the amplifier, at a constant strain.",
         )
     if report.plant is not None:
         caption = "Frequency response of the model"
         if report.posterior is not None:
-            caption += ", with its 95 % interval by the covariance"
+            caption += ", with its 95 % interval from the covariance"
         found["model"] = _bode_chart(report.plant, report.posterior), f"{caption}."
     return found
 

@@ -24,7 +24,7 @@ from haselab.report.style import (
 )
 from haselab.store.folder import drafted, write_text
 
-__all__ = ["CHART_ENDINGS", "draw_chart", "write_chart", "write_figure"]
+__all__ = ["CHART_ENDINGS", "ChartFigure", "draw_chart", "write_chart", "write_figure"]
 
 CHART_ENDINGS = (".svg", ".png", ".html")
 _MOST_SAMPLES = 5000
@@ -32,17 +32,37 @@ _Z95 = 1.96
 _WIDTH_IN, _PANEL_IN, _REST_IN = 6.3, 2.1, 0.9
 
 
-def draw_chart(chart: Chart) -> Figure:
+class ChartFigure(Figure):
+    """A matplotlib figure of a chart, which a notebook shows as it is."""
+
+    @classmethod
+    def of(cls, chart: Chart) -> ChartFigure:
+        """Draw a chart in the style of all figures.
+
+        Args:
+            chart: what to show.
+        Returns:
+            The figure.
+        """
+        with figure_style():
+            return draw_chart(chart)
+
+    def _repr_svg_(self) -> str:
+        with figure_style():
+            return to_svg(self, "chart", self.get_suptitle())
+
+
+def draw_chart(chart: Chart) -> ChartFigure:
     """Draw a chart.
 
     Args:
         chart: what to show.
     Returns:
-        The figure; save it inside `figure_style`.
+        The figure; draw and save it inside `figure_style`.
     """
     count = len(chart.panels)
     height_in = _PANEL_IN * max(count, 1.5) + _REST_IN
-    figure = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
+    figure = ChartFigure(figsize=(_WIDTH_IN, height_in), layout="constrained")
     axes = figure.subplots(count, 1, sharex=chart.shared_x, squeeze=False)[:, 0]
     for place, (ax, panel) in enumerate(zip(axes, chart.panels, strict=True)):
         _draw_panel(ax, panel)

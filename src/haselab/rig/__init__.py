@@ -1,4 +1,4 @@
-"""A bench and its devices: the protocols, and what is known of a bench."""
+"""A bench and its devices: protocols and description."""
 
 from haselab.rig.protocols import (
     Acquisition,

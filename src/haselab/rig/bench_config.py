@@ -1,4 +1,4 @@
-"""RIG.toml of a real bench: every device with its address, its serial number and its limits."""
+"""RIG.toml of a real bench: every device with its address, serial number and limits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ __all__ = [
     "SupplyField",
 ]
 
-_EXPOSURE_SHARE = 0.05  # exposures come in steps of the camera's line time
+_EXPOSURE_SHARE = 0.05  # exposures are multiples of the camera's line time
 
 DaqField = Annotated[SerializeAsAny[DaqConfig], ByKind("daq")]
 GeneratorField = Annotated[SerializeAsAny[GeneratorConfig], ByKind("generator")]
@@ -49,7 +49,7 @@ class InstrumentOfFile:
     """One instrument of a rig file.
 
     Args:
-        section: that it has in the file.
+        section: its section in the file.
         instrument: its driver.
         config: the section.
     """
@@ -85,34 +85,36 @@ class BenchOutputs:
 
 
 class AmplifierConfig(PrintableSection):
-    """High-voltage amplifier: analogue in, analogue out, nothing to ask it."""
+    """High-voltage amplifier, which has only analogue inputs and outputs."""
 
-    name: str = Field(min_length=1, description="make and number; calibrations hold for it alone")
+    name: str = Field(
+        min_length=1, description="make and number; calibrations are valid only for this one"
+    )
     gain: float = Field(5000.0, gt=0)
     volt_per_monitor_volt: float = Field(5000.0, gt=0)
     ampere_per_monitor_volt: float = Field(2e-3, gt=0)
 
 
 class StandConfig(PrintableSection):
-    """Who hangs weights: a person, or the twin behind the wire."""
+    """Who hangs masses: a person, or a served twin."""
 
     kind: Literal["operator", "twin"] = "operator"
     address: str | None = Field(None, description="host:port of the twin")
     lock_step: bool = Field(
-        False, description="the twin's time passes only as readings are requested: nobody is late"
+        False, description="the twin's time advances only when samples are read, so nothing is late"
     )
 
     @model_validator(mode="after")
     def _address(self) -> Self:
         if (self.kind == "twin") != (self.address is not None):
-            raise ValueError("an address belongs to kind = 'twin', and to it alone")
+            raise ValueError("give an address if kind = 'twin', and only then")
         if self.lock_step and self.kind != "twin":
-            raise ValueError("lock_step belongs to kind = 'twin', and to it alone")
+            raise ValueError("lock_step can be set only if kind = 'twin'")
         return self
 
 
 class SpecimenConfig(PrintableSection):
-    """What hangs in the bench, by calipers and balance."""
+    """The actuator in the bench, measured with calipers and a balance."""
 
     shell_width_m: float = Field(gt=0)
     shell_thickness_m: float = Field(gt=0)
@@ -131,21 +133,23 @@ class BenchConfig(PrintableSection):
     supply: SupplyField = None
     specimen: SpecimenConfig
     stand: StandConfig = StandConfig()
-    camera: CameraField = Field(None, description="left out: no camera")
-    exposure: ExposureConfig | None = Field(None, description="left out: the computer's clock")
+    camera: CameraField = Field(None, description="omit: no camera")
+    exposure: ExposureConfig | None = Field(
+        None, description="omit: frames are timed by the computer's clock"
+    )
     scale_m_per_px: float = Field(1e-4, gt=0)
     rating: dict[str, object] = Field(
         default_factory=dict,
-        description="limits that amplifier and actuator withstand; empty: not checked",
+        description="what amplifier and actuator withstand; empty: not checked",
     )
     safety: dict[str, object] = Field(
-        default_factory=dict, description="limits of the safety chain that are not the usual ones"
+        default_factory=dict, description="limits of the safety chain that differ from the defaults"
     )
 
     @model_validator(mode="before")
     @classmethod
     def _exposure_of_camera(cls, data: Any) -> Any:
-        """The camera's exposure time is the line's, unless the file says otherwise."""
+        """Use the camera's exposure time for the exposure line unless the file sets one."""
         if not isinstance(data, dict):
             return data
         camera, line = data.get("camera"), data.get("exposure")
@@ -157,8 +161,8 @@ class BenchConfig(PrintableSection):
             return data
         if camera.get("exposure_s") is None:
             raise ValueError(
-                "exposure.duration_s is not known: give camera.exposure_s, to which the camera is "
-                "then set"
+                "exposure.duration_s is unknown. Set camera.exposure_s, which is also written to "
+                "the camera"
             )
         return data | {"exposure": line | {"duration_s": camera["exposure_s"]}}
 
@@ -167,9 +171,11 @@ class BenchConfig(PrintableSection):
         if self.exposure is None:
             return self
         if self.camera is None:
-            raise ValueError("section exposure belongs to a camera, and there is none")
+            raise ValueError("there is a section exposure, but no camera")
         if not self.camera.is_timed_by_exposures:
-            raise ValueError(f"a camera of kind {self.camera.kind!r} needs no section exposure")
+            raise ValueError(
+                f"a camera of kind {self.camera.kind!r} cannot have a section exposure"
+            )
         self._check_exposure(self.exposure, self.camera)
         self.daq.check_exposure(self.exposure)
         return self
@@ -183,14 +189,14 @@ class BenchConfig(PrintableSection):
         if exposure_s is not None and abs(line.duration_s / exposure_s - 1.0) > _EXPOSURE_SHARE:
             raise ValueError(
                 f"exposure.duration_s is {line.duration_s:g} s and camera.exposure_s "
-                f"{exposure_s:g} s: leave exposure.duration_s out"
+                f"{exposure_s:g} s. Remove exposure.duration_s"
             )
         if line.inverted is not None and line.line is None:
             raise ValueError("exposure.inverted needs exposure.line")
 
     @property
     def exposure_line(self) -> ExposureLine | None:
-        """Settings of the camera's exposure line; None: it is not wired."""
+        """Settings of the camera's exposure line; None if it is not wired."""
         return None if self.exposure is None else self.exposure.camera_line
 
     @property
@@ -202,7 +208,7 @@ class BenchConfig(PrintableSection):
         """Every instrument of the file: daq, generator, supply, camera.
 
         Raises:
-            DeviceError: a driver cannot be used.
+            DeviceError: A driver cannot be used.
         """
         for section in ("daq", "generator", "supply", "camera"):
             config = getattr(self, section)
@@ -210,7 +216,7 @@ class BenchConfig(PrintableSection):
                 yield InstrumentOfFile(section, instrument_of(section, config), config)
 
     def describe(self) -> RigDescription:
-        """What a user of this bench knows about it."""
+        """Nominal values of this bench."""
         daq, amplifier = self.daq, self.amplifier
         return RigDescription(
             name=self.name,

@@ -1,4 +1,4 @@
-"""One thing that `haselab rig check` looked at."""
+"""The result of one check of `haselab rig check`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ __all__ = ["CheckResult"]
 
 @dataclass(frozen=True)
 class CheckResult:
-    """One thing that was verified, or was not.
+    """The result of one check.
 
     Args:
         step: mock, dry or live.
-        what: was looked at.
-        found: in words.
-        passed: it is as it should be.
-        advice: what to change where it is not; empty where it is.
-        recommended: keys of the rig file, as `daq.skew_s`, with the values that were measured.
+        what: quantity or device that was checked.
+        found: what was found, in words.
+        passed: whether it is correct.
+        advice: what to change if it is not, else empty.
+        recommended: keys of the rig file, such as `daq.skew_s`, with the measured values.
     """
 
     step: str
@@ -29,6 +29,6 @@ class CheckResult:
     recommended: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "passed", bool(self.passed))  # numpy's own is no bool for JSON
+        object.__setattr__(self, "passed", bool(self.passed))  # JSON does not accept numpy's bool
         if self.passed:
             object.__setattr__(self, "advice", "")

@@ -1,4 +1,4 @@
-"""What every driver shares: optional packages, the words for their absence, quiet clean-up."""
+"""Functions shared by all drivers: import of optional packages, and clean-up without errors."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["load_driver", "quietly"]
 
 
 def load_driver(module: str, what: str) -> Any:
-    """A module of an optional package.
+    """Import a module of an optional package.
 
     Args:
         module: to import.
-        what: needs it, for the message.
+        what: device that needs it, for the message.
     Returns:
         The module.
     Raises:
-        DeviceError: it is not installed.
+        DeviceError: The package is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -28,15 +28,15 @@ def load_driver(module: str, what: str) -> Any:
         missing = error.name or module
     raise DeviceError(
         f"{what} needs the Python package {missing.partition('.')[0]!r}, which is not installed. "
-        "Type: pip install 'haselab[instruments]'"
+        "Run: pip install 'haselab[instruments]'"
     )
 
 
 def quietly(act: Callable[[], object]) -> Exception | None:
-    """Do something that must not stop what comes after it; returns what went wrong.
+    """Call a function that must not stop what follows; return its error instead of raising it.
 
-    On the way to 0 V the next step counts more than the last one's fault; whoever has to know
-    reads back what came of it.
+    During shutdown the next step matters more than the error of the last one; the result is read
+    back afterwards.
     """
     try:
         act()

@@ -1,4 +1,4 @@
-"""Who hangs the weights: a person at the terminal, or the client of a served twin."""
+"""Change the hung mass: by a person at the terminal, or by the client of a served twin."""
 
 from __future__ import annotations
 
@@ -12,54 +12,56 @@ __all__ = ["BenchStand", "Clock", "OperatorWeights", "WeightHandler", "check_mas
 
 _LONGEST_WAIT_S = 86400.0
 _HEAVIEST_KG = 20.0
-_CALL_S = 0.5  # that one call lets pass
+_CALL_S = 0.5  # longest time that one call lets pass
 
 
 def check_mass(mass_kg: float) -> None:
-    """Refuse a mass that no stand holds.
+    """Refuse a mass outside 0 to 20 kg.
 
     Raises:
-        LimitError: outside 0 to 20 kg.
+        LimitError: The mass is outside 0 to 20 kg.
     """
     if not 0.0 <= mass_kg <= _HEAVIEST_KG:
         raise LimitError(
-            f"Mass = {mass_kg:g} kg is outside [0, {_HEAVIEST_KG:g}] kg. Hang another mass."
+            f"The mass is {mass_kg:g} kg, but it must be within [0, {_HEAVIEST_KG:g}] kg. Use "
+            "another mass."
         )
 
 
 def check_wait(duration_s: float) -> None:
-    """Refuse a waiting time that is none.
+    """Refuse a waiting time outside 0 s to a day.
 
     Raises:
-        LimitError: outside 0 s to a day.
+        LimitError: The time is outside 0 s to a day.
     """
     if not 0.0 <= duration_s <= _LONGEST_WAIT_S:
         raise LimitError(
-            f"Waiting time = {duration_s:g} s is outside [0, {_LONGEST_WAIT_S:g}] s. Wait in parts."
+            f"The waiting time is {duration_s:g} s, but it must be within [0, {_LONGEST_WAIT_S:g}] "
+            "s. Split it."
         )
 
 
 class WeightHandler(Protocol):
-    """Moves weights; does not let time pass for anybody else."""
+    """Changes the hung mass; does not let time pass on the bench's clock."""
 
     def hang(self, mass_kg: float) -> None:
         """Hang this mass."""
 
     def lift(self) -> None:
-        """Take the weight off."""
+        """Lift the mass off the actuator."""
 
     def drop(self) -> None:
-        """Let go."""
+        """Release the mass."""
 
 
 class Clock(Protocol):
-    """The part of an acquisition that a stand needs."""
+    """The calls of an acquisition that a stand needs."""
 
     def pause(self) -> None:
-        """The output stands; blocks pass."""
+        """Hold the output while blocks pass."""
 
     def catch_up(self) -> None:
-        """Pass over the blocks that have passed."""
+        """Skip the blocks that have passed."""
 
     def pass_time(self, duration_s: float) -> None:
         """Let time pass."""
@@ -69,8 +71,8 @@ class OperatorWeights:
     """A person at the terminal, who reads each step and confirms it with Enter.
 
     Args:
-        ask: where the person answers.
-        output: where the person reads.
+        ask: stream from which the reply is read.
+        output: stream to which prompts are written.
     """
 
     def __init__(self, ask: TextIO | None = None, output: TextIO | None = None) -> None:
@@ -81,13 +83,13 @@ class OperatorWeights:
         self._output.flush()
         if not self._ask.readline():
             raise DeviceError(
-                f"Nobody answered the prompt to {task}. Run this study in a terminal, or leave out "
+                f"The prompt to {task} was not answered. Run this study in a terminal, or remove "
                 "its loads."
             )
 
     def hang(self, mass_kg: float) -> None:
-        """See `WeightHandler`: the output was commanded to 0 V and read back before."""
-        task = f"hang {1e3 * mass_kg:g} g on the lower clamp" if mass_kg else "remove the weight"
+        """See `WeightHandler`; the output was commanded to 0 V and read back before."""
+        task = f"hang {1e3 * mass_kg:g} g on the lower clamp" if mass_kg else "remove the mass"
         self._request(
             "All outputs were commanded to 0 V. Charge may remain. Switch the amplifier off, short "
             f"the electrodes and measure. Then {task}, remove the short, switch the amplifier on, "
@@ -98,22 +100,22 @@ class OperatorWeights:
     def lift(self) -> None:
         """See `WeightHandler`: the output keeps its voltage."""
         self._request(
-            "HIGH VOLTAGE MAY BE ON. Do not touch the weight, the clamp or the actuator. Lift the "
-            "weight by its insulating string, hold it and press Enter: ",
-            "lift the weight",
+            "HIGH VOLTAGE MAY BE ON. Do not touch the mass, the clamp or the actuator. Lift the "
+            "mass by its insulating string, hold it and press Enter: ",
+            "lift the mass",
         )
 
     def drop(self) -> None:
-        """See `WeightHandler`: the recording runs, so this does not wait."""
-        self._output.write("\aLet go now.\n")
+        """See `WeightHandler`; the recording runs, so this does not wait."""
+        self._output.write("\aRelease the mass now.\n")
         self._output.flush()
 
 
 class BenchStand:
-    """Fulfils `haselab.rig.LoadStand`: a weight handler, and the clock that goes on meanwhile.
+    """Implements `haselab.rig.LoadStand`: changes the mass while the bench's clock continues.
 
     Args:
-        weights: who moves the weights.
+        weights: changes the mass.
         clock: of the bench.
     """
 
@@ -140,7 +142,7 @@ class BenchStand:
         self._weights.drop()
 
     def wait(self, duration_s: float) -> None:
-        """See `haselab.rig.LoadStand`; whole blocks."""
+        """See `haselab.rig.LoadStand`; waits for whole blocks."""
         check_wait(duration_s)
         left_s = duration_s
         while left_s > 0.0:  # in short calls: a bench can be made safe between two of them

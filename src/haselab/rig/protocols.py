@@ -52,25 +52,25 @@ class MonitorCalibration:
 
 @dataclass(frozen=True)
 class RigDescription:
-    """What a user of the bench knows about it: nominal values from data sheets and calipers.
+    """Nominal values of a bench, from data sheets and calipers.
 
     Args:
         name: of the rig, for the record.
         rate_hz: samples per second and channel.
-        block_samples: samples per channel in one block; one new output a block.
-        switch_sample: samples from the start of a block to the moment at which the output asked for
-            before it takes effect; more than `block_samples` where outputs are queued ahead.
+        block_samples: samples per channel in one block; each block has one new output.
+        switch_sample: samples from the start of a block until the output requested before it takes
+            effect; more than `block_samples` if outputs are queued.
         skew_s: time from the voltage sample to the current sample.
         volt_per_code: of both channels.
         amplifier_gain: V per V.
         v_monitor_v_per_v: volts of the voltage monitor per volt of output.
         i_monitor_v_per_a: volts of the current monitor per ampere of output.
-        drive_limits: what the drive output may be asked for, in V.
+        drive_limits: limits of the drive output, in V.
         shell_area_m2: cross-section of the unstretched shell, width times thickness.
         lateral_stretch: fixed by the clamps.
         scale_m_per_px: of the camera.
-        mass_kg: the weight that hangs on the lower clamp when a study begins.
-        amplifier: its make and number: a calibration of the monitors holds for this one alone.
+        mass_kg: mass hung on the lower clamp when a study begins.
+        amplifier: make and number; a calibration of the monitors is valid only for this one.
         calibration: of the monitors; None: by the nominal gains.
     """
 
@@ -108,13 +108,13 @@ class RigDescription:
 
     @property
     def switch_in_block(self) -> int:
-        """Sample of every block at which an output changes, whichever block asked for it."""
+        """Sample of every block at which the output changes."""
         return self.switch_sample % self.block_samples
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Pictures with the middle of each exposure on the acquisition's clock.
+    """Images with the middle of each exposure on the acquisition's clock.
 
     Args:
         images: grey levels, shape `(frames, height, width)`.
@@ -126,17 +126,17 @@ class Frames:
 
 
 class VoltageSource(Protocol):
-    """The drive output ahead of the amplifier."""
+    """The drive output at the amplifier's input."""
 
     def write(self, voltage_v: float) -> None:
-        """Ask for an output; it takes effect at `switch_sample` of the next block.
+        """Request an output; it takes effect at `switch_sample` of the next block.
 
         Raises:
-            LimitError: outside the drive limits; the output stays as it was.
+            LimitError: The voltage is outside the drive limits; the output is unchanged.
         """
 
     def zero(self) -> None:
-        """Go to 0 V now, whatever else is going on, and forget every earlier request. Never raises.
+        """Go to 0 V at once and discard all earlier requests. Never raises.
 
         No later call may put out a value that was requested before this one.
         """
@@ -146,195 +146,196 @@ class Acquisition(Protocol):
     """Both monitors, continuously sampled."""
 
     def read(self) -> NDArray[np.int16]:
-        """The next block: ADC codes, shape `(block_samples, 2)`, voltage then current.
+        """Read the next block: ADC codes, shape `(block_samples, 2)`, voltage then current.
 
         Raises:
-            DeviceError: the block did not arrive.
-            SafetyError: the bench protected itself.
+            DeviceError: The block did not arrive.
+            SafetyError: The bench tripped.
         """
 
     @property
     def time_s(self) -> float:
-        """Clock at the end of the last block."""
+        """Time at the end of the last block, in s."""
 
 
 class FunctionGenerator(Protocol):
-    """The sensing signal, summed to the drive."""
+    """The sensing signal, which is added to the drive."""
 
     def sine(self, frequency_hz: float, amplitude_v: float) -> None:
         """Put out a sine of this frequency and peak amplitude."""
 
     def off(self) -> None:
-        """Put out nothing and forget every earlier request. Never raises."""
+        """Switch the output off and discard all earlier requests. Never raises."""
 
 
 class HighVoltageSupply(Protocol):
-    """A supply with a rail of its own."""
+    """A separate high-voltage supply."""
 
     def set_voltage(self, voltage_v: float) -> None:
-        """Ask for a voltage, in V.
+        """Set a voltage, in V.
 
         Raises:
-            LimitError: outside what the rig file allows; the supply stays as it was.
-            DeviceError: the supply does not confirm it.
+            LimitError: The voltage is outside the limits of the rig file; the supply is unchanged.
+            DeviceError: The supply does not confirm it.
         """
 
     def read_voltage(self) -> float:
-        """What the supply measures at its output, in V.
+        """Voltage that the supply measures at its output, in V.
 
         Raises:
-            DeviceError: no answer, or none that is a number.
+            DeviceError: There is no reply, or it is not a number.
         """
 
     def off(self) -> None:
-        """0 V, output switched off, every earlier request forgotten. Never raises."""
+        """Go to 0 V, switch the output off and discard all earlier requests. Never raises."""
 
 
 @runtime_checkable
 class GaplessAcquisition(Protocol):
-    """An acquisition that goes on by itself: blocks that nobody reads are passed over, or kept."""
+    """An acquisition that runs by itself and keeps or skips blocks that are not read."""
 
     def keep(self, on: bool) -> None:
-        """From now on no block may be lost: one that comes too late raises; or no longer so.
+        """Choose whether every block is kept, so that a lost one raises an error.
 
-        While a camera takes frames it is on, since they are timed by the blocks.
+        It is on while a camera takes frames, since the blocks time them.
 
         Raises:
-            DeviceError: the instrument does not answer.
+            DeviceError: The instrument does not reply.
         """
 
 
 @runtime_checkable
 class PreloadsOutputs(Protocol):
-    """A source that puts outputs out by its own clock, and accepts them early."""
+    """A source that queues outputs and puts them out by its own clock."""
 
-    missed_outputs: int  # since the bench was opened: came too late, and were left out
+    missed_outputs: int  # outputs since opening that came too late and were skipped
 
     def preload(self, voltages_v: NDArray[np.float64]) -> int:
-        """The values of the coming writes, one a block: they wait in the device for their time.
+        """Queue the values of the coming writes, one per block, in the device.
 
-        Anything else that is done to the output forgets them.
+        Any other call on the output discards them.
 
         Args:
             voltages_v: in V, shape `(B,)`.
         Returns:
-            How many blocks ahead they will wait; 0 where blocks may be passed over.
+            Number of blocks for which they can be queued; 0 if blocks may be skipped.
         Raises:
-            LimitError: outside the drive limits; nothing is preloaded.
+            LimitError: A value is outside the drive limits; nothing is queued.
         """
 
 
 @runtime_checkable
 class ReportsOutput(Protocol):
-    """A source whose output can be measured by another way than the one that set it."""
+    """A source whose output can be measured independently."""
 
     def read_back(self) -> float:
-        """The output now, in V ahead of the amplifier, as a meter sees it.
+        """Measure the output now, in V at the amplifier's input.
 
         Raises:
-            DeviceError: no measurement.
+            DeviceError: The measurement failed.
         """
 
 
 @runtime_checkable
 class ReportsOutputState(Protocol):
-    """An instrument that says whether its output is off."""
+    """An instrument that reports whether its output is off."""
 
     def is_off(self) -> bool:
-        """The instrument's own word, asked for now.
+        """Query now whether the output is off.
 
         Raises:
-            DeviceError: no answer.
+            DeviceError: There is no reply.
         """
 
 
 class ClosesLoop(Protocol):
-    """A controller of the rig's own: the program asks for strains, the rig finds the outputs.
+    """A built-in controller: the program requests strains, the rig computes the outputs.
 
-    It watches over itself; its trips come as `SafetyError` from `Acquisition.read`.
+    It has its own protection; `Acquisition.read` raises its trips as `SafetyError`.
     """
 
     strain_limits: Limits
 
     def follow(self, strain: float) -> None:
-        """The desired strain from now on; closes the loop where it is open.
+        """Set the desired strain; close the loop if it is open.
 
         Raises:
-            LimitError: outside `strain_limits`; the desired strain stays as it was.
-            DeviceError: the controller refuses.
+            LimitError: The strain is outside `strain_limits`; the desired strain is unchanged.
+            DeviceError: The controller refuses.
         """
 
     @property
     def output_v(self) -> float:
-        """The drive at the end of the last block, in V."""
+        """Drive at the end of the last block, in V."""
 
 
 class Camera(Protocol):
     """Frames on the acquisition's clock."""
 
     def start(self, rate_hz: float) -> None:
-        """Take frames from now on."""
+        """Start taking frames."""
 
     def take(self) -> Frames | None:
-        """The frames that have come in since the last call, `None` if there are none."""
+        """Return the frames that have arrived since the last call, or `None`."""
 
     def stop(self) -> None:
-        """Take no more frames."""
+        """Stop taking frames."""
 
 
 class LoadStand(Protocol):
-    """What hangs on the lower clamp: a person on a real bench."""
+    """Changes the mass on the lower clamp; on a real bench a person does."""
 
     def hang(self, mass_kg: float) -> None:
-        """Hang this mass, smoothly, and let it hang."""
+        """Hang this mass smoothly."""
 
     def lift(self) -> None:
-        """Take the weight off the actuator by hand."""
+        """Lift the mass off the actuator by hand."""
 
     def drop(self) -> None:
-        """Let go, at once."""
+        """Release the mass at once."""
 
     def wait(self, duration_s: float) -> None:
-        """Let time pass at 0 V drive or at the output that stands."""
+        """Let time pass with the present output."""
 
 
 class ReferenceFixture(Protocol):
-    """Where reference capacitors take the actuator's place: a person on a real bench."""
+    """Connects reference capacitors in place of the actuator; on a real bench a person does."""
 
     def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
-        """Put this capacitor where the actuator is, `None` puts the actuator back.
+        """Connect this capacitor in place of the actuator; `None` reconnects the actuator.
 
         Cable and fixture stay connected, in parallel with it.
 
         Args:
             capacitance_f: of the reference, in F.
-            series_ohm: of the reference, in ohm: its loss, or a resistor in series.
+            series_ohm: series resistance of the reference, in ohm.
         Raises:
-            LimitError: no such reference, or the output is not at 0 V with the carrier off.
+            LimitError: The reference is outside the limits, or the output is not at 0 V with the
+                carrier off.
         """
 
 
 class Gate(Protocol):
-    """What stands in front of every driver; `haselab.safety.gate` has the one implementation.
+    """Checks the permission of every driver call; implemented in `haselab.safety.gate`.
 
-    A bench is opened with one. Whoever needs an instrument gets what `instrument` returns, so that
-    no call reaches a driver without a valid permission.
+    A bench is opened with a gate. All code gets the wrapped drivers that `instrument` returns, so
+    no call energises anything without a valid permission.
     """
 
     def claim(self, key: str, call_s: float, shared: Collection[str] = ()) -> bool:
-        """Be the only program that uses this output device, and these shared instruments.
+        """Take this output device and these shared instruments for this program alone.
 
         Returns:
-            Whether the last program that used it has vanished.
+            Whether the last program that used it crashed.
         Raises:
-            DeviceError: another program uses it.
+            DeviceError: Another program uses it.
         """
 
     def release(self) -> None:
-        """Leave the device to other programs."""
+        """Release the device for other programs."""
 
     def instrument(self, driver: _T) -> _T:
-        """The driver behind the gate."""
+        """Wrap a driver."""
 
 
 @dataclass
@@ -348,12 +349,12 @@ class Rig:
         generator: sensing signal.
         camera: frames.
         stand: load.
-        fixture: for reference capacitors; None where a person has to be asked.
-        supply: high-voltage rail; None where the amplifier has its own.
-        controller: closes the loop; None where the program does.
-        gate: in front of the drivers above; None: `safety.guard` puts one there.
-        simulated: physics or a recording in this process, which can put out no voltage. Only such
-            a bench may be run without being armed by its user.
+        fixture: for reference capacitors; None if a person connects them.
+        supply: separate high-voltage supply; None if the amplifier has its own.
+        controller: built-in controller; None if the program closes the loop.
+        gate: wraps the drivers above; None: `safety.guard` adds one.
+        simulated: whether it is physics or a recording in this process, which cannot put out a
+            voltage. Only such a bench may run without being armed by its user.
     """
 
     description: RigDescription
@@ -369,7 +370,7 @@ class Rig:
     simulated: bool = False
 
     def safe(self) -> None:
-        """0 V, supply off, no sensing signal: every exit path of a run ends here. Never raises."""
+        """Go to 0 V, switch supply and sensing signal off. Every run ends here. Never raises."""
         self.source.zero()
         if self.supply is not None:
             self.supply.off()

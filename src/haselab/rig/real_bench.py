@@ -1,4 +1,4 @@
-"""A real bench made of instruments: RIG.toml of `kind = "bench"` becomes a `Rig`."""
+"""Open a real bench: RIG.toml with `kind = "bench"` becomes a `Rig`."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from haselab.rig.twin.client import TwinClient
 
 __all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
 
-_CALLS_S = 2.0  # that one call of a driver may take beside the blocks that it waits for
+_CALLS_S = 2.0  # longest call of a driver, not counting the blocks that it waits for
 _CALL_BLOCKS = 50  # `DaqDevice.pass_time` at most, see `stand.BenchStand.wait`
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """One device that answered.
+    """One device that replied.
 
     Args:
         name: section of the rig file.
-        identity: what it says it is.
+        identity: its own identification.
     """
 
     name: str
@@ -37,12 +37,12 @@ class Instrument:
 
 
 def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
-    """Ask every instrument of a bench who it is, each by itself; outputs stay as they are.
+    """Identify every instrument of a bench, one by one; outputs are not changed.
 
     Args:
         config: of the bench.
     Returns:
-        Section of the rig file, and what the instrument says it is, or what is wrong.
+        Section of the rig file, and the instrument's identification or the error.
     """
     found: list[tuple[str, str | HaselabError]] = []
     for each in config.instruments():
@@ -55,7 +55,7 @@ def identify(config: BenchConfig) -> list[tuple[str, str | HaselabError]]:
 
 
 class _NoCamera:
-    """No frames, ever."""
+    """The camera of a bench without one: no frames."""
 
     def start(self, rate_hz: float) -> None:
         """Nothing to start."""
@@ -69,34 +69,34 @@ class _NoCamera:
 
 
 class UnbrokenCamera:
-    """A camera that keeps the acquisition's clock unbroken for as long as it takes frames.
+    """A camera that makes the acquisition keep every block for as long as it takes frames.
 
-    Frames are timed on that clock, so while they are taken no block may be passed over.
+    Frames are timed on the acquisition's clock, so no block may be skipped meanwhile.
 
     Args:
         opened: the camera that takes the frames.
-        board: whose clock it is.
+        board: the device whose clock is used.
     """
 
     def __init__(self, opened: OpenedCamera, board: DaqDevice) -> None:
         self._opened = opened
         self._camera = opened.camera
         self._board = board
-        self._since_s = 0.0  # of the first block that is kept
+        self._since_s = 0.0  # time of the first block that is kept
 
     @property
     def identity(self) -> str:
-        """What the camera says it is; empty where there is none."""
+        """Identification of the camera; empty if there is none."""
         return self._opened.identity
 
     @property
     def dropped(self) -> int:
-        """Frames that are lost, since the last start."""
+        """Number of frames lost since the last start."""
         return self._opened.dropped()
 
     @property
     def uncertainty_s(self) -> float:
-        """Half width of what a frame's time is known to, in s."""
+        """Uncertainty of a frame's time (half width), in s."""
         return self._opened.uncertainty_s()
 
     @property
@@ -106,12 +106,12 @@ class UnbrokenCamera:
 
     @property
     def lag_s(self) -> float:
-        """From an exposure's middle to its frame's estimated one, in s; NaN: not known."""
+        """Delay from an exposure's middle to its estimate from the frame, in s; NaN: unknown."""
         return self._opened.lag_s()
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second, measured by the camera's own clock; 0: not known."""
+        """Frames per second, measured by the camera's own clock; 0: unknown."""
         return self._opened.rate_hz()
 
     def start(self, rate_hz: float) -> None:
@@ -123,7 +123,7 @@ class UnbrokenCamera:
         self._since_s = self._board.time_s
 
     def take(self) -> Frames | None:
-        """See `haselab.rig.Camera`. Without frames of the blocks that the output's start took."""
+        """See `haselab.rig.Camera`. Drops frames from the blocks that starting the output took."""
         frames = self._camera.take()
         if frames is None or frames.time_s[0] >= self._since_s:
             return frames
@@ -137,15 +137,15 @@ class UnbrokenCamera:
 
 
 class RealBench(Closing):
-    """Opens every instrument of a rig file. Use as a context: leaving it is 0 V and all closed.
+    """Opens every instrument of a rig file. Use as a context, which ends at 0 V and closes all.
 
     Args:
         config: of the bench.
-        gate: in front of all its drivers.
+        gate: wraps all its drivers.
     Raises:
-        DeviceError: an instrument or its driver is missing, or does not answer as it should; or
-            another program uses the bench.
-        InputError: another instrument than the rig file names.
+        DeviceError: An instrument or its driver is missing or does not reply correctly; or another
+            program uses the bench.
+        InputError: An instrument is not the one that the rig file names.
     """
 
     def __init__(self, config: BenchConfig, gate: Gate) -> None:
@@ -161,7 +161,7 @@ class RealBench(Closing):
             call_s = _CALLS_S + _CALL_BLOCKS * description.block_s
             vanished = gate.claim(link.key, call_s, config.shared_instruments)
             opened.callback(gate.release)
-            if vanished:  # a device server keeps what it had reserved
+            if vanished:  # a device server keeps its reservations
                 link.reset()
             with reported_faults(config.daq):
                 self.board = gate.instrument(daq.open(config.daq, context, link))
@@ -207,12 +207,12 @@ class RealBench(Closing):
         return UnbrokenCamera(found, self.board)
 
     def _clock(self) -> tuple[float, float]:
-        """End of the last block, and that it is seen now."""
+        """End of the last block, and the time at which it is read."""
         return self.board.fetched_s, time.monotonic()
 
     @property
     def instruments(self) -> list[Instrument]:
-        """All devices that answered, with what they say they are."""
+        """All devices that replied, with their identification."""
         found = [
             Instrument("daq", self.board.identity),
             Instrument("generator", self.generator.identity),
@@ -224,6 +224,6 @@ class RealBench(Closing):
         return found
 
     def close(self) -> None:
-        """0 V, everything off, all connections closed. Never raises."""
+        """Go to 0 V, switch everything off, and close all connections. Never raises."""
         self.rig.safe()
         quietly(self._opened.close)

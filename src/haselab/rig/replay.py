@@ -1,6 +1,6 @@
-"""A recorded session as a rig: it plays its blocks again and compares every request with them.
+"""A recorded session as a rig, which replays its blocks and compares every request with them.
 
-For work on sensing and loops with no hardware. A request for another output than the recorded one
+For work on sensing and loops without hardware. A request for an output other than the recorded one
 is refused, because the next recorded block does not show its effect.
 """
 
@@ -25,12 +25,12 @@ from haselab.store.video.opening import open_video
 __all__ = ["ReplayBench"]
 
 _FASTEST_FRAMES_HZ = 1e6
-_SAME_V = 1e-9  # outputs are recorded as the numbers that were asked for
+_SAME_V = 1e-9  # outputs are recorded as requested
 
 
 @dataclass(frozen=True)
 class _Block:
-    """Where one block stands."""
+    """Position of one block in the session."""
 
     start_s: float
     experiment: str
@@ -65,13 +65,13 @@ def _films(folder: Path) -> list[_Film]:
 
 
 class ReplayBench(Closing):
-    """Plays a session; fulfils the protocols of `haselab.rig`. Use as a context.
+    """Replays a session; implements the protocols of `haselab.rig`. Use as a context.
 
     Args:
-        path: of session.h5; kept videos are found in the folder `video` beside it.
-        experiments: which ones; empty: all that have blocks.
+        path: of session.h5; kept videos are in the folder `video` beside it.
+        experiments: names of the experiments; empty: all that have blocks.
     Raises:
-        InputError: no such session or experiment, or one without blocks.
+        InputError: The session or an experiment does not exist or has no blocks.
     """
 
     def __init__(self, path: Path, experiments: tuple[str, ...] = ()) -> None:
@@ -102,7 +102,9 @@ class ReplayBench(Closing):
             for k, start_s in enumerate(record.block_start_s)
         ]
         if not blocks:
-            raise InputError(f"The session has no blocks to replay. Name another. {self._path}")
+            raise InputError(
+                f"The session has no blocks to replay. Choose another session. {self._path}"
+            )
         return sorted(blocks, key=lambda block: block.start_s)
 
     def close(self) -> None:
@@ -124,28 +126,28 @@ class ReplayBench(Closing):
 
     @property
     def time_s(self) -> float:
-        """Clock of the recording, in s."""
+        """Time on the recording's clock, in s."""
         return self._now_s
 
     def read(self) -> NDArray[np.int16]:
         """See `haselab.rig.Acquisition`.
 
         Raises:
-            DeviceError: another output was recorded with this block, or the recording is over.
+            DeviceError: Another output was recorded with this block, or the recording has ended.
         """
         if self._next >= len(self._blocks):
             raise DeviceError(
-                f"The recording is over after {len(self._blocks)} blocks. Play no more than it "
-                f"has. {self._path}"
+                f"The recording ended after {len(self._blocks)} blocks. Play at most that many. "
+                f"{self._path}"
             )
         block = self._blocks[self._next]
         record = self._records[block.experiment]
         recorded_v = float(record.drive_v[block.index])
         if not abs(recorded_v - self._requested_v) <= _SAME_V:
             raise DeviceError(
-                f"Output = {self._requested_v:g} V in block {block.index} of {block.experiment!r}, "
-                f"recorded was {recorded_v:g} V. Ask for what was recorded, or use the twin. "
-                f"{self._path}"
+                f"The output in block {block.index} of {block.experiment!r} is "
+                f"{self._requested_v:g} V, but {recorded_v:g} V was recorded. Request what was "
+                f"recorded, or use the twin. {self._path}"
             )
         self._next += 1
         self._now_s = block.start_s + self.description.block_s
@@ -153,7 +155,7 @@ class ReplayBench(Closing):
 
     @property
     def next_output_v(self) -> float | None:
-        """The output recorded with the next block, in V; none after the last."""
+        """Output recorded with the next block, in V; None after the last."""
         if self._next >= len(self._blocks):
             return None
         block = self._blocks[self._next]
@@ -162,11 +164,11 @@ class ReplayBench(Closing):
     # ---- FunctionGenerator ---------------------------------------------------------------------
 
     def sine(self, frequency_hz: float, amplitude_v: float) -> None:
-        """See `haselab.rig.FunctionGenerator`; only the recorded one is there.
+        """See `haselab.rig.FunctionGenerator`; accepts only the recorded sine.
 
         Raises:
-            LimitError: no such sine.
-            DeviceError: another one was recorded.
+            LimitError: The sine is outside the limits.
+            DeviceError: Another sine was recorded.
         """
         rate_hz = self.description.rate_hz
         if not (0.0 < frequency_hz < 0.4 * rate_hz and 0.0 <= amplitude_v <= 1.0):
@@ -179,8 +181,8 @@ class ReplayBench(Closing):
         recorded = (self._carrier["carrier_hz"], self._carrier["carrier_v"])
         if (frequency_hz, amplitude_v) != recorded:
             raise DeviceError(
-                f"Sine of {frequency_hz:g} Hz, {amplitude_v:g} V, recorded was one of "
-                f"{recorded[0]:g} Hz, {recorded[1]:g} V. Ask for that. {self._path}"
+                f"The sine is {frequency_hz:g} Hz, {amplitude_v:g} V, but {recorded[0]:g} Hz, "
+                f"{recorded[1]:g} V was recorded. Request that. {self._path}"
             )
 
     def off(self) -> None:
@@ -189,11 +191,11 @@ class ReplayBench(Closing):
     # ---- Camera --------------------------------------------------------------------------------
 
     def start(self, rate_hz: float) -> None:
-        """See `haselab.rig.Camera`; frames come as they were kept, whatever the rate."""
+        """See `haselab.rig.Camera`; returns the kept frames, whatever the rate."""
         if not 0.0 < rate_hz <= _FASTEST_FRAMES_HZ:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside (0, {_FASTEST_FRAMES_HZ:g}] Hz. Lower the "
-                "request."
+                f"The frame rate is {rate_hz:g} Hz, outside (0, {_FASTEST_FRAMES_HZ:g}] Hz. Lower "
+                "the request."
             )
         self._filming, self._seen_s = True, self._now_s
 
@@ -202,7 +204,7 @@ class ReplayBench(Closing):
         self._filming = False
 
     def take(self) -> Frames | None:
-        """See `haselab.rig.Camera`: the kept frames of the time that has passed."""
+        """See `haselab.rig.Camera`; returns the kept frames of the time that has passed."""
         if not self._filming:
             return None
         since_s, self._seen_s = self._seen_s, self._now_s
@@ -220,7 +222,7 @@ class ReplayBench(Closing):
     # ---- LoadStand -----------------------------------------------------------------------------
 
     def hang(self, mass_kg: float) -> None:
-        """See `haselab.rig.LoadStand`: the recording knows what hung."""
+        """See `haselab.rig.LoadStand`; has no effect on a recording."""
         check_mass(mass_kg)
 
     def lift(self) -> None:
@@ -230,7 +232,7 @@ class ReplayBench(Closing):
         """See `haselab.rig.LoadStand`."""
 
     def wait(self, duration_s: float) -> None:
-        """See `haselab.rig.LoadStand`: blocks of that time are passed over."""
+        """See `haselab.rig.LoadStand`; skips the blocks of that time."""
         check_wait(duration_s)
         self._now_s += duration_s
         half_s = 0.5 * self.description.block_s

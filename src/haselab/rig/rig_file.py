@@ -1,4 +1,4 @@
-"""RIG.toml: which back end, and what it needs."""
+"""Read RIG.toml and open its rig."""
 
 from __future__ import annotations
 
@@ -50,30 +50,30 @@ class TwinFile(PrintableSection):
     seed: int = Field(1, ge=0, le=MAX_SEED)
 
     def configuration(self, path: Path) -> TwinConfig:
-        """The physical bench.
+        """Load the twin's configuration.
 
         Args:
-            path: of the rig file, from which the twin's is found.
+            path: of the rig file, relative to which the twin's file is found.
         Raises:
-            InputError: a fault in the twin's file, or both a twin and a reading.
+            InputError: The twin's file is not valid, or both twin and reading are given.
         """
         if self.twin is None:
             return twin_of_reading(self.reading or "hz")
         if self.reading is not None:
-            raise InputError(f"twin and reading both given; the twin's file has a reading. {path}")
+            raise InputError(f"Set either twin or reading; the twin's file has a reading. {path}")
         return load_twin(path.parent / self.twin)
 
 
 class ReplayFile(PrintableSection):
-    """`kind = "replay"`, `session = "DIR/session.h5"`; videos are found beside it."""
+    """`kind = "replay"`, `session = "DIR/session.h5"`, with its videos beside it."""
 
     kind: Literal["replay"]
     session: str = Field(min_length=1)
-    experiments: tuple[str, ...] = Field((), description="which ones; empty: all")
+    experiments: tuple[str, ...] = Field((), description="names; empty: all")
 
 
 class _Kind(BaseModel):
-    """The key that says what else the file holds."""
+    """The key that determines the other contents of the file."""
 
     kind: Literal["twin", "bench", "mega", "replay"]
 
@@ -118,26 +118,27 @@ def load_rig(path: Path) -> RigFile:
     Returns:
         The checked configuration of one kind.
     Raises:
-        InputError: no such file, no TOML, no such kind, an unknown key or a value out of range.
+        InputError: The file is missing or not TOML, or has an unknown kind or key or a value out of
+            range.
     """
     data = read_toml(path, "rig file")
     return validated(_KINDS[validated(_Kind, data, path).kind], data, path)
 
 
 def load_rig_to_shut_down(path: Path) -> tuple[RigFile | BenchOutputs, list[tuple[str, str]]]:
-    """Read RIG.toml to shut its bench down: each output section by itself.
+    """Read RIG.toml to shut its bench down, each output section by itself.
 
-    A package that is broken, or a fault elsewhere in the file, must not keep the other outputs
-    from being shut down.
+    A broken package, or a fault elsewhere in the file, must not prevent the other outputs from
+    being shut down.
 
     Args:
         path: of the TOML file.
     Returns:
-        The rig, of a bench the instruments whose sections can be used; and each section that
-        cannot, with what is wrong.
+        The rig, or for a bench the instruments whose sections can be used; and each other section
+        with its fault.
     Raises:
-        InputError: as `load_rig`; of a bench, no section can be used.
-        DeviceError: no section can be used, because of the drivers.
+        InputError: As for `load_rig`; or no section of a bench can be used.
+        DeviceError: No section can be used, because of the drivers.
     """
     data = read_toml(path, "rig file")
     kind = validated(_Kind, data, path).kind
@@ -161,15 +162,15 @@ def load_rig_to_shut_down(path: Path) -> tuple[RigFile | BenchOutputs, list[tupl
 
 @contextlib.contextmanager
 def opened_rig(file: RigFile, path: Path, gate: Gate) -> Iterator[Rig]:
-    """The rig of a file; leaving the context is 0 V and all connections closed.
+    """Open the rig of a file; the context ends at 0 V and closes all connections.
 
     Args:
         file: from `load_rig`.
         path: of the rig file.
-        gate: in front of its drivers.
+        gate: wraps its drivers.
     Raises:
-        DeviceError: an instrument or its driver is missing.
-        InputError: another instrument than the file names, or no such session.
+        DeviceError: An instrument or its driver is missing.
+        InputError: An instrument is not the one that the file names, or the session is missing.
     """
     if isinstance(file, TwinFile):
         rig = replace(make_twin(file.configuration(path), file.seed), gate=gate)

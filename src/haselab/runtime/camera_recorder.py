@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from haselab.store.video.writer import VideoWriter, write_png
 from haselab.tracking import PointTracker, TrackOptions, detect_fiducials, detect_particles
 from haselab.tracking.tracks import FrameTracks, LossReason, TrackState
 
-__all__ = ["CameraRecorder", "KeepVideo"]
+__all__ = ["CameraRecorder", "FrameRecorder", "KeepVideo"]
 
 KeepVideo = Literal["none", "sample", "all"]
 _REST_FRAMES = 10
@@ -53,10 +53,26 @@ def _here(search: _Search, images: NDArray[np.uint8]) -> NDArray[np.float64]:
     return search(images)
 
 
+class FrameRecorder(Protocol):
+    """Where tracks of frames and events go: a session, or memory."""
+
+    def append_frames(
+        self,
+        name: str,
+        time_s: NDArray[np.float64],
+        tracks: NDArray[np.void],
+        mass_kg: float,
+    ) -> None:
+        """Add the tracks of frames."""
+
+    def event(self, time_s: float, what: str) -> None:
+        """Note that something happened."""
+
+
 class _Particles:
     """Row S11: the sheet's particles, tracked at a lower rate than the camera's."""
 
-    def __init__(self, session: SessionWriter, name: str, rate_hz: float, call: _Call) -> None:
+    def __init__(self, session: FrameRecorder, name: str, rate_hz: float, call: _Call) -> None:
         self._session = session
         self._name = name
         self._call = call
@@ -110,7 +126,7 @@ class CameraRecorder:
     def __init__(
         self,
         camera: Camera,
-        session: SessionWriter,
+        session: FrameRecorder,
         folder: Path,
         keep: KeepVideo,
         *,

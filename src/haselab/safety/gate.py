@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from haselab.base import DeviceError, SafetyError
+from haselab.base import DeviceError, JsonObject, SafetyError
 from haselab.rig.drivers import quietly
 from haselab.safety.interlock import Interlock, InterlockBusyError, interlock_folder
 
@@ -238,7 +238,7 @@ class Gate:
         name: str,
         method: Callable[..., Any],
         arguments: tuple[Any, ...],
-        named: dict[str, Any],
+        named: JsonObject,
     ) -> Any:
         """Check one call of a driver's method, then make it under the output lock."""
         if isinstance(instrument, _Companion):

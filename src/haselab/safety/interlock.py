@@ -5,7 +5,7 @@ number. This module uses only the standard library, because the guardian process
 
 - The *owner lock* is held by the one program that uses the bench.
 - The *latch* is a revision: a random number that every revocation replaces. A permission to
-  energise is valid for one revision, so a revocation ends it for good. A new permission requires
+  energise is valid for one revision, so a revocation ends it permanently. A new permission requires
   that the reason in the latch is acknowledged.
 - The *output lock* is held during every call that may energise something, and by a process that
   makes the bench safe. So no call that began with a valid permission ends after the bench was made
@@ -492,7 +492,7 @@ class Interlock:
     def _kill_holder(self) -> None:
         """Kill the process that holds the output lock: a program, or a guardian.
 
-        The system tells which process it is. If it does not, the process number in the file is
+        The system reports the process. If it does not, the process number in the file is
         used; any user could have changed that, so then only processes of the same user are killed,
         and none by root.
         """

@@ -13,7 +13,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array, Item, Table
 
-from haselab.base import InputError, to_plain
+from haselab.base import InputError, JsonObject, to_plain
 from haselab.store.folder import read_json, write_text
 from haselab.store.manifest import sha256_of
 from haselab.store.text_file import read_text
@@ -68,7 +68,7 @@ def hashed(paths: Sequence[Path]) -> Mapping[str, str]:
     return {path.name: sha256_of(path) for path in paths if path.is_file()}
 
 
-def read_actuator(path: Path) -> dict[str, Any]:
+def read_actuator(path: Path) -> JsonObject:
     """Read the sections of an actuator file, unchecked.
 
     Args:
@@ -86,7 +86,7 @@ def read_actuator(path: Path) -> dict[str, Any]:
     return read_toml(path, "actuator file")
 
 
-def read_run(path: Path) -> dict[str, Any]:
+def read_run(path: Path) -> JsonObject:
     """Read the sections of an actuator file, or of the folder of a run.
 
     Args:

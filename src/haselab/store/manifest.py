@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject, table_at
 from haselab.store.claim import create_exclusively
 from haselab.store.folder import read_json, write_json
 
@@ -29,7 +29,7 @@ MANIFEST = "manifest.json"
 State = Literal["OPEN", "SEALED", "RECOVERED"]
 _FORMAT = "haselab manifest 1"
 _RECORDED = ("session.h5", "video/**/*")
-_PIECE_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 20
 
 
 def _now() -> datetime:
@@ -37,16 +37,16 @@ def _now() -> datetime:
 
 
 def sha256_of(path: Path) -> str:
-    """Hash of a file, read piece by piece."""
+    """Hash of a file, read chunk by chunk."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while piece := file.read(_PIECE_BYTES):
-            digest.update(piece)
+        while chunk := file.read(_CHUNK_BYTES):
+            digest.update(chunk)
     return digest.hexdigest()
 
 
 def _recorded(folder: Path) -> dict[str, dict[str, Any]]:
-    """Every file that a recording makes, by its path in the folder."""
+    """Every file of a recording, by its path in the folder."""
     found = sorted({path for each in _RECORDED for path in folder.glob(each) if path.is_file()})
     return {
         path.relative_to(folder).as_posix(): {
@@ -57,11 +57,11 @@ def _recorded(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a recording.
+def read_manifest(folder: Path) -> JsonObject:
+    """Read the manifest of a recording.
 
     Raises:
-        InputError: there is none, or it is damaged.
+        InputError: there is no manifest, or it is damaged.
     """
     path = folder / MANIFEST
     data = read_json(path)
@@ -74,23 +74,23 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def seal(
-    folder: Path, state: State, told: Mapping[str, Any], *, clock: Callable[[], datetime] = _now
-) -> dict[str, Any]:
-    """Hash what was recorded and state how it ended.
+    folder: Path, state: State, details: Mapping[str, Any], *, clock: Callable[[], datetime] = _now
+) -> JsonObject:
+    """Hash the recorded files, and write how the recording ended.
 
     Args:
         folder: of the recording.
-        state: SEALED by the one who recorded, RECOVERED later.
-        told: what else the manifest is to say.
-        clock: tells the time of day.
+        state: SEALED by the recording program, RECOVERED later.
+        details: further entries of the manifest.
+        clock: returns the time of day.
     Returns:
         The manifest.
     Raises:
-        DeviceError: the disk refuses.
+        DeviceError: the file cannot be written.
     """
     path = folder / MANIFEST
     earlier = read_manifest(folder) if path.exists() else {"format": _FORMAT}
-    data = earlier | dict(told)
+    data = earlier | dict(details)
     data |= {"state": state, "closed": clock().isoformat(), "files": _recorded(folder)}
     write_json(path, data)
     return data
@@ -116,32 +116,32 @@ def recorded_when(manifest: Mapping[str, Any]) -> dict[str, object]:
 
 
 def changed_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
-    """Files that are not those that were sealed: changed, gone, or new.
+    """Files that differ from those that were sealed: changed, missing, or new.
 
     Args:
         folder: of the recording.
-        manifest: as `read_manifest` gives it.
+        manifest: from `read_manifest`.
     """
     stated, there = manifest.get("files", {}), _recorded(folder)
     return sorted(name for name in stated.keys() | there if stated.get(name) != there.get(name))
 
 
 def check_recorded(path: Path, *, unverified: bool = False) -> str:
-    """Compare a video with the manifest of the run that recorded it, where there is one.
+    """Compare a video with the manifest of the run that recorded it, if there is one.
 
     Args:
-        path: a file in the folder `video` of a run; any other is not looked at.
-        unverified: answer with the doubt instead of an error.
+        path: a file in the folder `video` of a run; others are not checked.
+        unverified: return the doubt instead of raising an error.
     Returns:
-        Why the video is doubtful; empty: no reason.
+        Why the video is not verified; empty if it is.
     Raises:
-        InputError: the video is not the one that was recorded.
+        InputError: the video was changed after the recording.
     """
     folder = path.absolute().parent
     if folder.name != "video" or not path.is_file() or not (folder.parent / MANIFEST).is_file():
         return ""
-    stated = read_manifest(folder.parent).get("files", {}).get(f"video/{path.name}")
-    if stated is None or stated.get("sha256") == sha256_of(path):
+    stated = table_at(read_manifest(folder.parent), "files", f"video/{path.name}")
+    if not stated or stated.get("sha256") == sha256_of(path):
         return ""
     doubt = "the SHA-256 of the video is not that in manifest.json"
     if unverified:
@@ -153,17 +153,17 @@ def check_recorded(path: Path, *, unverified: bool = False) -> str:
 
 
 class Manifest:
-    """Stands OPEN beside a recording, and is SEALED whatever way the recording ends.
+    """The manifest of a recording: OPEN while it runs, and SEALED when it ends in any way.
 
-    Only a process that is killed, or a machine that stops, leaves it OPEN: `haselab recover`.
+    It stays OPEN only if the process is killed or the machine stops; see `haselab recover`.
 
     Args:
         folder: of the recording.
-        record: configuration, versions, seed, calibrations, as JSON holds them.
-        clock: tells the time of day.
+        record: configuration, versions, seed and calibrations as JSON types.
+        clock: returns the time of day.
     Raises:
-        InputError: there is a manifest already; nothing in it was changed.
-        DeviceError: the disk refuses.
+        InputError: there is a manifest already; it is not changed.
+        DeviceError: the file cannot be written.
     """
 
     def __init__(
@@ -188,6 +188,6 @@ class Manifest:
         ended = "complete" if kind is None else f"{kind.__name__}: {' '.join(str(error).split())}"
         try:
             seal(self._folder, "SEALED", {"ended": ended}, clock=self._clock)
-        except OSError:  # a full disk must not hide what led here
+        except OSError:  # a full disk must not hide the original error
             if error is None:
                 raise

@@ -22,12 +22,12 @@ _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])(\..*)?"
 
 
 def check_name(name: str) -> None:
-    r"""Refuse the name of an experiment that is no file name on every system.
+    r"""Refuse a name of an experiment that is not a file name on every system.
 
     Args:
         name: of the experiment.
     Raises:
-        InputError: empty, too long, or it holds a path, a drive, a control character or a name that
+        InputError: empty, too long, or with a path, a drive, a control character or a name that
             Windows reserves.
     Example:
         >>> check_name("triangle-1")
@@ -59,13 +59,13 @@ def _distinct(
     keys: Callable[[str], Iterable[str]],
     taken: Iterable[str],
 ) -> dict[str, str]:
-    """A name for each, so that no two share a key; one that can stay as it is stays.
+    """Give each a name, so that no two share a key; keep names where possible.
 
     Args:
         names: of the experiments, each once.
-        plain: a name of the other tool for a name and an ending that makes it unique.
-        keys: what a name of the other tool occupies there.
-        taken: keys that nobody may have.
+        plain: returns the other tool's name for a name and an ending that makes it unique.
+        keys: returns the keys that a name occupies in the other tool.
+        taken: keys that must not be used.
     """
     used, found = set(taken), dict[str, str]()
 
@@ -88,14 +88,14 @@ def _distinct(
 def table_names(
     names: Sequence[str], endings: Sequence[str], taken: Sequence[str]
 ) -> dict[str, str]:
-    """Names of experiments as those of tables, each of which is a file of its own.
+    """Convert names of experiments to names of tables, each of which is a file.
 
     Args:
         names: of the experiments, each once.
-        endings: of the tables that an experiment has.
-        taken: names of tables that are no experiment's.
+        endings: of the tables of an experiment.
+        taken: names of other tables.
     Returns:
-        By experiment. No two tables have one name, on systems that do not tell `A` from `a` either.
+        Names by experiment, unique also on systems that ignore upper and lower case.
     Example:
         >>> table_names(["events", "a", "A"], ["", "-blocks"], ["events"])
         {'events': 'events-2', 'a': 'a', 'A': 'A-2'}
@@ -113,11 +113,11 @@ def table_names(
 
 
 def matlab_names(names: Sequence[str], taken: Sequence[str]) -> dict[str, str]:
-    """Names of experiments as variables of MATLAB.
+    """Convert names of experiments to names of MATLAB variables.
 
     Args:
         names: of the experiments, each once.
-        taken: variables that are no experiment's.
+        taken: names of other variables.
     Returns:
         By experiment, all different.
     Example:

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 
 __all__ = ["check_regular", "decode_json", "parse_json", "parse_toml", "read_text"]
 
@@ -27,11 +27,11 @@ _KINDS = {
 
 
 def check_regular(path: Path, what: str = "file") -> int:
-    """Refuse a path that is no file: a pipe would wait for ever, a device never ends.
+    """Refuse a path that is not a regular file: reading a pipe or a device may never end.
 
     Args:
-        path: to be opened.
-        what: it is, for the message: "twin file".
+        path: of the file.
+        what: kind of file for the message, such as "twin file".
     Returns:
         The size of the file, in bytes.
     Raises:
@@ -51,11 +51,11 @@ def check_regular(path: Path, what: str = "file") -> int:
 
 
 def read_text(path: Path, what: str = "file") -> str:
-    """The text of a file in UTF-8, with or without a byte order mark.
+    """Read a text file in UTF-8, with or without a byte order mark.
 
     Args:
         path: of the file, 64 MiB at most.
-        what: it is, for the message.
+        what: kind of file for the message.
     Raises:
         InputError: no such file, not a regular one, too large, or not UTF-8.
     """
@@ -78,7 +78,7 @@ def read_text(path: Path, what: str = "file") -> str:
 
 
 def decode_json(text: str) -> Any:
-    """The content of a JSON document, all of which can be written again.
+    """Parse a JSON document of values that can all be written again.
 
     Raises:
         ValueError: not JSON, an integer of thousands of digits, or half of a character.
@@ -91,7 +91,7 @@ def decode_json(text: str) -> Any:
 
 
 def parse_json(text: str, path: Path) -> Any:
-    """The content of a JSON document.
+    """Parse a JSON document.
 
     Args:
         text: of the document.
@@ -113,11 +113,11 @@ def parse_json(text: str, path: Path) -> Any:
     raise InputError(f"{path.name} is not a JSON document ({why}). Write it again: {path}")
 
 
-def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a TOML text, in a time that grows with its length alone.
+def parse_toml(text: str) -> JsonObject:
+    """Parse a TOML text, in a time proportional to its length.
 
     Raises:
-        ValueError: no TOML, or a key of more than 64 parts.
+        ValueError: not TOML, or a key of more than 64 parts.
         RecursionError: nested too deeply.
     """
     if found := _DOTTED.search(text):

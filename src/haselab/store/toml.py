@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.store.text_file import parse_toml, read_text
 
 __all__ = ["PrintableSection", "Section", "read_toml", "toml_text", "validated"]
@@ -31,10 +31,10 @@ _UNPRINTABLE = {"Cc", "Zl", "Zp"}  # control characters and line breaks
 
 
 class Section(BaseModel):
-    """A table of a file of settings: no unknown keys, and numbers that arithmetic can bear.
+    """A table of a settings file: no unknown keys, and no extreme numbers.
 
-    A field states its own range; every number is also finite, and 0 or of a size between 1e-18 and
-    1e18, so that squares and quotients neither overflow nor vanish.
+    A field states its own range. Every number must also be finite, and 0 or between 1e-18 and 1e18
+    in size, so that squares and quotients neither overflow nor underflow.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -52,7 +52,7 @@ class Section(BaseModel):
 
 
 class PrintableSection(Section):
-    """The same for names and addresses of devices and files: no control characters in a text."""
+    """A section with names and addresses: texts must not have control characters."""
 
     @field_validator("*", mode="after")
     @classmethod
@@ -66,10 +66,10 @@ class PrintableSection(Section):
 
 
 def toml_text(data: Mapping[str, Any]) -> str:
-    """Tables as a TOML file; a value of None is left out.
+    """Format tables as a TOML file; leave out values of None.
 
     Args:
-        data: numbers, texts, truth values, lists of them, and tables of such.
+        data: numbers, texts, booleans, lists and tables of them.
     Returns:
         The text.
     Example:
@@ -82,7 +82,7 @@ def toml_text(data: Mapping[str, Any]) -> str:
 
 
 def _lines(name: str, table: Mapping[str, Any]) -> list[str]:
-    """Of one table: its own values come before the tables in it."""
+    """Lines of one table: its own values, then the tables in it."""
     lines = [f"[{name}]"] if name else []
     tables = {key: value for key, value in table.items() if isinstance(value, Mapping)}
     for key, value in table.items():
@@ -93,35 +93,35 @@ def _lines(name: str, table: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """The tables of a TOML file.
+def read_toml(path: Path, what: str) -> JsonObject:
+    """Read the tables of a TOML file.
 
     Args:
         path: of the file.
-        what: the file is, for the message: "twin file".
+        what: kind of file for the message, such as "twin file".
     Returns:
         Its content.
     Raises:
-        InputError: no such file, or no TOML.
+        InputError: no such file, or not TOML.
     """
     text = read_text(path, what)
     try:
         return parse_toml(text)
     except RecursionError:
         why = "it is nested too deeply"
-    except ValueError as error:  # also integers of thousands of digits and days that are none
+    except ValueError as error:  # also integers of thousands of digits and invalid dates
         why = str(error)
     raise InputError(f"Not a TOML file that can be read: {why}. {path}")
 
 
 def validated(model: type[Model], data: Any, source: object, section: str = "") -> Model:
-    """The data as a model.
+    """Check data with a model.
 
     Args:
-        model: class that checks them.
-        data: as `read_toml` or `read_json` give them.
+        model: class of the model.
+        data: from `read_toml` or `read_json`.
         source: where they come from, for the message.
-        section: of the file, where the data are one of its tables.
+        section: of the file, if the data are one of its tables.
     Returns:
         The checked model.
     Raises:
@@ -143,7 +143,7 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
 
 
 def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
-    """What is wrong; with the keys that the table has, or the words that a missing key may have."""
+    """Describe an error, with the valid keys of the table or the valid values of a key."""
     kind = fault["type"]
     if kind not in ("extra_forbidden", "missing"):
         return str(fault["msg"])
@@ -160,7 +160,7 @@ def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
 
 
 def _table_of(model: type[BaseModel], path: Sequence[Any], data: Any) -> Any:
-    """The model of a table inside a file; None where the path leads to none.
+    """The model of a table inside a file; None if there is none at this path.
 
     A field whose model depends on the table has metadata with a method `model_of`.
     """
@@ -178,7 +178,7 @@ def _table_of(model: type[BaseModel], path: Sequence[Any], data: Any) -> Any:
 
 
 def _words(annotation: Any) -> tuple[str, ...]:
-    """What a key that is a choice between words may have; empty for another one."""
+    """The valid values of a key with a choice of words; empty for other keys."""
     if typing.get_origin(annotation) is not typing.Literal:
         return ()
     return tuple(f'"{word}"' for word in typing.get_args(annotation))
@@ -189,5 +189,5 @@ def _is_model(kind: object) -> bool:
 
 
 def _got(value: object) -> str:
-    """What stood there, where it is one value and not a whole table."""
+    """The value that was found, unless it is a whole table."""
     return "" if isinstance(value, (dict, list)) else f" (got {_SHORT.repr(value)})"

@@ -153,7 +153,7 @@ class Experiment(ABC, Generic[Settings]):
         """
 
     def masses_kg(self) -> tuple[float, ...]:
-        """Masses that the experiment hangs, besides the rig's own."""
+        """Masses that are hung in the experiment, besides the rig's own."""
         return ()
 
     def seconds(self, rig: RigDescription) -> float:

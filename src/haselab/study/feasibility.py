@@ -46,7 +46,7 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
 
 
 def study_masses_kg(study: Study) -> list[float]:
-    """All masses that a study hangs, besides the rig's own."""
+    """All masses that are hung in a study, besides the rig's own."""
     return [mass for experiment in experiments_of(study) for mass in experiment.masses_kg()]
 
 

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from haselab.base import JsonObject, table_at
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
 from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.claim import refuse_linked_folders
@@ -56,10 +57,10 @@ def results_of(
     header: Mapping[str, Any],
     noise_free: Mapping[str, float] | None,
     doubt: str = "",
-) -> dict[str, Any]:
+) -> JsonObject:
     """Content of results.json: one row per id, provenance, and whether it could be verified."""
     trials = found.find(Comparison)
-    results = {
+    results: JsonObject = {
         "quantities": quantity_rows(
             found.quantities, found.notes, header["rig_config"], noise_free, study
         ),
@@ -76,7 +77,7 @@ def results_of(
     return marked_unverified(results, doubt)
 
 
-def marked_unverified(results: dict[str, Any], doubt: str) -> dict[str, Any]:
+def marked_unverified(results: JsonObject, doubt: str) -> JsonObject:
     """Mark results whose session could not be verified, and add the reason.
 
     Args:
@@ -85,7 +86,7 @@ def marked_unverified(results: dict[str, Any], doubt: str) -> dict[str, Any]:
     """
     if not doubt:
         return results
-    provenance = {"unverified": doubt} | results["provenance"]
+    provenance = {"unverified": doubt, **table_at(results, "provenance")}
     return results | {"unverified": True, "provenance": provenance}
 
 
@@ -96,7 +97,7 @@ def write_findings(
     header: Mapping[str, Any],
     noise_free: Mapping[str, float] | None = None,
     doubt: str = "",
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write results.json, analysis.json and actuator.toml.
 
     Args:

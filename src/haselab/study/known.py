@@ -1,4 +1,4 @@
-"""What an actuator file knows, for a study that does not find it out by itself."""
+"""Values of an actuator file, for a study that does not find them itself."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = ["known_values", "with_known"]
 
 
 def known_values(tables: ActuatorTables) -> dict[type, object]:
-    """Values that experiments may ask for by their type, where the study itself gives none.
+    """Values that experiments may request by type, if the study itself does not find them.
 
     Args:
         tables: of the actuator file.
     Returns:
-        The maps, where the file has both of them and the length at zero strain; else nothing.
+        The maps, if the file has both of them and the length at zero strain; else nothing.
     """
     length_m, drive = tables.actuator.geometry.zero_length_m, tables.drive
     if length_m is None or tables.sensing.strain_map is None or drive.voltage_map is None:
@@ -29,14 +29,14 @@ def known_values(tables: ActuatorTables) -> dict[type, object]:
 
 
 def with_known(study: Study, tables: ActuatorTables) -> Study:
-    """The study with what it leaves open: the voltage of zero strain, and the controller.
+    """Complete a study with the voltage of zero strain and the controller of an actuator file.
 
     Args:
-        study: as its file says; what it states itself stays.
+        study: as in its file; its own settings are kept.
         tables: of the actuator file.
     Returns:
-        The study; with `[steps]` and without `[control]`, the trials `own_trials` are played by the
-        controller of the actuator file, within its limits.
+        The study; with `[steps]` and without `[control]`, its `own_trials` use the controller
+        of the actuator file, within its limits.
     Raises:
         InputError: the controller's kind is not registered, does not accept its parameters, or has
             no limits.
@@ -64,6 +64,6 @@ def with_known(study: Study, tables: ActuatorTables) -> Study:
 
 
 def _given(parameters: Mapping[str, float], kind: str) -> dict[str, object]:
-    """A PI of a design states the gains of a PID, those that it lacks as 0."""
+    """Parameters of a controller; a designed PI states the gains of a PID, some of them 0."""
     absent = ("kd", "derivative_filter_s") if kind == "pi" else ()
     return {name: value for name, value in parameters.items() if name not in absent or value}

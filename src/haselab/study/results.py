@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from haselab.base import Estimate
+from haselab.base import Estimate, Json, JsonObject
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
 from haselab.study.paper.quantity_table import quantities
@@ -69,7 +69,7 @@ def quantity_rows(
     rig_config: Mapping[str, Any],
     noise_free: Mapping[str, float] | None = None,
     study: Study | None = None,
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Rows of results.json.
 
     Args:
@@ -155,7 +155,7 @@ def _fixed_by(study: Study) -> dict[str, str]:
 
 def axis_interpretation(
     measured: Mapping[str, Estimate], rig_config: Mapping[str, Any]
-) -> dict[str, Any]:
+) -> JsonObject:
     """Decide which interpretation of the paper's frequency axis, rad/s or Hz, the data support.
 
     The criterion is the relative distance of a measured frequency from the printed number in either
@@ -170,7 +170,8 @@ def axis_interpretation(
     """
     if not {"S20.omega_n", "S19.omega_0", "S19.decay_1", "S19.decay_2"} <= set(measured):
         return {}
-    evidence, votes = [], []
+    votes = []
+    evidence: list[Json] = []
     for key, what, printed in (
         ("S20.omega_n", "natural frequency, chirp", 5.11),
         ("S19.omega_0", "natural frequency, free response", 5.1),

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from haselab import __version__
-from haselab.base import InputError, Limits, Progress, SilentProgress
+from haselab.base import InputError, JsonObject, Limits, Progress, SilentProgress
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig, RigDescription
 from haselab.rig.protocols import MonitorCalibration
@@ -71,13 +71,13 @@ class RunOptions:
     folder: Path
     seed: int
     keep_video: KeepVideo
-    rig_config: dict[str, Any]
+    rig_config: JsonObject
     known: ActuatorTables | None = None
 
 
 def session_header(
     study: Study | StepStudy, rig: RigDescription, options: RunOptions
-) -> dict[str, Any]:
+) -> JsonObject:
     """Provenance of the data: study, rig, seed, versions, hashes."""
     study_json = study.model_dump(mode="json")
     known = {} if options.known is None else {"actuator": _recorded(options.known)}
@@ -107,7 +107,7 @@ def _recorded(tables: ActuatorTables) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def recording(
-    rig: Rig, options: RunOptions, header: dict[str, Any], planned: Sequence[ExperimentPlan]
+    rig: Rig, options: RunOptions, header: JsonObject, planned: Sequence[ExperimentPlan]
 ) -> Iterator[tuple[SessionWriter, Observer]]:
     """Open the folder of a run: manifest, session and camera recorder.
 
@@ -213,9 +213,7 @@ def described(data: Mapping[str, Any]) -> RigDescription:
     return RigDescription(**fields)
 
 
-def analyse_session(
-    path: Path, *, unverified: bool = False
-) -> tuple[Findings, Study, dict[str, Any]]:
+def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, Study, JsonObject]:
     """Repeat all fits from the recorded session.
 
     Args:
@@ -258,17 +256,17 @@ def noise_free_results(
     config: TwinConfig, study: Study, known: ActuatorTables | None, played: Findings
 ) -> dict[str, float]:
     """Results of the same experiments and fits on the same twin without noise, by id."""
-    quiet = NoiseFreeBench(config, study)
+    noise_free = NoiseFreeBench(config, study)
     sensing = study.sensing
     # Without noise a sensor at rest repeats the same value, which is not a fault here.
     patient = SafetySettings(loop=WatchdogSettings(repeat_s=_HOUR_S))
-    bench = guard(quiet.rig, Safety(patient))
+    bench = guard(noise_free.rig, Safety(patient))
     arm_simulated(bench)
     with Runner(
-        bench, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
+        bench, noise_free, noise_free, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
     ) as runner:
         found = investigate(
-            quiet.observation, study, quiet.rig.description, runner,
+            noise_free.observation, study, noise_free.rig.description, runner,
             repeated=played.values, known={} if known is None else known_values(known),
         )  # fmt: skip
     return {key: estimate.value for key, estimate in found.quantities.items()}

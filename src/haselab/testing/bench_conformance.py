@@ -1,4 +1,4 @@
-"""What a bench promises its users, whichever instruments it is made of: see `conformance`."""
+"""Conformance tests of a whole bench, for any instruments: see `conformance`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def drive_v(rig: Rig, blocks: int = 1) -> NDArray[np.float64]:
 
 
 def pass_queue(rig: Rig) -> None:
-    """Read the blocks that are under way while outputs wait in the device."""
+    """Read the blocks that pass while outputs are queued in the device."""
     for _ in range(rig.description.switch_sample // rig.description.block_samples):
         rig.acquisition.read()
 
@@ -43,7 +43,7 @@ def carrier_v(rig: Rig) -> float:
 
 
 class BenchConformance:
-    """Drive output, acquisition and sensing signal together, seen by the voltage monitor.
+    """Tests of drive output, acquisition and sensing signal, through the voltage monitor.
 
     Use it for a driver of a data acquisition device or a function generator. It needs the drive
     output and the generator connected to the voltage monitor, through an amplifier or a divider as
@@ -52,7 +52,7 @@ class BenchConformance:
 
     @pytest.fixture
     def rig(self, rig_file: Path) -> Iterator[Rig]:
-        """The bench of a rig file, permitted to put out voltages."""
+        """Open the bench of a rig file, armed."""
         with opened_rig(load_rig(rig_file), rig_file, gate := Gate()) as rig:
             gate.permit(gate.interlock.revision)
             yield rig
@@ -63,7 +63,7 @@ class BenchConformance:
     def test_an_output_outside_the_limits_is_refused_and_the_old_one_stays(
         self, rig: Rig, beyond: str
     ) -> None:
-        """Also a number that is none."""
+        """This includes NaN."""
         limits = rig.description.drive_limits
         refused = {
             "above": np.nextafter(limits.high, np.inf),
@@ -79,7 +79,7 @@ class BenchConformance:
         np.testing.assert_allclose(drive_v(rig, 2), 0.5 * limits.high, rtol=_SHARE)
 
     def test_both_ends_of_the_limits_are_allowed(self, rig: Rig) -> None:
-        """The limits are closed."""
+        """The limits are inclusive."""
         limits = rig.description.drive_limits
         for end_v in (limits.low, limits.high):
             rig.source.write(end_v)
@@ -101,7 +101,7 @@ class BenchConformance:
         np.testing.assert_allclose(block[settled:], 1.0, rtol=_SHARE)
 
     def test_of_several_outputs_within_a_block_the_last_one_counts(self, rig: Rig) -> None:
-        """Earlier requests of the same block are forgotten."""
+        """Earlier requests in the same block are discarded."""
         for output_v in (1.5, 0.2, 1.0):
             rig.source.write(output_v)
         rig.acquisition.read()
@@ -122,7 +122,7 @@ class BenchConformance:
         assert np.abs(drive_v(rig, 1)).max() < _SHARE
 
     def test_safe_ends_drive_and_carrier(self, rig: Rig) -> None:
-        """Every exit path of a run ends with `safe`."""
+        """Every run ends with `safe`."""
         rig.generator.sine(CARRIER_HZ, CARRIER_V)
         rig.source.write(1.0)
         for _ in range(5):
@@ -138,13 +138,13 @@ class BenchConformance:
     def test_a_block_has_its_shape_and_the_clock_advances_by_it(self, rig: Rig) -> None:
         """No gap, no repetition."""
         d = rig.description
-        rig.acquisition.read()  # may pass blocks over while the output is started
+        rig.acquisition.read()  # may skip blocks while the output is started
         start_s = rig.acquisition.time_s
         for count in range(1, 21):
             codes = rig.acquisition.read()
             assert codes.shape == (d.block_samples, 2)
             assert codes.dtype == np.int16
-            # A clock in seconds that sums up blocks may round once a block.
+            # A clock that adds up blocks in seconds may round once per block.
             slack_s = 2.0 * count * np.spacing(start_s + 1.0)
             elapsed_s = rig.acquisition.time_s - start_s
             assert elapsed_s == pytest.approx(count * d.block_s, rel=0, abs=slack_s)
@@ -164,13 +164,13 @@ class BenchConformance:
         assert carrier_v(rig) < 0.05 * CARRIER_V
         for amplitude_v in (CARRIER_V, 2.0 * CARRIER_V):
             rig.generator.sine(CARRIER_HZ, amplitude_v)
-            # An amplifier of 6 kHz lifts 2 kHz by 3 %; 10 % is what any usable one may do.
+            # An amplifier of 6 kHz raises 2 kHz by 3 %; 10 % is acceptable.
             assert carrier_v(rig) == pytest.approx(amplitude_v, rel=0.1)
         rig.generator.off()
         assert carrier_v(rig) < 0.05 * CARRIER_V
 
     def test_the_carrier_is_continuous_from_block_to_block(self, rig: Rig) -> None:
-        """A jump in phase at a block's border would leave amplitude there; noise is white."""
+        """A phase jump between blocks would leave a residual amplitude; noise is white."""
         d = rig.description
         rig.generator.sine(CARRIER_HZ, CARRIER_V)
         rig.acquisition.read()
@@ -187,7 +187,7 @@ class BenchConformance:
     def test_a_sine_outside_the_limits_is_refused_and_the_old_one_stays(
         self, rig: Rig, frequency_hz: float, amplitude_v: float
     ) -> None:
-        """Seen by the voltage monitor."""
+        """Checked with the voltage monitor."""
         rig.generator.sine(CARRIER_HZ, CARRIER_V)
         with pytest.raises(LimitError, match=r"Sine of .* is outside .* Lower the request"):
             rig.generator.sine(frequency_hz, amplitude_v)

@@ -1,4 +1,4 @@
-"""What every driver promises its users, as pytest classes for a driver's own tests.
+"""Conformance tests for instrument drivers, as pytest classes to derive from.
 
 Derive a class from the one for your instrument, and give it a fixture `rig_file`:
 
@@ -10,7 +10,7 @@ Derive a class from the one for your instrument, and give it a fixture `rig_file
             ...  # write RIG.toml with your section, and return its path
             return path
 
-The tests put out voltages. Run them on an emulator; on a real instrument disconnect the actuator
+THE TESTS PUT OUT VOLTAGES. Run them on an emulator. On a real instrument, disconnect the actuator
 and the amplifier first, and keep clear.
 """
 
@@ -49,18 +49,18 @@ __all__ = [
     "SupplyConformance",
 ]
 
-_WITHIN_S = 3.0  # as the guardians wait for an instrument that refuses the connection
-_REACH_S = 10.0  # that a supply may take to reach its set point, or to run down
+_WITHIN_S = 3.0  # as long as the guardians retry a refused connection
+_REACH_S = 10.0  # longest time for a supply to reach its set point, or to discharge
 
 
 class InstrumentConformance:
-    """Of any instrument: the registry finds it, it identifies itself, its driver loads."""
+    """Tests of any instrument: registry, identification, driver."""
 
     section: ClassVar[str]  # of RIG.toml: daq, generator, supply or camera
 
     @pytest.fixture
     def file(self, rig_file: Path) -> BenchConfig:
-        """The rig file, read as every command reads it."""
+        """Read the rig file as all commands do."""
         file = load_rig(rig_file)
         assert isinstance(file, BenchConfig), f'kind must be "bench". {rig_file}'
         return file
@@ -74,7 +74,7 @@ class InstrumentConformance:
 
     @pytest.fixture
     def instrument(self, config: Any) -> Instrument[Any]:
-        """The driver that the section chooses."""
+        """Find the driver of the section."""
         return instrument_of(self.section, config)
 
     def test_the_driver_loads_on_this_computer(self, instrument: Instrument[Any]) -> None:
@@ -93,13 +93,13 @@ class InstrumentConformance:
     ) -> None:
         """A rig file that names another instrument must not energise this one."""
         if "serial_number" not in type(config).model_fields:
-            return  # nothing that could be another one
+            return  # it has no serial number
         other = config.model_copy(update={"serial_number": "0BADC0DE"})
         with pytest.raises(InputError, match="0BADC0DE"):
             instrument.identify(other)
 
     def test_its_address_stays_the_same(self, instrument: Instrument[Any], config: Any) -> None:
-        """Two programs must not use one instrument on two benches: its address tells them."""
+        """Two programs recognise by the address that they use one instrument on two benches."""
         if isinstance(instrument, OutputInstrument):
             addresses = instrument.addresses(config)
             assert addresses == instrument.addresses(config.model_copy())
@@ -107,7 +107,7 @@ class InstrumentConformance:
 
 
 class _OffConformance(InstrumentConformance):
-    """Of an instrument with an output of its own: how it goes off, and confirms it."""
+    """Tests of an instrument with an output: switching off, and confirming it."""
 
     def energise(self, device: Any) -> None:
         """Switch the output on."""
@@ -115,19 +115,19 @@ class _OffConformance(InstrumentConformance):
 
     @pytest.fixture
     def device(self, instrument: Instrument[Any], config: Any, file: BenchConfig) -> Iterator[Any]:
-        """The opened instrument; it is closed after the test."""
+        """Open the instrument, and close it after the test."""
         device = cast(Any, instrument).open(config, OpenContext(file.describe()))
         with contextlib.closing(device):
             yield device
 
     def test_it_is_off_after_opening(self, device: Any) -> None:
-        """Whatever the last user left."""
+        """Regardless of the state before."""
         assert device.is_off()
 
     def test_opening_switches_off_what_was_left_on(
         self, instrument: Any, config: Any, file: BenchConfig
     ) -> None:
-        """Also what this driver itself left on, closed without `off`."""
+        """This includes what this driver left on when it was closed without `off`."""
         first = instrument.open(config, OpenContext(file.describe()))
         self.energise(first)
         first.close()
@@ -136,7 +136,7 @@ class _OffConformance(InstrumentConformance):
             assert second.is_off()
 
     def test_it_reports_that_it_is_on(self, device: Any) -> None:
-        """`is_off` asks the instrument; it does not repeat what was requested."""
+        """`is_off` queries the instrument; it does not repeat what was requested."""
         self.energise(device)
         assert not device.is_off()
 
@@ -149,13 +149,13 @@ class _OffConformance(InstrumentConformance):
         assert device.is_off()
 
     def test_off_does_not_raise_on_a_closed_connection(self, device: Any) -> None:
-        """The way to 0 V goes on whatever one instrument does."""
+        """A failing instrument must not stop the shutdown of the others."""
         device.close()
         device.off()
         device.close()
 
     def test_a_closed_connection_is_not_reported_as_off(self, device: Any) -> None:
-        """An instrument that cannot be asked is not confirmed off."""
+        """An instrument that does not respond is not confirmed off."""
         device.close()
         with pytest.raises(DeviceError, match=r"."):
             device.is_off()
@@ -163,7 +163,7 @@ class _OffConformance(InstrumentConformance):
     def test_shut_down_from_outside_switches_off_an_output_in_use(
         self, device: Any, instrument: OutputInstrument[Any], config: Any
     ) -> None:
-        """As the guardians and `haselab rig safe` do it while the program is still connected."""
+        """The guardians and `haselab rig safe` do this while the program is still connected."""
         self.energise(device)
         instrument.shut_down(config, _WITHIN_S)
         assert device.is_off()
@@ -178,12 +178,12 @@ class _OffConformance(InstrumentConformance):
 
 
 class SupplyConformance(_OffConformance):
-    """Of a high-voltage supply."""
+    """Tests of a high-voltage supply."""
 
     section = "supply"
 
     def energise(self, device: SupplyDevice) -> None:
-        """A tenth of what the rig file allows."""
+        """Put out a tenth of the rig file's limit."""
         device.set_voltage(self.some_v)
 
     @pytest.fixture(autouse=True)
@@ -194,7 +194,7 @@ class SupplyConformance(_OffConformance):
     def test_a_voltage_outside_the_limits_is_refused_and_the_old_one_stays(
         self, device: SupplyDevice, config: Any, share: float
     ) -> None:
-        """The rig file's limit holds, whatever the instrument could do."""
+        """The rig file's limit applies even if the instrument could exceed it."""
         self.energise(device)
         _wait_for(device, self.some_v)
         with pytest.raises(LimitError, match=r"outside"):
@@ -202,19 +202,19 @@ class SupplyConformance(_OffConformance):
         assert abs(device.read_voltage() - self.some_v) <= device.tolerance_v
 
     def test_it_reaches_its_set_point_and_runs_down(self, device: SupplyDevice) -> None:
-        """By its own meter."""
+        """According to its own meter."""
         self.energise(device)
         _wait_for(device, self.some_v)
         device.off()
         _wait_for(device, 0.0)
 
     def test_its_tolerance_is_a_voltage(self, device: SupplyDevice) -> None:
-        """What its meter may show while it is off."""
+        """It is the largest reading of its meter while it is off."""
         assert 0.0 < device.tolerance_v < math.inf
 
 
 def _wait_for(device: SupplyDevice, wanted_v: float) -> None:
-    """Until the meter shows it."""
+    """Wait until the meter shows this voltage."""
     end_s = time.monotonic() + _REACH_S
     while abs(device.read_voltage() - wanted_v) > device.tolerance_v:
         assert time.monotonic() < end_s, f"{device.read_voltage():g} V instead of {wanted_v:g} V"
@@ -222,12 +222,12 @@ def _wait_for(device: SupplyDevice, wanted_v: float) -> None:
 
 
 class GeneratorConformance(_OffConformance):
-    """Of a function generator."""
+    """Tests of a function generator."""
 
     section = "generator"
 
     def energise(self, device: GeneratorDevice) -> None:
-        """A sine of a kilohertz, far below the limits."""
+        """Put out a sine of 1 kHz, far below the limits."""
         device.sine(1000.0, 0.02)
 
     @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ class GeneratorConformance(_OffConformance):
     def test_a_sine_outside_the_limits_is_refused_and_the_old_one_stays(
         self, device: GeneratorDevice, frequency_hz: float, amplitude_v: float
     ) -> None:
-        """Neither switched off nor changed."""
+        """It is neither switched off nor changed."""
         self.energise(device)
         with pytest.raises(LimitError, match=r"outside"):
             device.sine(frequency_hz, amplitude_v)

@@ -39,7 +39,7 @@ def rig_file(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_the_monitors_errors_are_found_told_and_stored(rig_file, tmp_path, capsys):
+def test_the_monitors_errors_are_found_reported_and_stored(rig_file, tmp_path, capsys):
     out = tmp_path / "new" / "calibration.toml"
     assert run(["--rig", rig_file, *TWO, "--json", "--out", str(out)]) == 0
     answer = json.loads(capsys.readouterr().out)
@@ -83,7 +83,7 @@ def test_the_default_twin_has_nothing_to_remove(capsys):
         (["--capacitor", "1e-9", "--capacitor", "x"], 2, "is not FARAD"),
         (["--capacitor", "1e-9", "--capacitor", "1,2,3,4"], 2, "is not FARAD"),
         (["--capacitor", "1e-9", "--capacitor", "-2e-9"], 2, "Correct it"),
-        (["--capacitor", "1e-9", "--capacitor", "2e-3"], 2, "Connect another one"),
+        (["--capacitor", "1e-9", "--capacitor", "2e-3"], 2, "Use another one"),
         ([*TWO, "--carrier-hz", "90e3"], 2, "Sine of 90000 Hz"),
         ([*TWO, "--carrier-hz", "70e3"], 2, "70000 Hz"),
         ([*TWO, "--carrier-v", "1e-7"], 3, "no carrier at 2000 Hz"),
@@ -126,7 +126,7 @@ def bench_without_fixture(monkeypatch: pytest.MonkeyPatch) -> tuple[TwinBench, R
     return bench, rig
 
 
-def test_a_person_is_asked_while_the_output_is_dead(monkeypatch, capsys):
+def test_the_operator_confirms_while_the_output_is_off(monkeypatch, capsys):
     bench, _ = bench_without_fixture(monkeypatch)
     values = iter([0.47e-9, 2.2e-9, None])
     # `connect` of the twin refuses while there is a drive or a carrier.

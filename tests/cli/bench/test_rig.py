@@ -71,12 +71,12 @@ def test_a_fault_is_named_with_what_to_do_and_the_protocol_holds_it(tmp_path, ca
         f"'haselab rig check' again. {path}"
     )
     assert "recommended for the rig file" not in out  # the file has what was measured
-    told = json.loads(save.read_text())
-    assert told["rig"]["text"] == path.read_text()
-    assert told["rig"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert told["passed"] is False and told["recommended"] == {"daq.skew_s": 2.5e-6}
-    assert [each["passed"] for each in told["checks"]].index(False) == len(told["checks"]) - 1
-    assert told["checks"][-1]["advice"].startswith("Swap the two wires")
+    printed = json.loads(save.read_text())
+    assert printed["rig"]["text"] == path.read_text()
+    assert printed["rig"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert printed["passed"] is False and printed["recommended"] == {"daq.skew_s": 2.5e-6}
+    assert [each["passed"] for each in printed["checks"]].index(False) == len(printed["checks"]) - 1
+    assert printed["checks"][-1]["advice"].startswith("Swap the two wires")
 
 
 def test_a_bench_that_cannot_be_opened_has_not_passed(tmp_path, capsys) -> None:
@@ -85,10 +85,10 @@ def test_a_bench_that_cannot_be_opened_has_not_passed(tmp_path, capsys) -> None:
         code, _, err = call(capsys, "doctor", "--rig", path)
         assert code == 0
         code, _, err = call(capsys, "rig", "check", path, "--save", save)
-    told = json.loads(save.read_text())
+    printed = json.loads(save.read_text())
     assert code == 4 and "its meter shows 80" in err
-    assert told["passed"] is False
-    assert "Pull its power jack" in told["checks"][-1]["found"]
+    assert printed["passed"] is False
+    assert "Pull its power jack" in printed["checks"][-1]["found"]
 
 
 def test_the_doctor_says_that_a_supply_is_on_and_leaves_it(tmp_path, capsys) -> None:
@@ -96,7 +96,7 @@ def test_the_doctor_says_that_a_supply_is_on_and_leaves_it(tmp_path, capsys) -> 
         for _ in range(2):
             code, out, _ = call(capsys, "doctor", "--rig", path)
             assert code == 0
-            assert "The high-voltage supply is ON: its meter shows 19" in out
+            assert "the high-voltage supply is ON, its meter shows 19" in out
             assert "haselab rig safe RIG.toml" in out
 
 
@@ -108,10 +108,10 @@ def test_the_check_verifies_mock_dry_and_live(rig: Path, capsys) -> None:
     assert [r["passed"] for r in checks] == [True] * len(checks)
     steps = [r["step"] for r in checks]
     assert steps == sorted(steps, key=["mock", "dry", "live"].index)
-    told = {(r["step"], r["what"]): r["found"] for r in checks}
-    assert told["dry", "source"].startswith("USB-6212, serial number ")
-    assert told["live", "time of an output"] == "sample 4408, the rig file says 4400"
-    assert told["live", "generator at rest"] == "off"
+    printed = {(r["step"], r["what"]): r["found"] for r in checks}
+    assert printed["dry", "source"].startswith("USB-6212, serial number ")
+    assert printed["live", "time of an output"] == "sample 4408, the rig file says 4400"
+    assert printed["live", "generator off"] == "off"
 
 
 def test_how_late_readings_come_gives_the_outputs_that_have_to_wait(rig, tmp_path, capsys) -> None:
@@ -179,20 +179,20 @@ def test_the_result_goes_into_a_file_each_time(rig: Path, capsys, tmp_path, numb
 def test_the_dry_checks_put_nothing_out(rig: Path, capsys) -> None:
     code, out, _ = call(capsys, "rig", "check", rig)
     assert code == 0
-    assert "live" not in out and "ok      dry   supply at rest" in out
+    assert "live" not in out and "ok      dry   supply off" in out
 
 
 @pytest.mark.parametrize(
-    ("flag", "told"),
+    ("flag", "printed"),
     [
         ("--live", "add --yes"),
-        ("--yes", "--yes belongs to --live"),
-        ("--acknowledge", "--acknowledge belongs to --live"),
+        ("--yes", "--yes has no effect without --live"),
+        ("--acknowledge", "--acknowledge has no effect without --live"),
     ],
 )
-def test_high_voltage_needs_two_words(rig: Path, capsys, flag: str, told: str) -> None:
+def test_high_voltage_needs_two_words(rig: Path, capsys, flag: str, printed: str) -> None:
     code, _, err = call(capsys, "rig", "check", rig, flag)
-    assert code == 2 and told in err
+    assert code == 2 and printed in err
 
 
 def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
@@ -202,12 +202,12 @@ def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
     other.write_text(rig.read_text().replace("MY00000001", "MY00000002"))
     code, _, err = call(capsys, "rig", "check", other)
     assert code == 2 and err.count("\n") == 1
-    assert "Serial number of the function generator = MY00000001" in err
+    assert "generator has the serial number MY00000001" in err
     code, out, _ = call(capsys, "doctor", "--rig", other, "--json")
     found = {f["name"]: f for f in json.loads(out)["findings"] if f["kind"] == "instrument"}
     assert code == 0
     assert [found[name]["found"] for name in ("daq", "generator", "supply")] == [True, False, True]
-    assert "Connect that one, or correct generator.serial_number" in found["generator"]["advice"]
+    assert "Connect that one, or change generator.serial_number" in found["generator"]["advice"]
 
 
 def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
@@ -231,7 +231,7 @@ def test_rig_safe_on_a_file_that_cannot_be_read_says_to_switch_off_by_hand(
     assert "NOTHING WAS COMMANDED TO 0 V: switch the high voltage off by hand." in err
 
 
-def test_a_bench_that_is_gone_is_told_and_not_called_safe(rig: Path, capsys, tmp_path) -> None:
+def test_a_missing_bench_is_reported_and_not_called_safe(rig: Path, capsys, tmp_path) -> None:
     gone = tmp_path / "gone.toml"
     gone.write_text(
         "\n".join(
@@ -262,9 +262,9 @@ def test_the_status_names_armed_benches_and_why_others_were_made_safe(
     try:
         assert "not armed" in call(capsys, "rig", "status")[1]
         gate.interlock.set_live(True)
-        code, told, _ = call(capsys, "rig", "status")
+        code, printed, _ = call(capsys, "rig", "status")
         assert code == 0
-        assert f"NI_01A2                 ARMED by process {os.getpid()}" in told
+        assert f"NI_01A2                 ARMED by process {os.getpid()}" in printed
         gate.interlock.set_live(False)
         gate.interlock.revoke("The strain is stuck.")
         (bench,) = json.loads(call(capsys, "rig", "status", "--json")[1])["benches"]

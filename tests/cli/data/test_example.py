@@ -40,8 +40,8 @@ def test_the_examples_are_listed(capsys):
 def test_bad_use_is_one_line(tmp_path, monkeypatch, capsys, words, said):
     monkeypatch.chdir(tmp_path)
     assert code_of("example", *words) == 2
-    told = capsys.readouterr().err
-    assert said in told and told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert said in printed and printed.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -57,8 +57,8 @@ def test_the_commands_of_each_readme_run_in_their_order(tmp_path, monkeypatch, c
     for command in commands:
         words = shlex.split(command)[1:]
         assert code_of(*words) == 0, capsys.readouterr().err
-        told = capsys.readouterr().out
-        assert max(map(len, told.splitlines())) <= 250, "no dictionaries on one line"
+        printed = capsys.readouterr().out
+        assert max(map(len, printed.splitlines())) <= 250, "no dictionaries on one line"
         for option in ("--plot", "--out"):
             if option in words:
                 assert Path(words[words.index(option) + 1]).exists()

@@ -235,9 +235,9 @@ PLANT = Plant(0.5, 40.0, 0.09, 0.005)
 
 def answer_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, object]:
     code = code_of(*arguments, "--json")
-    told = capsys.readouterr()
-    assert code == 0, told.err
-    return json.loads(told.out)
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    return json.loads(printed.out)
 
 
 def german(path: Path, header: str, *columns: np.ndarray) -> Path:
@@ -405,9 +405,9 @@ def test_what_cannot_be_decided_is_refused_in_one_line(tmp_path, capsys, name):
     path = tmp_path / ("a.xlsx" if name == "workbook" else "a.csv")
     path.write_text(text)
     assert code_of("identify", "arx", path, *options) == 2
-    told = capsys.readouterr().err
-    assert words in told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert words in printed
+    assert printed.count("\n") == 1
 
 
 def test_a_quantity_refuses_the_unit_of_another_one(tmp_path, capsys):

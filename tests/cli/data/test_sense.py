@@ -111,7 +111,7 @@ def test_the_rate_of_the_file_is_used_when_none_is_given(
     assert set(COLUMNS) <= set(answer)
 
 
-def test_a_block_without_carrier_is_marked_and_the_rest_stands(
+def test_a_block_without_carrier_is_marked_and_the_others_are_kept(
     record: np.ndarray, tmp_path: Path
 ) -> None:
     lost = record.copy()
@@ -199,7 +199,7 @@ def test_a_tone_beside_the_carrier_is_named(tmp_path, record, capsys):
     assert "The voltage has tones at 1950 and 2000 Hz" in capsys.readouterr().err
 
 
-def test_readings_of_the_actuator_itself_are_told_from_those_of_monitors(tmp_path, record, capsys):
+def test_values_at_the_actuator_are_distinguished_from_those_of_monitors(tmp_path, record, capsys):
     drive = 1000.0 * np.sin(2 * np.pi * 5 * np.arange(len(record)) / RATE_HZ)
     actuator = record * (5000.0, 2e-3) + np.stack([drive, 0.0 * drive], axis=1)
     source = write_csv(tmp_path / "m.csv", actuator)
@@ -241,7 +241,7 @@ def test_the_recording_itself_is_never_the_answers_place(tmp_path, record, capsy
 @pytest.mark.parametrize(
     ("good", "code", "words"), [(1, 3, "Too few blocks"), (8, 0, "warning: only")]
 )
-def test_few_valid_blocks_are_no_quiet_result(
+def test_few_valid_blocks_give_a_warning_or_an_error(
     record: np.ndarray, tmp_path: Path, capfd: pytest.CaptureFixture[str], good: int, code: int,
     words: str,
 ) -> None:  # fmt: skip
@@ -251,10 +251,10 @@ def test_few_valid_blocks_are_no_quiet_result(
     blocks = np.where(np.arange(len(blocks))[:, np.newaxis] < good * 2000, blocks, noise)
     source, out = write_csv(tmp_path / "m.csv", blocks), tmp_path / "out.csv"
     assert run("sense", source, "--carrier-hz", 2000, "--rate-hz", 2e5, "--out", out) == code
-    told = capfd.readouterr().err
-    assert words in told
-    assert f"{good} of 20 blocks valid" in told
-    assert "amplitude lost" in told
+    printed_err = capfd.readouterr().err
+    assert words in printed_err
+    assert f"{good} of 20 blocks valid" in printed_err
+    assert "amplitude lost" in printed_err
     assert out.exists()
 
 

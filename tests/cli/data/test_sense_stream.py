@@ -1,4 +1,4 @@
-"""`haselab sense` in pieces: any file, any length, bad blocks told, little memory."""
+"""`haselab sense` in chunks: any file, any length, bad blocks reported, little memory."""
 
 import csv
 import json
@@ -109,7 +109,7 @@ def lockin(**changes: object) -> Lockin:
 
 
 def test_each_kind_of_file_gives_the_same_rows_as_the_lockin_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PART_ROWS", 5 * BLOCK)  # 12 blocks in 5, 5 and 2
+    monkeypatch.setattr(sense_source, "_CHUNK_ROWS", 5 * BLOCK)  # 12 blocks in 5, 5 and 2
     sensed = lockin().sense(RECORD.reshape(-1, BLOCK, 2))
     rows = {}
     for kind in KINDS:
@@ -130,13 +130,13 @@ def test_each_kind_of_file_gives_the_same_rows_as_the_lockin_itself(tmp_path, mo
 @pytest.mark.parametrize("method", ["lockin", "sinefit", "paper"])
 def test_the_length_of_the_pieces_leaves_no_trace(tmp_path, monkeypatch, method):
     source = save(tmp_path / "pairs.npy", RECORD)
-    told = []
+    printed = []
     for blocks in (1, 3, 100):
-        monkeypatch.setattr(sense_source, "_PART_ROWS", blocks * BLOCK)
+        monkeypatch.setattr(sense_source, "_CHUNK_ROWS", blocks * BLOCK)
         out = tmp_path / f"{blocks}.csv"
         assert run(source, *ASK, "--method", method, "--out", out) == 0
-        told.append(out.read_text())
-    assert told[0] == told[1] == told[2]
+        printed.append(out.read_text())
+    assert printed[0] == printed[1] == printed[2]
 
 
 def test_float32_readings_give_what_their_rounding_allows(tmp_path):
@@ -206,9 +206,9 @@ def test_a_record_without_one_valid_block_is_one_line_and_rows_with_the_reason(
 ):
     source, out = save(tmp_path / "pairs.npy", change(RECORD)), tmp_path / "out.csv"
     assert run(source, *ASK, *options, "--out", out) == code
-    told = capsys.readouterr()
-    assert told.out == ""
-    lines = [line for line in told.err.splitlines() if "do not fill a block" not in line]
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    lines = [line for line in printed.err.splitlines() if "do not fill a block" not in line]
     assert len(lines) == 1
     assert words in lines[0]
     columns = read(out)
@@ -233,10 +233,10 @@ def test_a_record_that_fills_no_block_is_refused_and_leaves_nothing(
 ):
     source, out = save(tmp_path / kind, record), tmp_path / "out.csv"
     assert run(source, *ASK, "--out", out) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert words in told
-    assert told.endswith(f"{source}\n")
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert words in printed
+    assert printed.endswith(f"{source}\n")
     assert not out.exists()
 
 
@@ -257,11 +257,11 @@ def test_a_missing_channel_names_what_is_there(tmp_path, capsys):
     assert "or two columns with shape (n, 2)" in capsys.readouterr().err
 
 
-def test_samples_beyond_the_last_block_are_told(tmp_path, capsys):
+def test_samples_beyond_the_last_block_are_reported(tmp_path, capsys):
     assert run(save(tmp_path / "pairs.npy", RECORD[: 3 * BLOCK + 17]), *ASK, "--json") == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["blocks"] == 3
-    assert "the last 17 samples do not fill a block" in told.err
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["blocks"] == 3
+    assert "the last 17 samples do not fill a block" in printed.err
 
 
 def test_a_rate_that_contradicts_the_file_is_refused(tmp_path, capsys):
@@ -313,8 +313,8 @@ def session(path: Path, blocks: int = 23, **header: object) -> np.ndarray:
     return codes
 
 
-def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PART_ROWS", 7 * BLOCK)  # chunks of 10 blocks
+def test_a_session_states_everything_that_its_codes_need(tmp_path, monkeypatch):
+    monkeypatch.setattr(sense_source, "_CHUNK_ROWS", 7 * BLOCK)  # chunks of 10 blocks
     codes = session(tmp_path / "session.h5")
     out = tmp_path / "out.csv"
     assert run(tmp_path / "session.h5", "--experiment", "play", "--out", out) == 0
@@ -336,11 +336,7 @@ def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
     ("header", "options", "words"),
     [
         ({}, [], "a session with the experiments play. Name one with --experiment"),
-        (
-            {},
-            ["--experiment", "never"],
-            "The session has no experiment 'never' with blocks, only play.",
-        ),
+        ({}, ["--experiment", "never"], "no experiment 'never' with blocks, only play."),
         ({}, ["--experiment", "play", "--block-s", "0.02"], "blocks have 0.01 s"),
         ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),
         ({"study": {}}, ["--experiment", "play"], "lacks study.sensing"),
@@ -349,9 +345,9 @@ def test_a_session_tells_all_that_its_codes_need(tmp_path, monkeypatch):
 def test_what_a_session_lacks_is_one_line(tmp_path, capsys, header, options, words):
     session(tmp_path / "session.h5", 2, **header)
     assert run(tmp_path / "session.h5", *options) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert words in told
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert words in printed
 
 
 def test_a_file_that_is_no_session_has_no_experiment(tmp_path, capsys):
@@ -398,7 +394,7 @@ def test_a_calibration_of_something_else_is_refused(tmp_path, capsys):
 
 
 def test_json_holds_every_column_to_the_last_digit(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sense_source, "_PART_ROWS", 5 * BLOCK)
+    monkeypatch.setattr(sense_source, "_CHUNK_ROWS", 5 * BLOCK)
     record = spoiled(v=np.nan)
     assert run(save(tmp_path / "pairs.npy", record), *ASK, "--json") == 0
     answer = json.loads(capsys.readouterr().out)

@@ -18,8 +18,8 @@ HEADER = {"rig": {"rate_hz": 200e3, "volt_per_code": 3.0517578125e-4}}
 def typed(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as ended:
         main([str(each) for each in arguments])
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
+    printed = capsys.readouterr()
+    return int(ended.value.code or 0), printed.out, printed.err
 
 
 @pytest.fixture
@@ -38,23 +38,23 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_session_goes_out_and_comes_back(folder, tmp_path, capsys):
     out = tmp_path / "s.mat"
-    code, told, _ = typed(capsys, "session", "export", folder, "--to", "mat", "--out", out,
+    code, printed, _ = typed(capsys, "session", "export", folder, "--to", "mat", "--out", out,
                           "--json")  # fmt: skip
-    assert (code, json.loads(told)) == (0, {"files": [str(out)], "experiments": {"a": "a"}})
-    code, told, _ = typed(
+    assert (code, json.loads(printed)) == (0, {"files": [str(out)], "experiments": {"a": "a"}})
+    code, printed, _ = typed(
         capsys, "session", "import", out, "--v", "a/v_monitor_v", "--i", "a/i_monitor_v",
         "--rate-hz", 200e3, "--volt-per-code", 3.0517578125e-4, "--block-samples", 100,
         "--out", tmp_path / "back", "--json",
     )  # fmt: skip
-    assert (code, json.loads(told)["blocks"]) == (0, 12)
+    assert (code, json.loads(printed)["blocks"]) == (0, 12)
     with SessionReader(tmp_path / "back" / "session.h5") as back:
         codes = back.experiment("imported").codes
     np.testing.assert_array_equal(codes[:, 0, 0], np.arange(12))
 
 
-def test_recover_leaves_what_is_whole_and_tells_what_was_changed(folder, capsys):
-    code, told, _ = typed(capsys, "recover", folder, "--json")
-    answer = json.loads(told)
+def test_recover_keeps_complete_recordings_and_reports_changes(folder, capsys):
+    code, printed, _ = typed(capsys, "recover", folder, "--json")
+    answer = json.loads(printed)
     assert (code, answer["state"], answer["blocks"]) == (0, "SEALED", {"a": 12})
     (folder / "video").mkdir()
     (folder / "video" / "late.mkv").write_bytes(b"x")

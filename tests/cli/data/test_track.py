@@ -404,7 +404,7 @@ def test_an_overlay_video_shows_every_frame(clip, tmp_path):
     assert green > red + 40 and green > blue + 40
 
 
-def test_strain_is_unknown_where_a_clamp_is_covered_and_the_rest_stands(tmp_path, capsys):
+def test_strain_is_unknown_while_a_clamp_is_covered_and_known_otherwise(tmp_path, capsys):
     images = sheet([lambda p: p] * 8)
     rng = np.random.default_rng(9)
     for image in images[4:6]:
@@ -475,7 +475,7 @@ def test_a_recorded_video_that_changed_is_refused_or_marked(clip, tmp_path, caps
     assert "unverified numbers" in printed.err
 
 
-def test_motion_among_the_rest_frames_is_told_and_left_out(tmp_path, capsys):
+def test_motion_in_the_rest_frames_is_reported_and_left_out(tmp_path, capsys):
     folder = tmp_path / "images"
     folder.mkdir()
     noise = np.random.default_rng(3)

@@ -229,7 +229,7 @@ def test_a_computer_of_which_nothing_can_be_read_gets_no_advice(tmp_path):
         ),
     ],
 )
-def test_each_planted_fault_is_the_only_one_that_is_told(plant, changed, detail, advice):
+def test_each_simulated_fault_is_the_only_one_reported(plant, changed, detail, advice):
     found = bad(plant(changed))
     assert len(found) == 1, found
     assert detail in found[0].detail
@@ -237,15 +237,15 @@ def test_each_planted_fault_is_the_only_one_that_is_told(plant, changed, detail,
     assert "\n" not in found[0].detail + found[0].advice
 
 
-def test_devices_of_a_group_that_the_user_is_not_in_are_told_with_the_group(plant, tmp_path):
+def test_devices_of_another_group_are_reported_with_the_group(plant, tmp_path):
     group = (tmp_path / "probe").parent.stat().st_gid
     machine = plant({"etc/group": f"root:x:0:\nuucp:x:{group}:\n"}, mode=0o660)
     group = (tmp_path / "dev/ttyACM0").stat().st_gid
     (tmp_path / "etc/group").write_text(f"uucp:x:{group}:\n")
-    told = {found.name: found for found in bad(machine)}
-    assert set(told) == {"serial port", "USB camera"}
-    assert told["serial port"].advice.startswith("Type: sudo usermod -aG uucp $USER")
-    assert 'ENV{ID_USB_INTERFACES}=="*:ef0500:*", MODE="0666"' in told["USB camera"].advice
+    printed = {found.name: found for found in bad(machine)}
+    assert set(printed) == {"serial port", "USB camera"}
+    assert printed["serial port"].advice.startswith("Type: sudo usermod -aG uucp $USER")
+    assert 'ENV{ID_USB_INTERFACES}=="*:ef0500:*", MODE="0666"' in printed["USB camera"].advice
     member = Machine(tmp_path, "linux", 12345, frozenset({group}))
     assert bad(member) == []
 
@@ -278,7 +278,7 @@ def test_a_camera_by_name_or_none_leaves_the_ports_alone(plant):
         assert bad(machine, SystemNeeds(genicam=genicam, frame_bytes=512 * 512)) == []
 
 
-def test_a_local_board_on_macos_is_told_to_use_a_server(tmp_path):
+def test_on_macos_a_local_board_needs_a_server(tmp_path):
     machine = Machine(tmp_path, "darwin", 1, frozenset())
     (found,) = examine_system(machine, SystemNeeds(local_daq=True))
     assert found.detail == "NI-DAQmx is not available for macOS" and "daq.server" in found.advice
@@ -291,6 +291,6 @@ def test_files_with_junk_are_no_crash(plant, junk):
 
 
 def test_a_port_with_a_null_character_is_not_there_and_no_fault_of_the_program(plant):
-    told = bad(plant(), SystemNeeds(serial_ports=("/dev/tty\x00x",)))
-    assert "does not exist" in told[0].detail
+    printed = bad(plant(), SystemNeeds(serial_ports=("/dev/tty\x00x",)))
+    assert "does not exist" in printed[0].detail
     assert plant().group("dev/tty\x00x") == "dialout"

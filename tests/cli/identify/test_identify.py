@@ -83,7 +83,7 @@ def test_frequency_response_answers_with_arrays_of_one_length(sweep):
     assert np.abs(np.array(answer["magnitude"])[near] / expected - 1).max() < 0.05
 
 
-def test_free_response_answers_and_null_stands_for_a_missing_hull(tmp_path):
+def test_free_response_answers_null_for_a_missing_envelope(tmp_path):
     noise = 1e-5 * np.random.default_rng(2).normal(size=400)
     x = 0.01 * np.exp(-4.0 * TIME_S[:400]) * np.cos(5.1 * TIME_S[:400]) + noise
     answer = ask("free-response", write(tmp_path / "x.csv", x=x, time_s=TIME_S[:400]))
@@ -94,7 +94,7 @@ def test_free_response_answers_and_null_stands_for_a_missing_hull(tmp_path):
     )
 
 
-def test_hyperelastic_keeps_to_the_asked_range(tmp_path):
+def test_hyperelastic_uses_only_the_requested_range(tmp_path):
     stretch = np.linspace(1.0, 5.0, 100)
     stress_pa = Ogden(15e3, 2.4).nominal_stress_pa(stretch)
     stress_pa = stress_pa + 10.0 * np.random.default_rng(3).normal(size=100)
@@ -153,7 +153,7 @@ def test_no_result_is_a_result_error_with_the_reason_in_the_json(tmp_path):
         (["hyperelastic", "{sweep}"], "lacks stretch, nominal_stress_pa"),
     ],
 )
-def test_bad_use_is_told_in_one_line(sweep, arguments, match):
+def test_bad_use_is_reported_in_one_line(sweep, arguments, match):
     arguments = [argument.format(sweep=sweep) for argument in arguments]
     with pytest.raises(InputError, match=match):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
@@ -283,7 +283,7 @@ def test_creep_answers_with_a_verdict_and_a_forecast(tmp_path):
         (["creep", "{loops}", "--rate-hz", "9", "--forecast-s", "-1"], "later_s = -1 s"),
     ],
 )
-def test_bad_use_of_hysteresis_and_creep_is_told_in_one_line(loops, arguments, match):
+def test_bad_use_of_hysteresis_and_creep_is_reported_in_one_line(loops, arguments, match):
     arguments = [argument.format(loops=loops) for argument in arguments]
     with pytest.raises(InputError, match=match):
         CliRunner().invoke(command, arguments, catch_exceptions=False)

@@ -24,7 +24,7 @@ def write(path, drive_v, plant=PLANT, noise=1e-3):
     return str(path)
 
 
-def told(command, *arguments):
+def printed(command, *arguments):
     result = CliRunner().invoke(command, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.stdout
@@ -54,7 +54,9 @@ def model(tmp_path):
 def test_the_verdict_comes_with_its_evidence_and_a_model_for_the_plan(alternation, tmp_path):
     out = tmp_path / "verdict.json"
     answer = json.loads(
-        told(identify, "verdict", alternation, "--question", "creep", "--json", "--out", str(out))
+        printed(
+            identify, "verdict", alternation, "--question", "creep", "--json", "--out", str(out)
+        )
     )
     assert answer["verdict"] == "supports mechanical"
     assert answer["supported"] == "mechanical"
@@ -62,7 +64,7 @@ def test_the_verdict_comes_with_its_evidence_and_a_model_for_the_plan(alternatio
     assert {"bic", "log_likelihood", "probability", "lead", "misfit"} <= set(answer["rivals"][1])
     assert VoltagePlant.from_dict(answer["voltage_plant"]).creep == "mechanical"
     assert json.loads(out.read_text()) == answer
-    page = told(identify, "verdict", alternation, "--question", "creep")
+    page = printed(identify, "verdict", alternation, "--question", "creep")
     assert page.splitlines()[0] == "supports mechanical"
     assert "excluded" in page
 
@@ -70,20 +72,20 @@ def test_the_verdict_comes_with_its_evidence_and_a_model_for_the_plan(alternatio
 def test_the_plan_of_a_bipolar_rig_alternates_and_writes_its_drive(model, rig, tmp_path):
     out = tmp_path / "drive.csv"
     arguments = (model, "--rig", rig, "--goal", "creep", "--duration-s", "20")
-    answer = json.loads(told(plan, *arguments, "--json", "--out", str(out)))
+    answer = json.loads(printed(plan, *arguments, "--json", "--out", str(out)))
     assert answer["chosen"].startswith("alternation")
     head, columns, *rows = out.read_text().splitlines()
     assert (head, columns) == ("# rate_hz = 100", "time_s,drive_v")
     drive_v = np.array([float(row.split(",")[1]) for row in rows])
     assert drive_v.size / 100.0 == answer["duration_s"]
     assert -2.0 <= drive_v.min() < 0.0 < drive_v.max() <= 2.0
-    assert answer["chosen"] in told(plan, *arguments)
+    assert answer["chosen"] in printed(plan, *arguments)
 
 
 def test_the_default_rig_has_one_polarity_and_the_plan_says_so(model, tmp_path):
     rig = tmp_path / "unipolar.toml"
     rig.write_text('kind = "twin"\nreading = "rad"\n')
-    page = told(plan, model, "--rig", str(rig), "--goal", "creep", "--duration-s", "20")
+    page = printed(plan, model, "--rig", str(rig), "--goal", "creep", "--duration-s", "20")
     assert "has one polarity" in page
     assert "alternation" not in page.split("The window")[0]
 
@@ -93,7 +95,9 @@ def test_a_linear_model_is_good_enough_to_plan_with(rig, tmp_path):
     path = tmp_path / "linear.json"
     path.write_text(json.dumps({"plant": linear.to_dict()}))
     answer = json.loads(
-        told(plan, str(path), "--rig", rig, "--goal", "creep_share", "--duration-s", "20", "--json")
+        printed(
+            plan, str(path), "--rig", rig, "--goal", "creep_share", "--duration-s", "20", "--json"
+        )
     )
     assert answer["ranked"][0]["std"]["creep_share"] > 0.0
 
@@ -106,12 +110,12 @@ def test_answers_that_agree_and_answers_that_do_not(tmp_path):
         path.write_text(json.dumps({"natural_frequency_rad_s": estimate}))
         files[name] = str(path)
     ask = ("verdict", "--question", "agreement")
-    assert told(identify, *ask, files["a"], files["b"]).splitlines()[0] == "agree"
-    answer = json.loads(told(identify, *ask, *files.values(), "--json"))
+    assert printed(identify, *ask, files["a"], files["b"]).splitlines()[0] == "agree"
+    answer = json.loads(printed(identify, *ask, *files.values(), "--json"))
     assert answer["verdict"] == "disagree: a and c; b and c"
     unknown = {"value": None, "std": None, "ci95": [None, None], "unit": "rad/s"}
     (tmp_path / "b.json").write_text(json.dumps({"natural_frequency_rad_s": unknown}))
-    assert told(identify, *ask, files["a"], files["b"]).splitlines()[0] == "cannot tell"
+    assert printed(identify, *ask, files["a"], files["b"]).splitlines()[0] == "cannot tell"
 
 
 def test_modes_of_a_proportional_input(tmp_path):
@@ -120,7 +124,7 @@ def test_modes_of_a_proportional_input(tmp_path):
     y = Plant(0.5, 5.11, 0.09, 0.01).simulate(u, 100.0, time_s)
     y = y + 0.01 * np.random.default_rng(4).normal(size=1000)
     np.savetxt(tmp_path / "u.csv", np.column_stack([u, y]), "%.7g", ",", header="u,y", comments="")
-    page = told(identify, "verdict", str(tmp_path / "u.csv"), "--question", "modes", "--linear",
+    page = printed(identify, "verdict", str(tmp_path / "u.csv"), "--question", "modes", "--linear",
                 "--input", "u", "--rate-hz", "100")  # fmt: skip
     assert page.splitlines()[0] == "supports one"
 
@@ -137,7 +141,9 @@ def test_modes_of_a_proportional_input(tmp_path):
         (["verdict", "{model}", "--question", "agreement"], "has no estimate"),
     ],
 )
-def test_bad_use_of_a_verdict_is_told_in_one_line(alternation, model, arguments, match):
+def test_bad_use_of_a_model_comparison_is_reported_in_one_line(
+    alternation, model, arguments, match
+):
     arguments = [argument.format(file=alternation, model=model) for argument in arguments]
     with pytest.raises(InputError, match=match):
         CliRunner().invoke(identify, arguments, catch_exceptions=False)
@@ -153,7 +159,7 @@ def test_bad_use_of_a_verdict_is_told_in_one_line(alternation, model, arguments,
         (["--goal", "all", "--noise-std", "0"], "noise_std = 0"),
     ],
 )
-def test_bad_use_of_a_plan_is_told_in_one_line(model, rig, arguments, match):
+def test_bad_use_of_a_plan_is_reported_in_one_line(model, rig, arguments, match):
     with pytest.raises(InputError, match=match):
         CliRunner().invoke(plan, [model, "--rig", rig, *arguments], catch_exceptions=False)
 
@@ -167,8 +173,8 @@ def test_a_plan_without_a_drive_has_no_result(model, rig):
         )
 
 
-def test_a_chirp_tells_the_reading_on_the_command_line(tmp_path):
+def test_a_chirp_decides_the_frequency_axis_on_the_command_line(tmp_path):
     drive_v = 1.0 + 0.4 * linear_chirp(0.1, 8.0, 10.0, 100.0)
     file = write(tmp_path / "chirp.csv", drive_v)
-    page = told(identify, "verdict", file, "--question", "reading")
+    page = printed(identify, "verdict", file, "--question", "reading")
     assert page.splitlines()[0] == "supports rad"

@@ -129,19 +129,19 @@ def test_a_missing_model_is_exit_2(tmp_path, capsys):
 
 def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, capsys):
     model = tmp_path / "model.json"
-    told = {"plant": PLANT.to_dict(), "rate_hz": 50.0, "loop_delay_s": 0.023}
+    stated = {"plant": PLANT.to_dict(), "rate_hz": 50.0, "loop_delay_s": 0.023}
     for options, expected in (
         ((), {"rate_hz": 50.0, "measurement_delay_s": 0.023}),
         (("--delay-s", 0.004), {"rate_hz": 50.0, "measurement_delay_s": 0.004}),
         (("--rate-hz", 200), {"rate_hz": 200.0, "measurement_delay_s": 0.023}),
     ):
-        model.write_text(json.dumps(told))
+        model.write_text(json.dumps(stated))
         out = tmp_path / "controller.toml"
         arguments = ("design", model, "--structure", "pi", "--out", out, *options)
         assert run(capsys, *arguments, "--accept-shortfalls", "--force")[0] == 0
         assert tomllib.loads(out.read_text())["controller"]["loop"] == expected
     for wrong in ("late", -1.0, [0.01]):
-        model.write_text(json.dumps(told | {"loop_delay_s": wrong}))
+        model.write_text(json.dumps(stated | {"loop_delay_s": wrong}))
         code, _, error = run(capsys, "design", model)
         assert code == 2
         assert error.startswith("haselab: 1 error(s): loop_delay_s: Input should be ")

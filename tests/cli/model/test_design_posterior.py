@@ -121,9 +121,9 @@ def test_a_fitted_model_carries_its_covariance_into_the_design(tmp_path, capsys)
     arguments = ("identify", "transfer", data, "--held-at-hz", 100, "--poles", 2, "--zeros", 1,
                  "--delay", 0.01, "--out", fit)  # fmt: skip
     assert run(capsys, *arguments)[0] == 0
-    told = json.loads(fit.read_text())["covariance"]
-    assert told["names"][-2:] == ["gain", "numerator_1"]
-    assert [len(row) for row in told["matrix"]] == [5] * 5
+    covariance = json.loads(fit.read_text())["covariance"]
+    assert covariance["names"][-2:] == ["gain", "numerator_1"]
+    assert [len(row) for row in covariance["matrix"]] == [5] * 5
     code, text, _ = run(capsys, "design", fit, "--structure", "pi", "--json", "--draws", 50)
     assert code == 0 and json.loads(text)["posterior"]["stable"]["value"] == 1.0
 

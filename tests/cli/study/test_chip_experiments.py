@@ -53,8 +53,8 @@ def test_tools_that_are_missing_are_one_line_of_the_report(
     main(folder, "none")
     known = json.loads((folder / "firmware" / "experiments.json").read_text())
     for name in ("chip", "miniature"):
-        assert "is not installed. Type:  sudo apt-get install" in known["left_out"][name].replace(
-            ". Type: ", ". Type:  "
+        assert "is not installed. Run:  sudo apt-get install" in known["left_out"][name].replace(
+            ". Run: ", ". Run:  "
         )
     rows = chip_rows(folder, None)  # type: ignore[arg-type]
     assert rows.quantities == {}
@@ -120,7 +120,7 @@ def test_the_end_of_the_study_ends_them(folder: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.long
-def test_a_process_that_breaks_is_told_in_one_line(
+def test_a_process_that_fails_is_reported_in_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     beside, _ = started(folder, "raise SystemExit('no room on the disk')", monkeypatch)
@@ -129,8 +129,8 @@ def test_a_process_that_breaks_is_told_in_one_line(
     assert left_out == dict.fromkeys(
         ("S26", "S28"), "its process ended early: no room on the disk."
     )
-    told = chip_rows(folder, None).figures["chip"]["left_out"]  # type: ignore[arg-type]
-    assert told == "its process ended early: no room on the disk."
+    printed = chip_rows(folder, None).figures["chip"]["left_out"]  # type: ignore[arg-type]
+    assert printed == "its process ended early: no room on the disk."
 
 
 def test_the_rows_are_in_the_table() -> None:

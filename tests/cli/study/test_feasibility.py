@@ -37,11 +37,11 @@ def test_the_reference_study_is_feasible_on_the_twin(reading: str) -> None:
     judge_study(study, describe(config), rating_of_twin(config, study)).require()
 
 
-def test_the_field_foretold_is_the_field_that_breaks_the_twin() -> None:
+def test_the_predicted_field_is_the_field_that_breaks_the_twin() -> None:
     # A ramp to the highest output with the twin's own weight; its breakdown set just around.
     study = builtin_study()
-    told = judge_study(study, describe(TwinConfig()), rating_of_twin(TwinConfig(), study))
-    field = next(c.requested for c in told.checks if c.name == "field") * 1e6
+    printed = judge_study(study, describe(TwinConfig()), rating_of_twin(TwinConfig(), study))
+    field = next(c.requested for c in printed.checks if c.name == "field") * 1e6
     for factor, breaks in ((0.95, True), (1.05, False)):
         breakdown = factor * field / 1.01  # the carrier's 1 % is not in the twin's slow ramp
         config = TwinConfig.model_validate({"dielectric": {"breakdown_v_per_m": breakdown}})
@@ -51,7 +51,7 @@ def test_the_field_foretold_is_the_field_that_breaks_the_twin() -> None:
         assert twin._native.broken is breaks
 
 
-def test_the_command_tells_every_number_and_refuses_a_thin_dielectric(tmp_path: Path) -> None:
+def test_the_command_prints_every_number_and_refuses_a_thin_dielectric(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text('kind = "twin"\n')
     arguments = [str(STUDY), "--rig", str(tmp_path / "rig.toml"), "--json"]
     done = CliRunner().invoke(command, arguments, catch_exceptions=False)
@@ -127,7 +127,7 @@ def test_a_bench_that_was_made_safe_is_armed_only_after_its_reason_was_acknowled
         rig.source.write(1.0)
 
 
-def test_nobody_is_asked_about_a_recording(tmp_path: Path, monkeypatch) -> None:
+def test_a_recording_needs_no_confirmation(tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "rig.toml"
     path.write_text('kind = "replay"\nsession = "s.h5"\n')
     plain = rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz"))
@@ -216,7 +216,7 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"), [("kind = 'twin'\n", "needs 'bench'"), ("kind = \n", "Not a TOML")]
+    ("text", "words"), [("kind = 'twin'\n", "needs kind = 'bench'"), ("kind = \n", "Not a TOML")]
 )
 def test_a_guardian_that_cannot_act_is_never_ready(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "rig.toml").write_text(text)

@@ -40,9 +40,9 @@ def accepted(mass_kg: float) -> bool:
 @pytest.mark.long
 def test_a_mass_that_would_be_refused_is_said_with_the_largest_one_that_is_not() -> None:
     """Before, "hang about 0.35 kg" led to a refusal."""
-    told = note(0.35, HZ.model_dump(mode="json"))
-    assert "with that mass the study would be refused (field of " in told
-    best_kg = float(told.rpartition("accepted is ")[2].removesuffix(" kg"))
+    printed = note(0.35, HZ.model_dump(mode="json"))
+    assert "with that mass the study would be refused (field of " in printed
+    best_kg = float(printed.rpartition("accepted is ")[2].removesuffix(" kg"))
     assert accepted(best_kg) and not accepted(best_kg + 0.01)
 
 
@@ -52,7 +52,7 @@ def test_a_mass_that_is_accepted_is_said_to_be() -> None:
     )
 
 
-def test_on_a_bench_the_reader_is_told_to_check_first() -> None:
+def test_on_a_bench_the_note_says_to_check_first() -> None:
     assert "plan feasibility" in note(0.35, {"kind": "bench"})
 
 

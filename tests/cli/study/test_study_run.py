@@ -120,8 +120,8 @@ def play(
     """Run the tiny study; where its progress has come to `where` it gets a signal."""
     out, meter = folder / "out", folder / "meter.json"
     arguments = [*tiny_study(folder), "--keep-video", keep, "--json", "--out", str(out)]
-    told = [str(meter), where, str(int(number)), "again" if again else "once"]
-    command = [sys.executable, "-c", start + textwrap.dedent(DRIVER), *told, *arguments]
+    printed = [str(meter), where, str(int(number)), "again" if again else "once"]
+    command = [sys.executable, "-c", start + textwrap.dedent(DRIVER), *printed, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     lines = done.stderr.strip().splitlines()
     assert len(lines) == 1, done.stderr

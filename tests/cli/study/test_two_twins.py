@@ -62,11 +62,11 @@ def test_a_twin_that_is_too_heavy_is_refused_with_every_advice(twin: Path, tmp_p
             ["--twin", str(twin), "--quick", "--out", str(tmp_path / "out")],
             catch_exceptions=False,
         )
-    told = str(refused.value)
-    assert "inf" not in told
-    assert "in step trials by the paper's sensing chain" in told
-    assert "The carrier alone takes the amplifier's whole current." in told
-    assert "Lower the voltage or the hung mass of 0.35 kg." in told
+    printed = str(refused.value)
+    assert "inf" not in printed
+    assert "in step trials by the paper's sensing chain" in printed
+    assert "The carrier alone needs all of the amplifier's current." in printed
+    assert "Lower the voltage or the hung mass of 0.35 kg." in printed
 
 
 def test_the_doctor_looks_for_the_library_that_a_co_simulation_is_built_with(

@@ -87,7 +87,7 @@ def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
     assert re.search(r"ok  instrument supply +ACME,HV-3000,A1234", doctor)
     live = told["haselab rig check bench.toml --live --yes"]
     assert re.search(r"ok +dry +supply +ACME,HV-3000,A1234", live)
-    assert re.search(r"ok +live +supply +\S+ V read back, set were 200 V", live)
+    assert re.search(r"ok +live +supply +\S+ V read back, 200 V requested", live)
     assert re.search(r"ok +safe +supply +off", told["haselab rig safe bench.toml"])
     assert not lab.emulator.is_on and lab.emulator.set_v == 0.0
 

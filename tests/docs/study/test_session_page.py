@@ -54,7 +54,7 @@ def test_the_page_has_what_is_run_here() -> None:
     assert (len(PYTHON), len(COMMANDS)) == (3, 5)
 
 
-@pytest.mark.parametrize("code", PYTHON, ids=["follow", "xarray", "frames"])
+@pytest.mark.parametrize("code", PYTHON, ids=["frames", "follow", "xarray"])
 def test_each_piece_of_python_runs(code: str) -> None:
     if "xarray" in code:
         pytest.importorskip("xarray")

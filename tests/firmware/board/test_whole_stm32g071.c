@@ -43,7 +43,7 @@ static void hear(uint8_t byte)
     if (frame_decode(world.heard, world.heard_bytes) > 0) {
         const uint8_t *m = world.heard + 3;
         if (world.heard[0] == HP_ACK) {
-            CHECK(m[3] == HP_VERDICT_ACCEPTED, "command %d: verdict %d", m[0], m[3]);
+            CHECK(m[3] == HP_RESULT_ACCEPTED, "command %d: result %d", m[0], m[3]);
             world.token = m[0] == HP_REQUEST_ARMING ? hp_get_u16(m + 4) : world.token;
         } else if (world.heard[0] == HP_STATUS) {
             world.status.state = m[2];

@@ -40,7 +40,7 @@ def test_independent_lines_are_fitted_at_the_bound_with_honest_intervals():
     errors, inside, p = [], np.zeros(4), []
     for run in range(runs):
         fit = fit_response(AT_HZ, noisy(PLANT, [1, run]), STD)
-        estimates = [fit.estimates[name] for name in NAMES]
+        estimates = [fit.parameters[name] for name in NAMES]
         errors.append([e.value - t for e, t in zip(estimates, TRUTH, strict=True)])
         inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, TRUTH, strict=True)]
         p.append(fit.chi_squared_p)
@@ -60,8 +60,10 @@ def test_deviations_that_are_wrong_are_told_and_do_not_spoil_the_intervals():
         assert any(word in note for note in fit.notes)
         # Weights that are all wrong alike change nothing; the misfits set the size.
         for name in NAMES:
-            assert fit.estimates[name].value == pytest.approx(good.estimates[name].value, rel=1e-6)
-            assert fit.estimates[name].std == pytest.approx(good.estimates[name].std, rel=1e-3)
+            assert fit.parameters[name].value == pytest.approx(
+                good.parameters[name].value, rel=1e-6
+            )
+            assert fit.parameters[name].std == pytest.approx(good.parameters[name].std, rel=1e-3)
     assert not any("std are" in note for note in good.notes)
 
 
@@ -84,7 +86,7 @@ def test_one_sweep_by_local_models_gives_the_numbers_near_the_bound():
     for run in range(runs):
         noise = std * np.random.default_rng([3, run]).normal(size=4000)
         response = estimate_frequency_response(sweep, clean + noise, 400.0)
-        estimates = [response.fit().estimates[name] for name in NAMES]
+        estimates = [response.fit().parameters[name] for name in NAMES]
         errors.append([e.value - t for e, t in zip(estimates, TRUTH, strict=True)])
         inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, TRUTH, strict=True)]
     ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / best
@@ -105,7 +107,7 @@ def test_no_guess_is_needed_for_frequency_damping_or_delay(delay_s, zeta):
         assert fit.succeeded
         truth = dict(zip(NAMES, (-2.0, omega, zeta, delay_s), strict=True))
         for name, value in truth.items():
-            estimate = fit.estimates[name]
+            estimate = fit.parameters[name]
             assert abs(estimate.value - value) <= 4.5 * estimate.std, (omega, name)
         assert np.abs(fit.modelled - plant.frequency_response(2 * np.pi * at_hz)).max() < 0.05
 
@@ -137,13 +139,13 @@ def test_what_the_lines_do_not_tell_has_no_number():
 def test_known_numbers_are_kept_and_zeros_are_fitted():
     structure = TransferStructure(delay=0.012, fixed={"damping_ratio": PLANT.damping_ratio})
     fit = fit_response(AT_HZ, noisy(PLANT, 7), STD, structure)
-    assert fit.estimates["delay_s"].std == 0.0
-    assert fit.estimates["damping_ratio"].value == pytest.approx(PLANT.damping_ratio)
+    assert fit.parameters["delay_s"].std == 0.0
+    assert fit.parameters["damping_ratio"].value == pytest.approx(PLANT.damping_ratio)
     s = 2j * np.pi * AT_HZ
     exact = (3.0 + 0.5 * s) / (s * s + 2.0 * s + 30.0)
     fit = fit_response(AT_HZ, exact, np.full(50, 1e-6), TransferStructure(zeros=1, delay=0.0))
     assert np.abs(fit.modelled - exact).max() < 1e-7
-    assert fit.estimates["gain"].value == pytest.approx(0.1, rel=1e-5)
+    assert fit.parameters["gain"].value == pytest.approx(0.1, rel=1e-5)
 
 
 def test_noise_alone_gives_no_result():
@@ -151,7 +153,7 @@ def test_noise_alone_gives_no_result():
     for _ in range(5):
         noise = rng.normal(size=50) + 1j * rng.normal(size=50)
         fit = fit_response(AT_HZ, noise, np.full(50, np.sqrt(2.0)))
-        assert fit.status.startswith("no result"), fit.estimates
+        assert fit.status.startswith("no result"), fit.parameters
         with pytest.raises(ResultError, match="has no result"):
             _ = fit.plant
 
@@ -187,7 +189,7 @@ def test_a_delay_of_periods_keeps_the_sign_of_the_gain(periods, snr_db):
             continue
         assert fit.status == "ok"
         for name, value in zip(NAMES, (0.5, OMEGA, 0.22, plant.delay_s), strict=True):
-            assert abs(fit.estimates[name].value - value) < 5.0 * fit.estimates[name].std
+            assert abs(fit.parameters[name].value - value) < 5.0 * fit.parameters[name].std
 
 
 def test_two_delays_that_explain_the_lines_are_ambiguous():
@@ -199,4 +201,4 @@ def test_two_delays_that_explain_the_lines_are_ambiguous():
     assert any(fit.status.startswith("ambiguous: two models") for fit in fits)
     for fit in fits:
         if fit.succeeded:
-            assert abs(fit.estimates["gain"].value - 0.5) < 5.0 * fit.estimates["gain"].std
+            assert abs(fit.parameters["gain"].value - 0.5) < 5.0 * fit.parameters["gain"].std

@@ -31,10 +31,10 @@ def test_the_numbers_of_the_truth_lie_in_their_intervals(creep):
     assert fit.succeeded
     for name in ("natural_frequency_rad_s", "damping_ratio", "delay_s", "creep_share",
                  "creep_time_constant_s"):  # fmt: skip
-        estimate = fit.estimates[name]
+        estimate = fit.parameters[name]
         assert abs(estimate.value - getattr(truth, name)) <= 4.0 * estimate.std, name
     for k, gain in enumerate(truth.gains, start=1):
-        estimate = fit.estimates[f"gain_{k}"]
+        estimate = fit.parameters[f"gain_{k}"]
         assert abs(estimate.value - gain) <= 4.0 * estimate.std
     assert fit.answer()["residual_whiteness_p"] > 1e-3
 
@@ -44,8 +44,8 @@ def test_several_records_give_one_plant_each_with_its_own_offset():
     truth = VoltagePlant("mechanical", (0.05, 0.006), 30.0, 0.1, 0.005, 0.3, 3.0)
     records = [record(truth, jumps(0.2, 1.8, seed=s), 5e-4, s, offset=0.1 * s) for s in (1, 2)]
     fit = fit_voltage_plant(records)
-    together = fit.estimates["natural_frequency_rad_s"]
-    alone = fit_voltage_plant(records[:1]).estimates["natural_frequency_rad_s"]
+    together = fit.parameters["natural_frequency_rad_s"]
+    alone = fit_voltage_plant(records[:1]).parameters["natural_frequency_rad_s"]
     assert abs(together.value - 30.0) <= 4.0 * together.std
     # Twice the data: the interval shrinks by root two, each known to some ten percent.
     assert 0.5 < together.std / alone.std < 0.95
@@ -69,7 +69,7 @@ def test_the_predicted_deviation_is_that_of_repeated_fits():
         ("creep_share", False),
         ("gain_1", True),
     ):
-        values = np.array([fit.estimates[name].value for fit in fits])
+        values = np.array([fit.parameters[name].value for fit in fits])
         scatter = np.log(values).var(ddof=1) if logarithmic else values.var(ddof=1)
         assert 5.4 < 19 * scatter / predicted[name] ** 2 < 43.8, name
 
@@ -78,7 +78,7 @@ def test_creep_that_the_record_does_not_show_has_no_number():
     """Two seconds of motion about a level say nothing of a time constant of minutes."""
     truth = VoltagePlant("mechanical", (0.05,), 30.0, 0.1, 0.005)
     fit = fit_voltage_plant([record(truth, jumps(0.8, 1.2, 3, 0.1), 2e-3)])
-    unknown = fit.estimates["creep_time_constant_s"]
+    unknown = fit.parameters["creep_time_constant_s"]
     assert np.isnan(unknown.value)
     assert unknown.ci95 == (-np.inf, np.inf)
     assert any(note.startswith("creep_time_constant_s") for note in fit.notes)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from haselab.base import HaselabError, InputError
 from haselab.identify import (
     ArxOrders,
+    Record,
     find_regions,
     fit_arx,
     fit_capacitance_map,
@@ -40,7 +41,8 @@ FITS: dict[str, tuple[Fit, np.ndarray, np.ndarray, str, str]] = {
     ),
     "map": (fit_map, STRAIN, VOLTS, "x", "y"),
     "arx": (
-        lambda u, y: fit_arx(u, y, 10.0, ArxOrders(1, 1, 1)), DRIVE, np.cumsum(DRIVE), "u", "y",
+        lambda u, y: fit_arx(Record.sampled(u, y, 10.0), ArxOrders(1, 1, 1)),
+        DRIVE, np.cumsum(DRIVE), "u", "y",
     ),
 }  # fmt: skip
 ALL = pytest.mark.parametrize("name", list(FITS))

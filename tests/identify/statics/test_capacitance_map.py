@@ -26,7 +26,7 @@ def test_the_intervals_hold_the_paper_s_line_in_noise_of_any_colour(memory):
         # One hundredth of the span: what is left after averaging does not flatten the line.
         fit = fit_capacitance_map(capacitance(STRAIN + 0.002 * noise), STRAIN)
         for i, (name, truth) in enumerate((("slope", SLOPE), ("offset", OFFSET))):
-            low, high = fit.estimates[name].ci95
+            low, high = fit.parameters[name].ci95
             inside[i] += low <= truth <= high
     # Binomial: 3 spreads below 95 %.
     assert (inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
@@ -51,9 +51,9 @@ def test_a_bent_characteristic_widens_the_interval_by_its_misfit():
     straight = fit_capacitance_map(capacitance(STRAIN), STRAIN)
     fit = fit_capacitance_map(bent, STRAIN)
     tangents = np.gradient(STRAIN[:200], bent[:200])[20:180]
-    low, high = fit.estimates["slope"].ci95
-    assert tangents.min() < fit.estimates["slope"].value < tangents.max()
-    assert (high - low) > 1e3 * np.diff(straight.estimates["slope"].ci95)[0]
+    low, high = fit.parameters["slope"].ci95
+    assert tangents.min() < fit.parameters["slope"].value < tangents.max()
+    assert (high - low) > 1e3 * np.diff(straight.parameters["slope"].ci95)[0]
 
 
 def test_one_edge_is_fitted_and_told():

@@ -40,7 +40,7 @@ def ecoflex(shared_data):
 
 
 def numbers(fit):
-    return {name: estimate.value for name, estimate in fit.best.estimates.items()}
+    return {name: estimate.value for name, estimate in fit.best.parameters.items()}
 
 
 # Half a unit in the last printed digit of data/SOURCES.md and of the digest of the paper.
@@ -72,7 +72,7 @@ def test_treloars_rubber_gives_the_known_numbers_and_their_spread(shared_data):
         shared_data / "identification/treloar-uniaxial.csv", delimiter=",", skiprows=1
     )
     fit = fit_hyperelastic(table[:, 0], 1e6 * table[:, 1], "arruda-boyce")
-    mu, segments = fit.best.estimates["mu_pa"], fit.best.estimates["chain_segments"]
+    mu, segments = fit.best.parameters["mu_pa"], fit.best.parameters["chain_segments"]
     assert mu.value == pytest.approx(0.2666e6, abs=50.0)
     assert segments.value == pytest.approx(25.46, abs=0.005)
     assert (mu.std, segments.std) == (pytest.approx(4.3e3, abs=50), pytest.approx(0.21, abs=5e-3))
@@ -89,7 +89,7 @@ def test_the_fit_range_moves_the_numbers_as_the_digest_says(ecoflex):
 def test_the_lowest_criterion_is_chosen_and_all_candidates_are_shown(ecoflex):
     fit = fit_hyperelastic(*ecoflex)
     assert {candidate.model for candidate in fit.candidates} == set(LAWS)
-    told = [c for c in fit.candidates if all(np.isfinite(e.value) for e in c.estimates.values())]
+    told = [c for c in fit.candidates if all(np.isfinite(e.value) for e in c.parameters.values())]
     assert fit.best.aicc == min(candidate.aicc for candidate in told)
     for c in fit.candidates:
         # Hurvich and Tsai 1989; Schwarz 1978. The variance of the noise is a number too.
@@ -112,7 +112,7 @@ def test_intervals_cover_a_hidden_law(lateral):
             stretch, clean_pa + noise_pa, "arruda-boyce", deformation=kind, lateral_stretch=3.0
         )
         for i, name in enumerate(("mu_pa", "lambda_m")):
-            low, high = fit.best.estimates[name].ci95
+            low, high = fit.best.parameters[name].ci95
             inside[i] += low <= getattr(truth, name) <= high
     # Binomial: 3 spreads below 95 %.
     assert (inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
@@ -126,10 +126,10 @@ def test_electrodes_are_told_from_the_sheet():
     fit = fit_hyperelastic(
         stretch, stress_pa, "ogden", deformation="fixed_lateral", electrode_natural=0.58
     )
-    spring = fit.best.estimates["electrode_spring_pa"]
+    spring = fit.best.parameters["electrode_spring_pa"]
     assert abs(spring.value - 9e3) <= 4.0 * spring.std
     assert fit.law.parameters()["mu_pa"] == pytest.approx(
-        15e3, abs=4.0 * fit.best.estimates["mu_pa"].std
+        15e3, abs=4.0 * fit.best.parameters["mu_pa"].std
     )
 
 
@@ -146,7 +146,7 @@ def test_electrodes_that_stiffen_are_told_from_the_sheet():
         )
         for stiffening in (True, False)
     }  # fmt: skip
-    e = found[True].best.estimates
+    e = found[True].best.parameters
     true = {"mu_pa": 15.6e3, "electrode_spring_pa": 157e3, "electrode_cubic_pa": 47e3}
     for name, value in true.items():
         assert abs(e[name].value - value) <= 4.0 * e[name].std, name
@@ -155,7 +155,7 @@ def test_electrodes_that_stiffen_are_told_from_the_sheet():
         < 0.02
     )
     plain = found[False]
-    assert not plain.succeeded or plain.best.estimates["mu_pa"].value < 0.5 * 15.6e3
+    assert not plain.succeeded or plain.best.parameters["mu_pa"].value < 0.5 * 15.6e3
 
 
 def test_a_cubic_term_needs_the_electrodes():
@@ -248,7 +248,7 @@ def test_treloars_two_tests_together_are_fitted_no_worse_than_by_scipy(model, st
     assert joint_cost(fit.law, tests) <= 2e10 * other.cost * (1 + 1e-6)
     if model != "ogden-3":
         for name, value in zip(start, other.x * scale, strict=True):
-            assert abs(fit.best.numbers[name] - value) <= 0.01 * fit.best.estimates[name].std
+            assert abs(fit.best.numbers[name] - value) <= 0.01 * fit.best.parameters[name].std
 
 
 def test_three_terms_of_ogden_beat_his_fit_by_hand_and_the_chains_in_both_tests():
@@ -271,11 +271,11 @@ def test_three_kinds_of_test_give_the_published_ogden_law_back():
     order = [("mu3_pa", "alpha3"), ("mu1_pa", "alpha1"), ("mu2_pa", "alpha2")]
     for place, pair in enumerate(order, start=1):
         for name, truth in zip((f"mu{place}_pa", f"alpha{place}"), pair, strict=True):
-            got = fit.best.estimates[name]
+            got = fit.best.parameters[name]
             assert abs(got.value - OGDEN_1972.parameters()[truth]) <= 4.0 * got.std, name
     # One test of the three does not tell the third term from the others as well.
     alone = fit_hyperelastic_tests(tests[:1], "ogden-3")
-    assert not alone.best.estimates["alpha1"].std < 3.0 * fit.best.estimates["alpha1"].std
+    assert not alone.best.parameters["alpha1"].std < 3.0 * fit.best.parameters["alpha1"].std
 
 
 @pytest.mark.long
@@ -295,7 +295,7 @@ def test_intervals_cover_a_hidden_law_in_other_deformations(kind, options):
     for run in range(runs):
         noise_pa = 300.0 * np.random.default_rng([5, run]).normal(size=x.size)
         fit = fit_hyperelastic(x, clean_pa + noise_pa, "gent", deformation=kind, **options)
-        limits = [fit.best.estimates[name].ci95 for name in ("mu_pa", "jm")]
+        limits = [fit.best.parameters[name].ci95 for name in ("mu_pa", "jm")]
         inside += [
             low <= t <= high or np.isinf(high)
             for (low, high), t in zip(limits, (15.6e3, 60.0), strict=True)
@@ -328,7 +328,7 @@ def test_a_limit_of_the_chains_that_small_stretches_do_not_tell_is_no_number(mod
     noise_pa = 30.0 * np.random.default_rng(11).normal(size=50)
     fit = fit_hyperelastic(x, NeoHooke(15e3).nominal_stress_pa(x) + noise_pa, model)
     assert fit.succeeded
-    limit, mu = fit.best.estimates[number], fit.best.estimates["mu_pa"]
+    limit, mu = fit.best.parameters[number], fit.best.parameters["mu_pa"]
     assert np.isnan(limit.value) and limit.std == np.inf
     assert limit.ci95 == (-np.inf, np.inf)
     assert any(f"do not tell {number}" in note for note in fit.notes)
@@ -412,6 +412,6 @@ def test_two_terms_are_told_apart_and_named_by_rising_exponent():
         tests.append(SheetTest(x, stress_pa + 20.0 * rng.normal(size=100), deformation))
     fit = fit_hyperelastic_tests(tests, "ogden-2")
     for name, value in truth.parameters().items():
-        assert abs(fit.best.estimates[name].value - value) <= 4.0 * fit.best.estimates[name].std
+        assert abs(fit.best.parameters[name].value - value) <= 4.0 * fit.best.parameters[name].std
     with pytest.raises(InputError, match="No test was given"):
         fit_hyperelastic_tests([])

@@ -42,7 +42,7 @@ def test_the_intervals_hold_the_paper_s_coefficients_in_noise_of_any_colour(memo
         white = np.random.default_rng([14, run]).normal(size=e.size + 400)
         noise = lfilter([np.sqrt(1 - memory**2)], [1, -memory], white)[400:]
         fit = fit_voltage_map(e, PAPER.voltage_v(e) + 0.01 * noise)
-        limits = [fit.estimates[name].ci95 for name in TRUTH]
+        limits = [fit.parameters[name].ci95 for name in TRUTH]
         inside += [lo <= t <= hi for (lo, hi), t in zip(limits, TRUTH.values(), strict=True)]
     # Binomial: 3 spreads below 95 %.
     assert (inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
@@ -72,7 +72,7 @@ def test_a_loop_about_the_paper_s_curve_gives_its_width_and_its_coefficients():
     # The branch of the few samples next to the turning points is uncertain.
     assert fit.hysteresis_width == pytest.approx(0.1, rel=0.02)
     for name, value in TRUTH.items():
-        low, high = fit.estimates[name].ci95
+        low, high = fit.parameters[name].ci95
         assert low <= value <= high, name
     # The interval counts the loop as noise, yet stays far below the loop itself.
     assert 0.0 < fit.curve_std(0.05) < 0.05
@@ -106,9 +106,9 @@ def test_a_fat_loop_gets_the_best_monotone_curve_and_finite_numbers():
     assert (
         np.diff(chart.voltage_v(np.linspace(chart.strain_low, chart.strain_high, 500))) > 0
     ).all()
-    for estimate in fit.estimates.values():
+    for estimate in fit.parameters.values():
         assert np.isfinite([estimate.value, estimate.std]).all()
-    assert max(e.std / abs(e.value) for e in fit.estimates.values()) > 0.5
+    assert max(e.std / abs(e.value) for e in fit.parameters.values()) > 0.5
     # Sequential quadratic programming on the four numbers finds nothing better.
     x = (e - 0.5 * (e.max() + e.min())) / (0.5 * np.ptp(e))
     least = 1e-3 * 0.5 * np.ptp(v)
@@ -126,7 +126,7 @@ def test_a_fat_loop_gets_the_best_monotone_curve_and_finite_numbers():
     best = min(
         o.fun for o in others if o.success and min(slopes_at(o.x, s) for s in (-1.4, 1.4)) > 0
     )
-    assert float(np.mean(fit.residuals**2)) <= best * (1.0 + 1e-5)
+    assert float(np.mean(fit.residuals[0] ** 2)) <= best * (1.0 + 1e-5)
 
 
 def test_rates_that_meet_leave_the_curve_told_and_the_amplitudes_not():
@@ -135,7 +135,7 @@ def test_rates_that_meet_leave_the_curve_told_and_the_amplitudes_not():
     v = np.exp(0.5 * x) * np.cos(0.25 * x - 0.4) + 1e-4 * np.random.default_rng(4).normal(size=400)
     fit = fit_voltage_map(0.1 * x, v)
     assert any("exponentials meet" in note for note in fit.notes)
-    assert all(np.isfinite(e.value) and abs(e.value) < 100.0 for e in fit.estimates.values())
+    assert all(np.isfinite(e.value) and abs(e.value) < 100.0 for e in fit.parameters.values())
     assert fit.r_squared > 0.9999
     assert fit.map.voltage_v(0.0) == pytest.approx(np.cos(0.4), abs=0.01)
 
@@ -150,7 +150,7 @@ def test_a_falling_curve_is_fitted_as_well_as_a_rising_one():
     )
     assert down.monotone and up.monotone
     for name, factor in (("a1_v", -3.0), ("a2_v", -3.0), ("b1", 1.0), ("b2", 1.0)):
-        pair = down.estimates[name], up.estimates[name]
+        pair = down.parameters[name], up.parameters[name]
         # The search rests at a relative gain of 1e-10 of the cost: 1e-5 spreads.
         assert abs(pair[0].value - factor * pair[1].value) <= 1e-3 * pair[0].std, name
         assert pair[0].std == pytest.approx(abs(factor) * pair[1].std, rel=1e-3)
@@ -194,4 +194,4 @@ def test_no_random_start_finds_a_better_curve(case):
     fit = fit_voltage_map(0.1 * x, v)
     assert not any("best monotone one" in note for note in fit.notes)
     # The search rests at a relative gain of 1e-10.
-    assert float(fit.residuals @ fit.residuals) <= 2.0 * min(found) * (1.0 + 1e-8)
+    assert float(fit.residuals[0] @ fit.residuals[0]) <= 2.0 * min(found) * (1.0 + 1e-8)

@@ -48,7 +48,7 @@ def test_the_fit_reaches_the_cramer_rao_bound_with_honest_intervals():
     for run in range(runs):
         noise = std * np.random.default_rng([20181001, 30, run]).normal(size=TIME_S.size)
         fit = fit_transfer([Record(u, 100.0, clean + noise, TIME_S)])
-        estimates = [fit.estimates[name] for name in names]
+        estimates = [fit.parameters[name] for name in names]
         errors.append([e.value for e in estimates] - truth)
         inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, truth, strict=True)]
     rmse = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -67,7 +67,7 @@ def test_coloured_noise_keeps_the_intervals_honest():
         rng = np.random.default_rng([99, run])
         noise = lfilter([np.sqrt(1 - 0.99**2)], [1, -0.99], rng.normal(size=8000))[4000:]
         fit = fit_transfer([Record(u, 100.0, clean + 0.03 * noise, TIME_S)])
-        low, high = fit.estimates["damping_ratio"].ci95
+        low, high = fit.parameters["damping_ratio"].ci95
         inside += low <= ZETA <= high
     assert inside / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)
 
@@ -84,7 +84,7 @@ def test_a_chirp_and_a_step_together_tell_the_slow_branch(omega):
     fit = fit_transfer(records, TransferStructure(slow_modes=1))
     expected = {"gain": 0.5, "slow_gain": 0.4, "slow_time_constant_s": 4.7, "delay_s": 0.012}
     for name, value in expected.items():
-        estimate = fit.estimates[name]
+        estimate = fit.parameters[name]
         assert abs(estimate.value - value) <= 3.3 * estimate.std, name
         assert estimate.std < 0.06 * value, name
     assert fit.residual_whiteness_p > 1e-3
@@ -99,10 +99,10 @@ def test_fixed_numbers_stay_and_have_no_spread():
     fixed = {"natural_frequency_rad_s": OMEGA, "gain": 0.5}
     structure = TransferStructure(delay=0.0, fixed=fixed)
     fit = fit_transfer([Record(chirp(100), 100.0, y, TIME_S)], structure)
-    assert fit.estimates["gain"].value == 0.5
-    assert fit.estimates["natural_frequency_rad_s"].std == 0.0
+    assert fit.parameters["gain"].value == 0.5
+    assert fit.parameters["natural_frequency_rad_s"].std == 0.0
     assert (
-        abs(fit.estimates["damping_ratio"].value - ZETA) <= 4 * fit.estimates["damping_ratio"].std
+        abs(fit.parameters["damping_ratio"].value - ZETA) <= 4 * fit.parameters["damping_ratio"].std
     )
 
 
@@ -113,7 +113,7 @@ def test_the_hair_dryer_is_predicted_on_data_that_the_fit_has_not_seen(shared_da
     # SLICOT's order-4 subspace models: static gain 0.9994; two poles leave a drift.
     assert fit.plant.static_gain == pytest.approx(0.9994, rel=0.1)
     # ARX of the same data: 3 samples of delay, one of which is the hold.
-    assert 0.08 < fit.estimates["delay_s"].value < 0.24
+    assert 0.08 < fit.parameters["delay_s"].value < 0.24
     assert fit.residual_whiteness_p < 0.05
 
 
@@ -143,7 +143,7 @@ def test_one_step_from_rest_is_fitted_and_the_assumption_is_told():
     rng = np.random.default_rng(12)
     y = PAPER.simulate(np.ones(1), 100.0, TIME_S) + 0.005 * rng.normal(size=4000)
     fit = fit_transfer([Record(np.ones(1), 100.0, y, TIME_S)])
-    assert abs(fit.estimates["gain"].value - 0.5) <= 4 * fit.estimates["gain"].std
+    assert abs(fit.parameters["gain"].value - 0.5) <= 4 * fit.parameters["gain"].std
     assert any("rest before the step" in note for note in fit.notes)
 
 

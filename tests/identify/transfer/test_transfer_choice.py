@@ -36,7 +36,7 @@ def test_a_chirp_and_a_step_choose_the_structure_that_made_them(omega):
     chosen = choice.fit.structure
     assert (chosen.poles, chosen.zeros, chosen.delay, chosen.slow_modes) == (2, 0, "auto", 1)
     assert choice.notes == ()
-    tau = choice.fit.estimates["slow_time_constant_s"]
+    tau = choice.fit.parameters["slow_time_constant_s"]
     assert abs(tau.value - 5.0) < 4.0 * tau.std < 4.0
     assert choice.answer()["candidates"][0]["bic"] == 0.0 < choice.answer()["candidates"][1]["bic"]
 
@@ -46,8 +46,8 @@ def test_from_the_chirp_alone_creep_is_reported_as_not_identifiable(omega):
     (sweep, _) = creeping(2, omega)
     fit = fit_transfer([sweep], TransferStructure(slow_modes=1))
     for name in ("slow_time_constant_s", "slow_gain"):
-        assert np.isnan(fit.estimates[name].value)
-        assert fit.estimates[name].ci95 == (-np.inf, np.inf)
+        assert np.isnan(fit.parameters[name].value)
+        assert fit.parameters[name].ci95 == (-np.inf, np.inf)
         assert any(note.startswith(f"{name} is not identifiable") for note in fit.notes)
     assert np.isnan(fit.poles[-1])
     with pytest.raises(ResultError, match="slow_gain not identifiable"):
@@ -115,7 +115,7 @@ def test_the_bootstrap_has_the_spread_of_the_covariance_and_stays_inside_it():
     (sweep, rise) = creeping(4)
     fit = fit_transfer([sweep, rise], TransferStructure(slow_modes=1))
     drawn = bootstrap_transfer(fit, 300, np.random.default_rng(1))
-    for name, estimate in fit.estimates.items():
+    for name, estimate in fit.parameters.items():
         # The spread of 300 draws has a relative error of 1/sqrt(600): 4 of it.
         assert drawn[name].std == pytest.approx(estimate.std, rel=0.17), name
         assert drawn[name].ci95[0] < estimate.value < drawn[name].ci95[1]

@@ -28,7 +28,7 @@ def test_a_delay_of_half_a_period_is_not_taken_for_a_negative_gain():
     assert fit.status == "ok"
     truth = {"gain": 1.0, "natural_frequency_rad_s": 9.0, "damping_ratio": 0.1, "delay_s": 0.3}
     for name, value in truth.items():
-        assert abs(fit.estimates[name].value - value) < 5.0 * fit.estimates[name].std
+        assert abs(fit.parameters[name].value - value) < 5.0 * fit.parameters[name].std
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -39,7 +39,7 @@ def test_delays_of_up_to_three_periods_are_found_or_refused(seed):
     fit = fit_transfer([recorded(plant, prbs(rng, 3000, 8), 0.1, rng)])
     if fit.succeeded:
         for name, value in (("gain", plant.gain), ("delay_s", plant.delay_s)):
-            assert abs(fit.estimates[name].value - value) < 5.0 * fit.estimates[name].std
+            assert abs(fit.parameters[name].value - value) < 5.0 * fit.parameters[name].std
     else:
         assert fit.status.startswith("ambiguous")
 
@@ -62,7 +62,7 @@ def test_resonances_come_in_order_of_their_frequency():
     y = sum(Plant(0.4, w, 0.05).simulate(u, RATE_HZ, t) for w in (50.0, 12.0))
     y = y + 0.01 * rng.normal(size=t.size)
     fit = fit_transfer([Record.sampled(u, y, RATE_HZ)], TransferStructure(4, 2))
-    first, second = (fit.estimates[f"natural_frequency{mark}_rad_s"].value for mark in ("", "_2"))
+    first, second = (fit.parameters[f"natural_frequency{mark}_rad_s"].value for mark in ("", "_2"))
     assert first == pytest.approx(12.0, rel=0.01)
     assert second == pytest.approx(50.0, rel=0.01)
 
@@ -80,8 +80,8 @@ def test_an_acceleration_is_fitted_with_as_many_zeros_as_poles():
     fit = fit_transfer([Record.sampled(u, y, RATE_HZ)], TransferStructure(2, 2))
     assert fit.status == "ok"
     for name, value in (("natural_frequency_rad_s", omega), ("damping_ratio", zeta)):
-        assert abs(fit.estimates[name].value - value) < 4.0 * fit.estimates[name].std
-    direct = fit.estimates["numerator_2"]
+        assert abs(fit.parameters[name].value - value) < 4.0 * fit.parameters[name].std
+    direct = fit.parameters["numerator_2"]
     assert abs(direct.value - 0.7) < 4.0 * direct.std
     assert fit.rational.numerator[0] == pytest.approx(0.7, rel=0.02)
 

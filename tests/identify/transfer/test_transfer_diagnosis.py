@@ -21,7 +21,7 @@ def recorded(rng, count=4000):
 def is_right(fit, most=5.0):
     assert fit.status == "ok"
     for name, value in TRUTH.items():
-        assert abs(fit.estimates[name].value - value) < most * fit.estimates[name].std, name
+        assert abs(fit.parameters[name].value - value) < most * fit.parameters[name].std, name
 
 
 @pytest.mark.parametrize("size", [0.2, 3.0, 300.0])
@@ -34,7 +34,7 @@ def test_a_spike_neither_moves_the_numbers_nor_widens_their_intervals(size):
     fit = fit_transfer([Record.sampled(u, y, RATE_HZ)])
     is_right(fit)
     name = "natural_frequency_rad_s"
-    assert fit.estimates[name].std == pytest.approx(plain.estimates[name].std, rel=0.02)
+    assert fit.parameters[name].std == pytest.approx(plain.parameters[name].std, rel=0.02)
     assert any("1 of 4000 outputs are spikes" in note for note in fit.notes)
 
 
@@ -78,7 +78,9 @@ def test_spikes_at_random_times_of_steps_are_spikes():
     y[rng.choice(580, size=8, replace=False)] += 0.01
     fit = fit_transfer([Record(u, 100.0, y, time_s)], TransferStructure(delay=0.0))
     assert any("8 of 580 outputs are spikes" in note for note in fit.notes)
-    assert abs(fit.estimates["damping_ratio"].value - 0.5) < 5 * fit.estimates["damping_ratio"].std
+    assert (
+        abs(fit.parameters["damping_ratio"].value - 0.5) < 5 * fit.parameters["damping_ratio"].std
+    )
 
 
 @pytest.mark.parametrize("applied", [True, False])

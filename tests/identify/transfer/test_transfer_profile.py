@@ -21,7 +21,7 @@ def test_a_weak_resonance_gets_the_deviation_of_its_flat_likelihood(plant):
     fit = fit_transfer([Record.sampled(one.u, one.y, one.rate_hz)], one.structure)
     assert fit.status == "ok"
     for name, value in one.truth().items():
-        estimate = fit.estimates[name]
+        estimate = fit.parameters[name]
         if np.isfinite(estimate.std):
             assert abs(estimate.value - value) < 4.0 * estimate.std, name
 
@@ -56,4 +56,4 @@ def test_where_the_likelihood_is_a_parabola_nothing_is_widened(noise):
     names = ("gain", "natural_frequency_rad_s", "damping_ratio", "delay_s")
     for name, least in zip(names, bound, strict=False):
         # The variance of 4,000 outputs is known to 2 %; the initial state costs a little.
-        assert 0.9 < fit.estimates[name].std / least < 1.15, name
+        assert 0.9 < fit.parameters[name].std / least < 1.15, name

@@ -98,9 +98,9 @@ def test_straight_lines_between_the_samples_are_what_scipy_simulates():
     fit = fit_transfer([Record.sampled(u, y + noise, 400.0, hold="first")])
     held = fit_transfer([Record.sampled(u, y + noise, 400.0)])
     for name, value in (("gain", 0.5), ("natural_frequency_rad_s", OMEGA), ("delay_s", 0.0)):
-        assert abs(fit.estimates[name].value - value) < 4.0 * fit.estimates[name].std
+        assert abs(fit.parameters[name].value - value) < 4.0 * fit.parameters[name].std
     # Taken as held, half a sample is missing: that is the delay that comes out.
-    assert held.estimates["delay_s"].value == pytest.approx(-0.5 / 400.0, rel=0.05)
+    assert held.parameters["delay_s"].value == pytest.approx(-0.5 / 400.0, rel=0.05)
 
 
 def test_a_measured_band_limited_input_needs_no_hold():
@@ -116,11 +116,11 @@ def test_a_measured_band_limited_input_needs_no_hold():
     limited = fit_transfer([Record.sampled(u, y, 6.0, hold="band-limited")])
     held = fit_transfer([Record.sampled(u, y, 6.0)])
     for name, value in (("natural_frequency_rad_s", OMEGA), ("damping_ratio", ZETA)):
-        estimate = limited.estimates[name]
+        estimate = limited.parameters[name]
         # The polygon that stands for the input is 1e-5 off at the highest tone; the record's ends,
         # beyond which the input is not known, are within the noise.
         assert abs(estimate.value - value) < 4.0 * estimate.std
-        assert abs(held.estimates[name].value - value) > 4.0 * held.estimates[name].std
+        assert abs(held.parameters[name].value - value) > 4.0 * held.parameters[name].std
 
 
 def test_a_command_that_is_really_held_at_a_lower_rate_is_fitted_as_such():
@@ -130,9 +130,9 @@ def test_a_command_that_is_really_held_at_a_lower_rate_is_fitted_as_such():
     y = y + 0.01 * np.random.default_rng(2).normal(size=y.size)
     right = fit_transfer([Record.sampled(command, y, 400.0, held_at_hz=100.0)])
     wrong = fit_transfer([Record.sampled(command, y, 400.0)])
-    assert abs(right.estimates["delay_s"].value) < 4.0 * right.estimates["delay_s"].std
+    assert abs(right.parameters["delay_s"].value) < 4.0 * right.parameters["delay_s"].std
     # Three quarters of the hold are half a delay of three samples.
-    assert wrong.estimates["delay_s"].value == pytest.approx(1.5 / 400.0, abs=6e-4)
+    assert wrong.parameters["delay_s"].value == pytest.approx(1.5 / 400.0, abs=6e-4)
 
 
 def test_a_poor_first_start_is_mended_by_the_others():
@@ -143,7 +143,7 @@ def test_a_poor_first_start_is_mended_by_the_others():
     noise = lfilter([0.1], [1, -0.97], rng.normal(size=t.size))
     y = sum(Plant(0.4, w, 0.03).simulate(u, 100.0, t) for w in (20.0, 31.0)) + 0.05 * noise
     fit = fit_transfer([Record(u, 100.0, y, t)], TransferStructure(poles=4, zeros=2))
-    found = sorted(e.value for n, e in fit.estimates.items() if n.startswith("natural"))
+    found = sorted(e.value for n, e in fit.parameters.items() if n.startswith("natural"))
     assert found == pytest.approx([20.0, 31.0], rel=0.01)
 
 

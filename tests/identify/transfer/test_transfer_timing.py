@@ -27,7 +27,7 @@ def output(u, times_s, rng, plant=PLANT, rate_hz=RATE_HZ):
 def is_right(fit):
     assert fit.status == "ok"
     for name, value in TRUTH.items():
-        assert abs(fit.estimates[name].value - value) < 5.0 * fit.estimates[name].std, name
+        assert abs(fit.parameters[name].value - value) < 5.0 * fit.parameters[name].std, name
 
 
 @pytest.mark.long

@@ -114,51 +114,53 @@ def camera(tmp_path: Path) -> Camera:
     ],
 )
 def test_a_camera_that_says_it_will_be_slower_is_refused_with_its_rate(camera, name):
-    told = camera(RESULTING.format(name, 62.5), camera={"exposure_s": 2e-3})
-    assert told.startswith(
-        "LimitError Frame rate = 100 Hz is set, but camera Fake_1 reaches 62.5 Hz with these "
-        "settings. Shorten camera.exposure_s, take fewer lines"
+    reported = camera(RESULTING.format(name, 62.5), camera={"exposure_s": 2e-3})
+    assert reported.startswith(
+        "LimitError The frame rate is set to 100 Hz, but camera Fake_1 reaches only 62.5 Hz with "
+        "these settings. Shorten camera.exposure_s, lower camera.height_px"
     )
-    assert told.count("\n") == 1
+    assert reported.count("\n") == 1
     assert camera(RESULTING.format(name, 99.9)).startswith("started")
 
 
 def test_an_exposure_that_is_longer_than_a_period_is_the_cause_that_is_named(camera):
-    told = camera(RESULTING.format("ResultingFrameRate", 48.0), camera={"exposure_s": 0.02})
-    assert "The exposure of 20 ms is longer than a period of 10 ms: shorten" in told
+    reported = camera(RESULTING.format("ResultingFrameRate", 48.0), camera={"exposure_s": 0.02})
+    assert "The exposure of 20 ms is longer than a frame period of 10 ms. Shorten" in reported
 
 
 def test_the_limit_of_the_link_is_the_cause_that_is_named(camera):
     xml = RESULTING.format("ResultingFrameRate", 38.0) + THROUGHPUT
-    told = camera(xml, camera={"exposure_s": 2e-3})
+    reported = camera(xml, camera={"exposure_s": 2e-3})
     # 512 x 512 pixels at 100 Hz
-    assert "The frames are 26.21 MB/s and DeviceLinkThroughputLimit is 10 MB/s: raise it" in told
-    assert "arv-tool-0.8 control DeviceLinkThroughputLimit=28835840" in told
+    assert (
+        "The frames need 26.21 MB/s, but DeviceLinkThroughputLimit is 10 MB/s. Raise it" in reported
+    )
+    assert "arv-tool-0.8 control DeviceLinkThroughputLimit=28835840" in reported
 
 
 def test_the_exposure_is_put_on_the_line_of_the_rig_file(camera):
-    told = camera(
+    reported = camera(
         LINES,
         camera={"exposure_s": 2e-3},
         line={"duration_s": 2e-3, "line": "Line2", "inverted": True},
         tell=["LineSelector", "LineMode", "LineSource"],
         number="LineInverterRegister",
     )
-    assert told == "started Line2 Output ExposureActive\n1.0\n"
+    assert reported == "started Line2 Output ExposureActive\n1.0\n"
 
 
 def test_a_line_that_the_camera_does_not_have_is_one_line(camera):
     line = {"duration_s": 2e-3, "line": "Line7"}
-    told = camera(LINES, camera={"exposure_s": 2e-3}, line=line)
-    assert "exposure.line = 'Line7' does not take the exposure signal: " in told
-    assert "Correct exposure.line (arv-tool-0.8 features lists" in told
-    assert told.count("\n") == 1
+    reported = camera(LINES, camera={"exposure_s": 2e-3}, line=line)
+    assert "exposure.line = 'Line7' cannot output the exposure signal: " in reported
+    assert "Change exposure.line (arv-tool-0.8 features lists" in reported
+    assert reported.count("\n") == 1
     assert "DeviceError" in camera("", camera={"exposure_s": 2e-3}, line=line)
 
 
 def test_another_exposure_than_the_file_says_is_refused(camera):
-    told = camera("", line={"duration_s": 2e-3})  # the camera is left at its own 10 ms
-    assert told.startswith(
-        "LimitError exposure.duration_s = 0.002 s, but camera Fake_1 exposes for 0.01 s. Give "
+    reported = camera("", line={"duration_s": 2e-3})  # the camera is left at its own 10 ms
+    assert reported.startswith(
+        "LimitError exposure.duration_s is 0.002 s, but camera Fake_1 exposes for 0.01 s. Set "
         "camera.exposure_s"
     )

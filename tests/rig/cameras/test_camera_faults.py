@@ -58,41 +58,42 @@ def filmed(
 
 
 def test_a_healthy_camera_films_at_its_rate_and_says_nothing():
-    told = filmed(CameraFaults())
-    assert len(told["times_s"]) >= 75  # 80, less what waits for its block
-    assert (told["dropped"], told["remarks"]) == (0, ())
-    assert told["rate_hz"] == pytest.approx(RATE_HZ)
-    np.testing.assert_allclose(np.diff(told["times_s"]), 1.0 / RATE_HZ, atol=1e-6)
+    reported = filmed(CameraFaults())
+    assert len(reported["times_s"]) >= 75  # 80, less what waits for its block
+    assert (reported["dropped"], reported["remarks"]) == (0, ())
+    assert reported["rate_hz"] == pytest.approx(RATE_HZ)
+    np.testing.assert_allclose(np.diff(reported["times_s"]), 1.0 / RATE_HZ, atol=1e-6)
 
 
-def test_a_camera_that_is_slower_than_it_was_set_is_told_its_rate():
+def test_a_camera_that_is_slower_than_it_was_set_is_reported_with_its_rate():
     with pytest.raises(
-        DeviceError, match=r"frames come at 31 Hz, requested were 50 Hz\. Shorten camera\.exposure"
+        DeviceError,
+        match=r"at 31 Hz instead of the requested 50 Hz\. Shorten camera\.exposure",
     ) as caught:
         filmed(CameraFaults(real_rate_hz=31.0))
     assert "\n" not in str(caught.value)
 
 
-def test_frames_that_are_lost_on_the_way_are_counted_and_their_cause_is_told():
-    told = filmed(CameraFaults(lost_share=0.05))
-    assert 0 < told["dropped"] < 10
-    with pytest.raises(DeviceError, match=r"frames are lost, allowed .* never came: check the net"):
+def test_frames_that_are_lost_on_the_way_are_counted_and_their_cause_is_reported():
+    reported = filmed(CameraFaults(lost_share=0.05))
+    assert 0 < reported["dropped"] < 10
+    with pytest.raises(DeviceError, match=r"frames are lost .* frames were lost\. Check the net"):
         filmed(CameraFaults(lost_share=0.3))
 
 
-def test_stamps_in_ticks_are_told_with_the_setting_that_mends_them():
+def test_stamps_in_ticks_are_reported_with_the_setting_that_fixes_them():
     with pytest.raises(DeviceError, match=r"ticks of about 1\.25e\+08 Hz\. Set camera\.tick_hz"):
         filmed(CameraFaults(stamps_in_ticks=125e6))
-    told = filmed(CameraFaults(stamps_in_ticks=125e6), tick_hz=125e6)
-    assert told["rate_hz"] == pytest.approx(RATE_HZ)
-    told = filmed(CameraFaults(stamps_in_ticks=125e6), stamps="arrival")
-    assert told["rate_hz"] == pytest.approx(RATE_HZ)
+    reported = filmed(CameraFaults(stamps_in_ticks=125e6), tick_hz=125e6)
+    assert reported["rate_hz"] == pytest.approx(RATE_HZ)
+    reported = filmed(CameraFaults(stamps_in_ticks=125e6), stamps="arrival")
+    assert reported["rate_hz"] == pytest.approx(RATE_HZ)
 
 
-def test_a_camera_without_stamps_is_timed_by_arrival_and_told():
-    told = filmed(CameraFaults(stamps_in_ticks=0.0))
-    assert told["rate_hz"] == pytest.approx(RATE_HZ)
-    assert len(told["remarks"]) == 1 and "gives no time stamps" in told["remarks"][0]
+def test_a_camera_without_stamps_is_timed_by_arrival_and_reported():
+    reported = filmed(CameraFaults(stamps_in_ticks=0.0))
+    assert reported["rate_hz"] == pytest.approx(RATE_HZ)
+    assert len(reported["remarks"]) == 1 and "sends no time stamps" in reported["remarks"][0]
 
 
 def test_frames_that_come_late_are_late_by_what_was_planted():
@@ -112,13 +113,13 @@ def test_an_inverted_exposure_line_is_found_by_two_exposure_times():
         trials = []
         for exposure_s in (1e-3, 2e-3):
             camera = CONFIG.camera.model_copy(update={"exposure_s": exposure_s})
-            told = filmed(
+            reported = filmed(
                 CameraFaults(exposure_line_inverted=inverted),
                 blocks=60,
                 line=True,
                 config=CONFIG.model_copy(update={"camera": camera}),
             )
-            trials.append(ExposureTrial(exposure_s, told["lag_s"]))
+            trials.append(ExposureTrial(exposure_s, reported["lag_s"]))
         # Each edge is known to half a sample, and the readout takes 1 ms.
         assert starts_with_edge(*trials, uncertainty_s=2 * half_sample_s) is not inverted
         wrong_s = 0.0 if not inverted else 1e-3

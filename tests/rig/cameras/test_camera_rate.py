@@ -36,7 +36,7 @@ def test_lost_frames_and_scatter_do_not_change_the_measured_rate(rate_hz, lost, 
     assert metered(times_s).rate_hz == pytest.approx(rate_hz, rel=0.1 / 128 + 1e-9)
 
 
-def test_a_few_frames_tell_no_rate():
+def test_a_few_frames_give_no_rate():
     meter = metered(0.01 * np.arange(32))
     assert (meter.known, meter.rate_hz, meter.scatter_s) == (False, 0.0, 0.0)
 
@@ -75,11 +75,11 @@ def film(clock: StampedClock, tick_hz: float) -> None:
 def test_stamps_that_stand_still_are_named():
     clock = StampedClock()
     clock.host_s(5_000_000, 1.0)
-    with pytest.raises(DeviceError, match=r"do not go on: 0\.005 s comes after 0\.005 s.*arrival"):
+    with pytest.raises(DeviceError, match=r"do not rise: 0\.005 s follows 0\.005 s.*arrival"):
         clock.host_s(5_000_000, 1.01)
 
 
-def test_without_stamps_the_arrivals_count_and_their_scatter_is_told():
+def test_without_stamps_the_arrivals_count_and_their_scatter_is_reported():
     clock = StampedClock()
     random = np.random.default_rng(1)
     for k in range(100):
@@ -125,7 +125,7 @@ def test_four_hundred_frames_of_512_by_512_take_nine_tenths_of_a_gigabit():
     more_s=st.floats(2e-3, 2e-2),
     delay_s=st.floats(-5e-3, 5e-3),
 )
-def test_two_exposure_times_tell_which_edge_is_recorded(latency_s, short_s, more_s, delay_s):
+def test_two_exposure_times_show_which_edge_is_recorded(latency_s, short_s, more_s, delay_s):
     """By the times themselves: edge, middle and arrival, and a delay of all blocks."""
 
     def trial(exposure_s: float, *, begins: bool) -> ExposureTrial:
@@ -138,5 +138,5 @@ def test_two_exposure_times_tell_which_edge_is_recorded(latency_s, short_s, more
         assert starts_with_edge(*pair, uncertainty_s=2e-4) is begins
 
 
-def test_two_equal_exposures_tell_nothing():
+def test_two_equal_exposures_show_nothing():
     assert starts_with_edge(ExposureTrial(1e-3, 0.0), ExposureTrial(1.1e-3, 0.0), 1e-4) is None

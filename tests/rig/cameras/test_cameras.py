@@ -76,7 +76,7 @@ def by_hand() -> tuple[Callable[[], tuple[float, float]], Callable[[float], None
 
 
 def pictures(count: int) -> np.ndarray:
-    """Frames that can be told apart: shape (count, 24, 32)."""
+    """Frames that can be reported apart: shape (count, 24, 32)."""
     k, y, x = np.ogrid[:count, :24, :32]
     return ((7 * k + y + 2 * x) % 256).astype(np.uint8)
 
@@ -184,10 +184,10 @@ def test_a_camera_starts_again_after_a_stop_and_without_one(bench):
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, 1e9, float("nan"), float("inf")])
-def test_a_rate_that_cannot_be_is_refused_in_one_line_and_the_camera_is_as_before(bench, rate_hz):
-    with pytest.raises(HaselabError, match=r"Frame rate = .* is outside ") as told:
+def test_an_invalid_rate_is_refused_in_one_line_and_the_camera_is_unchanged(bench, rate_hz):
+    with pytest.raises(HaselabError, match=r"The frame rate is ") as reported:
         bench.opened.camera.start(rate_hz)
-    assert told.value.exit_code == 2 and "\n" not in str(told.value)
+    assert reported.value.exit_code == 2 and "\n" not in str(reported.value)
     bench.wait(BLOCK_S)
     assert bench.opened.camera.take() is None
     bench.opened.camera.start(RATE_HZ)

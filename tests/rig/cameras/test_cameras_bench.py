@@ -118,15 +118,15 @@ def test_a_genicam_camera_is_named_by_its_serial_number(served):
     except DeviceError as missing:
         pytest.skip(str(missing))
     camera = {"kind": "aravis", "name": "Fake_1", "serial_number": "1"}
-    told = dict(identify(with_camera(served, camera)))
-    assert told["camera"] == "Aravis Fake, serial number 1"
-    told = dict(identify(with_camera(served, camera | {"serial_number": "2"})))
-    assert "expected 2 by the rig file" in str(told["camera"])
+    reported = dict(identify(with_camera(served, camera)))
+    assert reported["camera"] == "Aravis Fake, serial number 1"
+    reported = dict(identify(with_camera(served, camera | {"serial_number": "2"})))
+    assert "but the rig file names 2" in str(reported["camera"])
 
 
 def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
     config = with_camera(served, {"kind": "v4l2", "device": "/dev/video-none"})
-    with pytest.raises(DeviceError, match="There is no such camera"), RealBench(config, Gate()):
+    with pytest.raises(DeviceError, match="The camera does not exist"), RealBench(config, Gate()):
         pass
     assert served.hub.output_v == pytest.approx(0.0, abs=1e-6)
     with RealBench(with_camera(served, None), Gate()) as bench:  # nothing holds the instruments
@@ -134,7 +134,7 @@ def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
 
 
 @pytest.mark.parametrize(
-    ("camera", "told"),
+    ("camera", "reported"),
     [
         ({"kind": "film"}, r"camera"),
         ({"kind": "folder"}, r"camera\.path"),
@@ -143,15 +143,15 @@ def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
             r"camera\.address: no such key; the keys are kind, path, repeat",
         ),
         ({"kind": "aravis", "exposure_s": -1.0}, r"camera\.exposure_s"),
-        ({"kind": "v4l2", "width_px": 640}, r"width_px and height_px belong together"),
+        ({"kind": "v4l2", "width_px": 640}, r"set both width_px and height_px"),
         ({"kind": "twin"}, r"camera\.address"),
     ],
 )
-def test_a_fault_in_the_section_is_told_with_its_place(served, tmp_path, camera, told):
+def test_a_fault_in_the_section_is_reported_with_its_place(served, tmp_path, camera, reported):
     path = written(with_camera(served, None), tmp_path / "rig.toml")
     text = "\n".join(f"{key} = {json.dumps(value)}" for key, value in camera.items())
     path.write_text(path.read_text() + f"[camera]\n{text}\n")
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=reported):
         load_rig(path)
 
 
@@ -166,7 +166,7 @@ def test_the_check_names_the_camera_and_counts_its_frames(served, pictures, tmp_
     assert checks["dry", "frames"] in found
 
 
-def test_the_doctor_tells_a_missing_driver_and_a_missing_camera(
+def test_the_doctor_reports_a_missing_driver_and_a_missing_camera(
     served, tmp_path, capsys, monkeypatch
 ):
     names = {key: ("libnone.so", *rest) for key, (_, *rest) in aravis_library._NAMES.items()}
@@ -179,7 +179,7 @@ def test_the_doctor_tells_a_missing_driver_and_a_missing_camera(
     assert found["optional", "Aravis"]["advice"].startswith("For GenICam cameras: ")
     assert not found["instrument", "camera"]["found"]
     code, _, err = call(capsys, "rig", "check", path)
-    assert code == 4 and err.count("\n") == 1 and "which is not installed. Type: " in err
+    assert code == 4 and err.count("\n") == 1 and "which is not installed. Run: " in err
 
 
 LINE = {"input": "PFI0"}
@@ -200,15 +200,21 @@ def test_the_exposure_of_the_camera_is_the_one_of_its_line(served):
 
 
 @pytest.mark.parametrize(
-    ("camera", "line", "told"),
+    ("camera", "line", "reported"),
     [
-        (ARAVIS | {"exposure_s": 3e-3}, {"duration_s": 2e-3}, "leave exposure.duration_s out"),
-        (ARAVIS, {}, "duration_s is not known: give camera.exposure_s"),
+        (ARAVIS | {"exposure_s": 3e-3}, {"duration_s": 2e-3}, "Remove exposure.duration_s"),
+        (ARAVIS, {}, "duration_s is unknown. Set camera.exposure_s"),
         (ARAVIS, {"duration_s": 2e-3, "inverted": True}, "exposure.inverted needs exposure.line"),
         ({"kind": "v4l2"}, {"duration_s": 2e-3, "line": "Line1"}, "need a camera of kind 'aravis'"),
-        ({"kind": "twin", "address": "x:1"}, {"duration_s": 2e-3}, "needs no section exposure"),
+        (
+            {"kind": "twin", "address": "x:1"},
+            {"duration_s": 2e-3},
+            "cannot have a section exposure",
+        ),
     ],
 )
-def test_an_exposure_section_that_does_not_fit_the_camera_is_refused(served, camera, line, told):
-    with pytest.raises(ValidationError, match=told):
+def test_an_exposure_section_that_does_not_fit_the_camera_is_refused(
+    served, camera, line, reported
+):
+    with pytest.raises(ValidationError, match=reported):
         exposed(served, camera, line)

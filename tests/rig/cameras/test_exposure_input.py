@@ -132,30 +132,30 @@ def test_an_exposure_without_a_frame_is_a_lost_frame(served):
 def test_a_terminal_that_the_device_lacks_is_one_line(served):
     _, file = served
     line = LINE.model_copy(update={"input": "PFI16"})
-    with pytest.raises(DeviceError, match=r"no such terminal .*-89120.*exposure\.input"):
+    with pytest.raises(DeviceError, match=r"has no such terminal.*-89120.*exposure\.input"):
         NidaqBoard(file.daq, file.describe().drive_limits, 1.0, line)
 
 
 @pytest.mark.parametrize(
-    ("camera", "exposure", "told"),
+    ("camera", "exposure", "reported"),
     [
-        (None, {}, "belongs to a camera, and there is none"),
-        ({"kind": "folder", "path": "x"}, {}, "of kind 'folder' needs no section exposure"),
+        (None, {}, "a section exposure, but no camera"),
+        ({"kind": "folder", "path": "x"}, {}, "of kind 'folder' cannot have a section exposure"),
         ({"kind": "aravis"}, {"counter": "ctr0"}, "exposure.counter: ctr0 clocks the output"),
         ({"kind": "aravis"}, {"duration_s": 0.0}, "greater than 0"),
     ],
 )
-def test_a_section_that_cannot_be_is_refused(served, camera, exposure, told):
+def test_an_invalid_section_is_refused(served, camera, exposure, reported):
     data = tomllib.loads(served[0].rig_file(ahead_blocks=1))
     data.pop("camera")
     data |= {"camera": camera} if camera else {}
     data["exposure"] = {"input": "PFI0", "duration_s": 1e-3, **exposure}
-    with pytest.raises(ValidationError, match=told):
+    with pytest.raises(ValidationError, match=reported):
         BenchConfig.model_validate(data)
 
 
 @given(st.integers(0, 2**40), st.lists(st.integers(-(2**31), 2**31 - 1), max_size=5))
-def test_a_counter_that_has_gone_round_is_told_by_what_was_read(position, offsets):
+def test_a_counter_overflow_is_resolved_by_the_samples_read(position, offsets):
     true = np.array([position + offset for offset in offsets], dtype=np.int64)
     latched = (true % 2**32).astype(np.uint32)
     np.testing.assert_array_equal(unrolled(latched, position), true)

@@ -20,7 +20,7 @@ from haselab.rig.instruments.keysight33500.generator import (
     switch_generator_off,
 )
 from haselab.rig.instruments.keysight33500.section import KeysightConfig
-from haselab.rig.instruments.keysight33500.state import check_rest, rest_question
+from haselab.rig.instruments.keysight33500.state import check_settings, settings_query
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.serve.generator.scpi import GeneratorFaults, ScpiServer
 from haselab.rig.twin.serve.generator.state import Channel
@@ -56,7 +56,7 @@ class Bench:
         self.server = ScpiServer(self.wire, faults=faults)  # type: ignore[arg-type]
         self.config = KeysightConfig(address=self.server.address, timeout_s=30.0)
 
-    def ask(self, line: str) -> str:
+    def query(self, line: str) -> str:
         """At its front panel, as it were."""
         return self.server.answer(line).decode().strip()
 
@@ -81,13 +81,13 @@ def before(where: Bench) -> bool:
     for line in ("OUTP1 OFF", "OUTP1:LOAD INF", "SOUR1:FUNC SIN", "SOUR1:VOLT:UNIT VPP",
                  "SOUR1:VOLT:OFFS 0", f"SOUR1:FREQ {HZ}", f"SOUR1:VOLT {2 * VOLT}",
                  "OUTP1 ON"):  # fmt: skip
-        where.ask(line)
-    told = where.ask("OUTP1:LOAD?;:SOUR1:FUNC?;:SOUR1:VOLT:UNIT?;:SOUR1:VOLT:OFFS?;:SOUR1:FREQ?;"
-                     ":SOUR1:VOLT?;:OUTP1?").split(";")  # fmt: skip
-    numbers = [float(told[k]) for k in (0, 3, 4, 5)]
+        where.query(line)
+    report = where.query("OUTP1:LOAD?;:SOUR1:FUNC?;:SOUR1:VOLT:UNIT?;:SOUR1:VOLT:OFFS?;:SOUR1:FREQ?"
+                     ";:SOUR1:VOLT?;:OUTP1?").split(";")  # fmt: skip
+    numbers = [float(report[k]) for k in (0, 3, 4, 5)]
     return (
-        told[1:3] == ["SIN", "VPP"]
-        and told[6] == "1"
+        report[1:3] == ["SIN", "VPP"]
+        and report[6] == "1"
         and numbers[0] > 1e30
         and (numbers[1:] == pytest.approx([0.0, HZ, 2 * VOLT]))
     )
@@ -131,19 +131,19 @@ def test_what_the_last_user_left_is_seen_by_no_old_read_back_and_is_reset(what: 
 )
 def test_what_is_not_seen_in_the_amplitude_is_reset_too(panel: str, question: str) -> None:
     with bench(panel) as b:
-        left = b.ask(question)
+        left = b.query(question)
         assert before(b)
-        assert b.ask(question) == left
+        assert b.query(question) == left
         with opened(b):
-            assert b.ask(question) in {"0", "OFF", "NORM", "NONE"}
-            assert b.ask(question) != left
+            assert b.query(question) in {"0", "OFF", "NORM", "NONE"}
+            assert b.query(question) != left
 
 
 def test_voltage_limits_keep_the_load_from_being_set_and_are_reset() -> None:
     limits = ("VOLT:LIM:HIGH 0.06", "VOLT:LIM:LOW -0.06", "VOLT:LIM:STAT ON")
     with bench(*limits) as b:
         assert not before(b)
-        assert b.ask("SYST:ERR?") == '-221,"Settings conflict"'
+        assert b.query("SYST:ERR?") == '-221,"Settings conflict"'
         with opened(b) as generator:
             generator.sine(HZ, 0.5)
             assert b.wire.sine == pytest.approx((HZ, 0.5))
@@ -167,9 +167,9 @@ TOUCHED = {
 def test_somebody_at_the_front_panel_is_noticed_before_the_output_goes_on(line: str) -> None:
     with bench() as b, opened(b) as generator:
         generator.sine(HZ, VOLT)
-        b.ask(line)
-        told = rf"does not put out the sine that was set: {TOUCHED[line]}.*its output is off"
-        with pytest.raises(DeviceError, match=told):
+        b.query(line)
+        reported = rf"does not put out the sine that was set: {TOUCHED[line]}.*its output is off"
+        with pytest.raises(DeviceError, match=reported):
             generator.sine(HZ, VOLT)
         assert b.wire.sine == (0.0, 0.0)
 
@@ -187,9 +187,9 @@ SIGNAL = {
 @pytest.mark.parametrize("line", SIGNAL)
 def test_load_unit_waveform_and_offset_are_asked_for_before_the_output_goes_on(line: str) -> None:
     with bench() as b, opened(b) as generator:
-        b.ask(line)
-        told = rf"does not put out the sine that was set: {SIGNAL[line]}; its output is off"
-        with pytest.raises(DeviceError, match=told):
+        b.query(line)
+        reported = rf"does not put out the sine that was set: {SIGNAL[line]}; its output is off"
+        with pytest.raises(DeviceError, match=reported):
             generator.sine(HZ, VOLT)
         assert (b.wire.sine, b.wire.offset_v, b.wire.highest_v) == ((0.0, 0.0), 0.0, 0.0)
 
@@ -197,7 +197,7 @@ def test_load_unit_waveform_and_offset_are_asked_for_before_the_output_goes_on(l
 def test_a_unit_of_the_panel_is_no_higher_amplitude_for_a_moment_either() -> None:
     with bench() as b, opened(b) as generator:
         generator.sine(HZ, VOLT)
-        b.ask("VOLT:UNIT VRMS")
+        b.query("VOLT:UNIT VRMS")
         with pytest.raises(DeviceError, match="its amplitude is in VRMS; its output is off"):
             generator.sine(HZ, VOLT)
         assert b.wire.highest_v == pytest.approx(VOLT)
@@ -209,7 +209,7 @@ def test_a_load_of_50_ohm_is_the_one_that_is_expected_where_the_rig_file_says_so
         b.config = b.config.model_copy(update={"load": "50"})
         with opened(b) as generator:
             generator.sine(HZ, VOLT)
-            b.ask("OUTP1:LOAD INF")
+            b.query("OUTP1:LOAD INF")
             with pytest.raises(DeviceError, match="load is set to INF ohm, expected 50; its out"):
                 generator.sine(HZ, VOLT)
             assert b.wire.sine == (0.0, 0.0)
@@ -217,10 +217,10 @@ def test_a_load_of_50_ohm_is_the_one_that_is_expected_where_the_rig_file_says_so
 
 def test_an_answer_that_is_no_number_is_no_offset_of_zero() -> None:
     rest = ";NORM;NORM;0;0;CW;0;0;0;0;0;0;0;0"
-    assert check_rest(f"9.9E+37;VPP;SIN;+0.0E+00{rest}", 1, "INF") == ""
-    assert check_rest(f"9.9E+37;VPP;SIN;OFF{rest}", 1, "INF") == "an offset of nan V is added"
-    told = "its load is set to nan ohm, expected 50"
-    assert check_rest(f"OFF;VPP;SIN;0{rest}", 1, "50") == told
+    assert check_settings(f"9.9E+37;VPP;SIN;+0.0E+00{rest}", 1, "INF") == ""
+    assert check_settings(f"9.9E+37;VPP;SIN;OFF{rest}", 1, "INF") == "an offset of nan V is added"
+    reported = "its load is set to nan ohm, expected 50"
+    assert check_settings(f"OFF;VPP;SIN;0{rest}", 1, "50") == reported
 
 
 def test_an_offset_of_the_emulated_generator_drives_the_amplifier() -> None:
@@ -244,14 +244,14 @@ def test_an_offset_of_the_emulated_generator_drives_the_amplifier() -> None:
 # ---- the error queue ----------------------------------------------------------------------------
 
 
-def test_errors_of_the_last_user_do_not_count_and_new_ones_are_told_in_one_line() -> None:
+def test_errors_of_the_last_user_do_not_count_and_new_ones_are_reported_in_one_line() -> None:
     with bench() as b:
         for _ in range(30):
-            b.ask("NONSENSE")
+            b.query("NONSENSE")
         with opened(b) as generator:
-            b.ask("SOUR1:NONSENSE")
-            b.ask("FREQ 1e12")
-            b.ask(f"FREQ {HZ}")
+            b.query("SOUR1:NONSENSE")
+            b.query("FREQ 1e12")
+            b.query(f"FREQ {HZ}")
             with pytest.raises(DeviceError, match=r"reports -113,\"Und.*\"; -222,\"Data.* is off"):
                 generator.sine(HZ, VOLT)
             assert b.wire.sine == (0.0, 0.0)
@@ -262,11 +262,11 @@ def test_errors_of_the_last_user_do_not_count_and_new_ones_are_told_in_one_line(
 def test_the_queue_holds_twenty_and_its_last_place_says_that_more_were_lost() -> None:
     with bench() as b:
         for _ in range(30):
-            b.ask("NONSENSE")
-        b.ask("*RST")
-        told = [b.ask("SYST:ERR?") for _ in range(21)]
-        assert told[:19] == ['-113,"Undefined header"'] * 19
-        assert told[19:] == ['-350,"Error queue overflow"', '+0,"No error"']
+            b.query("NONSENSE")
+        b.query("*RST")
+        reported = [b.query("SYST:ERR?") for _ in range(21)]
+        assert reported[:19] == ['-113,"Undefined header"'] * 19
+        assert reported[19:] == ['-350,"Error queue overflow"', '+0,"No error"']
 
 
 # ---- the emulator, by the guide -----------------------------------------------------------------
@@ -275,56 +275,56 @@ def test_the_queue_holds_twenty_and_its_last_place_says_that_more_were_lost() ->
 def test_amplitudes_are_clipped_to_10_vpp_into_50_ohm_and_20_vpp_into_an_open_circuit() -> None:
     with bench() as b:
         for load, most in (("50", 10.0), ("INF", 20.0)):
-            b.ask(f"OUTP1:LOAD {load}")
-            b.ask("VOLT 30")
-            assert b.ask("SYST:ERR?") == '-222,"Data out of range"'
-            assert float(b.ask("VOLT?")) == pytest.approx(most)
+            b.query(f"OUTP1:LOAD {load}")
+            b.query("VOLT 30")
+            assert b.query("SYST:ERR?") == '-222,"Data out of range"'
+            assert float(b.query("VOLT?")) == pytest.approx(most)
 
 
 def test_an_offset_that_leaves_no_room_for_an_amplitude_is_moved_with_an_error() -> None:
     with bench() as b:
         for line in ("OUTP1:LOAD INF", "VOLT 1", "VOLT:OFFS 9", "VOLT 10"):
-            b.ask(line)
-        assert b.ask("SYST:ERR?") == '-221,"Settings conflict"'
-        assert float(b.ask("VOLT:OFFS?")) == pytest.approx(5.0)
+            b.query(line)
+        assert b.query("SYST:ERR?") == '-221,"Settings conflict"'
+        assert float(b.query("VOLT:OFFS?")) == pytest.approx(5.0)
 
 
 def test_limits_clip_an_amplitude_with_an_error() -> None:
     with bench("VOLT:LIM:HIGH 0.1", "VOLT:LIM:LOW -0.1", "VOLT:LIM:STAT ON") as b:
-        b.ask("VOLT 1")
-        assert b.ask("SYST:ERR?") == '-221,"Settings conflict"'
-        assert float(b.ask("VOLT?")) == pytest.approx(0.2)
+        b.query("VOLT 1")
+        assert b.query("SYST:ERR?") == '-221,"Settings conflict"'
+        assert float(b.query("VOLT?")) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(("model", "most_hz"), [("33522B", 30e6), ("33509B", 20e6)])
 def test_the_highest_frequency_is_that_of_the_model(model: str, most_hz: float) -> None:
     with bench(model=model) as b:
-        b.ask("FREQ 100 MHZ")
-        assert b.ask("SYST:ERR?") == '-222,"Data out of range"'
-        assert float(b.ask("FREQ?")) == most_hz
+        b.query("FREQ 100 MHZ")
+        assert b.query("SYST:ERR?") == '-222,"Data out of range"'
+        assert float(b.query("FREQ?")) == most_hz
 
 
 def test_only_one_of_burst_sweep_and_modulation_runs() -> None:
     with bench("BURS:STAT ON", "AM:STAT ON") as b:
-        assert b.ask("BURS:STAT?;:AM:STAT?") == "0;1"
-        b.ask("PWM:STAT ON")
-        assert b.ask("SYST:ERR?") == '-221,"Settings conflict"'
-        assert b.ask("PWM:STAT?") == "0"
+        assert b.query("BURS:STAT?;:AM:STAT?") == "0;1"
+        b.query("PWM:STAT ON")
+        assert b.query("SYST:ERR?") == '-221,"Settings conflict"'
+        assert b.query("PWM:STAT?") == "0"
 
 
 def test_a_header_without_a_colon_goes_on_in_the_path_of_the_one_before() -> None:
     with bench() as b:
-        b.ask("SOUR1:VOLT:UNIT VRMS;OFFS 0.01")
-        assert b.ask("VOLT:UNIT?") == "VRMS"
-        assert float(b.ask("VOLT:OFFS?")) == pytest.approx(0.01)
-        b.ask("VOLT:UNIT VPP;VOLT 1")
-        assert b.ask("SYST:ERR?") == '-113,"Undefined header"'
+        b.query("SOUR1:VOLT:UNIT VRMS;OFFS 0.01")
+        assert b.query("VOLT:UNIT?") == "VRMS"
+        assert float(b.query("VOLT:OFFS?")) == pytest.approx(0.01)
+        b.query("VOLT:UNIT VPP;VOLT 1")
+        assert b.query("SYST:ERR?") == '-113,"Undefined header"'
 
 
 def test_nothing_is_answered_after_an_identity() -> None:
     with bench() as b:
-        assert b.ask("*IDN?;*OPC?").startswith("Agilent Technologies,33522B")
-        assert b.ask("SYST:ERR?").startswith("-440")
+        assert b.query("*IDN?;*OPC?").startswith("Agilent Technologies,33522B")
+        assert b.query("SYST:ERR?").startswith("-440")
 
 
 @pytest.mark.parametrize(
@@ -333,15 +333,15 @@ def test_nothing_is_answered_after_an_identity() -> None:
 )
 def test_units_are_understood(command: str, question: str, value: float) -> None:
     with bench() as b:
-        b.ask(command)
-        assert b.ask("SYST:ERR?") == '+0,"No error"'
-        assert float(b.ask(question)) == pytest.approx(value)
+        b.query(command)
+        assert b.query("SYST:ERR?") == '+0,"No error"'
+        assert float(b.query(question)) == pytest.approx(value)
 
 
 def test_tracking_carries_settings_over_and_switches_coupling_off() -> None:
     with bench("FREQ:COUP ON", "TRAC ON", "SOUR2:FREQ 5000") as b:
-        assert b.ask("SOUR1:FREQ?") == b.ask("SOUR2:FREQ?")
-        assert b.ask("FREQ:COUP?") == "0"
+        assert b.query("SOUR1:FREQ?") == b.query("SOUR2:FREQ?")
+        assert b.query("FREQ:COUP?") == "0"
 
 
 def test_an_endless_burst_is_a_sine_and_a_trigger_lets_a_burst_out() -> None:
@@ -354,10 +354,10 @@ def test_an_endless_burst_is_a_sine_and_a_trigger_lets_a_burst_out() -> None:
 def test_an_instrument_with_one_channel_is_not_asked_for_coupling() -> None:
     with bench(model="33511B") as b, opened(b) as generator:
         generator.sine(HZ, VOLT)
-        assert b.ask("TRAC?") == ""
-        assert b.ask("SYST:ERR?") == '-113,"Undefined header"'
-    assert check_rest("NORM", 1, "INF") == "1 of 17 settings were answered"
-    assert "TRAC" not in rest_question(1, 1)
+        assert b.query("TRAC?") == ""
+        assert b.query("SYST:ERR?") == '-113,"Undefined header"'
+    assert check_settings("NORM", 1, "INF") == "1 of 17 settings were reported"
+    assert "TRAC" not in settings_query(1, 1)
 
 
 @pytest.mark.long
@@ -367,7 +367,7 @@ def test_a_slow_reset_is_waited_for_and_a_slow_answer_is_not() -> None:
         KeysightGenerator(quick).close()
     with bench(answer_s=1.0) as b:
         quick = b.config.model_copy(update={"timeout_s": 0.2})
-        with pytest.raises(DeviceError, match="function generator does not answer"):
+        with pytest.raises(DeviceError, match="function generator does not reply"):
             KeysightGenerator(quick)
 
 
@@ -380,11 +380,11 @@ def test_a_third_connection_is_refused_with_what_to_do() -> None:
         with socket.create_connection(("127.0.0.1", port)) as held:
             held.sendall(b"*OPC?\n")
             assert held.recv(16) == b"1\n"
-            with pytest.raises(DeviceError, match=r"does not answer .*close other programs"):
+            with pytest.raises(DeviceError, match=r"does not reply .*close other programs"):
                 KeysightGenerator(b.config)
             with pytest.raises(
                 DeviceError,
-                match=r"connection to the function generator failed .*not confirmed off",
+                match=r"connection failed .*not confirmed off",
             ):
                 switch_generator_off(b.config, 0.1)
 
@@ -404,20 +404,20 @@ def test_asking_who_it_is_changes_nothing() -> None:
         assert b.wire.sine == pytest.approx((HZ, VOLT))
 
 
-def test_another_instrument_is_switched_off_and_told() -> None:
+def test_another_instrument_is_switched_off_and_reported() -> None:
     with bench() as b:
-        b.ask("OUTP1 ON")
+        b.query("OUTP1 ON")
         other = b.config.model_copy(update={"serial_number": "MY1"})
         with pytest.raises(
             DeviceError, match=r"The instrument .* was switched off, but .*serial number MY1"
         ):
             switch_generator_off(other, GUARD_S)
         assert b.wire.sine == (0.0, 0.0)
-        with pytest.raises(InputError, match="Serial number of the function generator = MY00"):
+        with pytest.raises(InputError, match="generator has the serial number MY00"):
             identify_generator(other)
 
 
-def test_an_output_that_stays_on_is_told() -> None:
+def test_an_output_that_stays_on_is_reported() -> None:
     with bench() as b:
         b.server.answer = lambda line: b"1;Agilent Technologies,33522B,MY00000001,x\n"  # type: ignore[method-assign]
         with pytest.raises(DeviceError, match=r"output is not off after OUTP OFF .*by hand"):

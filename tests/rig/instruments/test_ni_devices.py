@@ -149,7 +149,7 @@ def test_the_sample_clock_cannot_be_counted_by_the_exposure_counter(board: str) 
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_one_value_is_too_few_for_an_output_buffer_that_nobody_sized(board: str) -> None:
+def test_one_value_is_too_few_for_an_output_buffer_without_a_size(board: str) -> None:
     """NI-DAQmx C Reference, DAQmxWriteRaw, note: buffered writes need 2 samples or a size."""
     with served_board(board) as client:
         _, write = client.stream()
@@ -157,7 +157,7 @@ def test_one_value_is_too_few_for_an_output_buffer_that_nobody_sized(board: str)
             write([0.0])
 
 
-def test_the_first_write_sizes_the_buffer_and_foreseen_values_have_no_room() -> None:
+def test_the_first_write_sizes_the_buffer_and_queued_values_do_not_fit() -> None:
     with served_board("USB-6212") as client:
         clock, inputs, (stream, write) = client.clock(), client.inputs(), client.stream()
         write([0.0, 0.0])
@@ -215,7 +215,7 @@ def test_over_usb_a_start_that_is_taken_on_trust_is_in_the_wrong_block() -> None
             board.close()
 
 
-def test_a_usb_device_that_nobody_asks_stops_sending() -> None:
+def test_a_usb_device_that_is_not_queried_stops_sending() -> None:
     """nidaqmx-python issue 931; the threshold is the fault's."""
     with served_board("USB-6212", stall_s=1.0) as client:
         inputs = client.inputs()

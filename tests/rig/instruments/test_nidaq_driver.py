@@ -78,11 +78,13 @@ def opened(file: BenchConfig, exposure: ExposureConfig | None = None) -> Iterato
 # ---- rates and skew -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("rate_hz", "told"), [(300e3, "250000 or 312500"), (3e3, "2500 or 3125")])
+@pytest.mark.parametrize(
+    ("rate_hz", "reported"), [(300e3, "250000 or 312500"), (3e3, "2500 or 3125")]
+)
 def test_a_rate_that_does_not_divide_20_mhz_is_refused_with_the_nearest_ones(
-    rate_hz: float, told: str
+    rate_hz: float, reported: str
 ) -> None:
-    with pytest.raises(InputError, match=rf"daq\.rate_hz is .* divides 20 MHz exactly.*{told}"):
+    with pytest.raises(InputError, match=rf"daq\.rate_hz is .* divides 20 MHz exactly.*{reported}"):
         ticks_per_sample(NidaqConfig(rate_hz=rate_hz))
 
 
@@ -155,9 +157,11 @@ def test_the_check_of_routes_changes_no_output_and_leaves_the_device_free(board:
 
 def test_orphaned_tasks_are_one_line_and_making_the_bench_safe_helps() -> None:
     with served_board(orphaned_tasks=True) as (_, file):
-        with pytest.raises(DeviceError, match=r"-50103\)\. .*haselab rig safe RIG\.toml") as told:
+        with pytest.raises(
+            DeviceError, match=r"-50103\)\. .*haselab rig safe RIG\.toml"
+        ) as reported:
             RealBench(file, Gate())
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(reported.value)
         assert ("daq", "") in make_safe(file)
         with opened(file) as board:
             board.read()
@@ -194,7 +198,7 @@ def test_an_idle_usb_device_is_asked_so_that_it_goes_on(
     polls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not polls:
-        monkeypatch.setattr(NidaqBoard, "_ask_aside", lambda board: None)
+        monkeypatch.setattr(NidaqBoard, "_query_idle", lambda board: None)
     with served_board(pace=1.0, stall_s=3.0, ahead_blocks=8) as (served, file), opened(file) as b:
         b.read()
         end = served.hub.acquired + round(4.5 * file.daq.rate_hz)
@@ -246,16 +250,16 @@ def test_a_question_of_the_idle_poll_that_hangs_does_not_shorten_the_next_calls_
             return 0
 
         monkeypatch.setattr(TwinHub, "acquired", property(acquired))
-        told: list[Exception | None] = []
+        reported: list[Exception | None] = []
 
         def ask() -> None:
-            link.asks_aside()
-            told.append(quietly(lambda: inputs.in_stream.total_samp_per_chan_acquired))
+            link.ignore_silence()
+            reported.append(quietly(lambda: inputs.in_stream.total_samp_per_chan_acquired))
 
         thread = threading.Thread(target=ask)
         thread.start()
         thread.join(GUARD_S)
-        assert "Deadline" in str(told[0])
+        assert "Deadline" in str(reported[0])
         assert inputs.in_stream.total_samp_per_chan_acquired == 0
         hold.set()
         link.close()
@@ -384,7 +388,7 @@ def test_starts_that_could_not_be_seen_are_refused(starts: int, step_v: float) -
     with (
         served_board("PXIe-6363") as (_, file),
         opened(file) as board,
-        pytest.raises(LimitError, match=r"starts = .*needed at least\. Raise them"),
+        pytest.raises(LimitError, match=r"starts is .*must be at least.*Raise them"),
     ):
         measure_start(board, file.daq, starts=starts, step_v=step_v)
 

@@ -128,7 +128,7 @@ def test_with_an_external_switch_source_the_old_off_leaves_the_output_closed() -
             assert b.wire.rail_v == 0.0
 
 
-def test_off_while_somebody_else_drives_the_switch_is_told_and_then_done() -> None:
+def test_off_with_an_external_switch_source_is_reported_and_then_done() -> None:
     with bench() as b, opened(b) as supply:
         supply.set_voltage(2000.0)
         for command in ("SSwSrc 1", "SSwMode 0"):
@@ -181,10 +181,10 @@ def test_a_converter_that_does_not_run_down_is_not_confirmed_off(monkeypatch: An
         with before(b) as old:
             assert old.off()
             assert old.is_off(), "the old sequence never asked for the voltage"
-        told = r"not confirmed off: its meter shows 699 V 0.2 s after.*Pull its power jack"
-        with pytest.raises(DeviceError, match=told):
+        reported = r"Pull the power jack.*not confirmed off: its meter shows 699 V 0.2 s after"
+        with pytest.raises(DeviceError, match=reported):
             PetaPicoVoltron(b.config)
-        with pytest.raises(DeviceError, match=told):
+        with pytest.raises(DeviceError, match=reported):
             switch_supply_off(b.config)
 
 
@@ -198,7 +198,7 @@ def test_off_never_raises_whatever_answers() -> None:
         supply = PetaPicoVoltron(b.config.model_copy(update={"timeout_s": 0.2}))
         b.server.answer = lambda line: "?"  # type: ignore[method-assign]
         supply.off()
-        with pytest.raises(DeviceError, match="does not answer as it should"):
+        with pytest.raises(DeviceError, match="does not reply correctly"):
             supply.is_off()
         supply.close()
 
@@ -207,9 +207,9 @@ def test_off_never_raises_whatever_answers() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stored", "told"),
+    ("stored", "reported"),
     [
-        ({"stored_set_v": 2500}, r"up to 2500 V as soon as it gets power: .*SwMode 1"),
+        ({"stored_set_v": 2500}, r"up to 2500 V at power-on: .*SwMode 1"),
         ({"stored_set_v": 900, "stored_source": 2}, r"up to 900 V .*SwSrc 2"),
         ({"stored_set_v": 900, "stored_mode": 3}, r"up to 900 V .*SwMode 3"),
         ({"stored_set_v": 900, "stored_mode": 0, "stored_cycles": 3}, r"up to 900 V .*3 cycles"),
@@ -217,12 +217,12 @@ def test_off_never_raises_whatever_answers() -> None:
     ],
 )
 def test_a_supply_that_switches_on_at_power_on_is_refused_with_what_to_do(
-    stored: dict[str, int], told: str
+    stored: dict[str, int], reported: str
 ) -> None:
     with bench(**stored) as b:
         with before(b) as old:
             assert old.version == "slave 8", "the old sequence took it"
-        with pytest.raises(InputError, match=rf"{told}.*send 'Save'"):
+        with pytest.raises(InputError, match=rf"{reported}.*Send 'Save'"):
             PetaPicoVoltron(b.config)
         assert b.wire.rail_v == 0.0, "refused, and off"
         assert b.server.answer("Save") == "1"
@@ -256,7 +256,7 @@ def test_without_its_power_jack_a_supply_echoes_and_gives_nothing() -> None:
             assert old.set_voltage(1000), "the old sequence saw nothing"
             assert b.wire.rail_v == 0.0
         with opened(b) as supply:
-            with pytest.raises(DeviceError, match=r"its power jack is out.*Plug it in"):
+            with pytest.raises(DeviceError, match=r"its power jack is unplugged\. Plug it in"):
                 supply.set_voltage(1000.0)
             b.server.plug(True)
             supply.set_voltage(1000.0)
@@ -280,12 +280,15 @@ def test_a_switchboard_with_its_relays_open_is_refused() -> None:
         with before(b) as old:
             assert old.set_voltage(1000), "the old sequence took it for a supply"
             assert b.wire.rail_v == 0.0
-        with pytest.raises(InputError, match=r"'slave 1' .* a switchboard"):
+        with pytest.raises(InputError, match=r"a switchboard .*'slave 1'"):
             PetaPicoVoltron(b.config)
 
 
 def test_other_firmware_is_refused() -> None:
-    with bench(version="slave 7") as b, pytest.raises(InputError, match=r"'slave 7' .*firmware 8"):
+    with (
+        bench(version="slave 7") as b,
+        pytest.raises(InputError, match=r"'slave 7'.*Load firmware 8"),
+    ):
         PetaPicoVoltron(b.config)
 
 
@@ -304,10 +307,10 @@ def test_a_switch_source_that_changes_by_itself_is_noticed_before_the_output_cou
         real = b.server.answer
 
         def master(line: str) -> str:
-            told = real(line)
+            reported = real(line)
             if line == "SSwMode 1":  # over I2C, in between
                 real("SSwSrc 1")
-            return told
+            return reported
 
         b.server.answer = master  # type: ignore[method-assign]
         with pytest.raises(DeviceError, match=r"QSwSrc, .* are 1, 0, 1, 800, expected 0, 0, 1"):
@@ -325,7 +328,7 @@ def test_a_fragment_of_an_at_command_spoils_the_old_opening_and_not_the_new_one(
         assert supply.identity == "haselab-twin, slave 8"
 
 
-def test_answers_to_somebody_else_spoil_the_old_opening_and_not_the_new_one() -> None:
+def test_replies_to_another_program_break_the_old_opening_and_not_the_new_one() -> None:
     stale = b"Err\r\n0\r\n"
     with bench(stale=stale) as b, before(b) as old:
         assert old.version != "slave 8"
@@ -381,9 +384,7 @@ def test_no_command_is_a_defect_of_the_firmware(line: str) -> None:
 def test_nothing_that_answers_is_one_line_of_error() -> None:
     with bench() as b:
         b.server.answer = lambda line: "OK"  # type: ignore[method-assign]
-        with pytest.raises(
-            DeviceError, match=r"does not answer as it should \(QVer: .*Check cable"
-        ):
+        with pytest.raises(DeviceError, match=r"not reply correctly \(QVer: .*Check its cable"):
             PetaPicoVoltron(b.config.model_copy(update={"timeout_s": 0.2}))
 
 
@@ -392,15 +393,17 @@ def test_nothing_that_answers_is_one_line_of_error() -> None:
 
 def test_asking_who_it_is_leaves_it_as_it_is() -> None:
     with bench(left_by=("SVset 700", "SSwMode 1")) as b:
-        with pytest.raises(DeviceError, match=r"is ON: its meter shows 699 V\. .*haselab rig safe"):
+        with pytest.raises(
+            DeviceError, match=r"Keep clear: .* is ON, its meter shows 699 V\. .* rig safe"
+        ):
             identify_supply(b.config)
         assert b.wire.rail_v == 700.0
     with bench() as b:
         assert identify_supply(b.config) == "haselab-twin, slave 8"
 
 
-def test_asking_who_it_is_tells_of_a_power_jack_that_is_out() -> None:
-    with bench(jack_in=False) as b, pytest.raises(DeviceError, match="power jack is out"):
+def test_identifying_reports_an_unplugged_power_jack() -> None:
+    with bench(jack_in=False) as b, pytest.raises(DeviceError, match="power jack is unplugged"):
         identify_supply(b.config)
 
 
@@ -423,7 +426,7 @@ def test_it_is_switched_off_from_outside_whatever_is_wrong_with_it(faults: dict[
         assert b.server.converter_v <= 50.0
 
 
-def test_another_supply_is_switched_off_and_told() -> None:
+def test_another_supply_is_switched_off_and_reported() -> None:
     with bench(left_by=("SVset 900", "SSwMode 1")) as b:
         config = b.config.model_copy(update={"serial_number": "rev2"})
         with pytest.raises(

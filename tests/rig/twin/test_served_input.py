@@ -96,34 +96,34 @@ def test_the_generator_queues_an_error_and_goes_on(
 )
 def test_the_stand_refuses_what_is_no_request_and_goes_on(served: ServedTwin, line: bytes) -> None:
     with client(served.client.address) as stream:
-        told = json.loads(asked(stream, line + b"\n"))
-        assert told["error"]
-        assert told["kind"] in {"InputError", "LimitError"}
+        reported = json.loads(asked(stream, line + b"\n"))
+        assert reported["error"]
+        assert reported["kind"] in {"InputError", "LimitError"}
         assert "output_v" in json.loads(asked(stream, b'{"do": "meters"}\n'))
 
 
 def test_the_supply_refuses_a_number_of_4400_digits_and_goes_on(served: ServedTwin) -> None:
     with open(served.supply.port, "r+b", buffering=0) as port:  # noqa: PTH123
-        for command, told in (
+        for command, reported in (
             (b"SF " + b"1" * 4400, b"Err"),  # its buffer has begun again many times
             (b"SVset \xff", b"0"),
             (b"", b"0"),  # the last command once more
             (b"x" * 100_000, b"Err"),
         ):
             threading.Thread(target=port.write, args=(command + b"\r",)).start()
-            assert _read_line(port) == told
+            assert _read_line(port) == reported
         port.write(b"QName\r")
         assert _read_line(port) == b"haselab-twin"
 
 
 def _read_line(port: Any) -> bytes:
-    told = b""
-    while not told.endswith(b"\r\n"):
-        told += port.read(1)
-    return told.strip()
+    reported = b""
+    while not reported.endswith(b"\r\n"):
+        reported += port.read(1)
+    return reported.strip()
 
 
-def test_answers_that_nobody_reads_do_not_keep_the_supply_from_closing() -> None:
+def test_unread_replies_do_not_prevent_the_supply_from_closing() -> None:
     with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as twin:
         port = os.open(twin.supply.port, os.O_RDWR | os.O_NONBLOCK)
         with contextlib.suppress(BlockingIOError):
@@ -194,8 +194,8 @@ COMMANDS = st.builds(
 @MANY
 @given(line=st.one_of(SCPI, st.text()))
 def test_no_line_is_a_defect_of_the_generator(served: ServedTwin, line: str) -> None:
-    told = served.generator.answer(line.encode("ascii", "replace").decode())
-    assert told == b"" or told.endswith(b"\n")
+    reported = served.generator.answer(line.encode("ascii", "replace").decode())
+    assert reported == b"" or reported.endswith(b"\n")
 
 
 @MANY
@@ -318,7 +318,7 @@ def test_the_owner_of_a_connection_is_found_over_both_kinds_of_socket() -> None:
 
 
 @LINUX
-def test_a_client_that_has_closed_its_end_belongs_to_nobody() -> None:
+def test_a_client_that_has_closed_its_end_has_no_user() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         socket.create_connection(server.getsockname()).close()
         connection, address = server.accept()

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from scipy.optimize import curve_fit
 
 from haselab.base import InputError, LimitError
-from haselab.rig.twin import bench as twin_bench
+from haselab.rig.twin import twin_bench
 from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import make_twin
@@ -293,15 +293,15 @@ def test_a_length_outside_the_picture_is_refused(length_m: float) -> None:
 
 def test_bad_requests_are_refused() -> None:
     seen = camera(particles=0)
-    with pytest.raises(InputError, match=r"shape \(2,\), allowed is \(frames, samples\)"):
+    with pytest.raises(InputError, match=r"shape \(2,\), but it must be \(frames, samples\)"):
         seen.render([0.09, 0.09], first_index=0)
-    with pytest.raises(InputError, match="first_index = -1 is negative"):
+    with pytest.raises(InputError, match="first_index is -1, but"):
         seen.render([[0.09]], first_index=-1)
     with pytest.raises(LimitError, match=r"neck_coefficient = 0.5 .* would fold"):
         camera(neck_coefficient=0.5)
     with pytest.raises(LimitError, match="sheet half-width"):
         TwinCamera(TwinCameraConfig(), 0.005, FREE_LENGTH_M, seed=0)
-    with pytest.raises(LimitError, match="leaves no room for a sheet"):
+    with pytest.raises(LimitError, match=r"needs at least \d+ rows"):
         camera(height_px=100)
     with pytest.raises(ValidationError, match="longer than a frame"):
         TwinCameraConfig(rate_hz=400, exposure_s=3e-3)

@@ -1,4 +1,4 @@
-"""TWIN.toml: every parameter can be set, every fault is told at once with its path."""
+"""TWIN.toml: every parameter can be set, every fault is reported at once with its path."""
 
 from pathlib import Path
 
@@ -36,13 +36,13 @@ def test_a_reading_brings_its_values_and_the_file_may_overrule_them(
     assert own.viscosity == whole.viscosity
 
 
-def test_all_faults_are_told_at_once_each_with_its_path(tmp_path: Path) -> None:
+def test_all_faults_are_reported_at_once_each_with_its_path(tmp_path: Path) -> None:
     path = write(
         tmp_path,
         "[load]\nmass_kg = -0.25\n[shell]\nlenght_m = 0.06\n"
         '[acquisition]\nbits = 24\n[amplifier]\ngain = "high"\n',
     )
-    with pytest.raises(InputError, match=r"^4 fault\(s\)") as fault:
+    with pytest.raises(InputError, match=r"^4 error\(s\)") as fault:
         load_twin(path)
     message = str(fault.value)
     for where, what in (
@@ -62,7 +62,7 @@ def test_all_faults_are_told_at_once_each_with_its_path(tmp_path: Path) -> None:
     [
         ("[no_such_section]\nx = 1\n", "no_such_section"),
         ("color = 3\n", "color"),
-        ("[viscosity]\nshare = [0.1]\n", "one number a branch"),
+        ("[viscosity]\nshare = [0.1]\n", "one number per branch"),
         ("[viscosity]\nshare = [-1.0]\nrelaxation_s = [1.0]\n", "0 <= share"),
         ("[acquisition]\nskew_s = 4e-6\n", "half a sample"),
         ("[acquisition]\noutput_delay_s = 6e-3\n", "half a block"),

@@ -100,18 +100,18 @@ def test_gain_errors_and_offsets_belong_to_one_monitor_each():
      (1e-9, float("inf"))],
 )  # fmt: skip
 def test_a_reference_that_cannot_be_is_refused(capacitance_f, series_ohm):
-    with pytest.raises(LimitError, match=r"Reference of .* is outside .* Connect another one"):
+    with pytest.raises(LimitError, match=r"reference of .* is outside .* Use another one"):
         bench_of().connect(capacitance_f, series_ohm)
 
 
-def test_hands_stay_away_from_a_live_fixture():
+def test_a_live_fixture_must_not_be_touched():
     bench = bench_of()
     bench.write(0.5)
-    with pytest.raises(LimitError, match=r"Output = 0\.5 V .* Switch both off first"):
+    with pytest.raises(LimitError, match=r"Do not touch .* output is 0\.5 V .* both off first"):
         bench.connect(1e-9)
     bench.zero()
     bench.sine(2000.0, 0.02)
-    with pytest.raises(LimitError, match=r"0\.02 V of carrier"):
+    with pytest.raises(LimitError, match=r"the carrier 0\.02 V"):
         bench.connect(None)
     bench.off()
     bench.connect(1e-9)

@@ -384,7 +384,7 @@ def test_acquisition_and_motion_alone_are_the_same_mechanics():
 def test_breakdown_comes_at_its_field_and_takes_the_output_away():
     limit_v_m = 5e6
     bench = TwinBench(config_of(dielectric={"breakdown_v_per_m": limit_v_m}), 0)
-    with pytest.raises(SafetyError, match=r"Dielectric breakdown .* the output is at 0 V"):
+    with pytest.raises(SafetyError, match=r"Dielectric breakdown .* The output is at 0 V"):
         for drive_v in np.arange(0.0, 2.0, 0.01):
             bench.write(drive_v)
             bench.read()

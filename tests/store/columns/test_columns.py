@@ -1,4 +1,4 @@
-"""Columns come piece by piece, the same from every kind of file, in little memory."""
+"""Columns come chunk by chunk, the same from every kind of file, in little memory."""
 
 import tracemalloc
 from pathlib import Path
@@ -102,14 +102,14 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize("rows", [1, 7, 64, 500, ROWS, 5000])
 def test_pieces_of_any_length_make_the_column_in_its_own_type(folder, name, rows):
     if rows == 1 and name == "a.tdms":
-        rows = 3  # its reader takes a millisecond a piece
+        rows = 3  # its reader takes a millisecond a chunk
     with open_columns(folder / name, ["i", "k", "v"]) as stream:
         assert stream.rate_hz == pytest.approx(400.0)
         assert stream.rows == (None if name.endswith("csv") else ROWS)
-        pieces = list(stream.pieces(rows))
-    assert [len(piece[0]) for piece in pieces[:-1]] == [rows] * (len(pieces) - 1)
+        chunks = list(stream.chunks(rows))
+    assert [len(chunk[0]) for chunk in chunks[:-1]] == [rows] * (len(chunks) - 1)
     for k, wanted in enumerate((I, K, V)):
-        column = np.concatenate([piece[k] for piece in pieces])
+        column = np.concatenate([chunk[k] for chunk in chunks])
         np.testing.assert_array_equal(column, wanted)
         assert column.dtype == (np.float64 if name.endswith("csv") else wanted.dtype)
         assert column.dtype.isnative
@@ -118,8 +118,8 @@ def test_pieces_of_any_length_make_the_column_in_its_own_type(folder, name, rows
 @pytest.mark.parametrize("name", KINDS)
 def test_a_second_pass_begins_at_the_first_row(folder, name):
     with open_columns(folder / name, ["v"]) as stream:
-        first = next(iter(stream.pieces(10)))[0]
-        again = next(iter(stream.pieces(10)))[0]
+        first = next(iter(stream.chunks(10)))[0]
+        again = next(iter(stream.chunks(10)))[0]
         assert 0.0 < stream.share_read() <= 1.0
     np.testing.assert_array_equal(first, V[:10])
     np.testing.assert_array_equal(again, V[:10])
@@ -134,7 +134,7 @@ def test_a_missing_column_is_one_line_with_those_that_are_there(folder, name):
 
 @settings(max_examples=40, deadline=None)
 @given(sizes=st.lists(st.integers(1, 300), min_size=1, max_size=12), chunk=st.integers(1, 200))
-def test_whole_chunks_are_read_whatever_is_asked_for(tmp_path_factory, sizes, chunk):
+def test_whole_chunks_are_read_whatever_is_requested(tmp_path_factory, sizes, chunk):
     path = tmp_path_factory.getbasetemp() / "property.h5"
     values = np.arange(sum(sizes), dtype=np.int32)
     with h5py.File(path, "w") as file:
@@ -142,7 +142,7 @@ def test_whole_chunks_are_read_whatever_is_asked_for(tmp_path_factory, sizes, ch
     with open_columns(path, ["x"]) as stream:
         take = stream._archive.start(["x"])
         got = [take(size)[0] for size in sizes]
-    assert [len(piece) for piece in got] == sizes
+    assert [len(chunk) for chunk in got] == sizes
     np.testing.assert_array_equal(np.concatenate(got), values)
     assert got[0].dtype == np.float64
 
@@ -157,10 +157,10 @@ def test_both_columns_of_an_array_without_names_are_taken_by_position(
     np.save(tmp_path / "a.npy", np.asarray(table, order=order))
     with open_columns(tmp_path / "a.npy", ["volts", "amps"]) as stream:
         assert (stream.rows, stream.rate_hz) == (ROWS, None)
-        pieces = list(stream.pieces(400))
-    np.testing.assert_array_equal(np.concatenate([p[0] for p in pieces]), K)
-    np.testing.assert_array_equal(np.concatenate([p[1] for p in pieces]), K // 2)
-    for volts, amps in pieces:
+        chunks = list(stream.chunks(400))
+    np.testing.assert_array_equal(np.concatenate([p[0] for p in chunks]), K)
+    np.testing.assert_array_equal(np.concatenate([p[1] for p in chunks]), K // 2)
+    for volts, amps in chunks:
         assert volts.dtype == np.dtype(dtype).newbyteorder("=")
         contiguous = volts.flags.c_contiguous and amps.flags.c_contiguous
         assert contiguous or pairs_of(volts, amps).shape == (volts.size, 2)
@@ -171,9 +171,9 @@ def test_fields_of_a_structured_array_are_columns(tmp_path):
     table["v"], table["i"] = I, K
     np.save(tmp_path / "a.npy", table)
     with open_columns(tmp_path / "a.npy", ["i", "v"]) as stream:
-        pieces = list(stream.pieces(999))
-    np.testing.assert_array_equal(np.concatenate([p[0] for p in pieces]), K)
-    np.testing.assert_array_equal(np.concatenate([p[1] for p in pieces]), I)
+        chunks = list(stream.chunks(999))
+    np.testing.assert_array_equal(np.concatenate([p[0] for p in chunks]), K)
+    np.testing.assert_array_equal(np.concatenate([p[1] for p in chunks]), I)
     with pytest.raises(InputError, match="lacks x; it has t, v, i"):
         open_columns(tmp_path / "a.npy", ["x"])
 
@@ -189,7 +189,7 @@ def test_whole_numbers_that_matlab_stores_small_are_doubles_again(tmp_path):
     raw[place : place + 48] = small
     (tmp_path / "a.mat").write_bytes(raw)
     with open_columns(tmp_path / "a.mat", ["v", "i"]) as stream:
-        ((v, i),) = stream.pieces(10)
+        ((v, i),) = stream.chunks(10)
     assert (v.tolist(), i.tolist()) == ([0, 1, 2, 3, 4], [1, 2, 300, 4, 5])
     assert v.dtype == np.float64
 
@@ -197,26 +197,26 @@ def test_whole_numbers_that_matlab_stores_small_are_doubles_again(tmp_path):
 def test_what_is_not_finite_passes(tmp_path):
     (tmp_path / "a.csv").write_text("v,i\n1,nan\ninf,2\n")
     with open_columns(tmp_path / "a.csv", ["v", "i"]) as stream:
-        ((v, i),) = stream.pieces(10)
+        ((v, i),) = stream.chunks(10)
     np.testing.assert_array_equal(v, [1.0, np.inf])
     np.testing.assert_array_equal(i, [np.nan, 2.0])
 
 
-def test_a_cell_that_is_no_number_is_told_with_its_line_far_down(tmp_path):
-    rows = "1.5,2\n" * 900_000  # more than one piece of text
+def test_a_cell_that_is_not_a_number_is_reported_with_its_line(tmp_path):
+    rows = "1.5,2\n" * 900_000  # more than one chunk of text
     (tmp_path / "a.csv").write_text(f"v,i\n{rows}3,oops\n")
     with (
         open_columns(tmp_path / "a.csv", ["v", "i"]) as stream,
         pytest.raises(InputError, match="Column i has 'oops' in line 900002"),
     ):
-        for _ in stream.pieces(10_000):
+        for _ in stream.chunks(10_000):
             pass
 
 
 def test_comments_blank_lines_and_a_last_line_without_an_end_are_read(tmp_path):
     (tmp_path / "a.csv").write_text("# made by hand\n\nv,i\n# a note\n1,2\n\n3,4\r\n5,6")
     with open_columns(tmp_path / "a.csv", ["i"]) as stream:
-        ((i,),) = stream.pieces(10)
+        ((i,),) = stream.chunks(10)
     assert i.tolist() == [2.0, 4.0, 6.0]
 
 
@@ -229,7 +229,7 @@ def test_a_file_that_was_cut_off_is_one_line(folder, tmp_path, name):
         pytest.raises(InputError, match=r"cannot be read|unequal lengths|lacks") as caught,
         open_columns(cut, ["v", "i", "k"]) as stream,
     ):
-        for _ in stream.pieces(100):
+        for _ in stream.chunks(100):
             pass
     assert "\n" not in str(caught.value)
 
@@ -239,7 +239,7 @@ def test_a_rate_from_times_is_checked_to_the_end(tmp_path):
     np.savez(tmp_path / "even.npz", time_s=time_s, v=time_s)
     with open_columns(tmp_path / "even.npz", ["v"]) as stream:
         assert stream.rate_hz == pytest.approx(200.0)
-        assert [len(piece) for piece in stream.pieces(10_000)] == [1]
+        assert [len(chunk) for chunk in stream.chunks(10_000)] == [1]
     time_s[7000:] += 1.0
     np.savez(tmp_path / "gap.npz", time_s=time_s, v=time_s)
     for rows in (1000, 7000, 20_000):
@@ -249,10 +249,10 @@ def test_a_rate_from_times_is_checked_to_the_end(tmp_path):
                 InputError, match=r"time_s has a step of 1.005 s before row 7001, but 0.005"
             ),
         ):
-            list(stream.pieces(rows))
+            list(stream.chunks(rows))
     with open_columns(tmp_path / "gap.npz", ["v"], use_times=False) as stream:
         assert stream.rate_hz is None
-        assert sum(len(v) for (v,) in stream.pieces(1000)) == 10_000
+        assert sum(len(v) for (v,) in stream.chunks(1000)) == 10_000
 
 
 def test_uneven_times_state_no_rate():
@@ -264,7 +264,7 @@ def test_uneven_times_state_no_rate():
 
 @pytest.mark.parametrize("name", ["a.npz", "b.npz", "a.mat", "b.mat", "a.h5", "b.h5", "a.npy"])
 def test_memory_holds_pieces_and_not_the_file(tmp_path, name):
-    rows, piece = 2_000_000, 20_000
+    rows, chunk = 2_000_000, 20_000
     v = np.tile(RNG.standard_normal(1000), rows // 1000)
     kind, packed = Path(name).suffix, name.startswith("b")
     path = tmp_path / name
@@ -280,14 +280,14 @@ def test_memory_holds_pieces_and_not_the_file(tmp_path, name):
                 options = {"chunks": (50_000,), "compression": "gzip"} if packed else {}
                 file.create_dataset(column, data=v, **options)
     with open_columns(path, ["v", "i"]) as stream:
-        next(iter(stream.pieces(rows)))  # what modules and caches take is taken
+        next(iter(stream.chunks(rows)))  # what modules and caches take is taken
         tracemalloc.start()
-        for _ in stream.pieces(piece):
+        for _ in stream.chunks(chunk):
             pass
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-    # Two pieces of each column, and twice the largest unit that is read ahead: 1 MB of chunks.
-    assert peak < 4 * 8 * piece + 2 * 2 * (1 << 20) + 1_000_000
+    # Two chunks of each column, and twice the largest unit that is read ahead: 1 MB of chunks.
+    assert peak < 4 * 8 * chunk + 2 * 2 * (1 << 20) + 1_000_000
     assert peak < 0.2 * 2 * v.nbytes
 
 
@@ -316,9 +316,9 @@ def test_packed_chunks_are_what_hdf5_itself_reads(tmp_path, dtype, filters):
                 data[..., :300], data[..., 600:] = values[..., :300], values[..., 600:]
         wanted = {name: file[name][()].reshape(-1).astype("f8") for name in file}
     with open_columns(tmp_path / "a.h5", list(wanted)) as stream:
-        pieces = list(stream.pieces(130))
+        chunks = list(stream.chunks(130))
     for k, name in enumerate(wanted):
-        np.testing.assert_array_equal(np.concatenate([p[k] for p in pieces]), wanted[name])
+        np.testing.assert_array_equal(np.concatenate([p[k] for p in chunks]), wanted[name])
 
 
 def test_a_packed_chunk_that_is_damaged_is_one_line(tmp_path):
@@ -333,4 +333,4 @@ def test_a_packed_chunk_that_is_damaged_is_one_line(tmp_path):
         open_columns(path, ["v"]) as stream,
         pytest.raises(InputError, match="cannot be read"),
     ):
-        list(stream.pieces(100))
+        list(stream.chunks(100))

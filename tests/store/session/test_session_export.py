@@ -147,7 +147,7 @@ def test_columns_that_cannot_be_a_session_are_refused(tmp_path):
 
 
 def test_a_session_without_scale_and_an_unknown_form_are_refused(session, tmp_path):
-    with pytest.raises(InputError, match="Unknown format 'xls'. Use one of csv, mat"):
+    with pytest.raises(InputError, match=r"Unknown format 'xls'\. Use one of csv, mat"):
         export_session(session, "xls", tmp_path / "x")
     SessionWriter(tmp_path / "bare.h5", PLANS, SAMPLES, {}).close()
     with pytest.raises(InputError, match=r"lacks rig\.volt_per_code.*bare\.h5$"):

@@ -55,7 +55,7 @@ def test_a_full_queue_is_a_fault_once_patience_has_ended() -> None:
     queue.close()
 
 
-def test_after_a_fault_only_what_always_runs_is_done_and_the_fault_is_told_once() -> None:
+def test_after_a_failure_only_permanent_jobs_run_and_the_failure_is_raised_once() -> None:
     def fails() -> None:
         raise DeviceError("broken")
 
@@ -95,7 +95,7 @@ def test_in_real_time_a_disk_that_is_behind_is_a_device_fault_and_no_block_is_lo
         for k, block in enumerate(blocks):
             session.append_block("a", block, 0.01 * k, 0.0, 0.0)
             taken = k + 1
-    # Two chunks wait, one is in work; the fourth, whose last block told of it, is in the tail.
+    # Two chunks wait, one is in work; the fourth, whose last block raised the error, is in tail.
     assert taken in (29, 39)
     with SessionReader(path) as reader:
         np.testing.assert_array_equal(reader.experiment("a").codes, blocks[: taken + 1])
@@ -207,7 +207,7 @@ def test_experiments_that_take_turns_keep_their_own_rows(tmp_path: Path) -> None
             np.testing.assert_array_equal(reader.experiment(name).codes, blocks[mine])
 
 
-def test_the_disk_itself_is_asked_once_a_second(
+def test_data_are_synchronised_to_the_disk_once_a_second(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import os

@@ -119,7 +119,7 @@ def test_a_second_writer_is_refused_and_the_first_one_keeps_every_block(tmp_path
         np.testing.assert_array_equal(reader.experiment("a").codes, blocks_of(25))
 
 
-def test_a_manifest_tells_where_data_come_from_and_which_they_are(tmp_path):
+def test_a_manifest_states_provenance_and_hashes(tmp_path):
     with Manifest(tmp_path, {"seed": 7, "versions": {"numpy": "2"}}, clock=lambda: THEN):
         assert read_manifest(tmp_path)["state"] == "OPEN"
         with SessionWriter(tmp_path / "session.h5", PLANS, SAMPLES, {}):

@@ -54,7 +54,7 @@ def test_frames_of_a_killed_run_are_whole_up_to_its_end(tmp_path):
     writer._table.close()
 
 
-def test_a_damaged_frame_is_told_and_nothing_is_dropped(tmp_path):
+def test_a_damaged_frame_is_reported_and_nothing_is_deleted(tmp_path):
     record(tmp_path)
     (raw,) = waiting_videos(tmp_path)
     data = bytearray(raw.read_bytes())
@@ -65,7 +65,7 @@ def test_a_damaged_frame_is_told_and_nothing_is_dropped(tmp_path):
     assert raw.exists()
 
 
-def test_no_frames_leave_no_files_and_a_bad_place_is_told(tmp_path):
+def test_no_frames_leave_no_files_and_a_bad_path_is_reported(tmp_path):
     RawVideoWriter(tmp_path / "a.mkv", 100.0).close()
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("")

@@ -76,7 +76,7 @@ def raw(packed, form):
 
 
 @pytest.mark.parametrize(("colour_range", "word"), [(1, "limited"), (2, "full")])
-def test_limited_and_full_range_are_told_and_never_stretched(tmp_path, colour_range, word):
+def test_limited_and_full_range_are_reported_and_never_stretched(tmp_path, colour_range, word):
     ramp = np.tile(np.arange(16, 236, dtype=np.uint8), (64, 1))
     with av.open(str(tmp_path / "a.mkv"), "w") as container:
         stream = container.add_stream("ffv1", rate=Fraction(400))
@@ -157,7 +157,7 @@ def test_pgm_folders_come_back_exact_whatever_wrote_their_head(tmp_path, top):
         ("jpeg2000", ".mkv", {}, None), ("ffv1", ".mkv", {}, False),
     ],
 )  # fmt: skip
-def test_loss_is_told_by_codec_and_for_x264_by_its_own_words(
+def test_loss_is_known_from_the_codec_and_for_x264_from_its_settings(
     tmp_path, codec, suffix, options, lossy
 ):
     if codec not in av.codecs_available:

@@ -106,7 +106,7 @@ _FULL = """
 
 
 @pytest.mark.skipif(os.name == "nt", reason="limits of a process are POSIX")
-def test_a_full_disk_is_told_while_recording_and_what_was_written_can_be_read(tmp_path):
+def test_a_disk_that_fills_up_is_reported_and_the_recorded_data_can_be_read(tmp_path):
     path = tmp_path / "a.mkv"
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(_FULL), str(path)],

@@ -56,10 +56,10 @@ def test_the_reference_study_on_a_default_twin_has_no_changes() -> None:
 
 
 def test_a_quick_run_says_so_and_which_rows_it_changes() -> None:
-    told = changes_text(header(builtin_study(quick=True).model_dump(mode="json")))
-    assert told.startswith("This run used the quick form of the study, which changes rows ")
-    assert "S19, S20, S10, S21 to S25: " in told
-    assert "free_response.record_s 6 instead of 8" in told
+    printed = changes_text(header(builtin_study(quick=True).model_dump(mode="json")))
+    assert printed.startswith("This run used the quick form of the study, which changes rows ")
+    assert "S19, S20, S10, S21 to S25: " in printed
+    assert "free_response.record_s 6 instead of 8" in printed
 
 
 def test_changed_counts_a_fixed_baseline_and_another_twin_are_named() -> None:
@@ -69,13 +69,13 @@ def test_changed_counts_a_fixed_baseline_and_another_twin_are_named() -> None:
         "steps": {**STUDY["steps"], "open_trials": 1},
     }
     load = twin_of_reading("hz").load.model_copy(update={"mass_kg": 0.27})
-    told = changes_text(header(study, twin_of_reading("hz").model_copy(update={"load": load})))
-    assert "another study, which changes rows S18, S10, S21 to S25" in told
-    assert "operating_point.baseline_v 1.2 instead of left to the data" in told
-    assert "steps.open_trials 1 instead of 6" in told
-    assert "load.mass_kg 0.27 instead of 0.25" in told
+    printed = changes_text(header(study, twin_of_reading("hz").model_copy(update={"load": load})))
+    assert "another study, which changes rows S18, S10, S21 to S25" in printed
+    assert "operating_point.baseline_v 1.2 instead of left to the data" in printed
+    assert "steps.open_trials 1 instead of 6" in printed
+    assert "load.mass_kg 0.27 instead of 0.25" in printed
 
 
 def test_another_rig_than_the_twin_is_said() -> None:
-    told = changes_text({"study": STUDY, "rig_config": {"kind": "bench"}})
-    assert told == "This run used another rig than the twin, which rows S1 and S4 describe."
+    printed = changes_text({"study": STUDY, "rig_config": {"kind": "bench"}})
+    assert printed == "This run used another rig than the twin, which rows S1 and S4 describe."

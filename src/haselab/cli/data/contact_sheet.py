@@ -61,18 +61,18 @@ class ContactSheet:
                 (dots,) = axes[k].plot(found.x_px / step, found.y_px / step, "o", color=_COLOUR)
                 dots.set(markersize=2.5, markerfacecolor="none", markeredgewidth=0.6)
             lost = "" if found.valid.all() else f", {int((~found.valid).sum())} lost"
-            told = "paths" if last else f"frame {self._numbers[k]}{lost}"
-            _bare(axes[k], image.shape, told)
+            label = "paths" if last else f"frame {self._numbers[k]}{lost}"
+            _bare(axes[k], image.shape, label)
         figure.subplots_adjust(0.0, 0.0, 1.0, 1.0, 0.01, 0.01)
         _save(figure, self._path)
 
 
-def _bare(axes: Axes, shape: tuple[int, ...], told: str) -> None:
+def _bare(axes: Axes, shape: tuple[int, ...], label: str) -> None:
     axes.set_xlim(-0.5, shape[1] - 0.5)
     axes.set_ylim(shape[0] - 0.5, -0.5)
     axes.set_axis_off()
     box = {"facecolor": "white", "alpha": 0.7, "pad": 1.5, "linewidth": 0}
-    axes.text(0.02, 0.03, told, transform=axes.transAxes, fontsize=8, bbox=box)
+    axes.text(0.02, 0.03, label, transform=axes.transAxes, fontsize=8, bbox=box)
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -135,7 +135,7 @@ def _results(source: Source, method: _Method, request: Request) -> Iterator[tupl
 
     def numbered() -> Iterator[tuple[int, NDArray[Any], NDArray[Any]]]:
         first = 0
-        for v, i in ahead(source.pieces()):
+        for v, i in ahead(source.chunks()):
             if v.size >= length:
                 yield first, v, i
             first += v.size // length
@@ -174,7 +174,7 @@ def _charge_results(
     """Results without a carrier: the whole record is read before its first block is known."""
     charge, length = Charge(config), config.block_samples
     blocks = 0
-    for v, i in ahead(source.pieces()):
+    for v, i in ahead(source.chunks()):
         used = v.size // length * length
         charge.add(v[:used], i[:used])
         blocks += v.size // length
@@ -253,7 +253,7 @@ def _tones_hz(source: Source) -> list[float]:
     """The largest tones of the voltage with a few periods per block, at most two, in order."""
     from haselab.sensing.block.tones import strongest_tones  # scipy takes half a second to import
 
-    v, _ = next(source.stream.pieces(_TONE_ROWS))
+    v, _ = next(source.stream.chunks(_TONE_ROWS))
     config = source.config
     return strongest_tones(v.astype(np.float64), config.rate_hz, 3.0 / config.block_s)
 

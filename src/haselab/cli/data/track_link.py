@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from haselab.base import Estimate, HaselabError, InputError
+from haselab.base import Estimate, HaselabError, InputError, JsonObject
 from haselab.cli.common import progress_bar
 from haselab.pipelines.tracking.stream import Clock, read_ahead
 from haselab.pipelines.tracking.table import TrackRows
@@ -56,7 +56,7 @@ def link_clip(
     reach_px: float,
     scale: Estimate | None,
     overlay: Path | None,
-) -> tuple[dict[str, Any], HaselabError | None]:
+) -> tuple[JsonObject, HaselabError | None]:
     """Particles of each frame, linked, as a table; the answer, and what broke the video off."""
     if overlay is not None and overlay.suffix.lower() != ".png":
         raise InputError(f"--overlay with --link is a picture of the paths: .png. {overlay}")

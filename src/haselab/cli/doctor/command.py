@@ -114,7 +114,7 @@ def _library(instrument: Instrument[Any], needs: str) -> Finding:
     try:
         instrument.check_driver()
     except DeviceError as error:
-        what, _, advice = str(error).partition(". Type: ")
+        what, _, advice = str(error).partition(". Run: ")
         return Finding("optional", instrument.library, False, what, f"{needs}: {advice}")
     return Finding("optional", instrument.library, True, "loads")
 

@@ -5,24 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.base.chart import Chart
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, SEED, answer_options
-from haselab.cli.identify.charts import time_chart
 from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.identify.record import Record
 from haselab.identify.sampled.arx import ArxOrders, fit_arx
 from haselab.identify.sampled.subspace import fit_subspace
 from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["arx", "subspace"]
-
-Floats = NDArray[np.float64]
 
 
 @click.command("arx")
@@ -90,12 +85,10 @@ def arx(
     table = read_valid(file, [source, output], columns)
     used = slice(skip_rows, None if rows is None else skip_rows + rows)
     rate = rate_hz_of(table, rate_hz, file)
-    fit = fit_arx(
-        table[source][used], table[output][used], rate, orders,
-        criterion=criterion, remove_means=not keep_means,
-    )  # fmt: skip
+    record = Record.sampled(table[source][used], table[output][used], rate)
+    fit = fit_arx(record, orders, criterion=criterion, remove_means=not keep_means)
     give(fit, [file], as_json, out)
-    save_plot(plot, lambda: _chart("ARX", table[output][used], fit.residuals, rate, output))
+    save_plot(plot, lambda: fit.chart((source, output)))
 
 
 @click.command("subspace")
@@ -136,17 +129,9 @@ def subspace(
     table = read_valid(file, [source, output], columns)
     rate = rate_hz_of(table, rate_hz, file)
     fit = fit_subspace(
-        table[source], table[output], rate, options["order"],
+        Record.sampled(table[source], table[output], rate), options["order"],
         block_rows=options["block_rows"], remove_means=not keep_means,
         bootstrap=options["bootstrap"], seed=options["seed"],
     )  # fmt: skip
     give(fit, [file], as_json, out)
-    save_plot(plot, lambda: _chart("Subspace", table[output], fit.residuals, rate, output))
-
-
-def _chart(kind: str, y: Floats, residuals: Floats, rate_hz: float, output: str) -> Chart:
-    """Measured and modelled output, for the samples that have residuals."""
-    first = y.size - residuals.size
-    time_s = np.arange(first, y.size) / rate_hz
-    measured = y[first:]
-    return time_chart(f"{kind} model", time_s, measured, measured - residuals, (output, "model"))
+    save_plot(plot, lambda: fit.chart((source, output)))

@@ -12,7 +12,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError, ResultError
+from haselab.base import InputError, JsonObject, ResultError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.columns import Quantity, advice_on_columns, check_unit, note_units
 from haselab.cli.common import REAL, emit
@@ -80,7 +80,7 @@ class Fit(Protocol):
     def succeeded(self) -> bool:
         """Whether the numbers may be used."""
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """Keys of the public contract."""
 
 

@@ -8,13 +8,10 @@ from typing import Any
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from haselab.base import Estimate
-from haselab.base.chart import Chart
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options
-from haselab.cli.identify.charts import loop_chart, time_chart
 from haselab.cli.identify.common import (
     FILE,
     FILES,
@@ -29,11 +26,10 @@ from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.creep.fit import CreepFit, fit_creep
 from haselab.identify.hysteresis.fit import LoopRecord, fit_hysteresis
+from haselab.identify.record import Record
 from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["creep", "hysteresis"]
-
-Floats = NDArray[np.float64]
 
 
 @click.command("hysteresis")
@@ -77,13 +73,9 @@ def hysteresis(
         table = read_valid(file, [source, output], columns)
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate, from_s))
-    fit = fit_hysteresis(records, model, operators)
+    fit = fit_hysteresis(records, model, operators=operators)
     give(fit, files, as_json, out)
-    save_plot(plot, lambda: loop_chart(
-        f"Hysteresis, {fit.kind}", (source, output),
-        [(r.u[-e.size :], r.y[-e.size :], r.y[-e.size :] - e)
-         for r, e in zip(records, fit.residuals, strict=True)],
-    ))  # fmt: skip
+    save_plot(plot, lambda: fit.chart((source, output)))
 
 
 @dataclass(frozen=True)
@@ -161,14 +153,7 @@ def creep(
     table = read_valid(file, [output] if unit_step else [source, output], columns)
     rate = rate_hz_of(table, rate_hz, file)
     u = np.ones(table[output].size) if unit_step else table[source]
-    fit = fit_creep(u, table[output], rate, model, input_before, leave_out_s)
+    record = Record.sampled(u, table[output], rate, input_before)
+    fit = fit_creep(record, model, leave_out_s=leave_out_s)
     give(_Forecast(fit, forecast_s), [file], as_json, out)
-    save_plot(plot, lambda: _creep_chart(fit, u, table[output], rate, output))
-
-
-def _creep_chart(fit: CreepFit, u: Floats, y: Floats, rate_hz: float, output: str) -> Chart:
-    """The whole record with the model."""
-    time_s = np.arange(y.size) / rate_hz
-    modelled = fit.model.simulate(u, rate_hz)
-    modelled = modelled + np.median(y - modelled)
-    return time_chart(f"Creep, {fit.kind}", time_s, y, modelled, (output, "model"))
+    save_plot(plot, lambda: fit.chart((source, output)))

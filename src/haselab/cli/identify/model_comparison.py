@@ -12,10 +12,10 @@ import click
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.cli.columns import column_options
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
-from haselab.cli.identify.charts import odds_chart
 from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.identify.charts import odds_chart
 from haselab.identify.model_comparison.agreement import Agreement, agree
 from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
 from haselab.identify.model_comparison.hypotheses import (
@@ -74,7 +74,7 @@ def verdict(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """Compare models and report which one the records support.
+    """Compare models; report which the records support.
 
     The answer may be that the records do not decide. All FILES are fitted together; they hold the
     columns of the drive, in V with its sign, and of the output. For the question agreement, FILES

@@ -11,14 +11,13 @@ import click
 import numpy as np
 
 from haselab.base import InputError, ResultError
-from haselab.base.chart import Chart
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options, emit
-from haselab.cli.identify.charts import response_chart, time_chart
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
+from haselab.identify.charts import response_chart
+from haselab.identify.free.response import FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
 from haselab.identify.frequency.response import RESPONSE_METHODS, estimate_frequency_response
 from haselab.identify.transfer.layout import TransferStructure
@@ -105,7 +104,7 @@ def frequency_response(
 
 def _is_plant(fit: ResponseFit) -> bool:
     """Whether all parameters of the plant are identifiable."""
-    return fit.succeeded and all(math.isfinite(e.value) for e in fit.estimates.values())
+    return fit.succeeded and all(math.isfinite(e.value) for e in fit.parameters.values())
 
 
 def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequence[Path]) -> float:
@@ -141,10 +140,10 @@ def free_response(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Fit a decaying oscillation (eqs. 6 and 7).
+    """Fit a decaying oscillation to a free response.
 
-    The answer includes the decay rate, the damped and the natural frequency and both envelopes.
-    Several FILES are repeated trials.
+    The model is that of eqs. 6 and 7. The answer includes the decay rate, the damped and the
+    natural frequency and both envelopes. Several FILES are repeated trials.
     """
     trials = []
     for file in files:
@@ -153,12 +152,4 @@ def free_response(
         trials.append(FreeTrial(table[output], np.arange(table[output].size) / rate))
     fit = fit_free_response(trials, creep=creep)
     give(fit, files, as_json, out)
-    save_plot(plot, lambda: _free_chart(fit, trials, output))
-
-
-def _free_chart(fit: FreeResponseFit, trials: Sequence[FreeTrial], output: str) -> Chart:
-    """The first trial, from its release on."""
-    modelled = fit.modelled[0]
-    measured = trials[0].moving().x[-modelled.size :]
-    time_s = np.asarray(fit.time_s[0][-modelled.size :])
-    return time_chart("Free response", time_s, measured, modelled, (output, "fit"))
+    save_plot(plot, lambda: fit.chart(("", output)))

@@ -5,21 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
-from haselab.base.chart import Chart
 from haselab.cli.columns import column_options
 from haselab.cli.common import answer_options
-from haselab.cli.identify.charts import curve_chart
 from haselab.cli.identify.common import FILE, give, read_valid
 from haselab.cli.plot import save_plot
-from haselab.identify.statics.monotone_map import MapFit, fit_map
+from haselab.identify.statics.monotone_map import fit_map
 from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["spline_map"]
-
-Floats = NDArray[np.float64]
 
 
 @click.command("map")
@@ -54,12 +48,6 @@ def spline_map(
     The rows of FILE are in order of time. The smoothness is chosen from the data.
     """
     table = read_valid(file, [abscissa, ordinate], columns, ["--x", "--y"])
-    x, y = table[abscissa], table[ordinate]
-    fit = fit_map(x, y, monotone=monotone)
+    fit = fit_map(table[abscissa], table[ordinate], monotone=monotone)
     give(fit, [file], as_json, out)
-    save_plot(plot, lambda: _chart(fit, (abscissa, ordinate), (x, y)))
-
-
-def _chart(fit: MapFit, axes: tuple[str, str], measured: tuple[Floats, Floats]) -> Chart:
-    grid = np.linspace(measured[0].min(), measured[0].max(), 400)
-    return curve_chart("Map", axes, measured, (grid, fit.map.value(grid)), fit.value_std(grid))
+    save_plot(plot, lambda: fit.chart((abscissa, ordinate)))

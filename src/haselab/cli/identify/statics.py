@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
-from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.columns import column_option, column_options
 from haselab.cli.common import INTEGER, REAL, actuator_option, answer_options
 from haselab.cli.identify.actuator_maps import read_pairs, save_strain_map, save_voltage_map
-from haselab.cli.identify.charts import curve_chart
 from haselab.cli.identify.common import (
     CAPACITANCE,
     FILE,
@@ -130,21 +128,7 @@ def hyperelastic(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )
     give(_WithStress(fit, np.asarray(test["at_stretch"])), files, as_json, out)
-    save_plot(plot, lambda: _law_chart(fit))
-
-
-def _law_chart(fit: HyperelasticFit) -> Chart:
-    """All tests, and the law for the deformation of each."""
-    curves = []
-    for test in fit.tests:
-        kind = test.deformation.kind
-        curves.append(Curve(test.stretch, test.nominal_stress_pa, f"measured, {kind}", "points"))
-        predicted = fit.predict(np.linspace(*test.stretch_range, 300), test.deformation)
-        curves.append(
-            Curve(predicted.stretch, predicted.nominal_stress_pa, "law", "line", predicted.std_pa)
-        )
-    panel = Panel("Stretch", "Nominal stress (Pa)", curves)
-    return Chart(f"Hyperelastic law, {fit.best.model}", (panel,))
+    save_plot(plot, fit.chart)
 
 
 def _deformations(count: int, test: Mapping[str, Any]) -> list[Deformation]:
@@ -203,7 +187,7 @@ class _WithStress:
                 predicted.stretch, predicted.nominal_stress_pa, predicted.std_pa, strict=True
             )
         ]
-        answer["notes"] = [*answer["notes"], *predicted.notes]
+        answer["notes"] = [*self.fit.notes, *predicted.notes]
         return answer
 
 
@@ -241,15 +225,7 @@ def regions(
     stretch, load_n = _between(stretch, load_n, stretch_min, stretch_max, file)
     fit = find_regions(stretch, load_n, segments)
     give(fit, [file], as_json, out)
-
-    def chart() -> Chart:
-        order = np.argsort(stretch, kind="stable")
-        line = load_n[order] - fit.residuals
-        axes = ("Stretch", "Force (N)")
-        title = f"{len(fit.regions)} linear regions"
-        return curve_chart(title, axes, (stretch, load_n), (fit.stretch, line))
-
-    save_plot(plot, chart)
+    save_plot(plot, fit.chart)
 
 
 @click.command("voltage-map")
@@ -270,9 +246,10 @@ def voltage_map(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Fit the voltage as a function of strain (eq. 4).
+    """Fit the voltage as a function of strain.
 
-    FILE holds the columns of strain and voltage, in order of time.
+    The map is eq. 4, a sum of two exponentials. FILE holds the columns of strain and voltage, in
+    order of time.
     """
     if actuator is not None:
         load_actuator(actuator)
@@ -283,11 +260,7 @@ def voltage_map(
     give(fit, [file], as_json, out)
     if actuator is not None:
         save_voltage_map(actuator, fit, file)
-    grid = _grid(strain)
-    save_plot(plot, lambda: curve_chart(
-        "Voltage map", ("Strain", "Voltage (V)"), (strain, voltage_v),
-        (grid, fit.map.voltage_v(grid)), fit.curve_std(grid),
-    ))  # fmt: skip
+    save_plot(plot, fit.chart)
 
 
 @click.command("capacitance-map")
@@ -313,10 +286,10 @@ def capacitance_map(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Fit the strain as a function of capacitance (eq. 5).
+    """Fit the strain as a function of capacitance.
 
-    FILE holds the columns of capacitance and strain. The slope is per F for a capacitance in F, and
-    per unit of relative capacitance otherwise.
+    The map is eq. 5, a straight line. FILE holds the columns of capacitance and strain. The slope
+    is per F for a capacitance in F, and per unit of relative capacitance otherwise.
     """
     if actuator is not None:
         load_actuator(actuator)
@@ -328,12 +301,4 @@ def capacitance_map(
         section = save_strain_map(actuator, pairs, files)
         more = {"strain_map": {name: part for name, part in section.items() if part is not None}}
     give(fit, files, as_json, out, more)
-    grid = _grid(pairs.capacitance)
-    save_plot(plot, lambda: curve_chart(
-        "Capacitance map", ("Capacitance (as in the file, SI)", "Strain"),
-        (pairs.capacitance, pairs.strain), (grid, fit.map.strain(grid)),
-    ))  # fmt: skip
-
-
-def _grid(values: Floats) -> Floats:
-    return np.linspace(values.min(), values.max(), 400)
+    save_plot(plot, fit.chart)

@@ -13,7 +13,6 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, SEED, actuator_option, answer_options
-from haselab.cli.identify.charts import records_chart
 from haselab.cli.identify.common import (
     FILES,
     INPUT,
@@ -190,8 +189,7 @@ def transfer(
     if actuator is not None:
         modelled = "strain" if options["through_voltage_map"] else source
         _save(actuator, fit, (modelled, output), unit, files)
-    title = f"Transfer function, fit {fit.fit_percent:.1f} %"
-    save_plot(plot, lambda: records_chart(title, fit.records, fit.residuals, output))
+    save_plot(plot, lambda: fit.chart((source, output)))
 
 
 def _save(

@@ -11,7 +11,7 @@ from haselab.control import LinearController, LoopSetting, PidGains, simulate_lo
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plants.general_loops import trace_general
 from haselab.control.stability.margins import loop_response
-from haselab.identify.prediction import Prediction
+from haselab.identify.fit import Prediction
 from haselab.models import Plant
 
 __all__ = ["design_chart", "loop_chart", "prediction_chart"]

@@ -9,7 +9,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import ResultError
+from haselab.base import ResultError, table_at
 from haselab.cli.columns import column_options
 from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
@@ -17,7 +17,8 @@ from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_posterior
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.identify.prediction import Prediction, predict
+from haselab.identify.fit import Prediction
+from haselab.identify.prediction import predict
 from haselab.identify.record import Record
 from haselab.store.actuator_file import read_actuator
 from haselab.store.columns.selection import ColumnOptions
@@ -113,8 +114,7 @@ def _used(model: Path) -> list[str]:
     """Hashes of the files that [model] was identified from."""
     if model.suffix.lower() != ".toml":
         return []
-    origin = read_actuator(model).get("provenance", {}).get("model", {})
-    hashes = origin.get("sha256", [])
+    hashes = table_at(read_actuator(model), "provenance", "model").get("sha256", [])
     return [str(item) for item in hashes] if isinstance(hashes, list) else []
 
 

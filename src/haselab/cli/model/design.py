@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, ResultError, table_at
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.model.charts import design_chart, loop_chart
@@ -205,9 +206,12 @@ def _other_controllers(path: Path, name: str) -> list[dict[str, object]]:
     typed = load_actuator(path).controller
     if typed is None:
         return []
-    table = read_actuator(path)["controller"]
+    table = table_at(read_actuator(path), "controller")
+    others = table.get("alternatives", ())
     held = [{key: table[key] for key in table if key not in ("alternatives", "demands")}]
-    every = zip((typed, *typed.alternatives), [*held, *table.get("alternatives", ())], strict=True)
+    if isinstance(others, Sequence):
+        held += [dict(other) for other in others if isinstance(other, Mapping)]
+    every = zip((typed, *typed.alternatives), held, strict=True)
     return [dict(raw) for one, raw in every if one.is_known and (one.name or one.kind) != name]
 
 

@@ -1,4 +1,4 @@
-"""The feedback of a controller in a file: gains of a PI or PID, or what another kind says of it."""
+"""The linear feedback of a controller in a file: gains of a PI or PID, or of another kind."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ __all__ = ["feedback_of", "held_controller"]
 
 
 def held_controller(path: Path, kind: str | None) -> ControllerSection:
-    """The controller of an actuator file.
+    """Read a controller of an actuator file.
 
     Args:
         path: of the actuator file.
         kind: its kind or name; None: the one of `[controller]` itself.
     Returns:
-        Its section; of a registered kind that the file does not hold, one without parameters.
+        Its section; without parameters for a registered kind that is not in the file.
     Raises:
-        InputError: the file holds no such controller, and no such kind is registered.
+        InputError: the file has no such controller, and no such kind is registered.
     """
     tables = load_actuator(path)
     held = {} if tables.controller is None else tables.controller.all_kinds
@@ -35,15 +35,15 @@ def held_controller(path: Path, kind: str | None) -> ControllerSection:
 
 
 def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearController:
-    """What a controller makes of the measurement.
+    """Return the linear feedback of a controller from the measurement.
 
     Args:
         held: its section.
-        rate_hz: steps a second.
+        rate_hz: steps per second.
     Returns:
-        Gains of a PI or PID; of another kind what its method `linear_feedback` says.
+        Gains of a PI or PID; for another kind the result of its method `linear_feedback`.
     Raises:
-        InputError: the kind does not say it, or does not accept its parameters.
+        InputError: the kind has no linear feedback, or does not accept its parameters.
     """
     if held.kind in ("pi", "pid"):
         return PidGains(**held.parameters)
@@ -51,8 +51,8 @@ def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearCon
     if not isinstance(controller, LinearisableController):
         raise InputError(
             f"Controllers of kind {held.kind!r} have no method linear_feedback, so their margins "
-            "cannot be computed. Add it to the class (docs/add-a-controller.md), or test the loop "
-            "on the twin with: haselab run STUDY.toml --rig RIG.toml --actuator A.toml"
+            "cannot be computed. Add it to the class (docs/extend/add-a-controller.md), or test "
+            "the loop on the twin with: haselab run STUDY.toml --rig RIG.toml --actuator A.toml"
         )
     numerator, denominator = controller.linear_feedback(1.0 / rate_hz)
     return LinearController(tuple(numerator), tuple(denominator), rate_hz)

@@ -43,13 +43,13 @@ def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -
     Raises:
         ResultError: a number is not identifiable.
     """
-    unknown = [name for name, estimate in fit.estimates.items() if np.isnan(estimate.value)]
+    unknown = [name for name, estimate in fit.parameters.items() if np.isnan(estimate.value)]
     if unknown:
         raise ResultError(
             f"Not identifiable from these records: {', '.join(unknown)}. [model] was not written. "
             "Add a record that determines it, fit a simpler structure, or give it with --fix."
         )
-    value = {name: estimate.value for name, estimate in fit.estimates.items()}
+    value = {name: estimate.value for name, estimate in fit.parameters.items()}
     simple = fit.structure.poles == 2 and not fit.structure.zeros
     names = ("natural_frequency_rad_s", "damping_ratio")
     roots = {} if simple else {"poles": list(fit.poles), "zeros": list(fit.zeros)}

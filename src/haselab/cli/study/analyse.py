@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from haselab.base import InputError
+from haselab.base import InputError, table_at
 from haselab.cli.common import answer_options, unverified_option, warn_unverified
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import analyse_on_chip
@@ -87,7 +87,7 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
     found, study, header = analyse_session(session, unverified=unverified)
     if study.is_reference:
         found = with_chip_rows(found, folder)
-    found = with_mass_limit(found, study, header["rig_config"])
+    found = with_mass_limit(found, study, table_at(header, "rig_config"))
     noise_free = None if folder is None else _earlier_noise_free(folder)
     header = with_date(header, path.parent)
     results = write_findings(target, found, study, header, noise_free, doubt)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
+from haselab.base import JsonObject
 from haselab.cli.bench.arming import Operator, armed_rig
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
@@ -56,7 +57,7 @@ def record_on_chip(
     folder: Path,
     keep_video: str,
     operator: Operator | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Play step trials on a microcontroller and write the folder, without report and table.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any, Protocol, cast
 
 import click
 
-from haselab.base import InputError, ResultError, to_plain
+from haselab.base import InputError, JsonObject, ResultError, table_at, to_plain
 from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
@@ -122,7 +122,7 @@ def execute(
 def execute_on(
     study: Study,
     rig: Rig,
-    rig_config: dict[str, Any],
+    rig_config: JsonObject,
     folder: Path,
     keep_video: str,
     as_json: bool,
@@ -200,8 +200,8 @@ def mark_found(folder: Path, found: Findings, recorded_in: Path | None, *, simul
         simulated: the run was played on a twin.
     """
     try:
-        files = {} if recorded_in is None else read_manifest(recorded_in).get("files", {})
-        inputs = {"session.h5": str(files["session.h5"]["sha256"])}
+        manifest = {} if recorded_in is None else read_manifest(recorded_in)
+        inputs = {"session.h5": str(table_at(manifest, "files", "session.h5")["sha256"])}
     except (InputError, KeyError, TypeError):
         inputs = {}
     mark_sections(folder / ACTUATOR, sections_found(found), inputs, simulated=simulated)

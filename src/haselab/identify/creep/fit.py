@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.charts import time_chart
 from haselab.identify.creep.laws import (
     CreepLaw,
     FractionalLaw,
@@ -18,10 +20,12 @@ from haselab.identify.creep.laws import (
     PronyLaw,
     Span,
 )
+from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.model_choice import APART, bic, effective_count, told_apart
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.projection import Basis, Solution, minimise, project
-from haselab.identify.record import finite_vector
+from haselab.identify.record import Record
+from haselab.identify.sampled.record import sampled
 from haselab.models.creep import Creep
 
 __all__ = ["CreepFit", "fit_creep"]
@@ -118,46 +122,35 @@ class _Fitted:
         return coloured_covariance(self.solution.columns, self.solution.residuals, self.parameters)
 
 
-@dataclass(frozen=True)
-class CreepFit:
-    """Fitted creep.
+@dataclass(frozen=True, kw_only=True)
+class CreepFit(RecordFit[Record]):
+    """Fitted creep; see `Fit` for what all fits have.
+
+    Its `residuals` are those of the samples that count.
 
     Args:
-        status: "ok", or why there is no result.
         kind: the law that is given: none, prony, fractional or logarithmic.
         verdict: the law that the data support, "no creep visible", or "cannot tell".
-        estimates: every number by name; those that the data do not tell are NaN.
         bic: criterion of each kind's best law against the lowest.
         fit_percent: NRMSE fit of the samples that count.
         validation_fit_percent: fit of the last quarter of them, forecast by the same law fitted
             to the rest, against the spread of all: late in a creep nothing spreads but noise. NaN
             where the rest is too short.
         residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
-        residuals: measured minus modelled, of the samples that count. Shape `(M,)`.
-        notes: what the reader of the numbers should know, a sentence each.
         fitted: the creep. None: no result.
         rivals: laws that the data do not tell from the given one, the given one first.
         setting: the record.
     """
 
-    status: str
-    kind: str
-    verdict: str
-    estimates: dict[str, Estimate]
-    bic: dict[str, float]
-    fit_percent: float
-    validation_fit_percent: float
-    residual_whiteness_p: float
-    residuals: Floats
-    notes: tuple[str, ...]
-    fitted: Creep | None
-    rivals: tuple[_Fitted, ...]
-    setting: _Setting
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    kind: str = ""
+    verdict: str = ""
+    bic: dict[str, float] = field(default_factory=dict)
+    fit_percent: float = math.nan
+    validation_fit_percent: float = math.nan
+    residual_whiteness_p: float = math.nan
+    fitted: Creep | None = None
+    rivals: tuple[_Fitted, ...] = field(default=(), repr=False)
+    setting: _Setting = field(repr=False)
 
     @property
     def model(self) -> Creep:
@@ -169,6 +162,23 @@ class CreepFit:
         if self.fitted is None:
             raise ResultError(f"The fit has no result: {self.status}")
         return self.fitted
+
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`."""
+        return self.model.simulate(u, rate_hz or self.setting.span.rate_hz)
+
+    def _modelled(self, record: Record) -> tuple[Floats, Floats]:
+        new = sampled(record)
+        moved = self.model.simulate(new.u - _rest(new), new.input_rate_hz)
+        return new.y, moved + (new.y - moved).mean()
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`; the whole record with the model from its first row on."""
+        span, y = self.setting.span, self.setting.y
+        modelled = self.model.simulate(span.inputs, span.rate_hz)
+        modelled = modelled + np.median(y - modelled)
+        time_s, output = np.arange(y.size) / span.rate_hz, (names or ("", "Output"))[1]
+        return time_chart(f"Creep, {self.kind}", time_s, y, modelled, (output, "model"))
 
     def forecast(self, later_s: float) -> Estimate:
         """Output `later_s` after the record's end, the input held at its last value.
@@ -192,12 +202,12 @@ class CreepFit:
         high = max(entry.ci95[1] for entry in entries)
         return Estimate(entries[0].value, entries[0].std, (low, high), "")
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """Keys of the command's answer."""
         return {
             "model": self.kind,
             "verdict": self.verdict,
-            "parameters": self.estimates,
+            "parameters": self.parameters,
             "bic": self.bic,
             "fit_percent": self.fit_percent,
             "validation_fit_percent": self.validation_fit_percent,
@@ -208,12 +218,7 @@ class CreepFit:
 
 
 def fit_creep(
-    u: ArrayLike,
-    y: ArrayLike,
-    rate_hz: float,
-    model: str = "auto",
-    input_before: float | None = None,
-    leave_out_s: float = 0.0,
+    records: Record | Sequence[Record], model: str = "auto", *, leave_out_s: float = 0.0
 ) -> CreepFit:
     r"""Fit creep to the answer to an input that is held between its updates.
 
@@ -222,12 +227,10 @@ def fit_creep(
     "cannot tell". A time constant that the record is too short for is NaN, with a note.
 
     Args:
-        u: input at each sample. Shape `(N,)`.
-        y: output right after the input's update. Shape `(N,)`.
-        rate_hz: samples a second, in Hz.
+        records: one record, its outputs read right after the input's updates
+            (`Record.sampled`). With an `input_before` of None the output had settled at 0 when the
+            input never changes (a step at the first sample), else at the first input.
         model: auto, prony, fractional or logarithmic.
-        input_before: input before the record, at which the output had settled. None: 0 when `u`
-            never changes (a step at the first sample), else `u[0]`.
         leave_out_s: time after each update of the input whose outputs do not count, in s: for
             what swings or lags for a moment.
     Returns:
@@ -242,18 +245,19 @@ def fit_creep(
         >>> u = np.r_[np.zeros(100), np.ones(1900)]
         >>> y = PronyCreep(1.0, (0.2,), (3.0,)).simulate(u, 100.0)
         >>> y = y + 0.002 * np.random.default_rng(1).normal(size=u.size)
-        >>> fit = fit_creep(u, y, 100.0, model="prony")
-        >>> low, high = fit.estimates["time_constant_1_s"].ci95
+        >>> fit = fit_creep(Record.sampled(u, y, 100.0), model="prony")
+        >>> low, high = fit.parameters["time_constant_1_s"].ci95
         >>> fit.verdict, low < 3.0 < high
         ('prony', True)
     """
-    setting, stepped = _setting(u, y, rate_hz, input_before, leave_out_s)
+    record = sampled(records)
+    setting, stepped = _setting(record, leave_out_s)
     if model not in _KINDS:
         raise InputError(f"model = {model}; allowed are {', '.join(_KINDS)}. Correct the name.")
     drift = _drift_before(setting, rest_known=not stepped)
     if drift is not None:
         return _no_result(setting, drift)
-    if _swapped(finite_vector("u", u, _LEAST_SAMPLES), setting.y):
+    if _swapped(record.u, setting.y):
         return _no_result(
             setting,
             "the output is held between few updates, and the input moves at every row; the columns "
@@ -272,32 +276,26 @@ def fit_creep(
     return _describe(setting, scored, scores, verdict, stepped)
 
 
-def _setting(
-    u: ArrayLike, y: ArrayLike, rate_hz: float, before: float | None, leave_out_s: float
-) -> tuple[_Setting, bool]:
-    inputs, outputs = finite_vector("u", u, _LEAST_SAMPLES), finite_vector("y", y, _LEAST_SAMPLES)
-    if inputs.size != outputs.size:
+def _rest(record: Record) -> float:
+    """Input before the record, at which the output had settled."""
+    if record.input_before is not None:
+        return record.input_before
+    return 0.0 if np.ptp(record.u) == 0.0 else float(record.u[0])
+
+
+def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
+    inputs, outputs, rate_hz = record.u, record.y, record.input_rate_hz
+    if not 0.0 <= leave_out_s < math.inf:
         raise InputError(
-            f"u has {inputs.size} values and y {outputs.size}; allowed are equal lengths. "
-            "Give one output for each input."
-        )
-    if not 0.0 < rate_hz < math.inf or not 0.0 <= leave_out_s < math.inf:
-        raise InputError(
-            f"rate_hz = {rate_hz:g} Hz, leave_out_s = {leave_out_s:g} s; allowed are above 0 Hz "
-            "and 0 s or more. Correct them."
+            f"leave_out_s is {leave_out_s:g} s, but must be 0 s or more. Correct the time."
         )
     stepped = bool(np.ptp(inputs) == 0.0)
-    rest = (0.0 if stepped else float(inputs[0])) if before is None else before
+    rest = _rest(record)
     moved = inputs - rest
     if not moved.any():
         raise InputError(
             f"The input is {rest:g} throughout and before, so nothing creeps; allowed is an input "
             "that changes. Name the right column, or record a step."
-        )
-    if np.ptp(outputs) == 0.0:
-        raise InputError(
-            f"The output is {outputs[0]:g} throughout; allowed is an output that changes. "
-            "Name the right column, or check the sensor."
         )
     since = np.full(inputs.size, np.inf)
     for k in np.flatnonzero(np.diff(moved, prepend=0.0)):
@@ -408,32 +406,37 @@ def _describe(
     stepped: bool,
 ) -> CreepFit:
     best = scored[0]
-    estimates = _estimates(best, setting)
+    estimates, covariance = _estimates(best, setting)
     residuals = best.solution.residuals[0]
     measured = setting.y[setting.kept]
     instant = float(best.solution.shared[0])
     return CreepFit(
-        "ok",
-        _kind(best),
-        verdict,
-        estimates,
-        scores,
-        fit_percent([measured], [measured - residuals]),
-        _validation(setting, best),
-        whiteness_p([residuals]),
-        residuals,
-        _notes(setting, estimates, stepped, residuals),
-        best.law.model(best.solution.search, instant, best.gains(setting)),
-        tuple(entry for entry in scored if entry.bic - best.bic < APART),
-        setting,
+        status="ok",
+        parameters=estimates,
+        covariance=covariance,
+        residuals=(residuals,),
+        notes=_notes(setting, estimates, stepped, residuals),
+        kind=_kind(best),
+        verdict=verdict,
+        bic=scores,
+        fit_percent=fit_percent([measured], [measured - residuals]),
+        validation_fit_percent=_validation(setting, best),
+        residual_whiteness_p=whiteness_p([residuals]),
+        fitted=best.law.model(best.solution.search, instant, best.gains(setting)),
+        rivals=tuple(entry for entry in scored if entry.bic - best.bic < APART),
+        setting=setting,
     )
 
 
-def _estimates(entry: _Fitted, setting: _Setting) -> dict[str, Estimate]:
-    """All numbers by name; a time constant that the record cannot tell takes its gain with it."""
+def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], Floats]:
+    """All numbers by name, and their covariance.
+
+    A time constant that the record cannot tell takes its gain with it.
+    """
     solution = entry.solution
     count = solution.search.size
-    std = np.sqrt(np.maximum(np.diag(entry.covariance()), 0.0))
+    inner = entry.covariance()
+    std = np.sqrt(np.maximum(np.diag(inner), 0.0))
     names = [*entry.law.names[:count], "instant", *["offset"] * setting.offset]
     names += entry.law.names[count:]
     values = np.concatenate([solution.search, solution.shared])
@@ -456,7 +459,10 @@ def _estimates(entry: _Fitted, setting: _Setting) -> dict[str, Estimate]:
         if not math.isfinite(known.std) or straight or (name == "order" and known.std > 0.5):
             estimates[name] = Estimate(math.nan, math.inf, _UNKNOWN, known.unit)
     order = ("instant", "offset")
-    return {k: estimates[k] for k in order if k in estimates} | estimates
+    ordered = {k: estimates[k] for k in order if k in estimates} | estimates
+    at = [names.index(name) for name in ordered]
+    spread = np.array([known.std for known in ordered.values()])
+    return ordered, rescaled(inner[np.ix_(at, at)], spread)
 
 
 def _forecast(setting: _Setting, entry: _Fitted, later_s: float) -> Estimate:
@@ -534,7 +540,4 @@ def _notes(
 
 
 def _no_result(setting: _Setting, reason: str) -> CreepFit:
-    nan = math.nan
-    return CreepFit(
-        f"no result: {reason}", "", "", {}, {}, nan, nan, nan, np.zeros(0), (), None, (), setting
-    )
+    return CreepFit(status=f"no result: {reason}", setting=setting)

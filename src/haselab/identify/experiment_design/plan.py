@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.identify.experiment_design.drives import BenchLimits, DriveCandidate, candidate_drives
 from haselab.identify.model_comparison.voltage_plant import (
     VoltageStructure,
@@ -84,7 +83,7 @@ class PlannedExperiment:
     separation: float
     score: float
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Keys of the answer, without the drive."""
         return {
             "name": self.name,
@@ -125,7 +124,7 @@ class ExperimentPlan:
         """The best candidate."""
         return self.ranked[0]
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "goal": self.goal,

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
+from haselab.base.chart import Chart
+from haselab.identify.charts import time_chart
+from haselab.identify.fit import CurveFit, Prediction, propagated, rescaled
 from haselab.identify.free.envelope import Swing, hull_decay
 from haselab.identify.noise import (
     autoregression,
@@ -71,16 +73,17 @@ class FreeTrial:
         return FreeTrial(self.x[start:], self.time_s[start:])
 
 
-@dataclass(frozen=True)
-class FreeResponseFit:
+@dataclass(frozen=True, kw_only=True)
+class FreeResponseFit(CurveFit):
     r"""Fit of $x = x_0 + c\,e^{-t/\tau} + A e^{-\delta t}\cos(\omega_d t - \varphi_0)$.
 
     Time counts from the first sample, or from the release where the record begins at rest.
 
+    See `Fit` for what all fits have. Its `parameters` are `damped_frequency_rad_s`,
+    `decay_rate_per_s`, `natural_frequency_rad_s`, `damping_ratio`, and of the first trial
+    `amplitude`, `phase_rad`.
+
     Args:
-        status: "ok", or why there is no result.
-        estimates: `damped_frequency_rad_s`, `decay_rate_per_s`, `natural_frequency_rad_s`,
-            `damping_ratio`, and of the first trial `amplitude`, `phase_rad`.
         hull_positive_decay_per_s: decay through the positive peaks; None with fewer than two.
         hull_negative_decay_per_s: the same through the negative peaks.
         trials: the fit of each trial alone; empty for one trial.
@@ -88,31 +91,59 @@ class FreeResponseFit:
         residual_whiteness_p: Ljung-Box probability.
         modelled: fitted motion of each trial. Shape `(N_r,)` each.
         time_s: times of it, in s. Shape `(N_r,)` each.
-        notes: what the reader of the numbers should know.
+        motion: of each trial: amplitudes of cosine and sine, position at rest, and creep.
+        search: logarithms of decay rate and damped frequency, and with creep of its time constant.
     """
 
-    status: str
-    estimates: dict[str, Estimate]
-    hull_positive_decay_per_s: Estimate | None
-    hull_negative_decay_per_s: Estimate | None
-    trials: tuple[FreeResponseFit, ...]
-    r_squared: float
-    residual_whiteness_p: float
-    modelled: tuple[Floats, ...]
-    time_s: tuple[Floats, ...]
-    notes: tuple[str, ...]
+    hull_positive_decay_per_s: Estimate | None = None
+    hull_negative_decay_per_s: Estimate | None = None
+    trials: tuple[FreeResponseFit, ...] = ()
+    r_squared: float = math.nan
+    residual_whiteness_p: float = math.nan
+    modelled: tuple[Floats, ...] = field(repr=False)
+    time_s: tuple[Floats, ...] = field(repr=False)
+    motion: tuple[Floats, ...] = field(repr=False)
+    search: Floats = field(repr=False)
 
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    def simulate(self, x: ArrayLike) -> Floats:
+        """Motion of the first trial at times since its release, in s; see `CurveFit`."""
+        self._require()
+        time_s = np.atleast_1d(np.asarray(x, dtype=np.float64))
+        return np.asarray(_shapes(self.search, time_s) @ self.motion[0])
 
-    def answer(self) -> dict[str, Any]:
+    def compare(self, x: ArrayLike, y: ArrayLike) -> Prediction:
+        """Predict another free motion with the fitted frequency and decay, and compare.
+
+        Amplitude, phase and position at rest are those that suit the new motion best.
+
+        Args:
+            x: times, in s. Shape `(N,)`.
+            y: motion. Shape `(N,)`.
+        Returns:
+            The fit in percent, the error, and the predicted motion.
+        Raises:
+            ResultError: the fit has no result.
+            InputError: wrong shapes, times that do not rise, no motion.
+        """
+        self._require()
+        new = FreeTrial(np.asarray(y), np.asarray(x)).moving()
+        shapes = _shapes(self.search, new.time_s - new.time_s[0])
+        own = np.linalg.lstsq(shapes, new.x, rcond=None)[0]
+        return Prediction.of([new.x], [shapes @ own])
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`; the first trial from its release on."""
+        modelled, time_s = self.modelled[0], np.asarray(self.time_s[0])
+        measured = modelled + self.residuals[0]
+        output = (names or ("", "Motion"))[1]
+        return time_chart("Free response", time_s, measured, modelled, (output, "fit"))
+
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         keys = ("damped_frequency_rad_s", "decay_rate_per_s", "natural_frequency_rad_s",
                 "damping_ratio", "amplitude", "phase_rad")  # fmt: skip
         return {
-            **{key: self.estimates.get(key) for key in keys},
+            **{key: self.parameters.get(key) for key in keys},
             "hull_positive_decay_per_s": self.hull_positive_decay_per_s,
             "hull_negative_decay_per_s": self.hull_negative_decay_per_s,
             "r_squared": self.r_squared,
@@ -142,7 +173,7 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
         >>> x = 0.01 * np.exp(-4.0 * t) * np.cos(32.0 * t - 0.3)
         >>> x = x + 1e-4 * np.random.default_rng(1).normal(size=t.size)
         >>> fit = fit_free_response([FreeTrial(x, t)])
-        >>> low, high = fit.estimates["damped_frequency_rad_s"].ci95
+        >>> low, high = fit.parameters["damped_frequency_rad_s"].ci95
         >>> low < 32.0 < high
         True
     """
@@ -158,17 +189,15 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
     good = [fit for fit in alone if fit.succeeded]
     if len(good) < 2:
         return joint
-    estimates = dict(joint.estimates)
+    estimates = dict(joint.parameters)
     for name in list(estimates)[:4]:
-        values = np.array([fit.estimates[name].value for fit in good])
+        values = np.array([fit.parameters[name].value for fit in good])
         between = float(values.std(ddof=1) / math.sqrt(values.size))
         old = estimates[name]
         std = max(old.std, between)
         estimates[name] = Estimate.lognormal(old.value, std / old.value, old.unit)
-    return FreeResponseFit(
-        "ok", estimates, joint.hull_positive_decay_per_s, joint.hull_negative_decay_per_s, alone,
-        joint.r_squared, joint.residual_whiteness_p, joint.modelled, joint.time_s, joint.notes,
-    )  # fmt: skip
+    wider = rescaled(joint.covariance, np.array([e.std for e in estimates.values()]))
+    return replace(joint, parameters=estimates, covariance=wider, trials=alone)
 
 
 def _better(
@@ -190,23 +219,28 @@ def _basis(search: Floats, trial: FreeTrial) -> Basis:
     """Search holds log decay, log damped frequency and, with creep, log time constant."""
     t = trial.time_s - trial.time_s[0]
     decay, omega = math.exp(search[0]), math.exp(search[1])
-    hull = np.exp(-decay * t)
-    cosine, sine = hull * np.cos(omega * t), hull * np.sin(omega * t)
-    one, zero = np.ones(t.size), np.zeros(t.size)
-    own = [cosine, sine, one]
+    own = _shapes(search, t)
+    cosine, sine, zero = own[:, 0], own[:, 1], np.zeros(t.size)
     by_search = [
         [-decay * t * cosine, -decay * t * sine, zero],
         [-omega * t * sine, omega * t * cosine, zero],
     ]
     if search.size == 3:
-        rate = math.exp(-search[2])
-        slow = np.exp(-rate * t)
-        own.append(slow)
         by_search = [[*row, zero] for row in by_search]
-        by_search.append([zero, zero, zero, rate * t * slow])
+        by_search.append([zero, zero, zero, math.exp(-search[2]) * t * own[:, 3]])
     slopes = np.stack([np.stack(row, axis=1) for row in by_search])
     known_slope = np.zeros((search.size, t.size))
-    return Basis(trial.x, np.zeros((t.size, 0)), np.stack(own, axis=1), slopes, zero, known_slope)
+    return Basis(trial.x, np.zeros((t.size, 0)), own, slopes, zero, known_slope)
+
+
+def _shapes(search: Floats, t: Floats) -> Floats:
+    """Decaying cosine and sine, 1, and the creep, at times since the release. Shape `(N, 3|4)`."""
+    hull = np.exp(-math.exp(search[0]) * t)
+    swing = math.exp(search[1]) * t
+    shapes = [hull * np.cos(swing), hull * np.sin(swing), np.ones(t.size)]
+    if search.size == 3:
+        shapes.append(np.exp(-math.exp(-search[2]) * t))
+    return np.stack(shapes, axis=1)
 
 
 def _bounds(trials: Sequence[FreeTrial], creep: bool) -> tuple[Floats, Floats]:
@@ -246,12 +280,16 @@ def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
     solution, settled = _search(trials, creep)
     modelled = tuple(r.x - e for r, e in zip(trials, solution.residuals, strict=True))
     times = tuple(trial.time_s for trial in trials)
-    estimates = _estimates(trials, solution)
+    estimates, covariance = _estimates(trials, solution)
     measured, explained = np.concatenate([r.x for r in trials]), np.concatenate(modelled)
     least = _bounds(trials, creep)[0][0]
     status = _judged(solution, estimates, settled, decays=solution.search[0] > least + _AT_LEAST)
-    if status != "ok":
-        return FreeResponseFit(status, {}, None, None, (), math.nan, math.nan, modelled, times, ())
+    fit = FreeResponseFit(
+        status=status, residuals=tuple(solution.residuals), modelled=modelled, time_s=times,
+        motion=tuple(solution.own), search=solution.search,
+    )  # fmt: skip
+    if not fit.succeeded:
+        return fit
     hulls = {sign: _hull(trials, solution, sign) for sign in (1.0, -1.0)}
     notes = [
         f"Fewer than two {name} peaks stand above the noise: no hull through them."
@@ -261,14 +299,22 @@ def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
     white = whiteness_p(solution.residuals)
     if white < _WHITE:
         notes.append("The residuals are not white: the motion is not one decaying cosine alone.")
-    return FreeResponseFit(
-        "ok", estimates, hulls[1.0], hulls[-1.0], (), r_squared(measured, explained), white,
-        modelled, times, tuple(notes),
-    )  # fmt: skip
+    return replace(
+        fit,
+        parameters=estimates,
+        covariance=covariance,
+        notes=tuple(notes),
+        hull_positive_decay_per_s=hulls[1.0],
+        hull_negative_decay_per_s=hulls[-1.0],
+        r_squared=r_squared(measured, explained),
+        residual_whiteness_p=white,
+    )
 
 
-def _estimates(trials: Sequence[FreeTrial], solution: Solution) -> dict[str, Estimate]:
-    """Numbers with intervals by propagation from the joint covariance."""
+def _estimates(
+    trials: Sequence[FreeTrial], solution: Solution
+) -> tuple[dict[str, Estimate], Floats]:
+    """Numbers with intervals by propagation from the joint covariance, and their covariance."""
     bases = [_basis(solution.search, trial) for trial in trials]
     width = sum(basis.own.shape[1] for basis in bases)
     columns, at = [], 0
@@ -284,28 +330,31 @@ def _estimates(trials: Sequence[FreeTrial], solution: Solution) -> dict[str, Est
     a, b = solution.own[0][:2]
     natural = math.hypot(omega, decay)
     first = solution.search.size
-
-    def std(slopes: dict[int, float]) -> float:
-        at = list(slopes)
-        vector = np.array(list(slopes.values()))
-        return math.sqrt(max(float(vector @ covariance[np.ix_(at, at)] @ vector), 0.0))
-
     share = (decay / natural) ** 2
     square = a * a + b * b or 1.0
-    phase_std = std({first: -b / square, first + 1: a / square})
-    amplitude_std = std({first: a / square, first + 1: b / square})
-    return {
-        "damped_frequency_rad_s": Estimate.lognormal(omega, std({1: 1.0}), "rad/s"),
-        "decay_rate_per_s": Estimate.lognormal(decay, std({0: 1.0}), "1/s"),
-        "natural_frequency_rad_s": Estimate.lognormal(
-            natural, std({0: share, 1: 1.0 - share}), "rad/s"
-        ),
-        "damping_ratio": Estimate.lognormal(
-            decay / natural, std({0: 1.0 - share, 1: share - 1.0}), ""
-        ),
-        "amplitude": Estimate.lognormal(math.hypot(a, b), amplitude_std, ""),
-        "phase_rad": Estimate.normal(math.atan2(b, a), phase_std, "rad"),
+    # Derivatives of the logarithm of each number, of the phase itself, by decay, frequency, a, b.
+    slopes = np.array([
+        [0.0, 1.0, 0.0, 0.0],
+        [1.0, 0.0, 0.0, 0.0],
+        [share, 1.0 - share, 0.0, 0.0],
+        [1.0 - share, share - 1.0, 0.0, 0.0],
+        [0.0, 0.0, a / square, b / square],
+        [0.0, 0.0, -b / square, a / square],
+    ])  # fmt: skip
+    places = [0, 1, first, first + 1]
+    relative = propagated(slopes, covariance[np.ix_(places, places)])
+    std = np.sqrt(np.maximum(np.diag(relative), 0.0))
+    size = math.hypot(a, b)
+    estimates = {
+        "damped_frequency_rad_s": Estimate.lognormal(omega, std[0], "rad/s"),
+        "decay_rate_per_s": Estimate.lognormal(decay, std[1], "1/s"),
+        "natural_frequency_rad_s": Estimate.lognormal(natural, std[2], "rad/s"),
+        "damping_ratio": Estimate.lognormal(decay / natural, std[3], ""),
+        "amplitude": Estimate.lognormal(size, std[4], ""),
+        "phase_rad": Estimate.normal(math.atan2(b, a), std[5], "rad"),
     }
+    scale = np.array([omega, decay, natural, decay / natural, size, 1.0])
+    return estimates, np.asarray(relative * np.outer(scale, scale))
 
 
 def _judged(

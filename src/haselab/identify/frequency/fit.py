@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import chdtrc
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.charts import lines_chart
+from haselab.identify.fit import RecordFit
 from haselab.identify.frequency.line_noise import IndependentLines, LineNoise, MixedLines
 from haselab.identify.frequency.problem import ResponseProblem
+from haselab.identify.prediction import fitted_output
 from haselab.identify.projection import Solution, minimise, project
-from haselab.identify.record import finite_vector
+from haselab.identify.record import Record, finite_vector
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
 from haselab.models import Plant, SlowMode
 
@@ -40,40 +43,33 @@ _HOPELESS = 10.0  # misfits over the given standard deviations: no interval mean
 _UNRELATED_P = 1e-6
 
 
-@dataclass(frozen=True)
-class ResponseFit:
-    """A transfer function fitted to a frequency response.
+@dataclass(frozen=True, kw_only=True)
+class ResponseFit(RecordFit[Record]):
+    """A transfer function fitted to a frequency response; see `Fit` for what all fits have.
+
+    Its `parameters` are named as those of `TransferFit`; its `residuals` are the real parts, then
+    the imaginary parts, of the lines.
 
     Args:
-        status: "ok", or why there is no result.
         structure: what was fitted; its `offset` and `initial_state` have no meaning here.
-        estimates: every number by name: `gain`, `natural_frequency_rad_s`, `damping_ratio`,
-            `delay_s`, `slow_gain`, `slow_time_constant_s`, and so on.
+        frequency_hz: lines that were fitted, in Hz. Shape `(K,)`.
         modelled: fitted response on the lines. Shape `(K,)`.
         chi_squared_ratio: mean squared misfit over the variance that was given; 1 when the
             deviations of the lines are right and the structure is.
         chi_squared_p: probability of a ratio as far from 1.
-        notes: what the reader of the numbers should know, a sentence each.
     """
 
-    status: str
     structure: TransferStructure
-    estimates: dict[str, Estimate]
-    modelled: Complexes
-    chi_squared_ratio: float
-    chi_squared_p: float
-    notes: tuple[str, ...]
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    frequency_hz: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
+    modelled: Complexes = field(default_factory=lambda: np.zeros(0, np.complex128), repr=False)
+    chi_squared_ratio: float = math.nan
+    chi_squared_p: float = math.nan
 
     @property
     def slow_modes(self) -> tuple[tuple[Estimate, Estimate], ...]:
         """Gain and time constant of each slow branch."""
-        gains = [e for name, e in self.estimates.items() if name.startswith("slow_gain")]
-        taus = [e for name, e in self.estimates.items() if name.startswith("slow_time_constant")]
+        gains = [e for name, e in self.parameters.items() if name.startswith("slow_gain")]
+        taus = [e for name, e in self.parameters.items() if name.startswith("slow_time_constant")]
         return tuple(zip(gains, taus, strict=True))
 
     @property
@@ -90,7 +86,7 @@ class ResponseFit:
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
                 "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
             )
-        number = {name: estimate.value for name, estimate in self.estimates.items()}
+        number = {name: estimate.value for name, estimate in self.parameters.items()}
         untold = [name for name, value in number.items() if not math.isfinite(value)]
         if untold:
             raise ResultError(
@@ -105,11 +101,29 @@ class ResponseFit:
             tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
         )
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`; lines have no rate, so `rate_hz` is needed."""
+        inputs = finite_vector("u", u, 1)
+        if rate_hz is None:
+            raise InputError("A frequency response has no sampling rate. Give rate_hz.")
+        return self.plant.simulate(inputs, rate_hz, np.arange(inputs.size) / rate_hz)
+
+    def _modelled(self, record: Record) -> tuple[Floats, Floats]:
+        return record.y, fitted_output(self.plant, record)
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`; magnitude and phase over frequency."""
+        del names
+        if not self.residuals:
+            raise ResultError(f"The fit has no result: {self.status}")
+        measured = self.modelled + self.residuals[0] + 1j * self.residuals[1]
+        return lines_chart("Frequency response and fit", self.frequency_hz, measured, self.modelled)
+
+    def answer(self) -> JsonObject:
         """The keys of the public contract for a transfer function, with the chi-square test."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
         return {
-            **{key: self.estimates.get(key) for key in keys},
+            **{key: self.parameters.get(key) for key in keys},
             "slow_modes": [{"gain": gain, "time_constant_s": tau} for gain, tau in self.slow_modes],
             "chi_squared_ratio": self.chi_squared_ratio,
             "chi_squared_p": self.chi_squared_p,
@@ -155,7 +169,7 @@ def fit_response(
         >>> true = Plant(0.5, 5.11, 0.09, 0.012).frequency_response(2 * np.pi * frequency_hz)
         >>> noise = np.random.default_rng(1).normal(size=(2, 50)) @ np.eye(50) * 0.01
         >>> fit = fit_response(frequency_hz, true + noise[0] + 1j * noise[1], np.full(50, 0.0141))
-        >>> low, high = fit.estimates["damping_ratio"].ci95
+        >>> low, high = fit.parameters["damping_ratio"].ci95
         >>> fit.status, low < 0.09 < high
         ('ok', True)
     """
@@ -302,10 +316,7 @@ def _ambiguity(
 
 
 def _no_result(layout: Layout, reason: str) -> ResponseFit:
-    empty = np.zeros(0, dtype=np.complex128)
-    return ResponseFit(
-        f"no result: {reason}", layout.structure, {}, empty, math.nan, math.nan, ()
-    )  # fmt: skip
+    return ResponseFit(status=f"no result: {reason}", structure=layout.structure)
 
 
 def _describe(problem: ResponseProblem, ends: Sequence[tuple[Solution, bool]]) -> ResponseFit:
@@ -335,7 +346,34 @@ def _describe(problem: ResponseProblem, ends: Sequence[tuple[Solution, bool]]) -
         notes.append(f"The delay is {shown}; the plant takes 0 s.")
     modelled = problem.modelled(solution.search, solution.shared)
     status = _ambiguity(problem, ends, estimates, ratio) or "ok"
-    return ResponseFit(status, layout.structure, estimates, modelled, ratio, p, tuple(notes))
+    misfit = problem.response - modelled
+    return ResponseFit(
+        status=status,
+        structure=layout.structure,
+        parameters=estimates,
+        covariance=_covariance(layout, estimates, covariance),
+        residuals=(misfit.real, misfit.imag),
+        notes=tuple(notes),
+        frequency_hz=problem.s.imag / (2.0 * math.pi),
+        modelled=modelled,
+        chi_squared_ratio=ratio,
+        chi_squared_p=p,
+    )
+
+
+def _covariance(layout: Layout, estimates: dict[str, Estimate], inner: Floats) -> Floats:
+    """Covariance of the numbers from that of what was searched: logarithms, but for the delay."""
+    values = np.array([estimate.value for estimate in estimates.values()])
+    free = np.concatenate([np.isnan(layout.template), np.isnan(layout.factor_template)])
+    logarithmic = np.array([name != "delay_s" for name in layout.names])
+    slope = np.ones(values.size)
+    slope[: logarithmic.size][logarithmic] = values[: logarithmic.size][logarithmic]
+    covariance = np.zeros((values.size, values.size))
+    covariance[np.outer(free, free)] = inner.ravel()
+    blind = ~np.isfinite([estimate.std for estimate in estimates.values()])
+    covariance *= np.outer(np.where(blind, 0.0, slope), np.where(blind, 0.0, slope))
+    covariance[blind] = covariance[:, blind] = np.inf
+    return covariance
 
 
 def _related(factors: Floats, covariance: Floats) -> bool:

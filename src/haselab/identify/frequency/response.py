@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.identify.frequency.charts import BodeChart, NicholsChart, NyquistChart
 from haselab.identify.frequency.clipping import clipped_at
 from haselab.identify.frequency.fit import ResponseFit, fit_response
@@ -90,7 +89,7 @@ class FrequencyResponse:
             self.frequency_hz, self.response, self.std, structure, mixing=self.mixing
         )  # fmt: skip
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract; the phase runs on without jumps."""
         return {
             "status": self.status,

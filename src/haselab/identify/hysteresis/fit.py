@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.charts import loop_chart
+from haselab.identify.fit import RecordFit, rescaled, several
 from haselab.identify.hysteresis.lag import lag_rival
 from haselab.identify.hysteresis.loops import (
     LoopRecord,
@@ -33,6 +35,7 @@ from haselab.identify.hysteresis.search import (
 )
 from haselab.identify.model_choice import APART, effective_count, told_apart
 from haselab.identify.noise import fit_percent, whiteness_p
+from haselab.identify.record import finite_vector
 from haselab.models.hysteresis.common import Hysteresis
 
 __all__ = ["HysteresisFit", "LoopRecord", "fit_hysteresis"]
@@ -55,23 +58,23 @@ _LAG = (
 _BIPOLAR = 0.2  # of the larger side of the drive: the smaller one is above
 _SQUARABLE = (1e-150, 1e150)  # inputs whose squares are numbers
 LINEAR, SQUARE = "u", "u squared"
+_UNKNOWN = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
 _BUTTERFLY = (
     "The output follows the square of the drive (a butterfly): model and thresholds are those of "
     "u squared. Apply the model to u squared; the root of its inverse's output is the drive."
 )
 
 
-@dataclass(frozen=True)
-class HysteresisFit:
-    """A fitted hysteresis model.
+@dataclass(frozen=True, kw_only=True)
+class HysteresisFit(RecordFit[LoopRecord]):
+    """A fitted hysteresis model; see `Fit` for what all fits have.
 
     Args:
-        status: "ok", or why there is no result.
         kind: the model that is given: the one asked for, else the best of curve,
             prandtl-ishlinskii and bouc-wen.
         verdict: the model that the data support, "no hysteresis visible", "linear lag", or
             "cannot tell".
-        estimates: every number by name; those that the data do not tell are NaN.
+        records: what was fitted.
         bic: criterion of each kind's best model against the lowest.
         cycles: width of each cycle's loop.
         width: mean of these, in the unit of the output; positive where the output lags.
@@ -82,33 +85,23 @@ class HysteresisFit:
         validation_fit_percent: NRMSE fit of the last quarter of each record, by the same model
             fitted to the rest. NaN where the rest is too short.
         residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
-        residuals: measured minus modelled, all samples. Shape `(N_r,)` each.
-        notes: what the reader of the numbers should know, a sentence each.
         fitted: the model. None: no result.
         drive: what the model takes: "u", or "u squared" for a butterfly under a bipolar drive.
     """
 
-    status: str
-    kind: str
-    verdict: str
-    estimates: dict[str, Estimate]
-    bic: dict[str, float]
-    cycles: tuple[LoopWidth, ...]
-    width: Estimate
-    relative_width: Estimate
-    reduction: float
-    fit_percent: float
-    validation_fit_percent: float
-    residual_whiteness_p: float
-    residuals: tuple[Floats, ...]
-    notes: tuple[str, ...]
-    fitted: Hysteresis | None
+    kind: str = ""
+    verdict: str = ""
+    records: tuple[LoopRecord, ...] = field(repr=False)
+    bic: dict[str, float] = field(default_factory=dict)
+    cycles: tuple[LoopWidth, ...] = ()
+    width: Estimate = _UNKNOWN
+    relative_width: Estimate = _UNKNOWN
+    reduction: float = math.nan
+    fit_percent: float = math.nan
+    validation_fit_percent: float = math.nan
+    residual_whiteness_p: float = math.nan
+    fitted: Hysteresis | None = None
     drive: str = LINEAR
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
 
     @property
     def model(self) -> Hysteresis:
@@ -121,13 +114,35 @@ class HysteresisFit:
             raise ResultError(f"The fit has no result: {self.status}")
         return self.fitted
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`; the memory is that of rest at the first value of the input."""
+        inputs = self._driven(finite_vector("u", u, 1))
+        rate = self.records[0].rate_hz if rate_hz is None else rate_hz
+        return self.model.simulate(inputs, rate, float(inputs[0]))
+
+    def _driven(self, u: Floats) -> Floats:
+        """The input as the model takes it."""
+        return u**2 if self.drive == SQUARE else u
+
+    def _modelled(self, record: LoopRecord) -> tuple[Floats, Floats]:
+        modelled = self.simulate(record.u, record.rate_hz)
+        counted = record.settled()
+        left = (record.y - modelled)[counted]
+        return record.y[counted], modelled[counted] + left.mean()
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        loops = [(r.u, r.y, r.y - e) for r, e in zip(self.records, self.residuals, strict=True)]
+        title = f"Hysteresis, {self.kind}"
+        return loop_chart(title, names or ("Input", "Output"), loops)
+
+    def answer(self) -> JsonObject:
         """Keys of the command's answer."""
         return {
             "model": self.kind,
             "drive": self.drive,
             "verdict": self.verdict,
-            "parameters": self.estimates,
+            "parameters": self.parameters,
             "rate_filter_s": getattr(self.fitted, "rate_filter_s", None),
             "dead_zone_thresholds": list(self.fitted.dead_zones.thresholds) if self.fitted else [],
             "width": self.width,
@@ -144,7 +159,10 @@ class HysteresisFit:
 
 
 def fit_hysteresis(
-    records: Sequence[LoopRecord], model: str = "auto", operators: int | None = None
+    records: LoopRecord | Sequence[LoopRecord],
+    model: str = "auto",
+    *,
+    operators: int | None = None,
 ) -> HysteresisFit:
     r"""Fit a hysteresis model with an inverse, and say whether the data support it.
 
@@ -157,7 +175,7 @@ def fit_hysteresis(
     the input has once covered its range.
 
     Args:
-        records: loops, one array of samples each; several rates tell the rate dependence.
+        records: loops, or one; several rates tell the rate dependence.
         model: auto, prandtl-ishlinskii or bouc-wen.
         operators: number of play operators, 1 to 20; None: chosen by BIC.
     Returns:
@@ -172,18 +190,21 @@ def fit_hysteresis(
         >>> y = PrandtlIshlinskii(1.0, (0.2, 0.5), (0.4, 0.3)).simulate(u)
         >>> y = y + 0.005 * np.random.default_rng(1).normal(size=u.size)
         >>> fit = fit_hysteresis([LoopRecord(u, y, 100.0)])
-        >>> low, high = fit.estimates["threshold_1"].ci95
+        >>> low, high = fit.parameters["threshold_1"].ci95
         >>> fit.verdict, low < 0.2 < high
         ('prandtl-ishlinskii', True)
     """
-    _check(records, model, operators)
+    records = several(records)
+    _check(model, operators)
     fit = _fitted(records, model, operators)
     if all(_follows_square(record) for record in records):
         squared = [replace(record, u=record.u**2) for record in records]
         other = _fitted(squared, model, operators)
         better = not fit.succeeded or other.fit_percent > fit.fit_percent
         if other.succeeded and better:
-            return replace(other, drive=SQUARE, notes=(*other.notes, _BUTTERFLY))
+            return replace(
+                other, drive=SQUARE, records=tuple(records), notes=(*other.notes, _BUTTERFLY)
+            )
     return fit
 
 
@@ -221,16 +242,14 @@ def _fitted(records: Sequence[LoopRecord], model: str, operators: int | None) ->
     if not fit.succeeded:
         return fit
     notes = fit.notes
-    if verdict != _NONE and (rival := lag_rival(records, fit.residuals, len(fit.estimates))):
+    if verdict != _NONE and (rival := lag_rival(records, fit.residuals, len(fit.parameters))):
         lead = rival.lead
         verdict = LAG if lead > APART else _UNSURE if lead > -APART else verdict
         notes = (*notes, _LAG.format(rival)) if lead > -APART else notes
     return replace(fit, verdict=verdict, bic=scores, notes=notes)
 
 
-def _check(records: Sequence[LoopRecord], model: str, operators: int | None) -> None:
-    if not records:
-        raise InputError("records is empty; allowed is one record or more. Give a record.")
+def _check(model: str, operators: int | None) -> None:
     if model not in _KINDS:
         raise InputError(f"model = {model}; allowed are {', '.join(_KINDS)}. Correct the name.")
     if operators is not None and not 1 <= operators <= _MOST_OPERATORS:
@@ -252,15 +271,18 @@ def _describe(
         if fewer == family:
             break
         family, numbers = fewer, problem.solve(fewer, start, steps=60, gain=1e-9).numbers
-    estimates = hysteresis_estimates(problem, family, numbers)
+    estimates, covariance = hysteresis_estimates(problem, family, numbers)
     if chosen.kind == PLAYS and spread < ONE_RATE:
-        estimates["rate_dependence_s"] = Estimate(math.nan, math.inf, (-math.inf, math.inf), "s")
+        estimates["rate_dependence_s"] = replace(_UNKNOWN, unit="s")
+        missing = len(estimates) - covariance.shape[0]
+        covariance = np.pad(covariance, (0, missing), constant_values=np.inf)
     fitted = model_of(family, numbers, scale)
     residuals = tuple(r.y - fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records)
     told = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
     measured = [r.y[mask] for r, mask in zip(records, masks, strict=True)]
     if not _related(measured, told):
-        return _no_result("the output does not follow the input; check the columns")
+        reason = "no result: the output does not follow the input; check the columns"
+        return HysteresisFit(status=reason, records=tuple(records))
     modelled = [  # a model without its past may begin beyond all outputs
         np.clip(r.y - e, r.y.min(), r.y.max())[r.first :]
         for r, e in zip(records, residuals, strict=True)
@@ -270,21 +292,21 @@ def _describe(
     width, relative = _means(cycles, span)
     before, after = mean_width(records, common_curve(records)), mean_width(records, residuals)
     return HysteresisFit(
-        "ok",
-        chosen.kind,
-        "",
-        estimates,
-        {},
-        cycles,
-        width,
-        relative,
-        before / after if after > 0.0 else math.nan,
-        fit_percent(measured, [y - e for y, e in zip(measured, told, strict=True)]),
-        _validation(records, scale, family, numbers),
-        white,
-        residuals,
-        _notes(records, masks, chosen, estimates, fitted, spread, white, cycles),
-        fitted,
+        status="ok",
+        parameters=estimates,
+        covariance=rescaled(covariance, np.array([entry.std for entry in estimates.values()])),
+        residuals=residuals,
+        notes=_notes(records, masks, chosen, estimates, fitted, spread, white, cycles),
+        kind=chosen.kind,
+        records=tuple(records),
+        cycles=cycles,
+        width=width,
+        relative_width=relative,
+        reduction=before / after if after > 0.0 else math.nan,
+        fit_percent=fit_percent(measured, [y - e for y, e in zip(measured, told, strict=True)]),
+        validation_fit_percent=_validation(records, scale, family, numbers),
+        residual_whiteness_p=white,
+        fitted=fitted,
     )
 
 
@@ -299,8 +321,7 @@ def _related(measured: Sequence[Floats], residuals: Sequence[Floats]) -> bool:
 def _means(cycles: tuple[LoopWidth, ...], span: float) -> tuple[Estimate, Estimate]:
     """Mean width of all cycles, absolute and relative."""
     if not cycles:
-        unknown = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
-        return unknown, unknown
+        return _UNKNOWN, _UNKNOWN
     std = math.sqrt(sum(cycle.width.std**2 for cycle in cycles)) / len(cycles)
     mean = Estimate.normal(sum(cycle.width.value for cycle in cycles) / len(cycles), std, "")
     return mean, mean.scaled(1.0 / span, "")
@@ -322,15 +343,6 @@ def _validation(
         [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],
         [y[cut:] for y, cut in zip(modelled, cuts, strict=True)],
     )
-
-
-def _no_result(reason: str) -> HysteresisFit:
-    nan = math.nan
-    unknown = Estimate(nan, math.inf, (-math.inf, math.inf), "")
-    return HysteresisFit(
-        f"no result: {reason}", "", "", {}, {}, (), unknown, unknown, nan, nan, nan, nan, (), (),
-        None,
-    )  # fmt: skip
 
 
 def _notes(

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.record import finite_vector
 from haselab.identify.statics.cycles import loop_cells, loop_width, rising_edges
@@ -107,7 +106,7 @@ class LoopWidth:
     width: Estimate
     relative_width: Estimate
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Plain numbers and estimates."""
         return {
             "record": self.record,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Estimate
+from haselab.identify.fit import rescaled
 from haselab.identify.hysteresis.bouc_wen import BoucWenFamily, bouc_wen_model
 from haselab.identify.hysteresis.prandtl_ishlinskii import PlayFamily, play_model
 from haselab.identify.hysteresis.problem import (
@@ -95,15 +96,18 @@ def _values(family: Family, numbers: Numbers, scale: Scale) -> Floats:
 
 def hysteresis_estimates(
     problem: HysteresisProblem, family: Family, numbers: Numbers
-) -> dict[str, Estimate]:
-    """All numbers with intervals; those at a bound or beyond the data's reach are NaN.
+) -> tuple[dict[str, Estimate], Floats]:
+    """All numbers with intervals, and their covariance.
+
+    Those at a bound or beyond the data's reach are NaN.
 
     Args:
         problem: records and rows.
         family: the memory.
         numbers: the solution.
     Returns:
-        Estimates by name, play operators in the order of their thresholds.
+        Estimates by name, play operators in the order of their thresholds, and the covariance in
+        the same order, infinite where a number is NaN.
     """
     residuals, columns = problem.linearised(family, numbers)
     inner = coloured_covariance(
@@ -113,18 +117,20 @@ def hysteresis_estimates(
     blind = ~np.isfinite(np.diag(inner))
     inner = np.where(np.isfinite(inner), inner, 0.0)
     blind |= _at_bound(family, numbers)
-    variance = np.einsum("ij,jk,ik->i", matrix, inner, matrix)
+    covariance = matrix @ inner @ matrix.T
     lost = (np.abs(matrix[:, blind]) > 0.0).any(axis=1)
-    std = np.where(lost, math.inf, np.sqrt(np.maximum(variance, 0.0)))
+    std = np.where(lost, math.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     values = _values(family, numbers, problem.scale)
     names = _names(family, numbers)
     estimates = {
         name: _estimate(name, value, spread)
         for name, value, spread in zip(names, values, std, strict=True)
     }
+    order = np.arange(len(names))
     if isinstance(family, PlayFamily):
-        return _ordered(estimates, numbers.search[: family.count])
-    return estimates
+        estimates, order = _ordered(estimates, numbers.search[: family.count])
+    spread = np.array([entry.std for entry in estimates.values()])
+    return estimates, rescaled(covariance[np.ix_(order, order)], spread)
 
 
 def _at_bound(family: Family, numbers: Numbers) -> NDArray[np.bool_]:
@@ -147,10 +153,15 @@ def _estimate(name: str, value: float, std: float) -> Estimate:
     return Estimate.normal(value, std, unit)
 
 
-def _ordered(estimates: dict[str, Estimate], thresholds: Floats) -> dict[str, Estimate]:
-    """Play operators renumbered by threshold."""
-    ordered = {name: estimates[name] for name in ("gain", "offset")}
+def _ordered(
+    estimates: dict[str, Estimate], thresholds: Floats
+) -> tuple[dict[str, Estimate], NDArray[np.intp]]:
+    """Play operators renumbered by threshold, and the place that each number had before."""
+    before = {name: name for name in ("gain", "offset")}
     for number, k in enumerate(np.argsort(thresholds) + 1, start=1):
         for what in ("threshold", "weight"):
-            ordered[f"{what}_{number}"] = estimates[f"{what}_{k}"]
-    return ordered | {name: entry for name, entry in estimates.items() if name not in ordered}
+            before[f"{what}_{number}"] = f"{what}_{k}"
+    before |= {name: name for name in estimates if name not in before}
+    places = list(estimates)
+    order = np.array([places.index(name) for name in before.values()])
+    return {name: estimates[old] for name, old in before.items()}, order

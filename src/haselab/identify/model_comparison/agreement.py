@@ -6,12 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, ndtri
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.base.estimate import Z95
 
 __all__ = ["Agreement", "agree"]
@@ -44,7 +43,7 @@ class Agreement:
         """Whether there is a verdict; "cannot tell" is one."""
         return self.status == "ok"
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "verdict": self.verdict,

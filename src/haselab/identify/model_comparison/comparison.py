@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
 from haselab.identify.record import Record
 
@@ -106,7 +106,7 @@ class Rival:
     estimates: Mapping[str, Estimate]
     model: Mapping[str, Any]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Keys of the answer."""
         return {
             "name": self.name,
@@ -155,7 +155,7 @@ class Verdict:
         """Whether there is a verdict; "cannot tell" is one."""
         return self.status == "ok"
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "verdict": self.verdict,

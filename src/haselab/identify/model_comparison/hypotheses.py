@@ -55,7 +55,7 @@ class VoltageHypothesis:
         fit = min(usable, key=lambda f: sum(float(e @ e) for e in f.residuals))
         model = {"voltage_plant": fit.plant.to_dict()} if fit.plant else {}
         return Explanation(
-            fit.status, fit.parameters, fit.modelled, fit.residuals, fit.estimates, model
+            fit.status, fit.parameter_count, fit.modelled, fit.residuals, fit.parameters, model
         )
 
 
@@ -81,9 +81,9 @@ class TransferHypothesis:
             return Explanation(fit.status, 0, (), (), {}, {})
         s = self.structure
         own = s.offset + (s.poles + s.slow_modes if s.initial_state else 0)
-        free = sum(estimate.std > 0.0 for estimate in fit.estimates.values())
+        free = sum(estimate.std > 0.0 for estimate in fit.parameters.values())
         open_to = {name for rival in fit.rivals if rival.possible for name in rival.differs}
-        estimates = {name: e for name, e in fit.estimates.items() if name not in open_to}
+        estimates = {name: e for name, e in fit.parameters.items() if name not in open_to}
         # Which of two minima is right does not matter here: they explain the records equally well.
         parameters = free + own * len(records)
         return Explanation("ok", parameters, fit.modelled, fit.residuals, estimates, {})

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.charts import records_chart
+from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.projection import Basis, Solution, minimise, project
-from haselab.identify.record import Record
+from haselab.identify.record import Record, finite_vector
 from haselab.models.plant import Plant
 from haselab.models.voltage_plant import VoltagePlant
 
@@ -141,40 +143,53 @@ class _Range:
         return VoltagePlant(self.structure.creep, ones, **named, second_mode=second)
 
 
-@dataclass(frozen=True)
-class VoltagePlantFit:
-    """A fitted voltage plant.
+@dataclass(frozen=True, kw_only=True)
+class VoltagePlantFit(RecordFit[Record]):
+    """A fitted voltage plant; see `Fit` for what all fits have.
+
+    Of its `parameters`, `gain_1` is output per V^2, `gain_2` per V^4.
 
     Args:
-        status: "ok", or why there is no result.
         structure: what was fitted.
-        estimates: every number by name; `gain_1` is output per V^2, `gain_2` per V^4.
+        records: the experiments.
         plant: with the fitted numbers, a number that is not told included; None without a result.
-        parameters: fitted numbers, each record's own included.
+        parameter_count: fitted numbers, each record's own included.
         modelled: fitted output of each record. Shape `(M_r,)` each.
-        residuals: measured minus fitted. Shape `(M_r,)` each.
-        notes: what the reader of the numbers should know, a sentence each.
     """
 
-    status: str
     structure: VoltageStructure
-    estimates: dict[str, Estimate]
-    plant: VoltagePlant | None
-    parameters: int
-    modelled: tuple[Floats, ...]
-    residuals: tuple[Floats, ...]
-    notes: tuple[str, ...]
+    records: tuple[Record, ...] = field(default=(), repr=False)
+    plant: VoltagePlant | None = None
+    parameter_count: int = 0
+    modelled: tuple[Floats, ...] = field(default=(), repr=False)
 
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`; the first voltage has stood for ever."""
+        plant = self._fitted()
+        rate = self.records[0].input_rate_hz if rate_hz is None else rate_hz
+        inputs = finite_vector("u", u, 1)
+        return plant.simulate(inputs, rate, np.arange(inputs.size) / rate)
 
-    def answer(self) -> dict[str, Any]:
+    def _fitted(self) -> VoltagePlant:
+        if self.plant is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.plant
+
+    def _modelled(self, record: Record) -> tuple[Floats, Floats]:
+        moved = self._fitted().simulate(record.u, record.input_rate_hz, record.output_time_s)
+        return record.y, moved + (record.y - moved).mean()
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        self._require()
+        output = (names or ("", "Output"))[1]
+        return records_chart("Voltage plant", self.records, self.residuals, output)
+
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         measured = [m + e for m, e in zip(self.modelled, self.residuals, strict=True)]
         return {
-            **self.estimates,
+            **self.parameters,
             "fit_percent": fit_percent(measured, self.modelled) if measured else math.nan,
             "residual_whiteness_p": whiteness_p(self.residuals) if measured else math.nan,
             "status": self.status,
@@ -208,7 +223,7 @@ def fit_voltage_plant(
         >>> truth = VoltagePlant("mechanical", (0.03, 0.004), 5.11, 0.09, 0.01, 0.3, 4.0)
         >>> y = truth.simulate(drive_v, 100.0, time_s) + 1e-3 * rng.normal(size=2000)
         >>> fit = fit_voltage_plant([Record(drive_v, 100.0, y, time_s)])
-        >>> low, high = fit.estimates["creep_share"].ci95
+        >>> low, high = fit.parameters["creep_share"].ci95
         >>> fit.status, low < 0.3 < high
         ('ok', True)
     """
@@ -235,7 +250,7 @@ def fit_voltage_plant(
     )
     if not math.isfinite(solution.cost):
         reason = "no result: no start led to a finite model; record longer, or drive harder"
-        return VoltagePlantFit(reason, structure, {}, None, 0, (), (), ())
+        return VoltagePlantFit(status=reason, structure=structure)
     return _describe(records, ranges, solution, settled)
 
 
@@ -462,6 +477,16 @@ def _describe(
     plant = replace(
         ranges.plant(solution.search), gains=tuple(float(gain) for gain in solution.shared)
     )
+    spread = np.array([estimate.std for estimate in estimates.values()])
     return VoltagePlantFit(
-        "ok", structure, estimates, plant, parameters, modelled, solution.residuals, tuple(notes)
+        status="ok",
+        parameters=estimates,
+        covariance=rescaled(covariance, spread),
+        residuals=tuple(solution.residuals),
+        notes=tuple(notes),
+        structure=structure,
+        records=tuple(records),
+        plant=plant,
+        parameter_count=parameters,
+        modelled=modelled,
     )

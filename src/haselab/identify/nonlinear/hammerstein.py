@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from haselab.base import Estimate, InputError
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
+from haselab.identify.prediction import fitted_output
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import lags_of, means_before
+from haselab.identify.transfer.fit import TransferFit
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer.parameters import numbers_of, poles_of, zeros_of
 from haselab.identify.transfer.problem import Columns, TransferProblem
@@ -73,24 +75,23 @@ class _Curve:
         lead = int(np.argmax(np.abs(factors)))
         return replace(self, factors=factors / factors[lead], lead=lead)
 
+    def at(self, u: Floats, factors: Floats | None = None) -> Floats:
+        """Value of the curve, or of one with other factors."""
+        powers = self.powers if factors is None else factors @ self.basis
+        d = (u - self.middle) / self.half
+        return np.asarray(np.polynomial.polynomial.polyval(d, np.concatenate([[0.0], powers])))
+
     def applied(
         self, records: Sequence[Record], factors: Floats | None = None
     ) -> list[Record] | None:
         """The records behind the curve; None where it makes an input constant."""
-        powers = self.powers if factors is None else factors @ self.basis
-        polynomial = np.concatenate([[0.0], powers])
-
-        def at(u: Floats) -> Floats:
-            d = (u - self.middle) / self.half
-            return np.asarray(np.polynomial.polynomial.polyval(d, polynomial))
-
         out = []
         for r in records:
             before = r.input_before
             if before is not None:
-                before = float(at(np.array([before]))[0])
+                before = float(self.at(np.array([before]), factors)[0])
             try:
-                out.append(replace(r, u=at(r.u), input_before=before))
+                out.append(replace(r, u=self.at(r.u, factors), input_before=before))
             except InputError:
                 return None
         return out
@@ -120,6 +121,7 @@ class _Solution:
 class _Hammerstein:
     layout: Layout
     solution: _Solution
+    linear: TransferFit  # behind the curve
 
     def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
         """Outputs by the numbers that fit the first three quarters."""
@@ -133,6 +135,19 @@ class _Hammerstein:
             return None
         # An offset of the curve is part of the record's own offset, which the fit has found.
         return TransferProblem(self.layout, whole, delay_margin_s(whole)).predict(found.best.found)
+
+    def simulated(self, u: Floats, rate_hz: float) -> Floats:
+        """Output for a new input, from rest at the input 0."""
+        at = self.solution.curve.at
+        bent = at(u) - at(np.zeros(1))
+        return self.linear.rational.simulate(bent, rate_hz, np.arange(u.size) / rate_hz)
+
+    def modelled(self, record: Record) -> Floats:
+        """Output for a new record with the initial state and constant that suit it best."""
+        bent = self.solution.curve.applied([record])
+        if bent is None:
+            return np.full_like(record.y, record.y.mean())  # the curve makes the input constant
+        return fitted_output(self.linear.rational, bent[0])
 
 
 def fit_hammerstein(
@@ -164,7 +179,7 @@ def fit_hammerstein(
         >>> u, time_s = np.repeat(rng.uniform(0.0, 2.0, 400), 10), np.arange(4000) / 400.0
         >>> y = Plant(0.5, 5.11, 0.09).simulate(u**2, 400.0, time_s) + 0.01 * rng.normal(size=4000)
         >>> fit = fit_hammerstein([Record(u, 400.0, y, time_s)])
-        >>> low, high = fit.estimates["gain_2"].ci95
+        >>> low, high = fit.parameters["gain_2"].ci95
         >>> fit.status, low < 0.5 < high
         ('ok', True)
     """
@@ -297,6 +312,13 @@ def _described(layout: Layout, records: Sequence[Record], at: _Solution) -> Nonl
     local = to_local @ curve.factors
     estimates, _, notes = numbers_of(layout, at.best, inner[:-powers, :-powers])
     names = list(estimates)
+    linear = TransferFit(
+        status="ok",
+        structure=structure,
+        parameters=dict(estimates),
+        poles=poles_of(layout, layout.full(found.search), estimates),
+        zeros=zeros_of(layout, layout.full(found.search), found),
+    )
     # From (searched, common factors, curve) to (searched, local factors, local curve).
     size, shared = found.search.size, found.shared.size
     free = np.concatenate([np.isnan(layout.template), np.isnan(layout.factor_template)])
@@ -342,16 +364,16 @@ def _described(layout: Layout, records: Sequence[Record], at: _Solution) -> Nonl
     )
     operation = f"{operating:.4g}"
     return NonlinearFit(
-        "ok" if found.settled else "no result: the search did not come to rest",
-        structure,
-        estimates,
-        covariance,
-        poles_of(layout, numbers, estimates),
-        zeros_of(layout, numbers, found),
-        fit_percent([r.y for r in records], modelled),
-        at.best.whiteness_p,
-        residuals,
-        (
+        status="ok" if found.settled else "no result: the search did not come to rest",
+        structure=structure,
+        parameters=estimates,
+        covariance=covariance,
+        poles=poles_of(layout, numbers, estimates),
+        zeros=zeros_of(layout, numbers, found),
+        fit_percent=fit_percent([r.y for r in records], modelled),
+        residual_whiteness_p=at.best.whiteness_p,
+        residuals=tuple(residuals),
+        notes=(
             *notes,
             f"Gain, poles and zeros are the linear model for small changes about the input "
             f"{operation}, the mean of the records.",
@@ -363,5 +385,5 @@ def _described(layout: Layout, records: Sequence[Record], at: _Solution) -> Nonl
         curve=curve_names,
         fitted_records=tuple(records),
         count=parameters,
-        model=_Hammerstein(layout, at),
+        model=_Hammerstein(layout, at, linear),
     )

@@ -6,14 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
+from haselab.identify.fit import Prediction, RecordFit
 from haselab.identify.noise import fit_percent
-from haselab.identify.record import Record
+from haselab.identify.record import Record, finite_vector
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.fit import TransferFit
 from haselab.identify.transfer.layout import TransferStructure
@@ -35,8 +36,14 @@ class Nonlinear(Protocol):
     def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
         """Outputs by the numbers that fit the first three quarters; None: no fit."""
 
+    def simulated(self, u: Floats, rate_hz: float) -> Floats:
+        """Output for a new input, from rest at the input 0."""
 
-@dataclass(frozen=True)
+    def modelled(self, record: Record) -> Floats:
+        """Output for a new record with the initial state and constant that suit it best."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class NonlinearFit(TransferFit):
     """A linear part with one nonlinearity; `gain`, poles and zeros are those for small motions.
 
@@ -44,7 +51,7 @@ class NonlinearFit(TransferFit):
         kind: its name, see `NONLINEAR` of `transfer_nonlinear`.
         equation: the model in standard terms.
         operating_input: input about which the linear part is the model for small changes.
-        curve: names of the numbers of the nonlinearity, which `estimates` holds.
+        curve: names of the numbers of the nonlinearity, which `parameters` holds.
         fitted_records: the experiments.
         count: of all fitted numbers.
         model: what was fitted, for the check on rows that were not.
@@ -64,7 +71,7 @@ class NonlinearFit(TransferFit):
         return self.fitted_records
 
     @property
-    def parameters(self) -> int:
+    def parameter_count(self) -> int:
         """Count of all fitted numbers, the state and offset of each record included."""
         return self.count
 
@@ -101,19 +108,41 @@ class NonlinearFit(TransferFit):
         """
         if not self.succeeded:
             raise ResultError(f"The fit has no result: {self.status}")
-        gain = self.estimates["gain"]
+        gain = self.parameters["gain"]
         if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
             raise ResultError(
                 f"The slope of the output over the input at {self.operating_input:.4g} does not "
                 "differ from 0, so no linear model describes small changes there. Record about "
                 "the input that the loop will use."
             )
-        names = [name for name in self.estimates if name not in self.curve]
-        at = [list(self.estimates).index(name) for name in names]
+        names = [name for name in self.parameters if name not in self.curve]
+        at = [list(self.parameters).index(name) for name in names]
         return TransferFit(
-            self.status, self.structure, {name: self.estimates[name] for name in names},
-            self.covariance[np.ix_(at, at)], self.poles, self.zeros, self.fit_percent,
-        )  # fmt: skip
+            status=self.status,
+            structure=self.structure,
+            parameters={name: self.parameters[name] for name in names},
+            covariance=self.covariance[np.ix_(at, at)],
+            poles=self.poles,
+            zeros=self.zeros,
+            fit_percent=self.fit_percent,
+        )
+
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`; the nonlinearity is a part of it."""
+        inputs = finite_vector("u", u, 1)
+        return self._usable().simulated(inputs, self._rate_hz(rate_hz))
+
+    def compare(self, records: Record | Sequence[Record]) -> Prediction:
+        """See `RecordFit`; there is no band."""
+        return RecordFit.compare(self, records)
+
+    def _modelled(self, record: Record) -> tuple[Floats, Floats]:
+        return record.y, self._usable().modelled(record)
+
+    def _usable(self) -> Nonlinear:
+        if self.model is None:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return self.model
 
     @property
     def plant(self) -> Plant:
@@ -130,11 +159,11 @@ class NonlinearFit(TransferFit):
         """The numbers of the linear part with their covariance."""
         return self.linear.posterior
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of a transfer function for small motions, and the nonlinearity."""
-        linear = [name for name in self.estimates if name not in self.curve]
-        at = [list(self.estimates).index(name) for name in linear]
-        table = {name: self.estimates[name] for name in linear}
+        linear = [name for name in self.parameters if name not in self.curve]
+        at = [list(self.parameters).index(name) for name in linear]
+        table = {name: self.parameters[name] for name in linear}
         return {
             **super().answer(),
             "covariance": covariance_table(table, self.covariance[np.ix_(at, at)]),
@@ -142,7 +171,7 @@ class NonlinearFit(TransferFit):
                 "kind": self.kind,
                 "equation": self.equation,
                 "operating_input": self.operating_input,
-                **{name: self.estimates[name] for name in self.curve if name in self.estimates},
+                **{name: self.parameters[name] for name in self.curve if name in self.parameters},
             },
         }
 
@@ -174,4 +203,4 @@ def remarks(whiteness_p: float, gain: Estimate) -> list[str]:
 
 def no_fit(structure: TransferStructure, kind: str, reason: str) -> NonlinearFit:
     """A fit without a result."""
-    return NonlinearFit(f"no result: {reason}", structure, kind=kind)
+    return NonlinearFit(status=f"no result: {reason}", structure=structure, kind=kind)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _identify
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, ResultError
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
 from haselab.identify.record import Record
@@ -205,6 +205,31 @@ class _Fitted:
             return None
         return [r.y - e for r, e in zip(records, whole.residuals, strict=True)]
 
+    def simulated(self, u: Floats, rate_hz: float) -> Floats:
+        """Output for a new input, from rest at the input 0."""
+        record = Record.sampled(u, np.arange(float(u.size)), rate_hz, 0.0)
+        resting = replace(self.model.structure, initial_state=False, offset=False)
+        search = _Search(replace(self.model, structure=resting), [record])
+        return record.y - self._end(search, self.numbers[: self.model.shared]).residuals[0]
+
+    def modelled(self, record: Record) -> Floats:
+        """Output for a new record with the initial state and constant that suit it best."""
+        search, shared = _Search(self.model, [record]), self.model.shared
+        numbers = np.concatenate([self.numbers[:shared], np.zeros(self.model.own)])
+        for _ in range(_FIRST_STEPS):
+            end = self._end(search, numbers)
+            own = end.columns[0][:, shared:]
+            numbers[shared:] += np.linalg.lstsq(own, end.residuals[0], rcond=None)[0]
+        return record.y - self._end(search, numbers).residuals[0]
+
+    def _end(self, search: _Search, numbers: Floats) -> _End:
+        end = search.at(numbers)
+        if end is None:
+            raise ResultError(
+                "The model's motion grows without bound for this input. Use a smaller one."
+            )
+        return end
+
 
 def fit_spring(
     records: Sequence[Record],
@@ -235,7 +260,7 @@ def fit_spring(
         >>> u, time_s = np.repeat(rng.normal(size=400), 10), np.arange(4000) / 400.0
         >>> y = Plant(0.5, 5.11, 0.09).simulate(u, 400.0, time_s) + 0.01 * rng.normal(size=4000)
         >>> fit = fit_spring([Record(u, 400.0, y, time_s)])
-        >>> low, high = fit.estimates["stiffness_ratio_3"].ci95
+        >>> low, high = fit.parameters["stiffness_ratio_3"].ci95
         >>> fit.status, low < 0.0 < high
         ('ok', True)
     """
@@ -402,16 +427,15 @@ def _described(
         else f"y = x + {terms} + offset, x = G(s) u with one resonance (Wiener)"
     ).replace("+ -", "- ")
     return NonlinearFit(
-        "ok" if found.settled else "no result: the search did not come to rest",
-        structure,
-        estimates,
-        covariance[np.ix_(order, order)],
-        (complex(omega * (-zeta + root)), complex(omega * (-zeta - root))),
-        (),
-        fit_percent([r.y for r in records], modelled),
-        whiteness_p(found.residuals),
-        found.residuals,
-        (
+        status="ok" if found.settled else "no result: the search did not come to rest",
+        structure=structure,
+        parameters=estimates,
+        covariance=covariance[np.ix_(order, order)],
+        poles=(complex(omega * (-zeta + root)), complex(omega * (-zeta - root))),
+        fit_percent=fit_percent([r.y for r in records], modelled),
+        residual_whiteness_p=whiteness_p(found.residuals),
+        residuals=found.residuals,
+        notes=(
             "Gain, natural frequency and damping ratio are the linear model for small motions "
             "about the input 0.",
             *remarks(whiteness_p(found.residuals), estimates["gain"]),

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.fit import RecordFit
 from haselab.identify.noise import fit_percent, whiteness_p
-from haselab.identify.statics.columns import driven
+from haselab.identify.record import Record, finite_vector
+from haselab.identify.sampled.record import check_same_rate, driven, sampled, sampled_chart
 from haselab.models import ArxModel
 from haselab.models.filters import lfilter
 
@@ -57,15 +61,17 @@ class ArxOrders:
         return max(self.na, self.nb + self.nk - 1)
 
 
-@dataclass(frozen=True)
-class ArxFit:
-    """A fitted difference equation.
+@dataclass(frozen=True, kw_only=True)
+class ArxFit(RecordFit[Record]):
+    """A fitted difference equation; see `Fit` for what all fits have.
+
+    Its `parameters` are `a_1`, `a_2`, ..., `b_1`, `b_2`, ...; its `residuals` are the prediction
+    errors from sample `orders.memory` on.
 
     Args:
-        status: "ok", or why there is no result.
         orders: its size.
         model: the equation about the operating point; None without a result.
-        covariance: of `a` and `b`. Shape `(na + nb, na + nb)`.
+        record: what was fitted.
         operating_point: input and output that were taken off.
         fit_percent: of the simulated output, initial state fitted.
         prediction_fit_percent: of the output predicted one sample ahead.
@@ -73,14 +79,11 @@ class ArxFit:
         residual_whiteness_p: of the prediction errors.
         aic: Akaike's criterion.
         bic: Schwarz's criterion.
-        residuals: prediction errors, from sample `orders.memory` on.
-        notes: what the reader of the numbers should know, a sentence each.
     """
 
-    status: str
     orders: ArxOrders
     model: ArxModel | None
-    covariance: Floats
+    record: Record = field(repr=False)
     operating_point: tuple[float, float]
     fit_percent: float
     prediction_fit_percent: float
@@ -88,13 +91,6 @@ class ArxFit:
     residual_whiteness_p: float
     aic: float
     bic: float
-    residuals: Floats
-    notes: tuple[str, ...]
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
 
     def _fitted(self) -> ArxModel:
         if self.model is None:
@@ -104,14 +100,12 @@ class ArxFit:
     @property
     def a(self) -> tuple[Estimate, ...]:
         """Factors of the earlier outputs."""
-        std = _std(self.covariance)
-        return tuple(Estimate.normal(v, s, "") for v, s in zip(self._fitted().a, std, strict=False))
+        return tuple(self.parameters.values())[: self._fitted().a.size]
 
     @property
     def b(self) -> tuple[Estimate, ...]:
         """Factors of the inputs."""
-        std = _std(self.covariance)[self.orders.na :]
-        return tuple(Estimate.normal(v, s, "") for v, s in zip(self._fitted().b, std, strict=True))
+        return tuple(self.parameters.values())[self._fitted().a.size :]
 
     @property
     def static_gain(self) -> Estimate:
@@ -123,7 +117,7 @@ class ArxFit:
         return Estimate.normal(model.static_gain, math.sqrt(slope @ self.covariance @ slope), "")
 
     @property
-    def modes(self) -> tuple[dict[str, Any], ...]:
+    def modes(self) -> tuple[JsonObject, ...]:
         """Poles in continuous time, the slowest first, with frequency and damping or time constant.
 
         A pole at z <= 0 has none and is left out.
@@ -160,7 +154,28 @@ class ArxFit:
         part = self.covariance[: self.orders.na, : self.orders.na]
         return Estimate.normal(value, math.sqrt(max(float(slope @ part @ slope), 0.0)), unit)
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`; rest is the operating point, and the rate that of the record."""
+        model = self._fitted()
+        check_same_rate(rate_hz, model.rate_hz)
+        inputs = finite_vector("u", u, 1)
+        return model.simulate(inputs - self.operating_point[0]) + self.operating_point[1]
+
+    def _modelled(self, record: Record) -> tuple[Floats, Floats]:
+        model, new = self._fitted(), sampled(record)
+        check_same_rate(new.input_rate_hz, model.rate_hz)
+        if not model.is_stable:
+            raise ResultError(f"The equation is unstable and cannot be simulated: {self.notes[0]}")
+        free = np.column_stack([_free(model, new.y.size), np.ones(new.y.size)])
+        forced = model.simulate(new.u - self.operating_point[0])
+        own = np.linalg.lstsq(free, new.y - forced, rcond=None)[0]
+        return new.y, forced + free @ own
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`; the model predicts one sample ahead."""
+        return sampled_chart("ARX model", self.record, self.residuals[0], names)
+
+    def answer(self) -> JsonObject:
         """Numbers by name, for JSON."""
         told = self.succeeded
         return {
@@ -190,9 +205,7 @@ class ArxFit:
 
 
 def fit_arx(
-    u: object,
-    y: object,
-    rate_hz: float,
+    records: Record | Sequence[Record],
     orders: ArxOrders | None = None,
     *,
     criterion: str = "bic",
@@ -206,23 +219,22 @@ def fit_arx(
     the sensor it is biased, the more the faster the sampling: take `fit_transfer` then.
 
     Args:
-        u: input, held between the samples. Shape `(N,)`.
-        y: output, read at the same moments. Shape `(N,)`.
-        rate_hz: samples a second, in Hz.
+        records: one record whose input and output were sampled together (`Record.sampled`).
         orders: size of the equation. None: na and nb up to 4 and nk from 1 to 12 are tried.
         criterion: "bic" or "aic", by which the orders are chosen.
         remove_means: take the means off first; else the zeros of the columns are the rest.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: too few samples, NaN, unequal lengths, a column without change, an unknown name.
+        InputError: several records, times that are not those of the input, too few samples, an
+            input without change, an unknown name.
     Source: Ljung, System Identification (1999), section 10.1; criteria over the same samples for
         all orders, section 16.4.
     Example:
         >>> rng = np.random.default_rng(1)
         >>> u, e = rng.normal(size=(2, 600))
         >>> y = lfilter([0, 0, 0.5], [1, -1.2, 0.5], u) + lfilter([0.05], [1, -1.2, 0.5], e)
-        >>> fit = fit_arx(u, y, 100.0)
+        >>> fit = fit_arx(Record.sampled(u, y, 100.0))
         >>> fit.orders
         ArxOrders(na=2, nb=1, nk=2)
         >>> all(low < a < high for (low, high), a in zip([e.ci95 for e in fit.a], [-1.2, 0.5]))
@@ -232,7 +244,7 @@ def fit_arx(
         raise InputError(
             f"criterion = {criterion}; allowed are {', '.join(_CRITERIA)}. Choose one of them."
         )
-    record = driven(u, y, rate_hz)
+    record = driven(records)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
     if orders is None:
@@ -243,7 +255,7 @@ def fit_arx(
             f"The record has {inputs.size} samples; allowed are more than {least} for na = "
             f"{orders.na}, nb = {orders.nb}, nk = {orders.nk}. Record longer, or lower the orders."
         )
-    return _fit(inputs, outputs, record.input_rate_hz, orders, point)
+    return _fit(record, inputs, outputs, orders, point)
 
 
 def _regressors(u: Floats, y: Floats, orders: ArxOrders, first: int) -> Floats:
@@ -306,8 +318,9 @@ def _criteria(cost: float, count: int, numbers: int) -> dict[str, float]:
 
 
 def _fit(
-    u: Floats, y: Floats, rate_hz: float, orders: ArxOrders, point: tuple[float, float]
+    record: Record, u: Floats, y: Floats, orders: ArxOrders, point: tuple[float, float]
 ) -> ArxFit:
+    rate_hz = record.input_rate_hz
     numbers, covariance, errors = _solved(u, y, orders)
     model = ArxModel(numbers[: orders.na], numbers[orders.na :], orders.nk, rate_hz)
     criteria = _criteria(float(errors @ errors), errors.size, numbers.size)
@@ -320,24 +333,47 @@ def _fit(
             "no result: the record does not tell these orders apart; lower na or nb, or excite "
             "the plant with more frequencies"
         )
+    names = [f"a_{i + 1}" for i in range(orders.na)] + [f"b_{i + 1}" for i in range(orders.nb)]
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    estimates = {
+        name: Estimate.normal(value, spread, "")
+        for name, value, spread in zip(names, numbers, std, strict=True)
+    }
     return ArxFit(
-        status, orders, model if status == "ok" else None, covariance, point, simulated, predicted,
-        _validation_percent(u, y, rate_hz, orders), whiteness, criteria["aic"], criteria["bic"],
-        errors, _notes(model, simulated, predicted, whiteness),
-    )  # fmt: skip
+        status=status,
+        parameters=estimates if status == "ok" else {},
+        covariance=covariance,
+        residuals=(errors,),
+        notes=_notes(model, simulated, predicted, whiteness),
+        orders=orders,
+        model=model if status == "ok" else None,
+        record=record,
+        operating_point=point,
+        fit_percent=simulated,
+        prediction_fit_percent=predicted,
+        validation_fit_percent=_validation_percent(u, y, rate_hz, orders),
+        residual_whiteness_p=whiteness,
+        aic=criteria["aic"],
+        bic=criteria["bic"],
+    )
 
 
 def _simulation_percent(model: ArxModel, u: Floats, y: Floats) -> float:
     """Fit of the output simulated from the input alone, with the best initial state."""
     if not model.is_stable:
         return math.nan
-    length = max(model.a.size, model.b.size + model.nk - 1, 1)
-    starts = np.zeros((y.size, length))
-    starts[np.arange(length), np.arange(length)] = 1.0
-    free = np.asarray(lfilter([1.0], model.denominator, starts, axis=0))
+    free = _free(model, y.size)
     forced = model.simulate(u)
     state = np.linalg.lstsq(free, y - forced, rcond=None)[0]
     return fit_percent([y], [forced + free @ state])
+
+
+def _free(model: ArxModel, count: int) -> Floats:
+    """Output after each initial state, without input. Shape `(count, K)`."""
+    length = max(model.a.size, model.b.size + model.nk - 1, 1)
+    starts = np.zeros((count, length))
+    starts[np.arange(length), np.arange(length)] = 1.0
+    return np.asarray(lfilter([1.0], model.denominator, starts, axis=0))
 
 
 def _validation_percent(u: Floats, y: Floats, rate_hz: float, orders: ArxOrders) -> float:
@@ -369,7 +405,3 @@ def _notes(
     if not model.has_continuous:
         notes.append("A pole at z <= 0 has no continuous counterpart; lower na.")
     return tuple(notes)
-
-
-def _std(covariance: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
-from haselab.identify.record import Record
-from haselab.identify.statics.columns import driven
+from haselab.identify.record import Record, finite_vector
+from haselab.identify.sampled.record import check_same_rate, driven, sampled, sampled_chart
 from haselab.models import StateSpaceModel
 from haselab.models.filters import lfilter
 
@@ -25,12 +28,16 @@ _LEAST_GAP = 1e-12
 _WHITE = 0.05
 
 
-@dataclass(frozen=True)
-class SubspaceFit:
-    """A fitted state model.
+@dataclass(frozen=True, kw_only=True)
+class SubspaceFit(RecordFit[Record]):
+    """A fitted state model; see `Fit` for what all fits have.
+
+    Its `parameters` are `static_gain` and, for each mode, `natural_frequency_1_rad_s` and
+    `damping_ratio_1`, or `time_constant_1_s`; its `residuals` are output minus simulation.
 
     Args:
-        status: "ok", or why there is no result.
+        record: what was fitted.
+        operating_point: input and output that were taken off.
         model: about the operating point; None without a result.
         singular_values: what each further state explains. Shape `(block_rows,)`.
         static_gain: output per input at rest.
@@ -38,24 +45,16 @@ class SubspaceFit:
             its time constant.
         fit_percent: of the simulated output, initial state fitted.
         residual_whiteness_p: of output minus simulation.
-        residuals: output minus simulation. Shape `(N,)`.
-        notes: what the reader of the numbers should know, a sentence each.
     """
 
-    status: str
+    record: Record = field(repr=False)
+    operating_point: tuple[float, float]
     model: StateSpaceModel | None
     singular_values: Floats
     static_gain: Estimate
-    modes: tuple[dict[str, Any], ...]
+    modes: tuple[JsonObject, ...]
     fit_percent: float
     residual_whiteness_p: float
-    residuals: Floats
-    notes: tuple[str, ...]
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
 
     @property
     def plant(self) -> StateSpaceModel:
@@ -68,7 +67,28 @@ class SubspaceFit:
             raise ResultError(f"The fit has no result: {self.status}")
         return self.model
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`; rest is the operating point, and the rate that of the record."""
+        check_same_rate(rate_hz, self.plant.rate_hz)
+        inputs = finite_vector("u", u, 1)
+        return self.plant.simulate(inputs - self.operating_point[0]) + self.operating_point[1]
+
+    def _modelled(self, record: Record) -> tuple[Floats, Floats]:
+        new = sampled(record)
+        check_same_rate(new.input_rate_hz, self.plant.rate_hz)
+        inputs = new.u - self.operating_point[0]
+        free = np.column_stack([self.plant.responses(inputs)[1], np.ones(inputs.size)])
+        forced = self.plant.simulate(inputs)
+        own = np.linalg.lstsq(free, new.y - forced, rcond=None)[0]
+        return new.y, forced + free @ own
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        if not self.residuals:
+            raise ResultError(f"The fit has no result: {self.status}")
+        return sampled_chart("Subspace model", self.record, self.residuals[0], names)
+
+    def answer(self) -> JsonObject:
         """Numbers by name, for JSON."""
         model = self.model
         return {
@@ -88,9 +108,7 @@ class SubspaceFit:
 
 
 def fit_subspace(
-    u: object,
-    y: object,
-    rate_hz: float,
+    records: Record | Sequence[Record],
     order: int | None = None,
     *,
     block_rows: int = 15,
@@ -105,9 +123,7 @@ def fit_subspace(
     intervals come from repeated fits to the simulation with noise of the residuals' colour.
 
     Args:
-        u: input, held between the samples. Shape `(N,)`.
-        y: output, read at the same moments. Shape `(N,)`.
-        rate_hz: samples a second, in Hz.
+        records: one record whose input and output were sampled together (`Record.sampled`).
         order: states. None: up to the largest gap of the singular values, by their ratio.
         block_rows: samples of past and of future that are looked at; above the order.
         remove_means: take the means off first; what is left of an offset counts as a state.
@@ -116,28 +132,32 @@ def fit_subspace(
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: too few samples, NaN, unequal lengths, a column without change, an order that
-            is not below the block rows.
+        InputError: several records, times that are not those of the input, too few samples, an
+            input without change, an order that is not below the block rows.
     Source: Verhaegen, Automatica 30 (1994), 61, PO-MOESP; the same as SLICOT's IB01AD with METH=M.
     Example:
         >>> u = np.random.default_rng(1).normal(size=500)
         >>> y = lfilter([0.0, 0.3, 0.1], [1.0, -1.2, 0.5], u)
-        >>> fit = fit_subspace(u, y, 10.0, remove_means=False, bootstrap=0)
+        >>> record = Record.sampled(u, y, 10.0)
+        >>> fit = fit_subspace(record, remove_means=False, bootstrap=0)
         >>> np.round(np.poly(fit.plant.a), 6).tolist()
         [1.0, -1.2, 0.5]
     """
-    record = driven(u, y, rate_hz)
+    record = driven(records)
     _check(record, order, block_rows)
-    inputs, outputs = record.u, record.y
-    if remove_means:
-        inputs, outputs = inputs - inputs.mean(), outputs - outputs.mean()
+    rate_hz = record.input_rate_hz
+    point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
+    inputs, outputs = record.u - point[0], record.y - point[1]
     values, space = _space(inputs, outputs, block_rows)
     count = _gap(values) if order is None else order
     if values[count - 1] <= _LEAST_GAP * values[0]:
         none = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
         reason = f"no result: the record tells no {count} states; lower the order"
-        empty = np.zeros(0)
-        return SubspaceFit(reason, None, values, none, (), math.nan, math.nan, empty, ())
+        return SubspaceFit(
+            status=reason, record=record, operating_point=point, model=None,
+            singular_values=values, static_gain=none, modes=(), fit_percent=math.nan,
+            residual_whiteness_p=math.nan,
+        )  # fmt: skip
     model, simulated = _model(inputs, outputs, space[:, :count], rate_hz)
     residuals = outputs - simulated
     rng = np.random.default_rng(seed)
@@ -146,11 +166,22 @@ def fit_subspace(
         for again in _repeated(simulated, residuals, bootstrap, rng)
     ]
     whiteness = whiteness_p([residuals])
-    gains = [repeat.static_gain for repeat in repeats]
+    columns = _Columns.of(model, repeats)
     return SubspaceFit(
-        "ok", model, values, _estimate(model.static_gain, gains, ""), _modes(model, repeats),
-        fit_percent([outputs], [simulated]), whiteness, residuals, _notes(model, whiteness),
-    )  # fmt: skip
+        status="ok",
+        parameters=columns.estimates,
+        covariance=columns.covariance,
+        residuals=(residuals,),
+        notes=_notes(model, whiteness),
+        record=record,
+        operating_point=point,
+        model=model,
+        singular_values=values,
+        static_gain=columns.estimates["static_gain"],
+        modes=_modes(model, columns.estimates),
+        fit_percent=fit_percent([outputs], [simulated]),
+        residual_whiteness_p=whiteness,
+    )
 
 
 def _check(record: Record, order: int | None, block_rows: int) -> None:
@@ -226,24 +257,60 @@ def _rates(model: StateSpaceModel) -> Complexes:
     return np.asarray(s[np.argsort(np.abs(s.real))])
 
 
-def _modes(model: StateSpaceModel, repeats: list[StateSpaceModel]) -> tuple[dict[str, Any], ...]:
-    """Modes with the spread of the nearest ones of the repeated fits."""
-    others = [_rates(repeat) for repeat in repeats]
+def _numbers(at: int, s: Complexes) -> dict[str, Floats]:
+    """Frequency and damping, or time constant, of mode `at` from its pole and those nearest."""
+    if abs(s[0].imag) < 1e-9 * abs(s[0]):
+        return {f"time_constant_{at}_s": -1.0 / s.real}
+    return {f"natural_frequency_{at}_rad_s": np.abs(s), f"damping_ratio_{at}": -s.real / np.abs(s)}
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Numbers of the model with the spread of the repeated fits.
+
+    Args:
+        estimates: by name.
+        covariance: of them, in their order. Shape `(P, P)`.
+    """
+
+    estimates: dict[str, Estimate]
+    covariance: Floats
+
+    @classmethod
+    def of(cls, model: StateSpaceModel, repeats: list[StateSpaceModel]) -> _Columns:
+        """Each mode beside the nearest ones of the repeated fits."""
+        others = [rates for rates in map(_rates, repeats) if rates.size]
+        gains = [model.static_gain, *(repeat.static_gain for repeat in repeats)]
+        columns = {"static_gain": np.array(gains)}
+        for at, s in enumerate(_rates(model), start=1):
+            near = [rates[np.argmin(np.abs(rates - s))] for rates in others]
+            columns |= _numbers(at, np.array([s, *near]))
+        estimates = {
+            name: _estimate(column[0], column[1:].tolist(), _unit(name))
+            for name, column in columns.items()
+        }
+        std = np.array([estimate.std for estimate in estimates.values()])
+        spread = np.eye(std.size)
+        if np.isfinite(std).all() and len({column.size for column in columns.values()}) == 1:
+            spread = np.atleast_2d(np.cov([column[1:] for column in columns.values()]))
+        return cls(estimates, rescaled(spread, std))
+
+
+def _unit(name: str) -> str:
+    return "rad/s" if name.endswith("_rad_s") else "s" if name.endswith("_s") else ""
+
+
+def _modes(model: StateSpaceModel, estimates: dict[str, Estimate]) -> tuple[dict[str, Any], ...]:
+    """Poles with their numbers."""
     found = []
-    for s in _rates(model):
-        near = [rates[np.argmin(np.abs(rates - s))] for rates in others if rates.size]
+    for at, s in enumerate(_rates(model), start=1):
         z = np.exp(s / model.rate_hz)
         mode: dict[str, Any] = {
             "z": [float(z.real), float(z.imag)],
             "pole_rad_s": [float(s.real), float(s.imag)],
         }
-        if abs(s.imag) < 1e-9 * abs(s):
-            spread = [float(-1.0 / n.real) for n in near]
-            mode["time_constant_s"] = _estimate(-1.0 / s.real, spread, "s")
-        else:
-            sizes, dampings = [abs(n) for n in near], [-n.real / abs(n) for n in near]
-            mode["natural_frequency_rad_s"] = _estimate(abs(s), sizes, "rad/s")
-            mode["damping_ratio"] = _estimate(-s.real / abs(s), dampings, "")
+        for name in _numbers(at, np.array([s])):
+            mode[name.replace(f"_{at}", "")] = estimates[name]
         found.append(mode)
     return tuple(found)
 

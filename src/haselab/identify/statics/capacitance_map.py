@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject
+from haselab.base.chart import Chart
+from haselab.identify.charts import curve_chart
+from haselab.identify.fit import CurveFit, rescaled
 from haselab.identify.noise import autoregression, coloured_covariance, r_squared
 from haselab.identify.statics.columns import paired, plausible_strain
 from haselab.identify.statics.cycles import loop_cells, rising_edges, trend
@@ -22,28 +24,21 @@ Floats = NDArray[np.float64]
 _ONE_EDGE = "The record has one edge only: rising and falling could not be averaged."
 
 
-@dataclass(frozen=True)
-class CapacitanceMapFit:
-    """A fitted capacitance map.
+@dataclass(frozen=True, kw_only=True)
+class CapacitanceMapFit(CurveFit):
+    """A fitted capacitance map; see `Fit` for what all fits have.
+
+    Its `parameters` are `slope` and `offset`, strain per unit of capacitance and strain.
 
     Args:
-        status: "ok", or why there is no result.
-        estimates: `slope` and `offset`, strain per unit of capacitance and strain.
         r_squared: share of the variance of all strains that the line explains.
-        residuals: strain minus line, all samples. Shape `(N,)`.
-        notes: what the reader of the numbers should know, a sentence each.
+        x: capacitances that were fitted, in any unit. Shape `(N,)`.
+        strain: strains at these. Shape `(N,)`.
     """
 
-    status: str
-    estimates: dict[str, Estimate]
-    r_squared: float
-    residuals: Floats
-    notes: tuple[str, ...]
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    r_squared: float = math.nan
+    x: Floats = field(repr=False)
+    strain: Floats = field(repr=False)
 
     @property
     def map(self) -> LinearMap:
@@ -52,15 +47,26 @@ class CapacitanceMapFit:
         Raises:
             ResultError: the fit has no result.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
-        return LinearMap(self.estimates["slope"].value, self.estimates["offset"].value)
+        self._require()
+        return LinearMap(self.parameters["slope"].value, self.parameters["offset"].value)
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, x: ArrayLike) -> Floats:
+        """Strain at capacitances; see `CurveFit`."""
+        return np.asarray(self.map.strain(x), dtype=np.float64)
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        grid = np.linspace(self.x.min(), self.x.max(), 400)
+        return curve_chart(
+            "Capacitance map", names or ("Capacitance (as in the file, SI)", "Strain"),
+            (self.x, self.strain), (grid, self.simulate(grid)),
+        )  # fmt: skip
+
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
-            "slope": self.estimates.get("slope"),
-            "offset": self.estimates.get("offset"),
+            "slope": self.parameters.get("slope"),
+            "offset": self.parameters.get("offset"),
             "r_squared": self.r_squared,
             "status": self.status,
             "notes": list(self.notes),
@@ -88,14 +94,14 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
         >>> strain = 0.05 - 0.1 * np.cos(2 * np.pi * 0.25 * np.arange(1600) / 100.0)
         >>> capacitance = (strain + 0.276) / 4.923e6 + 2e-10 * rng.normal(size=1600)
         >>> fit = fit_capacitance_map(capacitance, strain)
-        >>> low, high = fit.estimates["slope"].ci95
+        >>> low, high = fit.parameters["slope"].ci95
         >>> fit.status, low < 4.923e6 < high
         ('ok', True)
     """
     c, e = _checked(relative_capacitance, strain)
     if trend(c, e) == 0:
         reason = "no result: the strain does not follow the capacitance; check the columns"
-        return CapacitanceMapFit(reason, {}, math.nan, np.zeros(0), ())
+        return CapacitanceMapFit(status=reason, x=c, strain=e)
     middle, half = float(c.mean()), 0.5 * float(np.ptp(c))
     columns = np.column_stack([(c - middle) / half, np.ones_like(c)])
     cells = _Cells.of(e)
@@ -107,15 +113,24 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     # From the line about the middle to the line about zero capacitance.
     about_zero = np.array([[1.0 / half, 0.0], [-middle / half, 1.0]])
     slope, offset = about_zero @ factors
-    spread = np.sqrt([np.diag(about_zero @ part @ about_zero.T) for part in (along, in_time)]).max(
-        axis=0
-    )
+    covariances = [about_zero @ part @ about_zero.T for part in (along, in_time)]
+    spread = np.sqrt([np.diag(part) for part in covariances]).max(axis=0)
     estimates = {
         "slope": Estimate.normal(slope, spread[0], ""),
         "offset": Estimate.normal(offset, spread[1], ""),
     }
     notes = () if cells.both else (_ONE_EDGE,)
-    return CapacitanceMapFit("ok", estimates, r_squared(e, e - residuals), residuals, notes)
+    larger = max(covariances, key=lambda part: float(part[0, 0]))
+    return CapacitanceMapFit(
+        status="ok",
+        parameters=estimates,
+        covariance=rescaled(larger, spread),
+        residuals=(residuals,),
+        notes=notes,
+        r_squared=r_squared(e, e - residuals),
+        x=c,
+        strain=e,
+    )
 
 
 def _checked(relative_capacitance: ArrayLike, strain: ArrayLike) -> tuple[Floats, Floats]:

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.identify.record import Record, finite_vector
+from haselab.identify.record import finite_vector
 
-__all__ = ["driven", "paired", "plausible_strain", "plausible_stretch", "plausible_voltage"]
+__all__ = ["paired", "plausible_strain", "plausible_stretch", "plausible_voltage"]
 
 Floats = NDArray[np.float64]
 _LONGEST = 30.0  # stretch: above the break of any elastomer
@@ -48,32 +48,6 @@ def paired(
                 f"Name the right column, or {record}."
             )
     return x, y
-
-
-def driven(u: object, y: object, rate_hz: float) -> Record:
-    """Record of an input that changes and an output of the same length.
-
-    Args:
-        u: input, held between the samples. Shape `(N,)`.
-        y: output, read at the same moments. Shape `(N,)`.
-        rate_hz: samples a second, in Hz.
-    Returns:
-        The record.
-    Raises:
-        InputError: too few values, NaN, unequal lengths, a column without change.
-    """
-    record = Record.sampled(u, y, rate_hz)
-    if record.u.size != record.y.size:
-        raise InputError(
-            f"u has {record.u.size} values and y {record.y.size}; allowed are equal lengths. "
-            "Give one input for each output."
-        )
-    if np.ptp(record.u) == 0.0:
-        raise InputError(
-            f"The input is {record.u[0]:g} throughout, so it excites nothing; allowed is an input "
-            "that changes. Name the right column, or record a chirp or a step."
-        )
-    return record
 
 
 def plausible_stretch(stretch: Floats, other: str, values: Floats) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, LimitError, ResultError
+from haselab.base import InputError, JsonObject, LimitError
+from haselab.base.chart import Chart, Curve, Panel
+from haselab.identify.fit import CurveFit
 from haselab.identify.statics.columns import paired, plausible_stretch
 from haselab.identify.statics.hyperelastic_search import (
     ELECTRODE_NAMES,
@@ -102,28 +103,26 @@ class StressPrediction:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class HyperelasticFit:
-    """The chosen law and its rivals.
+@dataclass(frozen=True, kw_only=True)
+class HyperelasticFit(CurveFit):
+    """The chosen law and its rivals; see `Fit` for what all fits have.
+
+    Its `parameters` are those of the law; its `residuals` are stresses of each test, in Pa.
 
     Args:
-        status: "ok", or why there is no result.
         best: the chosen candidate.
         candidates: all that were fitted, the best first.
         tests: the data, each in the order of its stretch.
-        notes: what the reader of the numbers should know, a sentence each.
     """
 
-    status: str
     best: Candidate
     candidates: tuple[Candidate, ...]
     tests: tuple[SheetTest, ...]
-    notes: tuple[str, ...]
 
     @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    def r_squared(self) -> float:
+        """Share of the variance that the law explains."""
+        return self.best.r_squared
 
     @property
     def stretch_range(self) -> tuple[float, float]:
@@ -148,9 +147,25 @@ class HyperelasticFit:
         Raises:
             ResultError: the fit has no result.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
+        self._require()
         return _law(self.best)
+
+    def simulate(self, x: ArrayLike) -> Floats:
+        """Nominal stress at stretches, in Pa, deformed as the first test; see `CurveFit`."""
+        return self.predict(x).nominal_stress_pa
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`; all tests, and the law in the deformation of each."""
+        curves = []
+        for test in self.tests:
+            kind = test.deformation.kind
+            curves.append(
+                Curve(test.stretch, test.nominal_stress_pa, f"measured, {kind}", "points")
+            )
+            law = self.predict(np.linspace(*test.stretch_range, 300), test.deformation)
+            curves.append(Curve(law.stretch, law.nominal_stress_pa, "law", "line", law.std_pa))
+        panel = Panel(*(names or ("Stretch", "Nominal stress (Pa)")), curves)
+        return Chart(f"Hyperelastic law, {self.best.model}", (panel,))
 
     def predict(
         self, stretch: ArrayLike, deformation: Deformation | None = None
@@ -188,15 +203,15 @@ class HyperelasticFit:
             "there it is a guess.",
         )
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "model": self.best.model,
-            "parameters": dict(self.best.estimates),
+            "parameters": dict(self.best.parameters),
             "stretch_range": list(self.stretch_range),
             "lateral_stretch": self.lateral_stretch,
             "tests": [
-                {**test.deformation.to_dict(), "stretch_range": list(test.stretch_range)}
+                test.deformation.to_dict() | {"stretch_range": list(test.stretch_range)}
                 for test in self.tests
             ],
             "r_squared": self.best.r_squared,
@@ -210,7 +225,7 @@ class HyperelasticFit:
                     "aicc": candidate.aicc,
                     "bic": candidate.bic,
                     "r_squared": candidate.r_squared,
-                    "parameters": dict(candidate.estimates),
+                    "parameters": dict(candidate.parameters),
                 }
                 for candidate in self.candidates
             ],
@@ -297,7 +312,7 @@ def fit_hyperelastic_tests(
         >>> for kind in (Deformation("uniaxial"), Deformation("equibiaxial")):
         ...     stress_pa = law.nominal_stress_pa(*kind.stretches(x)) + 50.0 * rng.normal(size=30)
         ...     tests.append(SheetTest(x, stress_pa, kind))
-        >>> low, high = fit_hyperelastic_tests(tests, "gent").best.estimates["jm"].ci95
+        >>> low, high = fit_hyperelastic_tests(tests, "gent").best.parameters["jm"].ci95
         >>> low < 40.0 < high
         True
     """
@@ -324,11 +339,23 @@ def fit_hyperelastic_tests(
     elif not best.r_squared > 0.0:
         status = "no result: no law explains the data better than their mean; check the columns"
     notes = _notes(best, tests, electrodes) if status == "ok" else ()
-    return HyperelasticFit(status, best, tuple(fitted), tuple(tests), notes)
+    return HyperelasticFit(
+        status=status,
+        parameters=best.parameters,
+        covariance=best.covariance,
+        residuals=tuple(
+            test.nominal_stress_pa - modelled_pa
+            for test, modelled_pa in zip(tests, best.modelled_pa, strict=True)
+        ),
+        notes=notes,
+        best=best,
+        candidates=tuple(fitted),
+        tests=tuple(tests),
+    )
 
 
 def _rank(candidate: Candidate) -> tuple[bool, bool, bool, float]:
-    untold = any(math.isnan(e.value) for e in candidate.estimates.values())
+    untold = any(math.isnan(e.value) for e in candidate.parameters.values())
     return not candidate.settled, candidate.softens_at is not None, untold, candidate.aicc
 
 
@@ -396,7 +423,7 @@ def _notes(
 
 
 def _untold_note(best: Candidate) -> list[str]:
-    untold = [name for name, e in best.estimates.items() if math.isnan(e.value)]
+    untold = [name for name, e in best.parameters.items() if math.isnan(e.value)]
     if not untold:
         return []
     reason = (
@@ -442,8 +469,8 @@ def _range_notes(
     if not half.settled:
         return []
     moved = []
-    for name, whole in best.estimates.items():
-        part = half.estimates[name]
+    for name, whole in best.parameters.items():
+        part = half.parameters[name]
         if name != "chain_segments" and abs(part.value - whole.value) > _MOVED * part.std:
             moved.append(f"{name} to {part.value:.4g} {part.unit}".rstrip())
     if not moved:

@@ -87,7 +87,7 @@ class Candidate:
 
     Args:
         model: name of the law.
-        estimates: its numbers, and those of the electrodes when asked for; one that the data do
+        parameters: its numbers, and those of the electrodes when asked for; one that the data do
             not tell is nan with an infinite interval.
         numbers: the same as they make the fitted curve, told or not.
         covariance: of `numbers`, in their order, linear about the fit. Shape `(P, P)`.
@@ -101,7 +101,7 @@ class Candidate:
     """
 
     model: str
-    estimates: dict[str, Estimate]
+    parameters: dict[str, Estimate]
     numbers: dict[str, float]
     covariance: Floats
     r_squared: float
@@ -277,7 +277,7 @@ def _with_idle_term(name: str, fewer: Candidate) -> Candidate:
     count = _terms(name)
     single = {"mu_pa": "mu1_pa", "alpha": "alpha1"}
     extra = {f"mu{count}_pa": 0.0, f"alpha{count}": 2.0}
-    estimates = {single.get(k, k): v for k, v in fewer.estimates.items()}
+    estimates = {single.get(k, k): v for k, v in fewer.parameters.items()}
     estimates |= {label: _unknown("Pa" if "_pa" in label else "") for label in extra}
     numbers = {single.get(k, k): v for k, v in fewer.numbers.items()} | extra
     size = len(fewer.numbers)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from haselab.base import ResultError
+from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.charts import curve_chart
+from haselab.identify.fit import CurveFit
 from haselab.identify.independent import independent_share
 from haselab.identify.noise import r_squared
 from haselab.identify.statics.columns import paired
@@ -30,37 +32,31 @@ _ROUNDS = 4
 _FEW = 30  # independent samples below which the spread of the noise is a guess
 
 
-@dataclass(frozen=True)
-class MapFit:
-    """A fitted map.
+@dataclass(frozen=True, kw_only=True)
+class MapFit(CurveFit):
+    """A fitted map; see `Fit` for what all fits have.
+
+    Its `parameters` are the value at the first knot, `start`, and the slope at each knot,
+    `slope_1` and so on.
 
     Args:
-        status: "ok", or why there is no result.
+        x: that was fitted. Shape `(N,)`.
+        y: the same. Shape `(N,)`.
         curve: the map; None without a result.
-        covariance: of its start and slopes. Shape `(K + 1, K + 1)`.
         monotone: whether the curve rises, or falls, everywhere.
         effective_parameters: numbers that the curve really uses; 2 is a straight line.
         hysteresis_width: mean distance of the rising and the falling branch at equal x; 0 when
             there is one branch only.
         r_squared: share of the variance that the curve explains.
-        residuals: y minus curve. Shape `(N,)`.
-        notes: what the reader of the numbers should know, a sentence each.
     """
 
-    status: str
-    curve: SplineMap | None
-    covariance: Floats
-    monotone: bool
-    effective_parameters: float
-    hysteresis_width: float
-    r_squared: float
-    residuals: Floats
-    notes: tuple[str, ...]
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    x: Floats = field(repr=False)
+    y: Floats = field(repr=False)
+    curve: SplineMap | None = None
+    monotone: bool = False
+    effective_parameters: float = math.nan
+    hysteresis_width: float = math.nan
+    r_squared: float = math.nan
 
     @property
     def map(self) -> SplineMap:
@@ -104,7 +100,19 @@ class MapFit:
         x = self.map.inverse(y)
         return np.asarray(self.value_std(x) / np.abs(self.map.slope(x)))
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, x: ArrayLike) -> Floats:
+        """See `CurveFit`."""
+        return np.asarray(self.map.value(x), dtype=np.float64)
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        grid = np.linspace(self.x.min(), self.x.max(), 400)
+        fitted = grid, self.simulate(grid)
+        return curve_chart(
+            "Map", names or ("x", "y"), (self.x, self.y), fitted, self.value_std(grid)
+        )
+
+    def answer(self) -> JsonObject:
         """Numbers by name, for JSON; arrays go over the knots."""
         told = self.succeeded
         return {
@@ -156,10 +164,7 @@ def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
             f"no result: x takes {distinct} values only; record a sweep of it" if distinct < 4
             else "no result: y does not follow x; check the columns, or leave out monotone"
         )  # fmt: skip
-        empty = np.zeros(0)
-        return MapFit(
-            reason, None, np.zeros((0, 0)), False, math.nan, math.nan, math.nan, empty, ()
-        )
+        return MapFit(status=reason, x=x, y=y)
     knots = np.linspace(x.min(), x.max(), pieces + 1)
     problem = _Problem.of(x, y, knots)
     weight, share = _weighed(problem)
@@ -172,10 +177,25 @@ def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
     residuals = y - problem.columns @ numbers
     curve = SplineMap(knots, numbers[1:], float(numbers[0]))
     covariance, effective = problem.spread(weight, share, float(residuals @ residuals))
+    names = ["start", *(f"slope_{k}" for k in range(1, knots.size + 1))]
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return MapFit(
-        "ok", curve, covariance, curve.is_monotone, effective, loop_width(x, y, residuals),
-        r_squared(y, y - residuals), residuals, _notes(curve, held, share * x.size),
-    )  # fmt: skip
+        status="ok",
+        parameters={
+            name: Estimate.normal(value, spread, "")
+            for name, value, spread in zip(names, numbers, std, strict=True)
+        },
+        covariance=covariance,
+        residuals=(residuals,),
+        notes=_notes(curve, held, share * x.size),
+        x=x,
+        y=y,
+        curve=curve,
+        monotone=curve.is_monotone,
+        effective_parameters=effective,
+        hysteresis_width=loop_width(x, y, residuals),
+        r_squared=r_squared(y, y - residuals),
+    )
 
 
 def _columns(x: Floats, knots: Floats) -> Floats:

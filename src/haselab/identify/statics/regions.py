@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
+from haselab.base.chart import Chart
+from haselab.identify.charts import curve_chart
+from haselab.identify.fit import CurveFit, propagated, rescaled
 from haselab.identify.independent import independent_share, spread_of, student_estimate
 from haselab.identify.noise import r_squared
 from haselab.identify.projection import Basis, Solution, minimise, project
@@ -44,7 +46,7 @@ class Region:
     slope_n: Estimate
     r_squared: float
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The form of the public contract."""
         return {
             "stretch": [self.low.value, self.high.value],
@@ -55,40 +57,54 @@ class Region:
         }
 
 
-@dataclass(frozen=True)
-class RegionsFit:
-    """A broken line.
+@dataclass(frozen=True, kw_only=True)
+class RegionsFit(CurveFit):
+    """A broken line; see `Fit` for what all fits have.
+
+    Its `parameters` are the break points `break_1` and so on and the slopes `slope_1_n` and so
+    on, in the order of the stretch; its `residuals` are load minus line at `stretch`, in N.
 
     Args:
-        status: "ok", or why there is no result.
         regions: straight pieces, the longest first.
         r_squared: share of the load's variance that the broken line explains.
         bic: Bayesian information criterion of each number of pieces that was tried, against that
             of the chosen number.
         stretch: stretches, sorted. Shape `(N,)`.
-        residuals: load minus line at `stretch`, in N. Shape `(N,)`.
-        notes: what the reader of the numbers should know, a sentence each.
+        load_n: load at `stretch`, in N. Shape `(N,)`.
     """
 
-    status: str
-    regions: tuple[Region, ...]
-    r_squared: float
-    bic: dict[int, float]
-    stretch: Floats
-    residuals: Floats
-    notes: tuple[str, ...]
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    regions: tuple[Region, ...] = ()
+    r_squared: float = math.nan
+    bic: dict[int, float] = field(default_factory=dict)
+    stretch: Floats = field(repr=False)
+    load_n: Floats = field(repr=False)
 
     @property
     def chosen(self) -> int:
         """Index of the longest region."""
         return 0
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, x: ArrayLike) -> Floats:
+        """Load at stretches, in N; the first and the last piece go on. See `CurveFit`."""
+        self._require()
+        pieces = sorted(self.regions, key=lambda region: region.low.value)
+        slopes_n = [region.slope_n.value for region in pieces]
+        breaks = np.array([region.low.value for region in pieces[1:]])
+        stretch = np.atleast_1d(np.asarray(x, dtype=np.float64))
+        bends = np.maximum(stretch[:, None] - breaks, 0.0) @ np.diff(slopes_n)
+        start_n = float(self.load_n[0] - self.residuals[0][0])
+        return np.asarray(start_n + slopes_n[0] * (stretch - self.stretch[0]) + bends)
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        self._require()
+        title, line_n = f"{len(self.regions)} linear regions", self.load_n - self.residuals[0]
+        return curve_chart(
+            title, names or ("Stretch", "Force (N)"), (self.stretch, self.load_n),
+            (self.stretch, line_n),
+        )  # fmt: skip
+
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
             "regions": [region.to_dict() for region in self.regions],
@@ -136,7 +152,7 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = Non
     }
     if not tried:
         reason = "no result: the stretches are too few or too repeated for the pieces; fit fewer"
-        return RegionsFit(reason, (), math.nan, {}, np.zeros(0), np.zeros(0), ())
+        return RegionsFit(status=reason, stretch=x, load_n=y)
     # The largest number of pieces leaves the least of the curve in its residuals.
     share = independent_share(tried[max(tried)].residuals)
     scores = {count: _bic(solution, count, y, share) for count, solution in tried.items()}
@@ -337,11 +353,25 @@ def _describe(x: Floats, y: Floats, solution: Solution, bic: dict[int, float]) -
         inside = (x >= ends[k].value) & (x <= ends[k + 1].value)
         quality = r_squared(y[inside], y[inside] - residuals[inside])
         regions.append(Region(ends[k], ends[k + 1], slope, quality))
+    parameters = {f"break_{k}": end for k, end in enumerate(ends[1:-1], start=1)}
+    parameters |= {f"slope_{k}_n": region.slope_n for k, region in enumerate(regions, start=1)}
+    std = np.array([estimate.std for estimate in parameters.values()])
+    to_slopes = np.zeros((std.size, covariance.shape[0]))
+    to_slopes[: breaks.size, : breaks.size] = np.eye(breaks.size)
+    to_slopes[breaks.size :, breaks.size + 1 :] = np.tri(breaks.size + 1)
     regions.sort(key=lambda region: region.low.value - region.high.value)
     return RegionsFit(
-        "ok", tuple(regions), r_squared(y, y - residuals), bic, x, residuals,
-        _notes(x, regions, bic),
-    )  # fmt: skip
+        status="ok",
+        parameters=parameters,
+        covariance=rescaled(propagated(to_slopes, covariance), std),
+        residuals=(residuals,),
+        notes=_notes(x, regions, bic),
+        regions=tuple(regions),
+        r_squared=r_squared(y, y - residuals),
+        bic=bic,
+        stretch=x,
+        load_n=y,
+    )
 
 
 def _notes(x: Floats, regions: list[Region], bic: dict[int, float]) -> tuple[str, ...]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.charts import curve_chart
+from haselab.identify.fit import CurveFit, propagated
 from haselab.identify.noise import coloured_covariance, r_squared
 from haselab.identify.projection import Solution
 from haselab.identify.statics.columns import paired, plausible_strain, plausible_voltage
@@ -31,35 +33,28 @@ _NAMES = ("a1_v", "b1", "a2_v", "b2")
 _MARGIN = 0.2  # of the strain's span, on each side
 
 
-@dataclass(frozen=True)
-class VoltageMapFit:
-    """A fitted voltage map.
+@dataclass(frozen=True, kw_only=True)
+class VoltageMapFit(CurveFit):
+    """A fitted voltage map; see `Fit` for what all fits have.
+
+    Its `parameters` are `a1_v`, `b1`, `a2_v`, `b2`; the larger rate is `b1`.
 
     Args:
-        status: "ok", or why there is no result.
-        estimates: `a1_v`, `b1`, `a2_v`, `b2`; the larger rate is `b1`.
         monotone: whether the curve rises, or falls, over the whole range of the map.
         hysteresis_width: mean distance of the rising and the falling branch at equal strain, in
             V; 0 when there is one branch only.
         r_squared: share of the voltage's variance that the curve explains.
-        residuals: voltage minus curve, in V. Shape `(N,)`.
-        notes: what the reader of the numbers should know, a sentence each.
+        strain: that was fitted. Shape `(N,)`.
+        voltage_v: the same, in V. Shape `(N,)`.
         curve: the curve in well-conditioned numbers, with their covariance. None: no result.
     """
 
-    status: str
-    estimates: dict[str, Estimate]
-    monotone: bool
-    hysteresis_width: float
-    r_squared: float
-    residuals: Floats
-    notes: tuple[str, ...]
-    curve: _Curve | None
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
+    monotone: bool = False
+    hysteresis_width: float = math.nan
+    r_squared: float = math.nan
+    strain: Floats = field(repr=False)
+    voltage_v: Floats = field(repr=False)
+    curve: _Curve | None = field(default=None, repr=False)
 
     @property
     def map(self) -> VoltageMap:
@@ -87,10 +82,22 @@ class VoltageMapFit:
             raise ResultError(f"The fit has no result: {self.status}")
         return self.curve
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, x: ArrayLike) -> Floats:
+        """Voltage at strains, in V; see `CurveFit`."""
+        return np.asarray(self.map.voltage_v(x), dtype=np.float64)
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        grid = np.linspace(self.strain.min(), self.strain.max(), 400)
+        return curve_chart(
+            "Voltage map", names or ("Strain", "Voltage (V)"), (self.strain, self.voltage_v),
+            (grid, self.simulate(grid)), self.curve_std(grid),
+        )  # fmt: skip
+
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         return {
-            **{name: self.estimates.get(name) for name in _NAMES},
+            **{name: self.parameters.get(name) for name in _NAMES},
             "monotone": self.monotone,
             "hysteresis_width": self.hysteresis_width,
             "r_squared": self.r_squared,
@@ -129,13 +136,14 @@ class _Curve:
         variance = np.einsum("ni,ij,nj->n", columns, self.covariance, columns)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(strain.shape))
 
-    def estimates(self) -> dict[str, Estimate]:
+    def estimates(self) -> tuple[dict[str, Estimate], Floats]:
         values, slope = coefficients(self.numbers, self.middle, self.half)
-        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slope, self.covariance, slope), 0.0))
+        covariance = propagated(slope, self.covariance)
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         return {
             name: Estimate.normal(value, spread, "V" if name.endswith("_v") else "")
             for name, value, spread in zip(_NAMES, values, std, strict=True)
-        }
+        }, covariance
 
 
 def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
@@ -159,7 +167,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
         >>> voltage_v = VoltageMap(1.324, 3.124, -0.2805, -26.92).voltage_v(strain)
         >>> voltage_v = voltage_v + 0.001 * np.random.default_rng(1).normal(size=200)
         >>> fit = fit_voltage_map(strain, voltage_v)
-        >>> low, high = fit.estimates["b2"].ci95
+        >>> low, high = fit.parameters["b2"].ci95
         >>> fit.status, low < -26.92 < high
         ('ok', True)
     """
@@ -169,7 +177,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
     sign = trend(x, v)
     if sign == 0:
         reason = "no result: the voltage does not follow the strain; check the columns"
-        return VoltageMapFit(reason, {}, False, math.nan, math.nan, np.zeros(0), (), None)
+        return VoltageMapFit(status=reason, strain=e, voltage_v=v)
     reach = 1.0 + 2.0 * _MARGIN
     solution = search_free(x, v)
     limited = not is_steep(solution, v, sign, reach)
@@ -194,17 +202,20 @@ def _describe(
     e: Floats, v: Floats, curve: _Curve, solution: Solution, limited: bool
 ) -> VoltageMapFit:
     """Numbers with intervals, judged."""
-    estimates, residuals = curve.estimates(), solution.residuals[0]
+    (estimates, covariance), residuals = curve.estimates(), solution.residuals[0]
     chart = curve.map
     return VoltageMapFit(
-        "ok",
-        estimates,
-        chart.is_monotone(chart.strain_low, chart.strain_high),
-        loop_width(e, v, residuals),
-        r_squared(v, v - residuals),
-        residuals,
-        _notes(solution, estimates, limited),
-        curve,
+        status="ok",
+        parameters=estimates,
+        covariance=covariance,
+        residuals=(residuals,),
+        notes=_notes(solution, estimates, limited),
+        monotone=chart.is_monotone(chart.strain_low, chart.strain_high),
+        hysteresis_width=loop_width(e, v, residuals),
+        r_squared=r_squared(v, v - residuals),
+        strain=e,
+        voltage_v=v,
+        curve=curve,
     )
 
 

@@ -52,7 +52,7 @@ def bootstrap_transfer(
         >>> y = Plant(0.5, 5.11, 0.09).simulate(u, 100.0, time_s) + 0.01 * rng.normal(size=2000)
         >>> fit = fit_transfer([Record(u, 100.0, y, time_s)])
         >>> drawn = bootstrap_transfer(fit, 200, rng)["damping_ratio"]
-        >>> 0.7 < drawn.std / fit.estimates["damping_ratio"].std < 1.4
+        >>> 0.7 < drawn.std / fit.parameters["damping_ratio"].std < 1.4
         True
     """
     if draws < _LEAST:
@@ -70,7 +70,7 @@ def bootstrap_transfer(
         name: old
         if not np.isfinite(old.std) or old.std == 0.0
         else Estimate(old.value, float(std[i]), (float(low[i]), float(high[i])), old.unit)
-        for i, (name, old) in enumerate(fit.estimates.items())
+        for i, (name, old) in enumerate(fit.parameters.items())
     }
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.identify.model_choice import APART
 from haselab.identify.noise import autoregression
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
@@ -75,7 +75,7 @@ class TransferChoice:
         """Whether the numbers may be used."""
         return self.fit.succeeded
 
-    def answer(self) -> dict[str, Any]:
+    def answer(self) -> JsonObject:
         """The keys of the public contract, and the candidates with their criterion."""
         lowest = self.candidates[0].bic
         return {
@@ -201,7 +201,7 @@ def _fit_or_not(records: Sequence[Record], structure: TransferStructure) -> Tran
     try:
         return fit_transfer(records, structure)
     except InputError as error:
-        return TransferFit(f"no result: {error}", structure)
+        return TransferFit(status=f"no result: {error}", structure=structure)
 
 
 def _key(structure: TransferStructure) -> tuple[object, ...]:
@@ -245,7 +245,7 @@ def _ranked(fits: Sequence[TransferFit]) -> list[Candidate]:
         if not fit.succeeded:
             return math.inf
         spread = max(_energy(fit, polynomial), 1e-300) / _count(fit)
-        return count * math.log(spread) + fit.parameters * math.log(count)
+        return count * math.log(spread) + fit.parameter_count * math.log(count)
 
     return sorted((Candidate(fit, bic(fit)) for fit in fits), key=lambda c: c.bic)
 
@@ -267,7 +267,7 @@ def _hidden_creep(ranked: Sequence[Candidate]) -> tuple[str, ...]:
     richer = next(rivals, None)
     if chosen.structure.slow_modes or richer is None:
         return ()
-    if richer.succeeded and math.isfinite(richer.estimates["slow_time_constant_s"].std):
+    if richer.succeeded and math.isfinite(richer.parameters["slow_time_constant_s"].std):
         return ()
     return (
         "Creep is not identifiable from these records: a slow branch may be there or not. Add a "

@@ -7,15 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.charts import records_chart
+from haselab.identify.fit import Prediction, RecordFit, several
 from haselab.identify.frequency.steady_tone import steady_tone_hz
 from haselab.identify.noise import coloured_covariance, fit_percent
-from haselab.identify.record import Record
+from haselab.identify.prediction import fitted_output, predict
+from haselab.identify.record import Record, finite_vector
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.checks.ambiguity import Rival, ambiguity, rivals_of
 from haselab.identify.transfer.checks.diagnosis import diagnosed
@@ -54,46 +57,32 @@ _RESTING = (
 )
 
 
-@dataclass(frozen=True)
-class TransferFit:
-    """A fitted transfer function.
+@dataclass(frozen=True, kw_only=True)
+class TransferFit(RecordFit[Record]):
+    """A fitted transfer function; see `Fit` for what all fits have.
+
+    Its `parameters` are `gain`, `natural_frequency_rad_s`, `damping_ratio`, `delay_s`,
+    `slow_gain`, `slow_time_constant_s`, and so on.
 
     Args:
-        status: "ok", or why there is no result.
         structure: what was fitted.
-        estimates: every number by name: `gain`, `natural_frequency_rad_s`, `damping_ratio`,
-            `delay_s`, `slow_gain`, `slow_time_constant_s`, and so on. One that the records do not
-            tell is NaN with an infinite interval, and `notes` says so.
-        covariance: of `estimates`, in their order. Shape `(P, P)`.
         poles: poles, in rad/s; the fast ones first.
         zeros: zeros of the fast part, in rad/s.
         fit_percent: NRMSE fit of all samples.
         residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
-        residuals: measured minus fitted. Shape `(M_r,)` each.
-        notes: what the reader of the numbers should know, a sentence each.
         best: what the search found; None without a result.
         rivals: other minima that the search met, with their likelihoods.
         ambiguous: two models explain the records: the fit is right, its numbers may not be.
     """
 
-    status: str
     structure: TransferStructure
-    estimates: dict[str, Estimate] = field(default_factory=dict)
-    covariance: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     poles: tuple[complex, ...] = ()
     zeros: tuple[complex, ...] = ()
     fit_percent: float = math.nan
     residual_whiteness_p: float = math.nan
-    residuals: tuple[Floats, ...] = ()
-    notes: tuple[str, ...] = ()
-    best: Best | None = None
+    best: Best | None = field(default=None, repr=False)
     rivals: tuple[Rival, ...] = ()
     ambiguous: bool = False
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
-        return self.status == "ok"
 
     @property
     def records(self) -> tuple[Record, ...]:
@@ -101,7 +90,7 @@ class TransferFit:
         return () if self.best is None else tuple(self.best.records)
 
     @property
-    def parameters(self) -> int:
+    def parameter_count(self) -> int:
         """Count of all fitted numbers, the state and offset of each record included."""
         if self.best is None:
             return 0
@@ -136,8 +125,8 @@ class TransferFit:
     @property
     def slow_modes(self) -> tuple[tuple[Estimate, Estimate], ...]:
         """Gain and time constant of each slow branch."""
-        gains = [e for name, e in self.estimates.items() if name.startswith("slow_gain")]
-        taus = [e for name, e in self.estimates.items() if name.startswith("slow_time_constant")]
+        gains = [e for name, e in self.parameters.items() if name.startswith("slow_gain")]
+        taus = [e for name, e in self.parameters.items() if name.startswith("slow_time_constant")]
         return tuple(zip(gains, taus, strict=True))
 
     @property
@@ -155,7 +144,7 @@ class TransferFit:
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
                 "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
             )
-        number = {name: estimate.value for name, estimate in self.estimates.items()}
+        number = {name: estimate.value for name, estimate in self.parameters.items()}
         blind = [name for name, value in number.items() if math.isnan(value)]
         if blind:
             raise ResultError(
@@ -179,7 +168,7 @@ class TransferFit:
         """
         if not self.succeeded:
             raise ResultError(f"The fit has no result: {self.status}")
-        gain, delay_s = (self.estimates[name].value for name in ("gain", "delay_s"))
+        gain, delay_s = (self.parameters[name].value for name in ("gain", "delay_s"))
         if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
             raise ResultError(
                 "A gain, pole, zero or delay is not identifiable from these records; a model "
@@ -199,13 +188,45 @@ class TransferFit:
         """
         if not self.succeeded:
             raise ResultError(f"The fit has no result: {self.status}")
-        return PlantPosterior.from_dict(covariance_table(self.estimates, self.covariance))
+        return PlantPosterior.from_dict(covariance_table(self.parameters, self.covariance))
 
-    def answer(self) -> dict[str, Any]:
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """See `RecordFit`."""
+        inputs = finite_vector("u", u, 1)
+        rate = self._rate_hz(rate_hz)
+        return self.rational.simulate(inputs, rate, np.arange(inputs.size) / rate)
+
+    def compare(self, records: Record | Sequence[Record]) -> Prediction:
+        """See `RecordFit`; the band is that of the covariance and of the residuals."""
+        return predict(
+            self.rational,
+            several(records),
+            posterior=None if np.isinf(self.covariance).any() else self.posterior,
+            noise_std=float(np.std(np.concatenate(self.residuals))),
+            rng=np.random.default_rng(1),
+        )
+
+    def _modelled(self, record: Record) -> tuple[Floats, Floats]:
+        return record.y, fitted_output(self.rational, record)
+
+    def _rate_hz(self, rate_hz: float | None) -> float:
+        """The rate given, else that of the first record."""
+        if rate_hz is None and not self.records:
+            raise InputError("The fit has no record, so its rate is not known. Give rate_hz.")
+        return self.records[0].input_rate_hz if rate_hz is None else rate_hz
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        if not self.records:
+            raise ResultError(f"The fit has no result: {self.status}")
+        title = f"Transfer function, fit {self.fit_percent:.1f} %"
+        return records_chart(title, self.records, self.residuals, (names or ("", "Output"))[1])
+
+    def answer(self) -> JsonObject:
         """The keys of the public contract."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
         return {
-            **{key: self.estimates.get(key) for key in keys},
+            **{key: self.parameters.get(key) for key in keys},
             "poles": list(self.poles),
             "zeros": list(self.zeros),
             "slow_modes": [{"gain": gain, "time_constant_s": tau} for gain, tau in self.slow_modes],
@@ -215,7 +236,7 @@ class TransferFit:
             "input_correlation_p": self.input_correlation_p,
             "status": self.status,
             "notes": list(self.notes),
-            "covariance": covariance_table(self.estimates, self.covariance),
+            "covariance": covariance_table(self.parameters, self.covariance),
             "rivals": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
                 for r in self.rivals
@@ -224,7 +245,7 @@ class TransferFit:
 
 
 def fit_transfer(
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     structure: TransferStructure | None = None,
     *,
     applied: bool = False,
@@ -236,7 +257,7 @@ def fit_transfer(
     output is predicted exactly at its own times. No first guess is needed.
 
     Args:
-        records: experiments; a chirp and a step together tell fast and slow parts.
+        records: experiments, or one; a chirp and a step together tell fast and slow parts.
         structure: what is fitted. One resonance with a delay when not given.
         applied: whether the inputs are known to have been applied as recorded, by the same clock:
             a clipped or slew-limited input and a drifting clock are no rival explanations then.
@@ -252,12 +273,12 @@ def fit_transfer(
         >>> u, time_s = rng.normal(size=1000), np.arange(4000) / 400.0
         >>> y = Plant(0.5, 5.11, 0.09, 0.012).simulate(u, 100.0, time_s)
         >>> y = y + 0.01 * rng.normal(size=4000)
-        >>> fit = fit_transfer([Record(u, 100.0, y, time_s)])
-        >>> low, high = fit.estimates["natural_frequency_rad_s"].ci95
+        >>> fit = fit_transfer(Record(u, 100.0, y, time_s))
+        >>> low, high = fit.parameters["natural_frequency_rad_s"].ci95
         >>> fit.status, low < 5.11 < high
         ('ok', True)
     """
-    structure = structure or TransferStructure()
+    records, structure = several(records), structure or TransferStructure()
     tones = _too_few_tones(layout_of(structure), records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)
@@ -343,8 +364,6 @@ def _runs_away(record: Record) -> bool:
 
 
 def _check_size(layout: Layout, records: Sequence[Record]) -> None:
-    if not records:
-        raise InputError("records is empty; allowed is one record or more. Give a record.")
     if len(records) > _MOST_RECORDS:
         raise InputError(
             f"records holds {len(records)} experiments; allowed are up to {_MOST_RECORDS}. "
@@ -376,7 +395,7 @@ def _variants(records: Sequence[Record]) -> list[list[Record]]:
 
 
 def _no_result(layout: Layout, reason: str) -> TransferFit:
-    return TransferFit(f"no result: {reason}", layout.structure)
+    return TransferFit(status=f"no result: {reason}", structure=layout.structure)
 
 
 def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
@@ -411,18 +430,18 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
     rivals = rivals_of(layout, problem, residuals, best.others, estimates) if best.others else ()
     doubt = ambiguity(rivals, estimates)
     return TransferFit(
-        doubt or "ok",
-        layout.structure,
-        estimates,
-        covariance,
-        poles_of(layout, numbers, estimates),
-        zeros_of(layout, numbers, found),
-        fit_percent([r.y for r in records], modelled),
-        best.whiteness_p,
-        residuals,
-        (*notes, *_notes(layout.structure, best, estimates)),
-        best,
-        rivals,
+        status=doubt or "ok",
+        structure=layout.structure,
+        parameters=estimates,
+        covariance=covariance,
+        poles=poles_of(layout, numbers, estimates),
+        zeros=zeros_of(layout, numbers, found),
+        fit_percent=fit_percent([r.y for r in records], modelled),
+        residual_whiteness_p=best.whiteness_p,
+        residuals=tuple(residuals),
+        notes=(*notes, *_notes(layout.structure, best, estimates)),
+        best=best,
+        rivals=rivals,
         ambiguous=bool(doubt),
     )
 

@@ -106,8 +106,8 @@ def linear_rivals(linear: TransferFit) -> list[TransferFit]:
         modelled = [y - e for y, e in zip(measured, residuals, strict=True)]
         fits.append(
             TransferFit(
-                "ok",
-                structure,
+                status="ok",
+                structure=structure,
                 fit_percent=fit_percent(measured, modelled),
                 residual_whiteness_p=best.whiteness_p,
                 residuals=residuals,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from haselab.base import Estimate
+from haselab.base import Estimate, JsonObject
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.transfer.layout import Layout, layout_of
 from haselab.identify.transfer.problem import Found, TransferProblem
@@ -69,7 +68,7 @@ def numbers_of(
     return estimates, covariance, notes
 
 
-def covariance_table(estimates: dict[str, Estimate], covariance: Floats) -> dict[str, Any]:
+def covariance_table(estimates: dict[str, Estimate], covariance: Floats) -> JsonObject:
     """The numbers with the covariance that the search had: logarithms where it searched them.
 
     Args:

@@ -17,14 +17,14 @@ from haselab.store.session.layout import ExperimentRecord
 from haselab.store.session.reader import SessionReader
 from haselab.study.fits.observe import gauge_length
 
-__all__ = ["derived_series"]
+__all__ = ["DEFAULT_REQUEST", "derived_series"]
 
 Columns = dict[str, NDArray[Any]]
 _CARRIERS = (("study", "sensing", "carrier_hz"), ("sensing", "carrier_hz"))
 _NAMES = (
     "time_s", "capacitance_f", "capacitance_std_f", "resistance_ohm", "relative_capacitance",
 )  # fmt: skip
-_REQUEST = Request(
+DEFAULT_REQUEST = Request(
     carrier_hz=None, rate_hz=None, block_s=None, method="lockin", skew_s=None, blank_s=None,
     volt_per_monitor_volt=None, ampere_per_monitor_volt=None, reactance_scale=2.5e6,
     capacitance_scale=10.0, calibration=None, amplifier=None, full_scale_v=None,
@@ -57,15 +57,15 @@ def derived_series(reader: SessionReader, experiment: str) -> Mapping[str, Colum
 
 def _capacitance(reader: SessionReader, record: ExperimentRecord) -> Columns:
     blocks, samples, _ = record.codes.shape
-    config = session_config(reader, samples, _REQUEST, Path(record.name))
+    config = session_config(reader, samples, DEFAULT_REQUEST, Path(record.name))
     sensed = Lockin(config).sense(record.codes)
     columns = columns_of(
         sensed,
         time_s=sensed.time_s - config.block_s * np.arange(blocks) + record.block_start_s,
         volt_per_reading=float(reader.stated("rig", "volt_per_code")),
         frequency_hz=config.carrier_hz,
-        reactance_scale=_REQUEST.reactance_scale,
-        capacitance_scale=_REQUEST.capacitance_scale,
+        reactance_scale=DEFAULT_REQUEST.reactance_scale,
+        capacitance_scale=DEFAULT_REQUEST.capacitance_scale,
     )
     return {name: np.asarray(columns[name]) for name in _NAMES} | {"valid": sensed.valid}
 

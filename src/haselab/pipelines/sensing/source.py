@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # Modules for sessions and calibrations are imported where these are opened: importing HDF5 and the
 # rig takes longer than sensing a gigabyte.
 
-__all__ = ["Request", "Source", "open_source", "session_config", "too_short"]
+__all__ = ["Request", "Source", "lockin_config", "open_source", "session_config", "too_short"]
 
 _MOST_SAMPLES = 2_000_000  # of a block
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
@@ -35,7 +35,7 @@ _LAST_CODE = 1.0 - 0.5**11  # of full scale: last code of the coarsest converter
 _MIN_AMPLITUDE_V = 1e-6  # below any converter's step: a channel that is not connected
 _MIN_AMPLITUDE_CODES = 5.0
 _RATE_ROWS = 4096  # number of times that are compared with --rate-hz
-_PART_ROWS = 1 << 20  # 8 MB per column in double precision
+_CHUNK_ROWS = 1 << 20  # 8 MB per column in double precision
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,10 @@ class Source:
     session: SessionColumns | None = None
     in_monitor_volts: bool = False
 
-    def pieces(self) -> Iterator[tuple[NDArray[Any], ...]]:
+    def chunks(self) -> Iterator[tuple[NDArray[Any], ...]]:
         """Yield both columns in parts; all but the last consist of whole blocks."""
-        blocks = max(1, _PART_ROWS // self.config.block_samples)
-        return self.stream.pieces(blocks * self.config.block_samples)
+        blocks = max(1, _CHUNK_ROWS // self.config.block_samples)
+        return self.stream.chunks(blocks * self.config.block_samples)
 
     def block_start_s(self, first: int, count: int) -> NDArray[np.float64]:
         """Time of each block's first sample, shape `(count,)`: the session's clock, or from 0."""
@@ -217,7 +217,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     if charge:
         config: LockinConfig | ChargeConfig = _charge_config(request, rate_hz, block_samples)
     else:
-        config = _lockin_config(request, rate_hz, block_samples)
+        config = lockin_config(request, rate_hz, block_samples)
     unscaled = request.volt_per_monitor_volt is None
     return Source(stream, config, 1.0, in_monitor_volts=unscaled)
 
@@ -273,7 +273,16 @@ def _charge_config(request: Request, rate_hz: float, block_samples: int) -> Char
     )
 
 
-def _lockin_config(request: Request, rate_hz: float, block_samples: int) -> LockinConfig:
+def lockin_config(request: Request, rate_hz: float, block_samples: int) -> LockinConfig:
+    """Settings of the demodulation for monitors in volts, the usual ones where none is given.
+
+    Args:
+        request: with a carrier.
+        rate_hz: samples a second, in Hz.
+        block_samples: samples in a block.
+    Returns:
+        The settings.
+    """
     assert request.carrier_hz is not None
     ohm, ampere = _ohm_per_ratio(request, _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT)
     return LockinConfig(

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import to_plain
+from haselab.base import JsonObject, to_plain
 from haselab.sensing import Sensed, reason_text, relative_capacitance
 
 __all__ = [
@@ -248,7 +248,7 @@ class Summary:
         self._capacitance_f.add(columns["capacitance_f"][valid])
         self._resistance_ohm.add(columns["resistance_ohm"][valid])
 
-    def answer(self, method: str) -> dict[str, Any]:
+    def answer(self, method: str) -> JsonObject:
         """The results that describe the record as a whole."""
         others = sum(self.models.values())
         models = Counter({"plain": self.valid_blocks - others}) + self.models

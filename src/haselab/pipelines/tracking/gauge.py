@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from haselab.base import JsonObject
 from haselab.pipelines.tracking.kept import Kept
 from haselab.pipelines.tracking.points import Points
 from haselab.tracking import GaugeStrain, Tracks, gauge_strain
@@ -34,7 +34,7 @@ def gauge_of(points: Points, rest_px: Floats, kept: Kept) -> GaugeStrain | None:
     return GaugeStrain(full[0], full[1], full[2], found.rest_length_px, *marks)
 
 
-def strain_answer(gauge: GaugeStrain | None, kept: Kept, out: Path) -> dict[str, Any] | None:
+def strain_answer(gauge: GaugeStrain | None, kept: Kept, out: Path) -> JsonObject | None:
     """Summarise the strain for the answer; write that of all frames to a table beside `out`."""
     if gauge is None:
         return None

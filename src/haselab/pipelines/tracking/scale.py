@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.pipelines.tracking.points import Points, read_points
 from haselab.pipelines.tracking.table import Block
 from haselab.store.folder import read_json, write_json
@@ -277,9 +277,7 @@ def make_correction(
     return Correction(lens, fixed, _without_lens(place_px, lens))
 
 
-def describe_scale(
-    lens: Lens | None, fixed: Sequence[str], scale: Estimate | None
-) -> dict[str, Any]:
+def describe_scale(lens: Lens | None, fixed: Sequence[str], scale: Estimate | None) -> JsonObject:
     """Summarise lens, fixed points and scale for the answer."""
     return {
         "scale_mm_per_px": None if scale is None else scale.scaled(1e3, "mm/px"),

@@ -80,9 +80,9 @@ PLAN = FigurePlan(
     "microcontroller's rate and delay, and the microcontroller (chip) in co-simulation. As in "
     "figure 6, a triangle was played before the step, unless the figure comes from 'haselab "
     "firmware simulate --precondition 0': an actuator that was never stretched softens during the "
-    "step and overshoots more (docs/firmware.md). Desktop: true strain of one trial. Chip: mean of "
-    "its trials, measured by the camera, or the true strain of one trial after 'haselab firmware "
-    "simulate'. The ringing is included.",
+    "step and overshoots more (docs/control/firmware.md). Desktop: true strain of one trial. "
+    "Chip: mean of its trials, measured by the camera, or the true strain of one trial after "
+    "'haselab firmware simulate'. The ringing is included.",
     (Panel("", "From the bench to the chip", _loops, wide=True, height_in=3.2),),
     needs="chip",
 )

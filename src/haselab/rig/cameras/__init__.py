@@ -1,1 +1,1 @@
-"""Cameras of a real bench behind `haselab.rig.Camera`: GenICam, V4L2, a folder or a video file."""
+"""Cameras of a real bench as `haselab.rig.Camera`: GenICam, V4L2, a folder or a video file."""

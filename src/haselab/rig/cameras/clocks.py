@@ -1,4 +1,4 @@
-"""The offset between two clocks, where every reading of one comes late by an unknown time."""
+"""Estimate the offset between two clocks if each reading of one is late by an unknown time."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from numpy.typing import NDArray
 
 __all__ = ["ClockOffset", "SlowOffset"]
 
-_PIECE_S = 0.25  # the least late reading of each is kept
-_PIECES = 80  # twenty seconds
-_FEW_PIECES = 4
-_SLOPE_FROM_S = 5.0  # a shorter record gives an offset, no drift
-_MOST_DRIFT = 5e-4  # beyond any crystal: one of the clocks was set
-_FASTEST = 0.1  # seconds of correction in a second
+_SEGMENT_S = 0.25  # the earliest reading of each segment is kept
+_SEGMENTS = 80  # twenty seconds
+_FEW_SEGMENTS = 4
+_SLOPE_FROM_S = 5.0  # a shorter record gives an offset but no drift
+_MOST_DRIFT = 5e-4  # more than any quartz clock drifts: one of the clocks was set
+_FASTEST = 0.1  # seconds of correction per second
 
 
 class ClockOffset:
-    r"""What to add to one clock to get another, from pairs of which the second is late.
+    r"""Offset to add to one clock to get another, from pairs whose second reading is late.
 
-    A block or a frame is seen after it happened, never before: the readings lie above the line
+    A block or a frame is seen after it happened, never before: the readings are above the line
 
     $\mathrm{late} = \mathrm{early} + o + d\,\mathrm{early}$
 
-    of offset $o$ and drift $d$. The line is the one below all readings of the last twenty seconds
-    that is nearest to them: the edge of their lower hull over their mean time. What every reading
-    is late by at least stays in the offset.
+    of offset $o$ and drift $d$. The line is the one closest below all readings of the last twenty
+    seconds: the edge of their lower convex hull at their mean time. The smallest delay, which all
+    readings share, remains in the offset.
 
     Source: S. B. Moon, P. Skelly, D. Towsley, Estimation and removal of clock skew from network
         delay measurements, INFOCOM 1999.
@@ -40,49 +40,49 @@ class ClockOffset:
     """
 
     def __init__(self) -> None:
-        self._early: deque[float] = deque(maxlen=_PIECES)
-        self._over: deque[float] = deque(maxlen=_PIECES)
-        self._late: deque[float] = deque(maxlen=_PIECES)
-        self._piece = 0
+        self._early: deque[float] = deque(maxlen=_SEGMENTS)
+        self._over: deque[float] = deque(maxlen=_SEGMENTS)
+        self._late: deque[float] = deque(maxlen=_SEGMENTS)
+        self._segment = 0
         self._origin_s = 0.0
         self._slope = 0.0
         self._base_s = 0.0
 
     @property
     def known(self) -> bool:
-        """There has been a reading."""
+        """Whether there has been a reading."""
         return bool(self._early)
 
     @property
     def spread_s(self) -> float:
-        """Median of what the least late readings of each piece lie above the line, in s.
+        """Median distance of the earliest reading of each segment from the line, in s.
 
-        In the first second the median of all readings, which is more.
+        In the first second it is the median of all readings, which is larger.
         """
         if not self._early:
             return 0.0
-        if len(self._early) < _FEW_PIECES:
+        if len(self._early) < _FEW_SEGMENTS:
             return float(np.median(self._late))
         over = [o - self.at(e) for e, o in zip(self._early, self._over, strict=True)]
         return float(np.median(over))
 
     def at(self, early_s: float) -> float:
-        """The offset, in s, at a moment of the first clock, in s."""
+        """Offset, in s, at a time of the first clock, in s."""
         return self._base_s + self._slope * (early_s - self._origin_s)
 
     def add(self, early_s: float, late_s: float) -> None:
-        """Take one pair of readings.
+        """Add one pair of readings.
 
         Args:
-            early_s: the moment on the one clock, in s.
-            late_s: when it was seen, on the other clock, in s.
+            early_s: time of the event on the first clock, in s.
+            late_s: time at which it was seen, on the second clock, in s.
         """
         if not self._early:
             self._origin_s = early_s
         over_s = late_s - early_s
-        piece = int((early_s - self._origin_s) // _PIECE_S)
-        if not self._early or piece != self._piece:
-            self._piece = piece
+        segment = int((early_s - self._origin_s) // _SEGMENT_S)
+        if not self._early or segment != self._segment:
+            self._segment = segment
             self._early.append(early_s)
             self._over.append(over_s)
             self._fit()
@@ -100,7 +100,7 @@ class ClockOffset:
 
 
 def _slope_below(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """Slope of the lower hull's edge over the mean of x; 0 where no two crystals differ so."""
+    """Slope of the lower convex hull at the mean of x; 0 if it exceeds any quartz clock's drift."""
     hull: list[tuple[float, float]] = []
     for point in zip(x.tolist(), y.tolist(), strict=True):
         while len(hull) > 1 and not _turns_up(hull[-2], hull[-1], point):
@@ -118,7 +118,7 @@ def _turns_up(a: tuple[float, float], b: tuple[float, float], c: tuple[float, fl
 
 
 class SlowOffset:
-    """An offset that changes by a tenth of the time that passes at most: what it is added to rises.
+    """An offset that changes by at most a tenth of the elapsed time, so that the sum rises.
 
     Example:
         >>> slow = SlowOffset()
@@ -131,11 +131,11 @@ class SlowOffset:
         self._offset_s = 0.0
 
     def step(self, at_s: float, wanted_s: float) -> float:
-        """The offset of the next moment.
+        """Return the offset at the next time.
 
         Args:
-            at_s: the moment, later than the last one, in s.
-            wanted_s: the best offset known, in s.
+            at_s: the time, later than the last one, in s.
+            wanted_s: the best known offset, in s.
         Returns:
             The offset to use, in s.
         """

@@ -13,13 +13,13 @@ __all__ = ["AravisConfig", "FolderConfig", "TwinCameraConfig", "V4l2Config"]
 
 
 class _Stamped(CameraConfig):
-    """A camera with a clock of its own."""
+    """A camera with its own clock."""
 
     stamps: Literal["camera", "arrival"] = Field(
-        "camera", description="whose clock times the frames; arrival: the camera's is no use"
+        "camera", description="clock that times the frames; arrival: ignore the camera's clock"
     )
     tick_hz: float | None = Field(
-        None, gt=0, le=1e12, description="of the camera's time stamps; left out: nanoseconds"
+        None, gt=0, le=1e12, description="of the camera's time stamps; omit: nanoseconds"
     )
 
 
@@ -29,10 +29,10 @@ class TwinCameraConfig(_Stamped):
     kind: Literal["twin"]
     address: str = Field(min_length=1, description="host:port of the twin")
     timed: bool = Field(
-        False, description="frames come late and are timed as those of a real camera are"
+        False, description="frames arrive late and are timed like those of a real camera"
     )
     exposure_s: float | None = Field(
-        None, gt=0, le=10, description="with timed; left out: as in the twin's own file"
+        None, gt=0, le=10, description="only with timed; omit: as in the twin's file"
     )
 
     @property
@@ -42,19 +42,19 @@ class TwinCameraConfig(_Stamped):
 
 
 class _Streamed(CameraConfig):
-    """What a camera that keeps its own time needs."""
+    """Settings of a camera whose frames the computer times."""
 
-    width_px: int | None = Field(None, ge=16, le=65536, description="left out: as the camera is")
+    width_px: int | None = Field(None, ge=16, le=65536, description="omit: unchanged")
     height_px: int | None = Field(None, ge=16, le=65536)
-    timeout_s: float = Field(2.0, gt=0, le=60, description="without a frame: the camera stalls")
-    buffer_s: float = Field(2.0, gt=0, le=20, description="frames kept for a program that is late")
+    timeout_s: float = Field(2.0, gt=0, le=60, description="longest time without a frame")
+    buffer_s: float = Field(2.0, gt=0, le=20, description="duration of the buffered frames")
     latency_s: float | None = Field(
         None,
         ge=0,
         le=1,
-        description="from the end of an exposure (v4l2: its middle) to arrival; None: not measured",
+        description="from the end of an exposure (v4l2: its middle) to arrival; omit: not measured",
     )
-    most_dropped: float = Field(0.1, ge=0, le=1, description="share of lost frames that is allowed")
+    most_dropped: float = Field(0.1, ge=0, le=1, description="largest fraction of lost frames")
 
     @property
     def is_timed_by_exposures(self) -> bool:
@@ -63,47 +63,50 @@ class _Streamed(CameraConfig):
 
     @property
     def timing(self) -> Timing:
-        """What is known of its frames' times."""
+        """Timing settings of its frames."""
         return Timing(self.timeout_s, self.latency_s, self.buffer_s, self.most_dropped)
 
 
 class AravisConfig(_Streamed, _Stamped):
-    """GenICam over GigE Vision or USB3 Vision, through the library Aravis."""
+    """GenICam camera over GigE Vision or USB3 Vision, through the library Aravis."""
 
     sets_exposure: ClassVar[bool] = True
     kind: Literal["aravis"]
     name: str | None = Field(
-        None, min_length=1, description="as arv-tool prints it; None: the first"
+        None, min_length=1, description="as arv-tool-0.8 prints it; omit: the first one"
     )
     serial_number: str | None = Field(None, description="another camera is refused")
-    x_px: int = Field(0, ge=0, description="where the picture begins on the sensor")
+    x_px: int = Field(0, ge=0, description="first column of the image on the sensor")
     y_px: int = Field(0, ge=0)
-    exposure_s: float | None = Field(None, gt=0, le=10, description="left out: as the camera is")
+    exposure_s: float | None = Field(None, gt=0, le=10, description="omit: unchanged")
     gain: float | None = Field(None, description="in the camera's own unit")
-    trigger: str | None = Field(None, description="input that starts each exposure, as Line1")
+    trigger: str | None = Field(None, description="input that starts each exposure, such as Line1")
     packet_bytes: int | None = Field(
-        None, ge=576, le=16384, description="GigE Vision; left out: the largest that gets through"
+        None,
+        ge=576,
+        le=16384,
+        description="GigE Vision; omit: the largest that the network accepts",
     )
 
 
 class V4l2Config(_Streamed):
-    """A webcam or another camera of Linux's V4L2, through FFmpeg."""
+    """A webcam or another V4L2 camera on Linux, through FFmpeg."""
 
     kind: Literal["v4l2"]
     device: str = Field("/dev/video0", min_length=1)
-    name: str | None = Field(None, description="what the driver calls it; another one is refused")
+    name: str | None = Field(None, description="the driver's name; another camera is refused")
     format: Literal["gray", "yuyv422", "uyvy422", "nv12", "yuv420p", "mjpeg"] = "yuyv422"
 
     @model_validator(mode="after")
     def _size(self) -> Self:
         if (self.width_px is None) != (self.height_px is None):
-            raise ValueError("width_px and height_px belong together")
+            raise ValueError("set both width_px and height_px, or neither")
         return self
 
 
 class FolderConfig(CameraConfig):
-    """A folder of images, or a video file, as a camera: its frames come with the blocks."""
+    """A folder of images or a video file as a camera; its frames follow the blocks' time."""
 
     kind: Literal["folder"]
     path: str = Field(min_length=1, description="of the folder or the file")
-    repeat: bool = Field(False, description="begin again after the last frame")
+    repeat: bool = Field(False, description="start again after the last frame")

@@ -1,4 +1,4 @@
-"""What frames take of a network link: bytes on the wire against what it carries."""
+"""Compute the load of a network link by camera frames."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 __all__ = ["GVSP_HEADERS", "LinkLoad"]
 
-GVSP_HEADERS = 36  # bytes of a packet that are no picture: IP 20, UDP 8, GVSP 8
+GVSP_HEADERS = 36  # header bytes of a packet: IP 20, UDP 8, GVSP 8
 _ETHERNET = 38  # bytes around a packet: preamble 8, header 14, checksum 4, gap 12
 
 
@@ -32,12 +32,12 @@ class LinkLoad:
 
     @property
     def byte_s(self) -> float:
-        """Bytes of pictures a second."""
+        """Image data per second, in bytes."""
         return self.payload_bytes * self.rate_hz
 
     @property
     def share(self) -> float:
-        """What the frames take of the link, headers and gaps included; above 1: they do not fit."""
+        """Load of the link, with headers and gaps; above 1 the frames do not fit."""
         whole = self.packet_bytes + _ETHERNET
         return 8.0 * self.byte_s * whole / (self.packet_bytes - GVSP_HEADERS) / self.link_bit_s
 

@@ -1,4 +1,4 @@
-"""A folder of images, or a video file, as a camera: its frames come with the blocks."""
+"""A folder of images or a video file as a camera; its frames follow the blocks' time."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from haselab.store.video.opening import open_video
 __all__ = ["FolderCamera", "FolderInstrument"]
 
 _FASTEST_HZ = 1e6
-_RATE_SHARE = 0.01  # by which a video's own rate may differ from the one asked for
+_RATE_SHARE = 0.01  # largest relative difference of a video's own rate from the requested one
 
 
 class FolderCamera:
-    """Plays pictures from the disk: fulfils `haselab.rig.Camera`.
+    """Plays images from the disk; implements `haselab.rig.Camera`.
 
     Frame `k` of a recording is exposed `k` periods after the start, on the acquisition's clock; it
-    is given out when that time has passed. Each start begins with the first frame.
+    is returned when that time has passed. Each start begins with the first frame.
 
     Args:
         config: section `camera` of the rig file.
         clock: the acquisition's.
     Raises:
-        InputError: no such folder or file, none of 8 bit, or it cannot be read.
+        InputError: The folder or file does not exist, cannot be read, or has no 8-bit images.
     """
 
     def __init__(self, config: FolderConfig, clock: BlockClock) -> None:
@@ -46,10 +46,10 @@ class FolderCamera:
         try:
             first = next(iter(self._reader), None)
             if first is None or first.dtype != np.uint8:
-                what = "no frame" if first is None else "frames of 16 bit"
+                what = "no frames" if first is None else "16-bit frames"
                 raise InputError(
-                    f"The recording has {what}, allowed for a camera are frames of 8 bit. Name "
-                    f"another in camera.path. {self._path}"
+                    f"The recording has {what}, but a camera needs 8-bit frames. Set camera.path "
+                    f"to another recording. {self._path}"
                 )
         except BaseException:
             self._reader.close()
@@ -64,30 +64,30 @@ class FolderCamera:
 
     @property
     def dropped(self) -> int:
-        """Frames that are lost: none."""
+        """Number of lost frames: none."""
         return 0
 
     @property
     def uncertainty_s(self) -> float:
-        """Frames are where they are said to be."""
+        """Uncertainty of a frame's time: none."""
         return 0.0
 
     def start(self, rate_hz: float) -> None:
         """See `haselab.rig.Camera`.
 
         Raises:
-            LimitError: no such rate, or another one than the recording's own.
+            LimitError: The rate is outside the limits, or not the recording's own.
         """
         if not 0.0 < rate_hz <= _FASTEST_HZ:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside (0, {_FASTEST_HZ:g}] Hz. Lower the "
-                f"request. {self._path}"
+                f"The frame rate is {rate_hz:g} Hz, but it must be above 0 and at most "
+                f"{_FASTEST_HZ:g} Hz. Change the frame rate. {self._path}"
             )
         own_hz = self._reader.rate_hz
         if own_hz is not None and abs(rate_hz / own_hz - 1.0) > _RATE_SHARE:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside what the recording has: {own_hz:g} Hz. "
-                f"Ask for that. {self._path}"
+                f"The frame rate is {rate_hz:g} Hz, but the recording has {own_hz:g} Hz. Request "
+                f"that rate. {self._path}"
             )
         with self._lock:
             self.stop()
@@ -105,8 +105,8 @@ class FolderCamera:
         """See `haselab.rig.Camera`.
 
         Raises:
-            DeviceError: the recording is over.
-            InputError: a frame cannot be read.
+            DeviceError: The recording has ended.
+            InputError: A frame cannot be read.
         """
         with self._lock:
             return None if self._frames is None else self._due(self._frames)
@@ -121,7 +121,7 @@ class FolderCamera:
         images = [image for _, image in zip(range(time_s.size), frames, strict=False)]
         if not images:
             raise DeviceError(
-                f"The recording is over after {self._given} frames. Play less, or set "
+                f"The recording ended after {self._given} frames. Play less, or set "
                 f"camera.repeat = true. {self._path}"
             )
         self._given += len(images)

@@ -1,4 +1,4 @@
-"""The rate at which frames really come, from their time stamps."""
+"""Measure the actual frame rate from time stamps."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 
 __all__ = ["FrameRateMeter"]
 
-_WINDOW = 129  # times kept: 128 intervals
-_FEW = 32  # intervals before a rate means something
+_WINDOW = 129  # number of times kept: 128 intervals
+_FEW = 32  # intervals needed for a meaningful rate
 
 
 class FrameRateMeter:
     r"""Measures a frame rate from times; lost frames do not lower it.
 
-    The median interval $m$ says how many periods lie between two neighbours, and the rate is all
-    periods over all time, $\sum_k \mathrm{round}(\Delta t_k / m) / \sum_k \Delta t_k$: half of the
-    frames may be missing, and the scatter of the times counts at the two ends only.
+    The median interval $m$ gives the number of periods between two frames, and the rate is all
+    periods divided by the total time, $\sum_k \mathrm{round}(\Delta t_k / m) / \sum_k \Delta t_k$.
+    Half of the frames may be missing, and the scatter of the times matters only at the two ends.
 
     Example:
         >>> meter = FrameRateMeter()
@@ -37,12 +37,12 @@ class FrameRateMeter:
 
     @property
     def known(self) -> bool:
-        """Enough frames have come."""
+        """Whether enough frames have arrived."""
         return len(self._times_s) > _FEW
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second of the last 128; 0 before there are enough."""
+        """Frames per second over the last 128 frames; 0 before there are enough."""
         if not self.known:
             return 0.0
         steps_s = np.diff(np.array(self._times_s))
@@ -53,7 +53,7 @@ class FrameRateMeter:
 
     @property
     def scatter_s(self) -> float:
-        """Median deviation of the intervals from their median, in s; 0 before there are enough."""
+        """Median absolute deviation of the intervals, in s; 0 before there are enough."""
         if not self.known:
             return 0.0
         steps_s = np.diff(np.array(self._times_s))

@@ -1,4 +1,4 @@
-"""A camera of a rig file, opened, with what is known of its frames."""
+"""An opened camera with the properties of its frames."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ __all__ = ["OpenedCamera", "opened_timed"]
 
 @dataclass(frozen=True)
 class OpenedCamera:
-    """A camera with what belongs to it.
+    """An opened camera and functions that report on its frames.
 
     Args:
         camera: takes the frames.
-        identity: what it reports to be.
-        close: lets go of it; never raises.
-        dropped: frames lost since the last start.
-        uncertainty_s: half width of what a frame's time is known to, in s.
-        remarks: what may go wrong with the frames, one line each.
-        lag_s: from an exposure's middle to its frame's estimated one, in s; NaN: not known.
-        rate_hz: frames a second as measured; 0: not known.
+        identity: its own identification.
+        close: closes it; never raises.
+        dropped: number of frames lost since the last start.
+        uncertainty_s: uncertainty of a frame's time (half width), in s.
+        remarks: possible problems with the frames, one line each.
+        lag_s: delay from an exposure's middle to its estimate from the frame, in s; NaN: unknown.
+        rate_hz: measured frames per second; 0: unknown.
     """
 
     camera: Camera
@@ -38,7 +38,7 @@ class OpenedCamera:
 
 
 def opened_timed(timed: TimedCamera) -> OpenedCamera:
-    """A camera that is timed by the computer, as `OpenedCamera`.
+    """Wrap a camera that the computer times as an `OpenedCamera`.
 
     Args:
         timed: around the driver.

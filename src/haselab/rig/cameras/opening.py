@@ -1,4 +1,4 @@
-"""The camera of a rig file, opened by its driver."""
+"""Open the camera of a rig file."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def open_camera(
     Args:
         config: section `camera` of the rig file.
         clock: the acquisition's.
-        exposures: where its exposure signal is recorded; None: it is not.
+        exposures: log of its exposure signal; None if that is not recorded.
         line: settings of that signal in the rig file.
     Returns:
         The camera.
     Raises:
-        DeviceError: the camera or its driver is missing.
-        InputError: another camera than the rig file names, or no such recording.
-        LimitError: a setting beyond what the camera can do.
+        DeviceError: The camera or its driver is missing.
+        InputError: The camera is not the one that the rig file names, or the recording is missing.
+        LimitError: A setting is outside the camera's limits.
     """
     with reported_faults(config):
         return camera_of(config).open(config, CameraContext(clock, exposures, line))

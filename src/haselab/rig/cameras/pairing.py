@@ -1,4 +1,4 @@
-"""Which exposure is which frame: an exposure signal's times for frames that the computer timed."""
+"""Assign recorded exposures to frames that the computer timed."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ __all__ = [
     "starts_with_edge",
 ]
 
-_EARLY_SHARE = 0.25  # of a period, by which a frame may seem to come before its exposure
-_FOLLOW = 0.1  # share of a deviation by which the lag follows
+_EARLY_SHARE = 0.25  # fraction of a period by which a frame may seem to precede its exposure
+_FOLLOW = 0.1  # fraction of a deviation by which the lag is updated
 
 
 class ExposureLog:
-    """The exposures that the acquisition has seen: the acquisition adds them, a camera reads them.
+    """Exposures that the acquisition has recorded, for a camera to read.
 
     Args:
-        uncertainty_s: half width of what the middle of an exposure is known to, in s.
+        uncertainty_s: uncertainty of the middle of an exposure (half width), in s.
     """
 
     def __init__(self, uncertainty_s: float) -> None:
@@ -38,23 +38,23 @@ class ExposureLog:
         """Add exposures.
 
         Args:
-            middle_s: of each, on the acquisition's clock, rising. Shape `(exposures,)`.
-            settled_s: before this time no other one will be added, in s.
+            middle_s: their middles on the acquisition's clock, rising. Shape `(exposures,)`.
+            settled_s: time before which no further exposure will be added, in s.
         """
         self.middle_s.extend(middle_s.tolist())
         self.settled_s = settled_s
 
     def forget(self) -> None:
-        """Exposures from now on alone: the camera starts."""
+        """Discard earlier exposures, because the camera starts."""
         self.middle_s.clear()
 
 
 class FramePairing:
-    """Gives each frame the exposure that it is of.
+    """Assigns each frame its exposure.
 
-    The first frame is of the last exposure before it: a camera that keeps up holds back less
-    than a period. From then on a frame is of the exposure nearest to its own time less that lag; an
-    exposure that is passed over is a frame that is lost.
+    The first frame belongs to the last exposure before it: a camera that keeps up delays frames by
+    less than a period. From then on a frame belongs to the exposure nearest to its own time minus
+    that lag; a skipped exposure is a lost frame.
 
     Args:
         log: of the exposures.
@@ -71,18 +71,18 @@ class FramePairing:
 
     @property
     def lag_s(self) -> float:
-        """Mean time from an exposure's middle to its frame's estimated one, in s; NaN: none yet."""
+        """Mean delay from an exposure's middle to its estimate from the frame, in s; or NaN."""
         return math.nan if self._lag_s is None else self._lag_s
 
     def match(self, frame_s: float) -> float | None:
-        """The middle of a frame's exposure.
+        """Return the middle of a frame's exposure.
 
         Args:
-            frame_s: when the frame was taken by the computer's clock, in s; rising.
+            frame_s: time of the frame by the computer's clock, in s; rising.
         Returns:
-            The time in s, or None: the exposure may not have been seen yet.
+            The time in s, or None if the exposure may not have been recorded yet.
         Raises:
-            DeviceError: a frame without an exposure.
+            DeviceError: A frame has no exposure.
         """
         if self._lag_s is None:
             low_s, high_s = frame_s - (1.0 - _EARLY_SHARE) * self._period_s, frame_s
@@ -118,11 +118,11 @@ class FramePairing:
 
 @dataclass(frozen=True)
 class ExposureTrial:
-    """Frames with one exposure time, for `starts_with_edge`.
+    """A measurement with one exposure time, for `starts_with_edge`.
 
     Args:
-        exposure_s: of the camera and of section `exposure`, in s.
-        lag_s: from the exposures' middles to the frames' estimated ones, in s.
+        exposure_s: exposure time of the camera and of section `exposure`, in s.
+        lag_s: delay from the exposures' middles to their estimates from the frames, in s.
     """
 
     exposure_s: float
@@ -134,10 +134,10 @@ def starts_with_edge(
 ) -> bool | None:
     r"""Whether the recorded edge begins an exposure, from two exposure times.
 
-    A frame comes a fixed time after its exposure is over. With the beginning recorded the lag
-    $\lambda$ does not depend on the exposure time $e$; with the end recorded each exposure is
-    taken to be $e$ later than it was, so $\lambda_2 - \lambda_1 = -(e_2 - e_1)$. What delays
-    blocks and frames alike drops out of the difference.
+    A frame arrives a fixed time after the end of its exposure. If the beginning is recorded, the
+    lag $\lambda$ does not depend on the exposure time $e$; if the end is recorded, each exposure
+    seems to be $e$ later than it was, so $\lambda_2 - \lambda_1 = -(e_2 - e_1)$. A delay common to
+    blocks and frames cancels in the difference.
 
     Args:
         short: frames with a short exposure.

@@ -1,4 +1,4 @@
-"""What a camera's driver gives: pictures on the computer's clock."""
+"""Protocols of a camera driver, whose images are timed on the computer's clock."""
 
 from __future__ import annotations
 
@@ -21,19 +21,18 @@ __all__ = [
 ]
 
 BlockClock = Callable[[], tuple[float, float]]
-"""End of the acquisition's last block on its own clock, and when it was seen on `time.monotonic`'s;
-both in s."""
+"""End of the acquisition's last block on its own clock, and when it was seen on the clock of
+`time.monotonic`; both in s."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture.
+    """One image.
 
     Args:
-        image: grey levels, shape `(height, width)`; belongs to the taker.
-        host_s: middle of the exposure as far as the driver knows it, on `time.monotonic`'s clock.
-        steady_s: its time on the steadiest clock that there is, to measure the frame rate by; NaN:
-            `host_s` is that.
+        image: grey levels, shape `(height, width)`; owned by the caller.
+        host_s: middle of the exposure as the driver estimates it, on `time.monotonic`'s clock.
+        steady_s: its time on the steadiest available clock, for the frame rate; NaN: `host_s`.
     """
 
     image: NDArray[np.uint8]
@@ -43,12 +42,12 @@ class Shot:
 
 @dataclass(frozen=True)
 class ExposureLine:
-    """The camera's output that says when it exposes.
+    """The camera's output line that signals its exposures.
 
     Args:
-        duration_s: of an exposure, as the acquisition takes it for granted.
+        duration_s: duration of an exposure that the acquisition assumes.
         line: its name in the camera; None: it was set by hand.
-        inverted: None: as the camera is.
+        inverted: LineInverter; None: unchanged.
     """
 
     duration_s: float
@@ -58,77 +57,77 @@ class ExposureLine:
 
 @runtime_checkable
 class KnownCamera(Protocol):
-    """A camera that says what it is, what it lost, and how well it knows the time."""
+    """A camera that reports its identity, its lost frames and its timing uncertainty."""
 
     @property
     def identity(self) -> str:
-        """What it says it is; empty where there is none."""
+        """Identification of the camera; empty if there is none."""
 
     @property
     def dropped(self) -> int:
-        """Frames that are lost, since the last start."""
+        """Number of frames lost since the last start."""
 
     @property
     def uncertainty_s(self) -> float:
-        """Half width of what a frame's time is known to, in s."""
+        """Uncertainty of a frame's time (half width), in s."""
 
 
 @runtime_checkable
 class RemarkingCamera(Protocol):
-    """A camera that says what may go wrong with its frames."""
+    """A camera that reports possible problems with its frames."""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """One line each: what was found since the last start, and what to do."""
+        """Problems found since the last start and what to do, one line each."""
 
 
 @runtime_checkable
 class KnowsCauses(Protocol):
-    """A driver that knows why frames are late or lost."""
+    """A driver that can explain late or lost frames."""
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """See `RemarkingCamera`."""
 
     def why_slow(self, rate_hz: float) -> str:
-        """What to change so that frames come at this rate, in sentences."""
+        """What to change to reach this frame rate, in sentences."""
 
     def why_lost(self) -> str:
-        """Where frames were lost and what to change, in sentences; empty: it does not know."""
+        """Where frames were lost and what to change, in sentences; empty: unknown."""
 
 
 class FrameSource(Protocol):
-    """A driver. One thread at a time calls it."""
+    """A camera driver. Only one thread calls it at a time."""
 
     @property
     def identity(self) -> str:
-        """What the camera says it is."""
+        """Identification of the camera."""
 
     @property
     def dropped(self) -> int:
-        """Pictures that were taken and are lost, since the last start."""
+        """Number of images that were taken but lost, since the last start."""
 
     @property
     def jitter_s(self) -> float:
-        """By how much `Shot.host_s` varies from one picture to another, in s."""
+        """Scatter of `Shot.host_s` from image to image, in s."""
 
     def start(self, rate_hz: float) -> None:
-        """Take pictures from now on.
+        """Start taking images.
 
         Raises:
-            LimitError: no such rate.
-            DeviceError: the camera does not start.
+            LimitError: The camera does not have this rate.
+            DeviceError: The camera does not start.
         """
 
     def take(self) -> list[Shot]:
-        """The pictures that have come in since the last call; does not wait.
+        """Return the images that have arrived since the last call, without waiting.
 
         Raises:
-            DeviceError: the camera is gone.
+            DeviceError: The camera no longer responds.
         """
 
     def stop(self) -> None:
-        """Take no more pictures. Never raises."""
+        """Stop taking images. Never raises."""
 
     def close(self) -> None:
-        """Let go of the camera. Never raises."""
+        """Close the camera. Never raises."""

@@ -1,4 +1,4 @@
-"""A frame's time on the computer's clock, from the camera's own time stamp and its arrival."""
+"""Estimate a frame's time on the computer's clock from its time stamp and its arrival."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from haselab.rig.cameras.frame_rate import FrameRateMeter
 __all__ = ["StampedClock"]
 
 _NANOSECONDS_HZ = 1e9
-_FEW, _MANY = 8, 64  # frames by which the stamps' speed is judged
-_SURE_S = 0.5  # of frames before stamps are called wrong
-_REGULAR = 0.2  # scatter of the arrivals' intervals, as a share, with which it can be
-_SAME_CLOCK = (0.8, 1.25)  # ratio of the intervals that no jitter of arrivals leaves
+_FEW, _MANY = 8, 64  # frames from which the rate of the stamps is determined
+_SURE_S = 0.5  # duration of frames before stamps are rejected
+_REGULAR = 0.2  # largest relative scatter of the arrival intervals for that
+_SAME_CLOCK = (0.8, 1.25)  # ratio of the intervals that jitter of the arrivals cannot exceed
 
 
 class StampedClock:
     """Times of frames on `time.monotonic`'s clock.
 
-    The camera's stamps take the scatter out of the arrivals. What they must do is checked: go on,
-    and go as fast as the computer's clock. Stamps of 0, or equal to the arrivals, mean that the
-    camera has no clock; the arrivals then count by themselves.
+    The camera's stamps remove the scatter of the arrival times. The stamps are checked: they must
+    rise, at the rate of the computer's clock. Stamps that are 0 or equal to the arrivals mean that
+    the camera has no clock; then only the arrivals are used.
 
     Args:
         tick_hz: of the stamps' clock; None: they are nanoseconds.
-        use_stamps: False: arrivals alone.
+        use_stamps: False: use only the arrivals.
     """
 
     def __init__(self, tick_hz: float | None = None, *, use_stamps: bool = True) -> None:
@@ -50,21 +50,21 @@ class StampedClock:
 
     @property
     def has_no_clock(self) -> bool:
-        """Frames have come, and none had a time stamp of the camera."""
+        """Whether frames have arrived without a time stamp of the camera."""
         return self._use_stamps and self._arrivals.known and not self.stamped
 
     def host_s(self, ticks: int, arrived_s: float, *, same: bool = False) -> tuple[float, float]:
-        """One frame.
+        """Compute the time of one frame.
 
         Args:
             ticks: of its stamp.
-            arrived_s: when its first packet came, in s.
-            same: the stamp is the time of arrival itself.
+            arrived_s: arrival of its first packet, in s.
+            same: whether the stamp is the arrival time itself.
         Returns:
-            When it came on the computer's clock with the scatter taken out, and the time on the
-            steadier of both clocks, to measure a rate by; in s.
+            Its arrival on the computer's clock with the scatter removed, and its time on the
+            steadier of both clocks, to measure a rate; in s.
         Raises:
-            DeviceError: stamps that do not go on, or that are not what the rig file says.
+            DeviceError: The stamps do not rise, or do not fit the rig file.
         """
         self._arrivals.add(arrived_s)
         if ticks <= 0 or same or not self._use_stamps:
@@ -72,8 +72,8 @@ class StampedClock:
         stamp_s = ticks / self._tick_hz
         if self._last_s is not None and stamp_s <= self._last_s:
             raise DeviceError(
-                f"its time stamps do not go on: {stamp_s:g} s comes after {self._last_s:g} s. "
-                'Start the camera anew, or set camera.stamps = "arrival" to use its frames\' '
+                f"its time stamps do not rise: {stamp_s:g} s follows {self._last_s:g} s. Restart "
+                'the camera, or set camera.stamps = "arrival" to use its frames\' '
                 "arrival."
             )
         if not self.stamped:
@@ -83,7 +83,7 @@ class StampedClock:
         self._arrival.add(stamp_s, arrived_s)
         wanted_s = self._arrival.at(stamp_s)
         if not self._trusted:
-            # The arrivals count until the stamps are known to be seconds; from there on smoothly.
+            # Use the arrivals until the stamps are known to be seconds, then change over smoothly.
             wanted_s = arrived_s - stamp_s
             self._trusted = self._keeps_time()
             if not self._trusted:
@@ -92,15 +92,15 @@ class StampedClock:
         return stamp_s + self._slow.step(stamp_s, wanted_s), stamp_s + self._base_s
 
     def _keeps_time(self) -> bool:
-        """Whether the stamps are seconds, by the medians of the intervals.
+        """Check that the stamps are seconds, by the medians of the intervals.
 
-        Lost frames change no median. Frames that come all at once after a stall of the computer do,
-        but not the time from the first frame on in the same measure.
+        Lost frames do not change the medians. Frames that arrive together after a stall of the
+        computer do, but they do not change the total time in the same ratio.
 
         Returns:
-            False: it cannot be said yet.
+            False if it is not known yet.
         Raises:
-            DeviceError: they are not.
+            DeviceError: They are not.
         """
         if len(self._pairs) < _FEW:
             return False
@@ -117,7 +117,7 @@ class StampedClock:
         whole = (last_s - first_s) / (went_s - came_s)
         if _SAME_CLOCK[0] < whole / ratio < _SAME_CLOCK[1]:
             raise DeviceError(
-                f"its time stamps go at {ratio:.3g} of the computer's clock, so they are ticks of "
+                f"its time stamps run at {ratio:.3g} of the computer's clock, so they are ticks of "
                 f"about {self._tick_hz * ratio:.4g} Hz. Set camera.tick_hz to that "
                 "(GevTimestampTickFrequency, or the camera's manual, has the exact number), or "
                 'camera.stamps = "arrival".'

@@ -1,4 +1,4 @@
-"""A driver's pictures on the acquisition's clock."""
+"""Time a driver's images on the acquisition's clock."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from haselab.rig.cameras.source import BlockClock, FrameSource, KnowsCauses, Sho
 
 __all__ = ["TimedCamera", "Timing"]
 
-_HANG_S = 5.0  # that another thread may be in the driver
-_RATE_SHARE = 0.06  # by which the measured frame rate may differ from the requested one
-_FEW = 50  # frames before a share of lost ones means something
+_HANG_S = 5.0  # longest wait for another thread in the driver
+_RATE_SHARE = 0.06  # largest relative difference of measured and requested frame rate
+_FEW = 50  # frames needed for a meaningful fraction of lost ones
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What is known, and what is asked, of a camera's time.
+    """Timing settings of a camera.
 
     Args:
-        timeout_s: without a frame, after which the camera is said to stall.
-        latency_s: from `Shot.host_s` as it should be to what it is; None where nobody measured.
+        timeout_s: longest time without a frame.
+        latency_s: error of `Shot.host_s`; None if it was not measured.
         buffer_s: how long frames may wait for the block that they belong to.
-        most_dropped: share of lost frames beyond which `take` raises.
+        most_dropped: fraction of lost frames above which `take` raises.
     """
 
     timeout_s: float = 2.0
@@ -43,18 +43,18 @@ class Timing:
 
 
 class TimedCamera:
-    """A camera whose frames are timed by the computer: fulfils `haselab.rig.Camera`.
+    """A camera whose frames the computer times; implements `haselab.rig.Camera`.
 
-    A block is seen when it is over, a frame when it has arrived; of both the least late ones give
-    the offset of the clocks. Frames are returned when the block of their time has been read. Any
-    thread may call it.
+    A block is seen when it has ended, a frame when it has arrived; the ones with the least delay
+    give the offset of the clocks. Frames are returned when the block of their time has been read.
+    Any thread may call it.
 
     Args:
         source: the driver.
         clock: the acquisition's.
-        timing: what is known of the camera.
+        timing: timing settings of the camera.
         now: the clock of `Shot.host_s`.
-        exposures: where the camera's exposure signal is recorded; its times then count.
+        exposures: log of the camera's exposure signal; if given, it times the frames.
     """
 
     def __init__(
@@ -72,32 +72,32 @@ class TimedCamera:
         self._exposures = exposures
         self._pairing: FramePairing | None = None
         self._lock = threading.RLock()
-        self._host = ClockOffset()  # computer over acquisition
+        self._host = ClockOffset()  # from acquisition to computer
         self._slow = SlowOffset()
         self._waiting: deque[Shot] = deque()
         self._rate_hz = 0.0  # 0: stopped
         self._period_s = 0.0  # at the last start
-        self._block_s = -np.inf  # the last end of a block that was seen
-        self._last_s = 0.0  # of the last frame on the acquisition's clock
-        self._silent_s = 0.0  # asked for without a frame
-        self._asked_s = 0.0  # when that was last
+        self._block_s = -np.inf  # end of the last block that was seen
+        self._last_s = 0.0  # time of the last frame on the acquisition's clock
+        self._silent_s = 0.0  # time in which frames were requested but none arrived
+        self._asked_s = 0.0  # time of the last request
         self._count = 0
         self._meter = FrameRateMeter()
 
     @property
     def identity(self) -> str:
-        """What the camera says it is."""
+        """Identification of the camera."""
         return self._source.identity
 
     @property
     def dropped(self) -> int:
-        """Frames that are lost, since the last start."""
+        """Number of frames lost since the last start."""
         with self._lock:
             return max(self._source.dropped, self._pairing.lost if self._pairing else 0)
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second, measured by the camera's own clock; 0 before enough have come."""
+        """Frames per second, measured by the camera's own clock; 0 before enough have arrived."""
         with self._lock:
             return self._meter.rate_hz
 
@@ -109,20 +109,20 @@ class TimedCamera:
 
     @property
     def lag_s(self) -> float:
-        """Time from an exposure's middle, by its line, to the frame's estimated one, in s.
+        """Delay from an exposure's recorded middle to its estimate from the frame, in s.
 
-        NaN: no exposure line, or no frame yet. See `starts_with_edge`.
+        NaN without an exposure line, or before the first frame. See `starts_with_edge`.
         """
         with self._lock:
             return math.nan if self._pairing is None else self._pairing.lag_s
 
     @property
     def uncertainty_s(self) -> float:
-        """Half width of what a frame's time is known to, in s.
+        """Uncertainty of a frame's time (half width), in s.
 
-        With an exposure signal that of its edges. Without, the scatter of both clocks' readings;
-        and where the latency was not measured one period of the frames, since a camera that keeps
-        up holds no more than one back.
+        With an exposure signal it is that of its edges. Otherwise it is the scatter of both clocks'
+        readings, plus one frame period if the latency was not measured, since a camera that keeps
+        up delays frames by less than that.
         """
         if self._exposures is not None:
             return self._exposures.uncertainty_s
@@ -133,8 +133,8 @@ class TimedCamera:
         """See `haselab.rig.Camera`.
 
         Raises:
-            LimitError: no such rate.
-            DeviceError: the camera does not start.
+            LimitError: The camera does not have this rate.
+            DeviceError: The camera does not start.
         """
         with self._lock:
             self.stop()
@@ -150,7 +150,7 @@ class TimedCamera:
             self._meter = FrameRateMeter()
 
     def stop(self) -> None:
-        """See `haselab.rig.Camera`. Never raises; a driver that hangs elsewhere is left alone."""
+        """See `haselab.rig.Camera`. Never raises; a driver that hangs is not stopped."""
         if self._lock.acquire(timeout=_HANG_S):
             try:
                 self._rate_hz = 0.0
@@ -160,7 +160,7 @@ class TimedCamera:
                 self._lock.release()
 
     def close(self) -> None:
-        """Let go of the camera. Never raises; a driver that hangs elsewhere is left alone."""
+        """Close the camera. Never raises; a driver that hangs is not closed."""
         if self._lock.acquire(timeout=_HANG_S):
             try:
                 self.stop()
@@ -172,8 +172,8 @@ class TimedCamera:
         """See `haselab.rig.Camera`.
 
         Raises:
-            DeviceError: the camera stalls or is gone, loses too many frames, or nobody reads the
-                blocks that its frames belong to.
+            DeviceError: The camera does not respond, or loses too many frames, or the blocks that
+                its frames belong to are not read.
         """
         with self._lock:
             if self._rate_hz == 0.0:
@@ -199,16 +199,16 @@ class TimedCamera:
         got_hz = self._meter.rate_hz
         if got_hz == 0.0 or abs(got_hz / self._rate_hz - 1.0) <= _RATE_SHARE:
             return
-        advice = "Shorten the exposure, or ask for another rate."
+        advice = "Shorten the exposure, or request another rate."
         if isinstance(self._source, KnowsCauses):
             advice = self._source.why_slow(self._rate_hz)
         raise DeviceError(
-            f"Camera {self.identity}: frames come at {got_hz:.4g} Hz, requested were "
+            f"Camera {self.identity}: frames arrive at {got_hz:.4g} Hz instead of the requested "
             f"{self._rate_hz:g} Hz. {advice}"
         )
 
     def _check_silence(self, came: bool) -> None:
-        """A program that was not run for a while is no silent camera: that counts for a quarter."""
+        """Raise if no frame has come for too long; a pause of the program counts only a quarter."""
         limit_s = max(self._timing.timeout_s, 3.0 / self._rate_hz)
         now_s = self._now()
         self._silent_s += min(now_s - self._asked_s, 0.25 * limit_s)
@@ -227,20 +227,21 @@ class TimedCamera:
         if lost > timing.most_dropped * max(all_, _FEW):
             why = self._source.why_lost() if isinstance(self._source, KnowsCauses) else ""
             advice = why or (
-                "Lower the frame rate or the picture's size, or raise camera.most_dropped."
+                "Lower the frame rate or the image size, or raise camera.most_dropped."
             )
             raise DeviceError(
-                f"Camera {self.identity}: {lost} of {all_} frames are lost, allowed is a share of "
-                f"{timing.most_dropped:g}. {advice}"
+                f"Camera {self.identity}: {lost} of {all_} frames are lost (limit: a fraction of "
+                f"{timing.most_dropped:g}). {advice}"
             )
         if len(self._waiting) > timing.buffer_s * self._rate_hz + _FEW:
             raise DeviceError(
-                f"Camera {self.identity}: {len(self._waiting)} frames wait for blocks that nobody "
-                "reads. Read the acquisition while the camera is on, or raise camera.buffer_s."
+                f"Camera {self.identity}: {len(self._waiting)} frames are waiting for blocks that "
+                "have not been read. Read the acquisition while the camera is on, or raise "
+                "camera.buffer_s."
             )
 
     def _due(self) -> Frames | None:
-        """Frames of the blocks that have been read."""
+        """Collect the frames of the blocks that have been read."""
         images, times_s = [], []
         while self._waiting:
             time_s = self._time(self._waiting[0])
@@ -248,8 +249,8 @@ class TimedCamera:
                 break
             if time_s <= self._last_s:
                 raise DeviceError(
-                    f"Camera {self.identity}: a frame's time lies {self._last_s - time_s:.3g} s "
-                    "before the last one's. Set the camera's clock right, or start it anew."
+                    f"Camera {self.identity}: a frame is {self._last_s - time_s:.3g} s earlier "
+                    "than the frame before it. Set the camera's clock, or restart the camera."
                 )
             self._last_s = time_s
             images.append(self._waiting.popleft().image)
@@ -257,7 +258,7 @@ class TimedCamera:
         return Frames(np.stack(images), np.array(times_s)) if images else None
 
     def _time(self, shot: Shot) -> float | None:
-        """On the acquisition's clock; None where that has not got so far."""
+        """Time on the acquisition's clock; None if that has not advanced so far."""
         host_s = shot.host_s - (self._timing.latency_s or 0.0)
         time_s = host_s + self._slow.step(host_s, -self._host.at(self._block_s))
         if self._pairing is not None:

@@ -1,4 +1,4 @@
-"""The served twin's camera as a driver: frames come late, numbered, with stamps of its clock."""
+"""Driver of the served twin's camera: late, numbered frames with time stamps."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["TwinCameraInstrument", "TwinSource"]
 
 
 class TwinSource:
-    """The camera of a served twin: fulfils `FrameSource`, on the acquisition's clock.
+    """The camera of a served twin on the acquisition's clock; implements `FrameSource`.
 
     Args:
         config: section `camera` of the rig file.
     Raises:
-        DeviceError: nobody answers there.
+        DeviceError: The twin does not reply.
     """
 
     def __init__(self, config: TwinCameraConfig) -> None:
@@ -40,7 +40,7 @@ class TwinSource:
 
     @property
     def dropped(self) -> int:
-        """See `FrameSource`: gaps in the frames' numbers."""
+        """See `FrameSource`: gaps in the frame numbers."""
         return self._lost
 
     @property
@@ -53,15 +53,15 @@ class TwinSource:
         """See `RemarkingCamera`."""
         if not self._clock.has_no_clock:
             return ()
-        return ("The camera gives no time stamps: its frames are timed by their arrival.",)
+        return ("The camera sends no time stamps, so its frames are timed by their arrival.",)
 
     def why_slow(self, rate_hz: float) -> str:
         """See `KnowsCauses`."""
-        return "Shorten camera.exposure_s, or take fewer lines (camera.height_px)."
+        return "Shorten camera.exposure_s, or lower camera.height_px."
 
     def why_lost(self) -> str:
         """See `KnowsCauses`."""
-        return f"{self._lost} frames never came: check the network (haselab doctor)."
+        return f"{self._lost} frames were lost. Check the network (haselab doctor)."
 
     def start(self, rate_hz: float) -> None:
         """See `FrameSource`."""
@@ -101,7 +101,7 @@ class TwinCameraInstrument(CameraInstrument[TwinCameraConfig]):
         if not config.timed:
             client = TwinClient(config.address)
             return OpenedCamera(client, f"twin at {config.address}", client.close)
-        # The twin's times are on the acquisition's clock: that one is the computer's here.
+        # The twin's times are on the acquisition's clock, which acts as the computer's clock here.
         now, exposures = _end_of_block(context.clock), context.exposures
         source = TwinSource(config)
         timed = TimedCamera(source, lambda: (now(), now()), Timing(), now=now, exposures=exposures)

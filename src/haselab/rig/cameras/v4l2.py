@@ -1,7 +1,7 @@
-"""A camera of Linux's V4L2, through FFmpeg's input of that name (PyAV).
+"""A V4L2 camera on Linux, through FFmpeg's input v4l2 (PyAV).
 
-PyAV is there already, for videos. linuxpy would report the driver's frame numbers, but its licence
-(GPL) is not haselab's; so frames that are missing are found by the gaps in the kernel's times.
+PyAV is already required for videos. linuxpy would report the driver's frame numbers, but it is
+licensed under the GPL; so missing frames are found by gaps in the kernel's time stamps.
 """
 
 from __future__ import annotations
@@ -30,32 +30,38 @@ __all__ = ["V4l2Instrument", "V4l2Source", "check_v4l2", "open_device"]
 
 _FASTEST_HZ = 1000.0
 _RATE_SHARE = 0.01
-_JOIN_S = 1.0  # a frame period, and then some
-_BYTES = {"gray": 1.0, "yuyv422": 2.0, "uyvy422": 2.0, "nv12": 1.5, "yuv420p": 1.5}  # a pixel
-_PACKED = {"yuyv422": 0, "uyvy422": 1}  # where luma lies in its pairs of bytes
+_JOIN_S = 1.0  # longer than a frame period
+_BYTES = {
+    "gray": 1.0,
+    "yuyv422": 2.0,
+    "uyvy422": 2.0,
+    "nv12": 1.5,
+    "yuv420p": 1.5,
+}  # bytes per pixel
+_PACKED = {"yuyv422": 0, "uyvy422": 1}  # offset of luma in each pair of bytes
 _STEPS = 5
-_SANE_S = 60.0  # that a frame's time may be off
-_TICK_S = 1e-6  # of the kernel's times
+_SANE_S = 60.0  # largest plausible error of a frame's time
+_TICK_S = 1e-6  # resolution of the kernel's times
 _EXPOSURE_STEPS_HZ = 1e4  # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
 
 
 def check_v4l2() -> None:
-    """Whether PyAV's FFmpeg has the input.
+    """Check that PyAV's FFmpeg has the input v4l2.
 
     Raises:
-        DeviceError: it has none.
+        DeviceError: It does not.
     """
     try:
         av.ContainerFormat("v4l2", "r")
     except ValueError:
         raise DeviceError(
-            "A V4L2 camera needs Linux and an FFmpeg with its input v4l2, which PyAV here has not. "
-            "Type: pip install --force-reinstall av"
+            "A V4L2 camera needs Linux and an FFmpeg with the input v4l2, which the installed PyAV "
+            "lacks. Run: pip install --force-reinstall av"
         ) from None
 
 
 def open_device(config: V4l2Config, rate_hz: float) -> Any:
-    """Open the device and have it stream.
+    """Open the device and start its stream.
 
     Args:
         config: section `camera` of the rig file.
@@ -63,7 +69,7 @@ def open_device(config: V4l2Config, rate_hz: float) -> Any:
     Returns:
         PyAV's container; its packets are frames with the kernel's monotonic time in microseconds.
     Raises:
-        DeviceError: no such device, or it refuses the configuration.
+        DeviceError: The device does not exist, or refuses the configuration.
     """
     options = {
         "framerate": str(Fraction(rate_hz).limit_denominator(1000)),
@@ -78,23 +84,23 @@ def open_device(config: V4l2Config, rate_hz: float) -> Any:
         words = getattr(error, "strerror", None) or str(error)
         raise DeviceError(
             f"The camera does not open ({words}) with {config.format}, "
-            f"{options.get('video_size', 'its own size')}, {rate_hz:g} Hz. v4l2-ctl "
-            f"--list-formats-ext lists what it can do. {config.device}"
+            f"{options.get('video_size', 'its own size')}, {rate_hz:g} Hz. Choose a mode that "
+            f"v4l2-ctl --list-formats-ext lists. {config.device}"
         ) from None
 
 
 class V4l2Source:
-    """One device: fulfils `FrameSource`.
+    """One V4L2 device; implements `FrameSource`.
 
-    A thread waits for the frames, since a driver keeps a few of them only. The time of a frame is
-    the kernel's, when its first packet came.
+    A thread waits for the frames, since the driver buffers only a few. The time of a frame is the
+    kernel's time at the arrival of its first packet.
 
     Args:
         config: section `camera` of the rig file.
-        opener: of the device.
+        opener: opens the device.
     Raises:
-        DeviceError: no such device, or nobody may use it.
-        InputError: another camera than the rig file names.
+        DeviceError: The device does not exist, or access is denied.
+        InputError: The camera is not the one that the rig file names.
     """
 
     def __init__(self, config: V4l2Config, opener: Any = open_device) -> None:
@@ -108,26 +114,26 @@ class V4l2Source:
         device = Path(self._config.device)
         if not device.exists():
             raise DeviceError(
-                "There is no such camera. Plug it in, or correct camera.device: ls "
-                f"/sys/class/video4linux lists what is there. {device}"
+                "The camera does not exist. Plug it in, or change camera.device; ls "
+                f"/sys/class/video4linux lists the devices. {device}"
             )
         if not os.access(device, os.R_OK | os.W_OK):
             raise DeviceError(
-                "The camera: permission denied for your user. Join its group: sudo usermod -aG "
-                f"video $USER, then log in anew. {device}"
+                "Your user has no permission to use the camera. Join its group with: sudo usermod "
+                f"-aG video $USER, then log in again. {device}"
             )
         reported = Path("/sys/class/video4linux", device.resolve().name, "name")
         name = reported.read_text(encoding="utf-8").strip() if reported.is_file() else "V4L2 camera"
         if self._config.name is not None and name != self._config.name:
             raise InputError(
-                f"Name of the camera = {name!r}, expected {self._config.name!r} by the rig file. "
-                f"Connect that one, or correct camera.name. {device}"
+                f"The camera's name is {name!r}, but the rig file names {self._config.name!r}. "
+                f"Connect that camera, or change camera.name. {device}"
             )
         return f"{name} at {device}"
 
     @property
     def dropped(self) -> int:
-        """See `FrameSource`: periods without a frame, and frames that nobody fetched."""
+        """See `FrameSource`: periods without a frame, and frames that were not taken in time."""
         return self._lost if self._reader is None else self._reader.lost
 
     @property
@@ -136,9 +142,9 @@ class V4l2Source:
         return ()
 
     def why_slow(self, rate_hz: float) -> str:
-        """See `KnowsCauses`: a driver answers VIDIOC_S_PARM with the rate that it was asked for."""
+        """See `KnowsCauses`; the driver just confirms the requested rate (VIDIOC_S_PARM)."""
         return (
-            "In dim light a webcam exposes for longer than a period: v4l2-ctl -d "
+            "In dim light a webcam exposes for longer than a frame period. Run: v4l2-ctl -d "
             f"{self._config.device} -c auto_exposure=1 -c exposure_time_absolute="
             f"{max(1, int(_EXPOSURE_STEPS_HZ / rate_hz / 2))} -c exposure_dynamic_framerate=0"
         )
@@ -148,11 +154,11 @@ class V4l2Source:
         reader = self._reader
         if reader is None or not reader.slow:
             return ""
-        return f"Every period is a long one: it is slower than asked. {self.why_slow(reader.hz)}"
+        return f"The camera is slower than the requested rate. {self.why_slow(reader.hz)}"
 
     @property
     def jitter_s(self) -> float:
-        """See `FrameSource`: the kernel takes the time when the frame begins to arrive."""
+        """See `FrameSource`; the kernel stamps a frame when it begins to arrive."""
         return _TICK_S
 
     def start(self, rate_hz: float) -> None:
@@ -160,8 +166,8 @@ class V4l2Source:
         self.stop()
         if not 0.0 < rate_hz <= _FASTEST_HZ:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside (0, {_FASTEST_HZ:g}] Hz. Lower the "
-                f"request. {self._config.device}"
+                f"The frame rate is {rate_hz:g} Hz, but it must be above 0 and at most "
+                f"{_FASTEST_HZ:g} Hz. Change the frame rate. {self._config.device}"
             )
         container = self._opener(self._config, rate_hz)
         try:
@@ -177,14 +183,14 @@ class V4l2Source:
         got_hz = float(stream.average_rate or 0.0)
         if abs(got_hz / rate_hz - 1.0) > _RATE_SHARE:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside what the camera does: it gives "
-                f"{got_hz:g} Hz. Ask for that, or take another size or format. {config.device}"
+                f"The camera set a frame rate of {got_hz:g} Hz instead of {rate_hz:g} Hz. Request "
+                f"that rate, or change the size or the format. {config.device}"
             )
         got = codec.pix_fmt if codec.name == "rawvideo" else codec.name
         if got != config.format:
             raise LimitError(
-                f"Format = {config.format!r} is outside what the camera does: it gives {got!r}. "
-                f"Correct camera.format. {config.device}"
+                f"The camera set the format {got!r} instead of {config.format!r}. Change "
+                f"camera.format. {config.device}"
             )
 
     def take(self) -> list[Shot]:
@@ -227,7 +233,7 @@ class _Reader:
                     break
                 if packet.size:
                     self._keep(packet)
-        except Exception as error:  # raised by take, in the caller's thread
+        except Exception as error:  # `take` raises it in the caller's thread
             self._error = error
         finally:
             quietly(self._container.close)
@@ -245,7 +251,7 @@ class _Reader:
         self._shots.append(Shot(self._luma(packet), host_s))
 
     def _luma(self, packet: Any) -> NDArray[np.uint8]:
-        """Grey levels as the camera sent them."""
+        """Extract the grey levels that the camera sent."""
         codec = packet.stream.codec_context
         if codec.name == "rawvideo":
             image = _raw_luma(packet, self._config.format, codec.width, codec.height)
@@ -257,8 +263,8 @@ class _Reader:
         wanted = (self._config.height_px or len(image), self._config.width_px or image.shape[1])
         if image.shape != wanted:
             raise DeviceError(
-                f"Pictures of {image.shape[1]} x {image.shape[0]} px come, allowed by the rig file "
-                f"are {wanted[1]} x {wanted[0]}. Correct camera.width_px, height_px. "
+                f"The camera sends images of {image.shape[1]} x {image.shape[0]} px, but the rig "
+                f"file sets {wanted[1]} x {wanted[0]}. Change camera.width_px and height_px. "
                 f"{self._config.device}"
             )
         return image
@@ -269,7 +275,7 @@ class _Reader:
 
     @property
     def slow(self) -> bool:
-        """No two of the last frames are one period apart."""
+        """Whether no two of the last frames are one period apart."""
         return len(self._steps) > 1 and min(self._steps) > 1
 
     def take(self) -> list[Shot]:
@@ -279,18 +285,18 @@ class _Reader:
                 raise self._error
             words = getattr(self._error, "strerror", None) or self._error or "no more frames"
             raise DeviceError(
-                f"The camera is gone ({words}). Check its cable. {self._config.device}"
+                f"The camera no longer responds ({words}). Check its cable. {self._config.device}"
             )
         return shots
 
     def stop(self) -> None:
         self._ends.set()
-        # A driver that stalls may hold the thread; it then ends with the next frame or unplugging.
+        # A stalled driver may block the thread until the next frame, or until it is unplugged.
         self._thread.join(_JOIN_S + self._period_s)
 
 
 def _monotonic(measured_s: float) -> float:
-    """A driver's time on `time.monotonic`'s clock: theirs is that one, or the time of day."""
+    """Convert a driver's time, which is monotonic or the time of day, to `time.monotonic`."""
     day_s = time.time()
     now_s = time.monotonic()
     if abs(measured_s - now_s) < _SANE_S:
@@ -298,19 +304,19 @@ def _monotonic(measured_s: float) -> float:
     if abs(measured_s - day_s) < _SANE_S:
         return measured_s - day_s + now_s
     raise DeviceError(
-        f"The camera's driver gives {measured_s:g} s as the time of a frame, allowed is this "
-        "computer's. Update the driver."
+        f"The camera's driver reports {measured_s:g} s as the time of a frame, which is not on "
+        "this computer's clock. Update the driver."
     )
 
 
 def _raw_luma(packet: Any, form: str, width: int, height: int) -> NDArray[np.uint8]:
-    """Luma of a frame of which no decoder is needed: it stands first, or in every other byte."""
+    """Luma of an uncompressed frame, which is first or in every other byte."""
     values = np.frombuffer(packet, np.uint8)
     wanted = int(_BYTES[form] * width * height)
     if values.size != wanted:
         raise DeviceError(
-            f"Frames of {values.size} bytes come, allowed for {form} of {width} x {height} px are "
-            f"{wanted}. Correct camera.width_px and height_px to a size that the camera has."
+            f"The camera sends frames of {values.size} bytes, but {form} of {width} x {height} px "
+            f"has {wanted}. Set camera.width_px and height_px to a size that the camera has."
         )
     first = _PACKED.get(form)
     step = 1 if first is None else 2

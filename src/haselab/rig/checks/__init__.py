@@ -1,4 +1,4 @@
-"""`haselab rig check`: what a bench is asked to show before a study is run on it."""
+"""`haselab rig check`: the checks of a bench before a study is run on it."""
 
 from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.dry import DryPlan, dry_checks

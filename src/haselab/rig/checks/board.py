@@ -1,4 +1,4 @@
-"""The checks of a data acquisition device: how late readings come, where outputs begin."""
+"""Checks of a data acquisition device: read latency and start of the outputs."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ __all__ = ["CountsSamples", "lateness_check", "start_checks"]
 
 _BLOCKS = 100
 _STARTS = 50
-_WIRE_S = 5e-6  # that an edge takes through the board itself
-_LEAST_CODES = 20.0  # of a step that stands out of the noise
-_SPREAD = 1.5  # samples between the earliest and the latest start of outputs that are in step
+_WIRE_S = 5e-6  # longest delay of an edge through the board itself
+_LEAST_CODES = 20.0  # smallest step that stands out from the noise
+_SPREAD = 1.5  # largest spread of the output starts that counts as synchronous, in samples
 
 
 @runtime_checkable
 class CountsSamples(Protocol):
-    """An acquisition that knows how many samples have come in."""
+    """An acquisition that counts the samples that it has acquired."""
 
     def acquired(self) -> int:
-        """Samples that have come in since the start.
+        """Number of samples acquired since the start.
 
         Raises:
-            DeviceError: the device does not answer.
+            DeviceError: The device does not reply.
         """
 
 
 def _inside(found: StartMeasurement, daq: DaqConfig) -> float:
-    """Samples from where a step should have come in its block to where it came."""
+    """Delay of a step within its block, in samples."""
     return float(np.nanmedian(found.late_samples)) - found.late_blocks * daq.block_samples
 
 
 def lateness_check(rig: Rig, daq: DaqConfig) -> Iterator[CheckResult]:
-    """How late blocks can be read, and how many outputs have to wait in the device for that.
+    """Measure the read latency, and derive how many outputs must be queued because of it.
 
     Args:
-        rig: a bench in real time; nothing is put out.
+        rig: a bench in real time; its output stays at 0 V.
         daq: section `daq` of the rig file.
     Yields:
-        One result; none where the device does not count its samples.
+        One result; none if the device does not count its samples.
     """
     board = rig.acquisition
     if not isinstance(board, CountsSamples):
@@ -62,7 +62,7 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Iterator[CheckResult]:
     late_s = []
     for _ in range(_BLOCKS):
         rig.acquisition.read()
-        # The question takes about as long as giving the device its next output.
+        # This query takes about as long as writing the next output.
         late_s.append(board.acquired() / daq.rate_hz - rig.acquisition.time_s)
     keep(rig, False)
     worst_s = max(late_s)
@@ -70,25 +70,25 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Iterator[CheckResult]:
     found = f"median {1e3 * float(np.median(late_s)):.2g} ms, worst {1e3 * worst_s:.2g} ms"
     left_s = blocks * block_s + daq.output_delay_s
     advice = (
-        f"Set daq.ahead_blocks = {blocks}, so that {1e3 * left_s:.3g} ms are left for an output; "
-        "or close other programs, or use another USB port"
+        f"Set daq.ahead_blocks = {blocks}, which leaves {1e3 * left_s:.3g} ms for an output; or "
+        "close other programs, or use another USB port"
     )
     good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
     yield CheckResult("dry", "read latency", found, good, advice, recommended)
 
 
 def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Iterator[CheckResult]:
-    """Fifty starts of the output, seen at the input to which it is wired.
+    """Start the output fifty times and measure it at the input to which it is wired.
 
     Args:
         rig: its output is wired to the voltage monitor's input, and the amplifier is not.
         daq: section `daq` of the rig file.
-        step_v: of the output, in V.
-        probe_v: a smaller one of the same sign, for the first start, in V.
+        step_v: step of the output, in V.
+        probe_v: a smaller step of the same sign, for the first start, in V.
     Yields:
-        Whether the wire is there, and whether the outputs come when they should.
+        Whether the wire is connected, and whether the outputs are on time.
     Raises:
-        DeviceError: the board failed on the way.
+        DeviceError: The board failed during the check.
     """
     board = cast(DaqDevice, rig.source)
     least_v = _LEAST_CODES * daq.volt_per_code
@@ -101,14 +101,14 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Ite
             "Raise daq.drive_high_v for this check",
         )
         return
-    # One small step at first: the amplifier may be connected all the same.
+    # Start with one small step: the amplifier may be connected by mistake.
     first = measure_start(board, daq, starts=1, step_v=probe_v)
     if first.seen and _inside(first, daq) > _WIRE_S * daq.rate_hz + 1.0:
         late_us = 1e6 * _inside(first, daq) / daq.rate_hz
         yield CheckResult(
             "live",
             "loop-back wire",
-            f"a step arrives {late_us:.3g} us late: the amplifier seems to be connected",
+            f"a step is {late_us:.3g} us late: the amplifier seems to be connected",
             False,
             "Disconnect the amplifier, and wire daq.output straight to daq.v_monitor",
         )
@@ -120,7 +120,7 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Ite
         f"{found.seen} of {_STARTS} steps seen",
         found.seen == _STARTS,
         "Wire daq.output to daq.v_monitor, without the amplifier, "
-        "and check that both are those terminals",
+        "and check that these are the right terminals",
     )
     if found.seen < _STARTS:
         return
@@ -132,7 +132,7 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Ite
         "starts of the output",
         f"{_STARTS}, {late}",
         in_step,
-        "The device gives "
-        "outputs whole blocks late: raise daq.ahead_blocks, close other programs, or use "
+        "The device puts "
+        "outputs out whole blocks late. Raise daq.ahead_blocks, close other programs, or use "
         "another USB port",
     )

@@ -1,4 +1,4 @@
-"""The checks without high voltage: blocks, clock, inputs at rest, frames, read-backs."""
+"""Checks without high voltage: blocks, clock, inputs at 0 V, frames, read-backs."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ from haselab.rig.instruments.sections import DaqConfig
 __all__ = ["QUIET_SHARE", "ChecksPower", "DryPlan", "dry_checks", "quiet_at_input_v", "read_backs"]
 
 _BLOCKS = 50
-QUIET_SHARE = 0.01  # of the drive's range: what a monitor may read at rest
-_CLOCK_SHARE = 0.1  # clock of the blocks against the computer's, over half a second
+QUIET_SHARE = 0.01  # fraction of the drive's range that a monitor may read at 0 V
+_CLOCK_SHARE = 0.1  # largest relative error of the blocks' clock, over half a second
 _FRAME_RATES_HZ = (100.0, 60.0, 50.0, 30.0, 25.0, 15.0)
 _LINK = (
-    "Frames are lost on the way: check the camera's link (haselab doctor), lower the frame rate or "
-    "the picture's size"
+    "Frames are lost. Check the camera's link (haselab doctor), or lower the frame rate or the "
+    "image size"
 )
 _SLOW = (
-    "The camera does not reach this rate: shorten camera.exposure_s, or take fewer lines "
+    "The camera does not reach this rate. Shorten camera.exposure_s, or take fewer lines "
     "(camera.height_px)"
 )
 _FILM_S = 10.0
-_RATE_SHARE = 0.1  # that the frame rate may be off, as found over half a second
-_MAINS_HZ = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0)  # rectifiers make harmonics of it
-_CURRENT_OFFSET_V = 0.1  # at the input of the current monitor, whose zero nobody adjusts
+_RATE_SHARE = 0.1  # largest relative error of the frame rate, over half a second
+_MAINS_HZ = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0)  # with the harmonics that rectifiers make
+_CURRENT_OFFSET_V = 0.1  # at the input of the current monitor, whose zero cannot be adjusted
 
 _OFFSET = (
-    "The output may be energised: switch the amplifier off and discharge the electrodes. If the "
-    "reading stays, the input floats: tie its negative side to ground by 100 kohm to 1 Mohm (bias "
-    "return). If it goes, adjust the amplifier's zero"
+    "The output may be energised. Switch the amplifier off and discharge the electrodes. If the "
+    "reading stays, the input floats: connect its negative side to ground through 100 kohm to 1 "
+    "Mohm (bias return). If it disappears, adjust the amplifier's zero"
 )
 _HUM = (
     "Connect the shields at one end only, use daq.wiring = 'DIFF', and move the cables away from "
@@ -58,13 +58,13 @@ _HUM = (
 
 @runtime_checkable
 class ChecksPower(Protocol):
-    """A supply that can say whether it has power."""
+    """A supply that can report whether it has power."""
 
     def check_power(self) -> None:
-        """Refuse to go on without.
+        """Check that the supply has power.
 
         Raises:
-            DeviceError: it has none.
+            DeviceError: It has none.
         """
 
 
@@ -73,9 +73,10 @@ class DryPlan:
     """Settings of the dry checks.
 
     Args:
-        real_time: the blocks' clock is to be compared with the computer's.
-        daq: section `daq` of a bench in real time, whose readings can be late; None: no such bench.
-        frames_hz: at which ten seconds are filmed; None: half a second at the highest usual rate.
+        real_time: whether to compare the blocks' clock with the computer's.
+        daq: section `daq` of a bench in real time, whose samples can be late; None for other rigs.
+        frames_hz: rate at which to film for ten seconds; None: half a second at the highest usual
+            rate.
     """
 
     real_time: bool = False
@@ -84,15 +85,15 @@ class DryPlan:
 
 
 def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
-    """Blocks, clock and read-backs at 0 V with no sensing signal.
+    """Check blocks, clock and read-backs at 0 V without a sensing signal.
 
     Args:
-        rig: the bench; nothing is put out.
-        plan: what is known of it.
+        rig: the bench; its output stays at 0 V.
+        plan: settings of the checks.
     Yields:
-        What was verified.
+        The result of each check.
     Raises:
-        DeviceError: an instrument failed on the way.
+        DeviceError: An instrument failed during the check.
     """
     rig.safe()
     keep(rig, True)
@@ -108,7 +109,7 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
         "blocks",
         f"{len(blocks)} of {shape[0]} x {shape[1]} readings",
         all(b.shape == (d.block_samples, 2) for b in blocks),
-        "Correct daq.block_samples",
+        "Change daq.block_samples",
     )
     gap_s = took_s - _BLOCKS * d.block_s
     yield CheckResult(
@@ -125,12 +126,13 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
             "clock",
             f"{100.0 * share:+.2g} % against the computer's",
             abs(share) < _CLOCK_SHARE,
-            "Correct daq.rate_hz, or close other programs: the "
-            "readings come at another rate than it says",
+            "The samples do not come at daq.rate_hz. Change it, or close other programs",
         )
     if plan.daq is not None:
         yield from lateness_check(rig, plan.daq)
-    if rig.controller is None:  # a chip's channels are behind filters: its level is read back
+    if (
+        rig.controller is None
+    ):  # a microcontroller's channels are filtered, so its level is read back
         yield from _see_monitors(rig, np.concatenate(blocks))
     yield from _see_frames(rig, plan.frames_hz)
     yield from read_backs(rig, "dry")
@@ -151,7 +153,9 @@ def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[CheckResult]:
         if stuck:
             advice = f"The input is at the end of its range. {_OFFSET}"
         elif np.ptp(codes[:, k]) == 0:
-            advice = "The input shows no noise at all: no cable, or the device is simulated"
+            advice = (
+                "The input shows no noise: connect its cable, or use a device that is not simulated"
+            )
         elif abs(at_rest_v) >= quiet_v:
             advice = _OFFSET
         yield CheckResult("dry", what, found, not advice, advice)
@@ -164,12 +168,12 @@ def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[CheckResult]:
 
 
 def quiet_at_input_v(rig: Rig) -> float:
-    """What the voltage monitor may show at rest, in V at its input."""
+    """Largest reading of the voltage monitor at 0 V, in V at its input."""
     return QUIET_SHARE * span_v(rig) * rig.description.monitor_v_per_drive_v
 
 
 def _mains(values: NDArray[np.float64], rate_hz: float) -> tuple[float, float]:
-    """Frequency and amplitude of the stronger mains, of values `(n,)` over half a second."""
+    """Frequency and amplitude of the strongest mains line in values `(n,)` over half a second."""
     whole = {hz: int(values.size * hz / rate_hz) for hz in _MAINS_HZ}
     found = [
         (abs(phasor(values[: round(whole[hz] * rate_hz / hz)], hz, rate_hz)), hz)
@@ -181,8 +185,8 @@ def _mains(values: NDArray[np.float64], rate_hz: float) -> tuple[float, float]:
 
 
 def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[CheckResult]:
-    """Frames for half a second at the highest usual rate that the camera takes, or for ten seconds
-    at the one that is wanted; nothing where there is no camera.
+    """Film for half a second at the highest usual rate that the camera accepts, or for ten seconds
+    at the given rate; do nothing without a camera.
     """
     known = rig.camera if isinstance(rig.camera, KnownCamera) else None
     if known is not None and not known.identity:
@@ -247,20 +251,20 @@ def _start_camera(rig: Rig, wanted_hz: float | None) -> float:
 
 
 def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
-    """What the instruments themselves say of their rest.
+    """Ask the instruments whether their outputs are off.
 
     Args:
         rig: at 0 V.
         step: of the check.
     Yields:
-        Output, generator and supply, as far as the bench has them.
+        Results for output, generator and supply, as far as the bench has them.
     """
     if isinstance(rig.source, ReportsOutput):
         measured_v = rig.source.read_back()
         measured_v = rig.source.read_back()
         yield CheckResult(
             step,
-            "output at rest",
+            "output at 0 V",
             f"{measured_v:.3g} V read back",
             abs(measured_v) < QUIET_SHARE * span_v(rig),
             "Switch the amplifier off by hand, then find what else drives its input",
@@ -269,7 +273,7 @@ def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
         off = rig.generator.is_off()
         yield CheckResult(
             step,
-            "generator at rest",
+            "generator off",
             "off" if off else "on",
             off,
             "Switch its output off at the front panel",
@@ -282,5 +286,5 @@ def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
             rig.supply.is_off() if isinstance(rig.supply, ReportsOutputState) else measured_v == 0.0
         )
         yield CheckResult(
-            step, "supply at rest", f"{measured_v:g} V", off, "Pull the supply's power jack"
+            step, "supply off", f"{measured_v:g} V", off, "Pull the supply's power jack"
         )

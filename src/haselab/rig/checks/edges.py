@@ -1,4 +1,4 @@
-"""Whether the recorded edge begins an exposure: found from two exposure times."""
+"""Check that the recorded edge begins an exposure, by means of two exposure times."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ __all__ = ["edge_check"]
 
 _RATE_HZ = 25.0
 _FILM_S = 1.0
-_BEFORE = 5  # blocks of the clock before the first frame
-_LONGER_S = 8e-3  # by which the second exposure is longer
-_UNCERTAINTY_S = 1.5e-3  # of a lag: arrivals over a network scatter by less
+_BEFORE = 5  # blocks before the first frame, for the clock
+_LONGER_S = 8e-3  # difference of the two exposure times
+_UNCERTAINTY_S = 1.5e-3  # uncertainty of a lag; arrivals over a network scatter less
 _SWITCH = (
-    "Set exposure.edge to the other one, or exposure.inverted where the camera's line can be turned"
+    "Set exposure.edge to the other edge, or exposure.inverted if the camera's line can be inverted"
 )
 
 
 def edge_check(
     config: BenchConfig, opened: Callable[[BenchConfig], AbstractContextManager[Rig]]
 ) -> Generator[CheckResult, None, None]:
-    """Film with two exposure times; nothing where no line is recorded or the time cannot be set.
+    """Film with two exposure times, if the exposure line is recorded and the time can be set.
 
     Args:
         config: of the bench.
-        opened: opens a bench of a changed configuration; nothing is put out.
+        opened: opens a bench with a changed configuration; its output stays at 0 V.
     Yields:
-        One check.
+        One result.
     Raises:
-        DeviceError: an instrument failed.
+        DeviceError: An instrument failed.
     """
     line, camera = config.exposure, config.camera
     if line is None or camera is None or "exposure_s" not in type(camera).model_fields:
@@ -58,7 +58,7 @@ def edge_check(
             yield CheckResult(
                 "dry",
                 "exposure line",
-                "no frame came with an edge",
+                "no frame arrived with an edge",
                 False,
                 "Check its wire to exposure.input, its levels and its pull-up",
             )
@@ -69,14 +69,14 @@ def edge_check(
     yield CheckResult(
         "dry",
         "exposure line",
-        f"frames come {found} of exposure: the edge {'begins' if begins else 'ends'} it",
+        f"frames arrive {found} of exposure: the edge {'begins' if begins else 'ends'} it",
         bool(begins),
         _SWITCH,
     )
 
 
 def _lag_s(rig: Rig) -> float:
-    """From the middle of an exposure, by its line, to the frame's estimated one, in s."""
+    """Delay from an exposure's recorded middle to its estimate from the frame, in s."""
     for _ in range(_BEFORE):
         rig.acquisition.read()
     rig.camera.start(_RATE_HZ)

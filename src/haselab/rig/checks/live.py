@@ -1,4 +1,4 @@
-"""The checks with high voltage: sensing signal, a small step, the supply, then rest again."""
+"""Checks with high voltage: sensing signal, a small step, the supply, then 0 V again."""
 
 from __future__ import annotations
 
@@ -22,22 +22,25 @@ __all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
 
 _BLOCKS = 50
 _CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # the amplitude is a peak
-_STEP_SHARE = 0.1  # of the drive's range, put out when the sensing signal is right
-_PROBE_SHARE = 0.1  # of that step, or the sensing signal's amplitude: put out to find a fault
+_STEP_SHARE = 0.1  # fraction of the drive's range, put out if the sensing signal is correct
+_PROBE_SHARE = 0.1  # fraction of that step, put out to find a fault
 _MEANS_S = 0.1  # whole periods of 50 and 60 Hz
-_LEAST_CODES = 20.0  # of a step that stands out of the noise
+_LEAST_CODES = 20.0  # smallest step that stands out from the noise
 _STEP_TOLERANCE = 0.02  # gain errors of amplifier and monitor
 _SETTLE_S = 0.5e-3
 _LATE = (
-    "Raise daq.ahead_blocks, close other programs, or use a USB port of its own (no hub), or a "
-    "PCIe or PXIe board"
+    "Raise daq.ahead_blocks, close other programs, connect the board to a USB port without a hub, "
+    "or use a PCIe or PXIe board"
 )
-_LATE_BLOCKS = 6  # for which an output that does not come in time is waited for
+_LATE_BLOCKS = 6  # longest wait for an output that is late
 SUPPLY_V = 100.0  # at least
 _SUPPLY_SHARE, _SUPPLY_OFFSET_V = 0.1, 50.0  # of its meter
-_SUPPLY_S = 3.0  # that it may take to rise, and to run down
-_MEASURABLE = 0.1  # of the sensing signal: with less there is no capacitance to measure
-_KNOWN_SHARE, _STRAY_F = 0.05, 60e-12  # of a known capacitor: gain errors; cable and fixture
+_SUPPLY_S = 3.0  # longest time to rise, and to discharge
+_MEASURABLE = 0.1  # fraction of the sensing signal needed to measure a capacitance
+_KNOWN_SHARE, _STRAY_F = (
+    0.05,
+    60e-12,
+)  # tolerance for a known capacitor: gain errors; cable and fixture
 
 
 @dataclass(frozen=True)
@@ -45,13 +48,14 @@ class LivePlan:
     """Settings of the live checks.
 
     Args:
-        capacitor_f: of a known capacitor that is in the actuator's place; None: the actuator is.
-        supply_v: that the supply puts out for a moment, in V.
-        loop_back: the board's output is wired to the voltage monitor's input, and the amplifier is
-            not: only the starts of the output are looked at.
+        capacitor_f: capacitance of a known capacitor in place of the actuator; None: the actuator
+            is connected.
+        supply_v: voltage that the supply puts out for a moment, in V.
+        loop_back: whether the board's output is wired to the voltage monitor's input, without the
+            amplifier; then only the starts of the output are checked.
         daq: section `daq` of the rig file; for `loop_back`.
-        alive: called before anything is energised, about every second: gives a sign of life to who
-            watches, and raises where nobody does any more.
+        alive: called about every second before anything is energised: sends the guardians a
+            heartbeat, and raises if they no longer watch.
     """
 
     capacitor_f: float | None = None
@@ -62,13 +66,13 @@ class LivePlan:
 
 
 def live_step_v(rig: RigDescription) -> float:
-    """The drive that the live checks put out, in V ahead of the amplifier."""
+    """Drive that the live checks put out, in V at the amplifier's input."""
     limits = rig.drive_limits
     return _STEP_SHARE * (limits.high if limits.high >= -limits.low else limits.low)
 
 
 def _probe_v(rig: RigDescription) -> float:
-    """The drive that names what is wrong with the sensing signal: about its amplitude."""
+    """Drive used to find what is wrong with the sensing signal; about its amplitude."""
     step_v = live_step_v(rig)
     least_v = _LEAST_CODES * rig.volt_per_code / rig.monitor_v_per_drive_v
     probe_v = max(_PROBE_SHARE * abs(step_v), CARRIER_V, least_v)
@@ -76,16 +80,16 @@ def _probe_v(rig: RigDescription) -> float:
 
 
 def live_checks(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
-    """Sensing signal, a small step and the supply, each seen by the monitors; then rest again.
+    """Check sensing signal, a small step and the supply with the monitors; then go to 0 V.
 
     Args:
-        rig: the bench; high voltage is put out.
+        rig: the bench. HIGH VOLTAGE WILL BE APPLIED.
         plan: what is connected.
     Yields:
-        What was verified.
+        The result of each check.
     Raises:
-        DeviceError: an instrument failed on the way.
-        SafetyError: the bench protected itself.
+        DeviceError: An instrument failed during the check.
+        SafetyError: The bench tripped.
     """
     try:
         if plan.loop_back and plan.daq is not None:
@@ -107,7 +111,7 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
 
 
 def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[CheckResult]:
-    """The voltage comes, and goes once it is off, by the supply's own meter."""
+    """Check with the supply's own meter that its voltage rises, and falls once it is off."""
     supply.set_voltage(wanted_v)
     near_v = max(_SUPPLY_SHARE * wanted_v, _SUPPLY_OFFSET_V)
     measured_v = _wait_for(supply, lambda v: abs(v - wanted_v) < near_v)
@@ -116,22 +120,22 @@ def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[CheckRes
     yield CheckResult(
         "live",
         "supply",
-        f"{measured_v:g} V read back, set were {wanted_v:g} V",
+        f"{measured_v:g} V read back, {wanted_v:g} V requested",
         abs(measured_v - wanted_v) < near_v,
         "Plug in its power, switch its main switch on, "
-        "calibrate it; a load that takes its current keeps it down",
+        "and calibrate it; check that the load does not draw too much current",
     )
     yield CheckResult(
         "live",
         "supply off",
         f"{left_v:g} V, within {_SUPPLY_S:g} s of switching it off",
         abs(left_v) < near_v,
-        "Pull its power jack: it does not switch off. Have the output switch repaired",
+        "Pull its power jack, because it does not switch off. Have the output switch repaired",
     )
 
 
 def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> float:
-    """The meter, as soon as it shows what is waited for, or after some seconds."""
+    """Reading of the meter when it reaches the expected value, or after some seconds."""
     end_s = time.monotonic() + _SUPPLY_S
     while True:
         measured_v = supply.read_voltage()
@@ -141,7 +145,7 @@ def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> fl
 
 
 def _see_loop(rig: Rig, controller: ClosesLoop) -> CheckResult:
-    """Zero strain held for half a second: the chip arms, senses and drives."""
+    """Hold zero strain for half a second: the microcontroller must arm, sense and drive."""
     wanted = max(0.0, controller.strain_limits.low)
     for _ in range(_BLOCKS):
         controller.follow(wanted)
@@ -153,20 +157,20 @@ def _see_loop(rig: Rig, controller: ClosesLoop) -> CheckResult:
         "loop",
         f"{drive_v:.3g} V of drive at a strain of {wanted:g}",
         0.0 < drive_v < rig.description.drive_limits.high,
-        "Calibrate the chip again; check its wiring",
+        "Calibrate the microcontroller again, and check its wiring",
     )
 
 
 def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
-    """The sensing signal; then a step of 10 %, or a smaller one that shows what is wrong."""
+    """Check the sensing signal; then a step of 10 %, or a smaller one that shows the fault."""
     probe_v = _probe_v(rig.description)
     expected = _expected(rig, probe_v)
     if abs(expected.step_v) < 0.99 * _LEAST_CODES * rig.description.volt_per_code:
         yield CheckResult(
             "live",
             "drive range",
-            f"a step of it is {1e3 * expected.step_v:.2g} mV at the "
-            "voltage monitor's input, too small to be measured",
+            f"its step is {1e3 * expected.step_v:.2g} mV at the "
+            "voltage monitor's input, too small to measure",
             False,
             "Lower daq.range_v, or raise daq.drive_high_v",
         )
@@ -192,11 +196,11 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
         plan.alive()
         change = _step(rig, probe_v).change_v
         named = diagnose(Seen(v_carrier, i_carrier, *change.tolist()), expected)
-        what, advice = named or ("it is right now", "Run the check again")
+        what, advice = named or ("correct on the second try", "Run the check again")
         yield CheckResult("live", "sensing signal", f"{found}: {what}", False, advice)
         return
     if plan.capacitor_f is None:
-        found += ", scale of the current not checked (--capacitor)"
+        found += ", current scale not checked (use --capacitor)"
     yield CheckResult("live", "sensing signal", found, True)
     plan.alive()
     yield from _see_step(rig, v_carrier, i_carrier)
@@ -218,7 +222,7 @@ def _expected(rig: Rig, step_v: float) -> Expected:
 
 
 def _carrier(rig: Rig) -> tuple[str, complex, complex]:
-    """Which monitor clips, empty if none does; phasors at both inputs, in V there."""
+    """Name of the monitor that clips, or empty; and the phasors at both inputs, in V."""
     rig.generator.sine(_CARRIER_HZ, CARRIER_V)
     rig.acquisition.read()
     codes = rig.acquisition.read()
@@ -231,7 +235,7 @@ def _carrier(rig: Rig) -> tuple[str, complex, complex]:
 
 
 def _means(rig: Rig) -> NDArray[np.float64]:
-    """Both inputs over whole periods of the mains, in V there; shape `(2,)`."""
+    """Means of both inputs over whole periods of the mains, in V; shape `(2,)`."""
     count = max(1, round(_MEANS_S / rig.description.block_s))
     blocks = [input_volts(rig, rig.acquisition.read()) for _ in range(count)]
     mean: NDArray[np.float64] = np.concatenate(blocks).mean(axis=0)
@@ -243,10 +247,10 @@ class _Step:
     """What both inputs showed of a step of the drive.
 
     Args:
-        rest_v: before, in V at the input, `(2,)`.
-        change_v: by the step, in V at the input, `(2,)`.
-        codes: from the block on after which the step was written, `(n, 2)`.
-        missed: outputs that were left out because they came too late.
+        rest_v: values before the step, in V at the input, `(2,)`.
+        change_v: changes by the step, in V at the input, `(2,)`.
+        codes: samples from the block after which the step was written, `(n, 2)`.
+        missed: number of outputs that were skipped because they came too late.
     """
 
     rest_v: NDArray[np.float64]
@@ -256,7 +260,7 @@ class _Step:
 
 
 def _step(rig: Rig, step_v: float) -> _Step:
-    """Put a step out, look at it, and go back to 0 V."""
+    """Put a step out, measure it, and return to 0 V."""
     d = rig.description
     missed = _missed(rig)
     keep(rig, True)
@@ -273,7 +277,7 @@ def _step(rig: Rig, step_v: float) -> _Step:
 def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[CheckResult]:
     d = rig.description
     step_v = live_step_v(d)
-    seen = _step(rig, step_v)  # at 0 V before a line is printed: printing may block
+    seen = _step(rig, step_v)  # back at 0 V before a line is printed, since printing may block
     rig.acquisition.read()
     left_v = float(volts(rig, rig.acquisition.read()).mean())
     if seen.missed:
@@ -301,7 +305,7 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
     v_step, i_step = seen.change_v.tolist()
     named = diagnose(Seen(v_carrier, i_carrier, v_step, i_step), expected)
     rest_v = float(seen.rest_v[0]) / d.monitor_v_per_drive_v
-    from_ = d.switch_in_block // 2  # noise is no output
+    from_ = d.switch_in_block // 2  # ignore noise before the output
     at = from_ + int(np.argmax(np.abs(volt[from_:] - rest_v) > 0.5 * abs(step_v)))
     if named is not None:
         yield CheckResult(
@@ -309,7 +313,10 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
         )
         return
     late = round((at - d.switch_sample) / d.block_samples)
-    advice = f"Correct daq.output_delay_s: the output begins {at % d.block_samples} samples into it"
+    advice = (
+        f"Change daq.output_delay_s: the output begins {at % d.block_samples} samples into the "
+        "block"
+    )
     if late:
         advice = f"Outputs come {late} blocks late. {_LATE}"
     yield CheckResult(
@@ -319,14 +326,14 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
         0 <= at - d.switch_sample < settle,
         advice,
     )
-    # The monitor's own offset is no fault of the step.
+    # The monitor's own offset is not part of the step.
     reached_v = v_step / d.monitor_v_per_drive_v
     yield CheckResult(
         "live",
         "size of an output",
-        f"{reached_v:.4g} V, set were {step_v:.4g} V",
+        f"{reached_v:.4g} V, {step_v:.4g} V requested",
         abs(reached_v / step_v - 1.0) < _STEP_TOLERANCE,
-        "Correct amplifier.gain, "
+        "Change amplifier.gain, "
         "amplifier.volt_per_monitor_volt or the gain of the summing stage, or calibrate "
         "the monitor",
     )
@@ -340,21 +347,21 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
 
 
 def _missed(rig: Rig) -> int:
-    """Outputs that the source has left out because they came too late, if it counts them."""
+    """Number of outputs that the source skipped because they came too late, if it counts them."""
     return int(getattr(rig.source, "missed_outputs", 0))
 
 
 def _known(farad: float, known_f: float, rig: Rig) -> CheckResult:
-    """A known capacitor gives the scale of the current monitor."""
+    """Check the scale of the current monitor with a known capacitor."""
     ratio = farad / known_f
     low_f, high_f = (1.0 - _KNOWN_SHARE) * known_f, (1.0 + _KNOWN_SHARE) * known_f + _STRAY_F
-    good = low_f <= farad <= high_f  # what is in parallel adds to it
+    good = low_f <= farad <= high_f  # parallel capacitance adds to it
     return CheckResult(
         "live",
         "known capacitor",
         f"measured {1e12 * farad:.4g} pF, nominal {1e12 * known_f:.4g} pF (ratio {ratio:.3g})",
         good,
-        f"Correct amplifier.ampere_per_monitor_volt: {1.0 / ratio:.3g} times what it is, "
-        f"{1.0 / (rig.description.i_monitor_v_per_a * ratio):.3g} A/V; or "
-        "volt_per_monitor_volt, if a voltmeter at the monitor says so",
+        f"Multiply amplifier.ampere_per_monitor_volt by {1.0 / ratio:.3g}, which gives "
+        f"{1.0 / (rig.description.i_monitor_v_per_a * ratio):.3g} A/V; or change "
+        "volt_per_monitor_volt, if a voltmeter at the monitor confirms that",
     )

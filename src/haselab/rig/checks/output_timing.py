@@ -1,7 +1,7 @@
-"""How late the outputs and the readings of a data acquisition device come.
+"""Measure how late the outputs and the samples of a data acquisition device are.
 
-`measure_start` needs the output looped to the voltage monitor's input, without the amplifier.
-`measure_lag` needs no wire.
+`measure_start` needs the output wired to the voltage monitor's input, without the amplifier.
+`measure_lag` needs no wiring.
 """
 
 from __future__ import annotations
@@ -26,21 +26,20 @@ __all__ = [
     "recommended_ahead_blocks",
 ]
 
-_SPARE_SHARE = 0.25  # of a block, for a computer that is a little late
+_SPARE_SHARE = 0.25  # fraction of a block kept as a reserve for a slow computer
 _SETTLE_BLOCKS = 3
-_EDGE_SHARE = 0.5  # of the step: where it counts as come
+_EDGE_SHARE = 0.5  # fraction of the step at which it counts as arrived
 
 
 @dataclass(frozen=True)
 class StartMeasurement:
-    """Starts of the output, seen at a looped input.
+    """Starts of the output, measured at the input to which it is wired.
 
     Args:
-        late_samples: of each start, from the expected edge to where the output really came, in
-            samples; NaN: it did not come within a few blocks, or was written too late. Shape
-            `(starts,)`.
-        block_samples: of a block.
-        missed: outputs that were written too late, by the driver's own count.
+        late_samples: delay of each start, from the expected edge to the measured one, in samples;
+            NaN: it did not come within a few blocks, or was written too late. Shape `(starts,)`.
+        block_samples: samples of a block.
+        missed: number of outputs that were written too late, counted by the driver.
     """
 
     late_samples: NDArray[np.float64]
@@ -49,31 +48,31 @@ class StartMeasurement:
 
     @property
     def seen(self) -> int:
-        """Starts whose output came."""
+        """Number of starts whose output was seen."""
         return int(np.isfinite(self.late_samples).sum())
 
     @property
     def late_blocks(self) -> int:
-        """Whole blocks that the latest one was late, or early (below zero); 0 where none came."""
+        """Delay of the latest start in whole blocks; negative if early, 0 if none was seen."""
         late = self.late_samples[np.isfinite(self.late_samples)]
         blocks = np.rint(late / self.block_samples)
         return int(blocks[np.argmax(np.abs(blocks))]) if blocks.size else 0
 
     @property
     def spread_samples(self) -> float:
-        """Largest less smallest delay, in samples."""
+        """Difference of the largest and the smallest delay, in samples."""
         late = self.late_samples[np.isfinite(self.late_samples)]
         return float(late.max() - late.min()) if late.size else math.nan
 
 
 @dataclass(frozen=True)
 class Lag:
-    """The driver's count of samples against the wall clock.
+    """The driver's count of samples compared with the wall clock.
 
     Args:
-        highest_s: by which the count was behind the device at the most, in s.
-        median_s: the same of half of the looks, in s.
-        rate_share: measured rate of the samples over the configured one, less 1.
+        highest_s: largest delay of the count, in s.
+        median_s: median delay of the count, in s.
+        rate_share: relative error of the configured sample rate: measured over configured, minus 1.
     """
 
     highest_s: float
@@ -84,27 +83,27 @@ class Lag:
 def measure_start(
     board: DaqDevice, daq: DaqConfig, *, starts: int = 50, step_v: float = 0.1
 ) -> StartMeasurement:
-    """Start the output again and again, each time with a step, and see where the step comes.
+    """Start the output repeatedly with a step, and measure when the step arrives.
 
-    The output is wired to the voltage monitor's input for this, without the amplifier. It ends at
+    This needs the output wired to the voltage monitor's input, without the amplifier. It ends at
     0 V.
 
     Args:
-        board: opened, and no other one uses its blocks meanwhile.
+        board: opened device; nothing else may read its blocks meanwhile.
         daq: section `daq` of the rig file.
         starts: how many.
         step_v: of the output, in V; within its limits.
     Returns:
-        How late each was.
+        The delay of each start.
     Raises:
-        DeviceError: the board does not answer as it should.
-        LimitError: the step is beyond the output's limits, or too small; or fewer than one start.
+        DeviceError: The board does not reply correctly.
+        LimitError: The step is outside the output's limits or too small; or there is no start.
     """
     least_v = 20.0 * daq.volt_per_code
     if starts < 1 or not abs(step_v) >= least_v:
         raise LimitError(
-            f"starts = {starts} and step_v = {step_v:g} V, but 1 start and {least_v:.2g} V are "
-            "needed at least. Raise them."
+            f"starts is {starts} and step_v is {step_v:g} V, but they must be at least 1 and "
+            f"{least_v:.2g} V. Raise them."
         )
     late, missed = np.full(starts, np.nan), 0
     expected = daq.switch_in_block + daq.ahead_blocks * daq.block_samples
@@ -114,7 +113,7 @@ def measure_start(
             board.pause()
             board.read()
             board.pause()
-            board.keep(True)  # starts the output anew; from here on no block is passed over
+            board.keep(True)  # restarts the output; from here on no block is skipped
             before, step = board.missed_outputs, []
             board.write(step_v)
             for _ in range(daq.ahead_blocks + _SETTLE_BLOCKS):
@@ -138,28 +137,28 @@ def measure_lag(
     now: Callable[[], float] = time.monotonic,
     pause: Callable[[float], None] = time.sleep,
 ) -> Lag:
-    """How far the driver's count of samples is behind the device.
+    """Measure the delay of the driver's count of samples behind the device.
 
-    What is least behind defines the device's own clock: a lag that is always there is not seen by
-    this, but by `measure_start`.
+    The smallest delay defines the device's own clock, so a constant delay is not found by this
+    function, but by `measure_start`.
 
     Args:
-        acquired: samples that have come in, as a `CountsSamples` does.
+        acquired: number of acquired samples, as in `CountsSamples`.
         rate_hz: of the samples.
-        duration_s: of the looks, in s.
+        duration_s: of the measurement, in s.
         now: clock, in s.
-        pause: between two looks.
+        pause: called between two readings.
     Returns:
-        The lag; all zero on a twin in lock-step, whose count stands still.
+        The lag; all zero on a twin in lock-step, whose count does not change.
     Raises:
-        DeviceError: the board does not answer.
+        DeviceError: The board does not reply.
     """
     times_s, counts = [now()], [acquired()]
     while times_s[-1] - times_s[0] < duration_s:
         pause(duration_s / 500.0)
         before_s = now()
         counts.append(acquired())
-        times_s.append(before_s)  # the count is no older than the question
+        times_s.append(before_s)  # the count is not older than the query
     if counts[-1] == counts[0]:
         return Lag(0.0, 0.0, 0.0)
     times, samples = np.array(times_s) - times_s[0], np.array(counts, dtype=np.float64)
@@ -170,17 +169,17 @@ def measure_lag(
 
 
 def recommended_ahead_blocks(lag_s: float, write_s: float, daq: DaqConfig) -> int:
-    """Output blocks that have to wait in the device so that none is late.
+    """Compute how many output blocks must be queued in the device so that none is late.
 
-    An output computed from a block has from the block's end until it is due: `output_delay_s`, and
-    a block for each one that waits.
+    The time from a block's end until the output computed from it is due is `output_delay_s` plus
+    one block for each queued output.
 
     Args:
         lag_s: from a block's end until it can be read, in s.
-        write_s: from then until its output is in the device, in s.
+        write_s: from then until its output has been written to the device, in s.
         daq: section `daq` of the rig file.
     Returns:
-        Value for `daq.ahead_blocks`, 10 at most.
+        Value for `daq.ahead_blocks`, at most 10.
     Example:
         >>> recommended_ahead_blocks(0.0, 1e-3, DaqConfig(kind="any"))
         1

@@ -1,4 +1,4 @@
-"""What the inputs of a bench show, in drive volts, in amperes and in volts at the input."""
+"""Convert samples of a bench to drive volts, to amperes and to volts at the input."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["amperes", "input_volts", "keep", "phasor", "saturated", "span_v", "v
 
 
 def input_volts(rig: Rig, codes: NDArray[np.int16]) -> NDArray[np.float64]:
-    """Both inputs in V as the board converts them, `(n, 2)`."""
+    """Both inputs in V at the board, `(n, 2)`."""
     return np.asarray(codes * rig.description.volt_per_code, dtype=np.float64)
 
 
@@ -40,12 +40,12 @@ def phasor(values: NDArray[np.float64], frequency_hz: float, rate_hz: float) -> 
 
 
 def saturated(codes: NDArray[np.int16]) -> bool:
-    """Whether a channel, `(n,)`, stands at an end of its range."""
+    """Whether a channel, `(n,)`, is at an end of its range."""
     return bool(np.abs(codes.astype(int)).max() >= 2**15 - 1)
 
 
 def keep(rig: Rig, on: bool) -> None:
-    """Ask for every block, or no longer, where the acquisition can pass blocks over."""
+    """Start or stop keeping every block, if the acquisition can skip blocks."""
     if isinstance(rig.acquisition, GaplessAcquisition):
         rig.acquisition.keep(on)
 

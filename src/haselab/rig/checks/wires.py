@@ -1,4 +1,4 @@
-"""From what both inputs show of a carrier and of a small step to the wire that is wrong."""
+"""Find the wrong wire from how a carrier and a small step appear at both inputs."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 __all__ = ["Expected", "Seen", "capacitance_f", "diagnose"]
 
-_NOTHING = 0.1  # of what is expected: less than this is no signal
-_ALIKE = 0.25  # two factors that differ by less have one cause, if both are far off
-_SAME = 0.08  # the same where only the step is
-_SCALE = 0.2  # an amplifier of 6 kHz lifts 2 kHz by 3 %; more than this is a wrong setting
+_NOTHING = 0.1  # fraction of the expected signal below which there is none
+_ALIKE = 0.25  # two factors that differ by less have one cause, if both are far from 1
+_SAME = 0.08  # the same if only the step is far from 1
+_SCALE = 0.2  # an amplifier of 6 kHz raises 2 kHz by 3 %; more than this is a wrong setting
 _STEP_SCALE = 0.1  # of a step of 20 codes or more, which the converter resolves to 5 %
-_CURRENT_LIKE = (1.0 / 3.0, 3.0)  # times the carrier: a current at the voltage monitor's input
+_CURRENT_LIKE = (1.0 / 3.0, 3.0)  # ratio to the carrier of a current at the voltage monitor's input
 _LARGE_A = 2e-3  # at 100 V and 2 kHz: 1.6 nF
 _LEAST_F = 3e-12  # open leads
-_HALF, _DOUBLE = (0.45, 0.55), (1.8, 2.2)  # the generator's 50 ohm, set wrong
-_RIGHT_ANGLE_DEG = 20.0  # that the current may be off a quarter of a period
+_HALF, _DOUBLE = (0.45, 0.55), (1.8, 2.2)  # ratios if the generator's 50 ohm load setting is wrong
+_RIGHT_ANGLE_DEG = 20.0  # largest deviation of the current's phase from 90 degrees
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Seen:
     Args:
         v_carrier: phasor at the input of the voltage monitor while the carrier was on.
         i_carrier: the same at the input of the current monitor.
-        v_step: change of the first input's mean by a step of the drive.
-        i_step: the same of the second one.
+        v_step: change of the voltage monitor's mean by a step of the drive.
+        i_step: the same for the current monitor.
     """
 
     v_carrier: complex
@@ -39,7 +39,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Expected:
-    """What they should show, by the rig file.
+    """What the inputs should show according to the rig file.
 
     Args:
         carrier_v: amplitude at the input of the voltage monitor.
@@ -59,14 +59,14 @@ class Expected:
 
 
 def capacitance_f(v_carrier: complex, i_carrier: complex, expected: Expected) -> complex:
-    """Admittance over j omega, in F: its imaginary part is a loss.
+    """Complex capacitance: admittance over j omega, in F; its imaginary part is a loss.
 
     Args:
         v_carrier: phasor at the input of the voltage monitor.
         i_carrier: of the current monitor.
-        expected: by the rig file.
+        expected: values of the rig file.
     Returns:
-        0 where the voltage is 0.
+        The capacitance; 0 if the voltage is 0.
     """
     if v_carrier == 0.0:
         return 0.0
@@ -77,19 +77,19 @@ def capacitance_f(v_carrier: complex, i_carrier: complex, expected: Expected) ->
 
 
 def diagnose(seen: Seen, expected: Expected) -> tuple[str, str] | None:
-    """The first cause that explains what was seen.
+    """Find the first cause that explains what was measured.
 
     Args:
-        seen: at both inputs.
-        expected: by the rig file.
+        seen: measured at both inputs.
+        expected: values of the rig file.
     Returns:
-        What is wrong, and what to change; None: all is as expected.
+        What is wrong, and what to change; None if all is as expected.
     """
     carrier = abs(seen.v_carrier) / expected.carrier_v
     step, step_at_i = seen.v_step / expected.step_v, seen.i_step / expected.step_v
     farad = capacitance_f(seen.v_carrier, seen.i_carrier, expected)
     ampere = abs(seen.i_carrier) / expected.i_monitor_v_per_a
-    # By the current alone, for the carrier's voltage that there should be.
+    # From the current alone, for the expected voltage of the carrier.
     current = ampere / (2.0 * math.pi * expected.frequency_hz * expected.carrier_output_v)
     return (
         _swapped(step, step_at_i, carrier, negative=farad.real < 0.0)
@@ -105,7 +105,7 @@ def _swapped(
     step: float, step_at_i: float, carrier: float, *, negative: bool
 ) -> tuple[str, str] | None:
     here = abs(step) < 0.5 < abs(step_at_i) and abs(step_at_i) < 2.0
-    # A monitor of another scale, or a small step: a current shows less of it than the voltage.
+    # A current shows less of a step than the voltage does, also with a wrong scale.
     beyond = (carrier < _CURRENT_LIKE[0] or carrier > _CURRENT_LIKE[1]) and negative
     if here or (beyond and abs(step_at_i) > 3.0 * abs(step) and abs(step_at_i) > _NOTHING):
         return (
@@ -118,10 +118,10 @@ def _swapped(
 def _overloaded(carrier: float, step: float, ampere: float) -> tuple[str, str] | None:
     if carrier < 1.0 - _SCALE and abs(step) > 0.5 and ampere > _LARGE_A:
         return (
-            f"the load takes {1e3 * ampere:.3g} mA of the sensing signal, which drops to "
-            f"{carrier:.2g} times what it should be",
-            "Disconnect the actuator: if the signal is right then, the actuator is shorted, or its "
-            "capacitance is too large for the amplifier's current",
+            f"the load draws {1e3 * ampere:.3g} mA from the sensing signal, which drops to "
+            f"{carrier:.2g} times its expected value",
+            "Disconnect the actuator. If the signal is then correct, the actuator is shorted, or "
+            "its capacitance is too large for the amplifier's current",
         )
     return None
 
@@ -132,9 +132,9 @@ def _silent(carrier: float, step: float, current: float) -> tuple[str, str] | No
     if no_carrier and no_step and no_current:
         return (
             "neither the sensing signal nor a step of the drive arrives at the monitors",
-            "Either neither monitor is connected: take the output to be energised, switch the "
-            "amplifier off and check their cables first. Or the amplifier is off: then switch it "
-            "and its high voltage on, close its enable contact, and check the cable to its input",
+            "Assume that the output is energised: switch the amplifier off, and check the cables "
+            "of both monitors first. If the amplifier was off, switch it and its high voltage "
+            "on, close its enable contact, and check the cable to its input",
         )
     if no_carrier and no_step:
         return (
@@ -144,14 +144,14 @@ def _silent(carrier: float, step: float, current: float) -> tuple[str, str] | No
         )
     if no_carrier:
         return (
-            "the sensing signal does not arrive, the step does",
-            "Connect the generator's output, of channel generator.channel, to the summing input; "
-            "or disconnect the actuator, since a short takes the signal",
+            "the sensing signal does not arrive, but the step does",
+            "Connect the generator's output (channel generator.channel) to the summing input; or "
+            "disconnect the actuator, since a short circuit removes the signal",
         )
     if no_step:
         return (
-            "the step of the drive does not arrive, the sensing signal does",
-            "Connect daq.output to the summing input; check that the board's output is that one",
+            "the step of the drive does not arrive, but the sensing signal does",
+            "Connect daq.output to the summing input, and check that it is the right output",
         )
     if no_current:
         return (
@@ -170,7 +170,7 @@ def _polarity(farad: complex, step: float) -> tuple[str, str] | None:
     if step < 0.0:
         return (
             "the output has the wrong sign, at both monitors",
-            "Use the amplifier's non-inverting input; or both monitors have their wires swapped",
+            "Use the amplifier's non-inverting input; or swap the wires of both monitors",
         )
     if farad.real < 0.0 and abs(farad.real) > abs(farad.imag):
         return (
@@ -182,39 +182,40 @@ def _polarity(farad: complex, step: float) -> tuple[str, str] | None:
 
 def _scale(carrier: float, step: float) -> tuple[str, str] | None:
     off_carrier, off_step = abs(carrier - 1.0) > _SCALE, abs(step - 1.0) > _STEP_SCALE
-    alike = _ALIKE if off_carrier else _SAME  # an amplifier lifts the carrier by some per cent
+    alike = _ALIKE if off_carrier else _SAME  # an amplifier raises the carrier by some per cent
     if off_step and abs(carrier / step - 1.0) < alike:
         return (
-            f"the voltage monitor shows {step:.3g} times what it should, of carrier and step alike",
-            "Correct amplifier.volt_per_monitor_volt or amplifier.gain (a switch on the amplifier "
-            "may choose it), or the gain of the summing stage",
+            f"the voltage monitor shows {step:.3g} times the expected value of carrier and step",
+            "Change amplifier.volt_per_monitor_volt or amplifier.gain (a switch on the amplifier "
+            "may set it), or the gain of the summing stage",
         )
     if off_carrier:
         return _generator(carrier)
     if off_step:
         return (
-            f"a step of the drive arrives {step:.3g} times, the sensing signal as it should",
-            "Correct the gain of the summing stage at daq.output's input",
+            f"a step of the drive is {step:.3g} times its expected value, but the sensing signal "
+            "is correct",
+            "Change the gain of the summing stage at daq.output's input",
         )
     return None
 
 
 def _generator(carrier: float) -> tuple[str, str]:
-    found = f"the sensing signal arrives {carrier:.3g} times, the step as it should"
+    found = f"the sensing signal is {carrier:.3g} times its expected value, but the step is correct"
     if _HALF[0] < carrier < _HALF[1] or _DOUBLE[0] < carrier < _DOUBLE[1]:
         return found, (
-            "Correct generator.load: 'INF' for an amplifier's or summing stage's input, '50' for a "
-            "50 ohm one; else generator.volt_per_volt"
+            "Set generator.load to 'INF' for an amplifier's or summing stage's input, or to '50' "
+            "for a 50 ohm input; else change generator.volt_per_volt"
         )
-    return found, "Correct generator.volt_per_volt: the summing stage's gain for the generator"
+    return found, "Set generator.volt_per_volt to the summing stage's gain for the generator"
 
 
 def _phase(farad: complex) -> tuple[str, str] | None:
     angle_deg = math.degrees(cmath.phase(farad)) if farad else 0.0
     if abs(angle_deg) > _RIGHT_ANGLE_DEG:
         return (
-            f"the current is {abs(angle_deg):.3g} degrees off a quarter of a period",
-            "Correct daq.skew_s; if it is right, measure the actuator's leakage and the filters "
+            f"the current's phase differs by {abs(angle_deg):.3g} degrees from 90 degrees",
+            "Change daq.skew_s; if it is correct, measure the actuator's leakage and the filters "
             "of the monitors",
         )
     return None

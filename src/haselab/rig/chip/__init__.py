@@ -1,4 +1,4 @@
-"""The ATmega2560: its firmware built from a checkout, and run in co-simulation with the twin."""
+"""The microcontroller: build its firmware, use it as a rig, and simulate it with the twin."""
 
 from haselab.rig.chip.boards import Board, board_names, checkout, load_board
 from haselab.rig.chip.build import Firmware, build_cosim, build_firmware, find_tool

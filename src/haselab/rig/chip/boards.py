@@ -1,4 +1,4 @@
-"""The boards that a firmware can be built for: a folder of firmware/board each."""
+"""The boards for which firmware can be built, each a folder in firmware/board."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _FILE = "board.toml"
 
 @dataclass(frozen=True)
 class Board:
-    """How a board's firmware is made.
+    """How to build the firmware of a board.
 
     Args:
         name: of its folder.
         prefix: of its compiler's programs, such as "avr-".
-        package: that brings them, as `apt-get install` takes it.
-        flags: for the compiler, ahead of the sources.
-        link: for the linker, behind the sources.
+        package: package that contains them, for `apt-get install`.
+        flags: compiler options, before the sources.
+        link: linker options, after the sources.
         front_end: converter and stages that the board expects.
     """
 
@@ -38,27 +38,27 @@ class Board:
 
 
 def checkout() -> Path:
-    """The folder of the sources.
+    """Find the folder of the sources.
 
     Returns:
         The root of the checkout that this package runs from.
     Raises:
-        InputError: this package was installed without them.
+        InputError: This package was installed without them.
     """
     root = Path(__file__).resolve().parents[4]
     if not (root / "firmware" / "app" / "main.c").is_file():
         raise InputError(
-            "The firmware's sources are not part of an installed package; needed is a checkout. "
-            f"Clone the project and run it from there. {root}"
+            "The firmware's sources are not part of an installed package. Clone the project, and "
+            f"run haselab from there. {root}"
         )
     return root
 
 
 def board_names() -> list[str]:
-    """Boards that there are.
+    """List the available boards.
 
     Returns:
-        Names, in order; none where the sources are not there.
+        Names in alphabetical order; none if the sources are missing.
     Example:
         >>> board_names()
         ['atmega2560', 'stm32g071']
@@ -71,14 +71,14 @@ def board_names() -> list[str]:
 
 
 def load_board(name: str) -> Board:
-    """What a board's folder says about itself in board.toml.
+    """Read the board.toml of a board.
 
     Args:
         name: of the folder.
     Returns:
         The board.
     Raises:
-        InputError: no sources, no such board, or its file is unusable.
+        InputError: The sources or the board are missing, or its file is not valid.
     Example:
         >>> load_board("stm32g071").front_end.converter_codes
         4096
@@ -86,15 +86,15 @@ def load_board(name: str) -> Board:
     path = checkout() / "firmware" / "board" / name / _FILE
     if name not in board_names():
         raise InputError(
-            f"There is no board {name!r}; allowed are {', '.join(board_names())}. Choose one, or "
-            f"write its folder. {path.parent}"
+            f"There is no board {name!r}. Choose one of {', '.join(board_names())}, or add a "
+            f"folder for it. {path.parent}"
         )
     try:
         return _board(name, tomllib.loads(path.read_text(encoding="utf-8")), path.parent)
     except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
         raise InputError(
-            f"board.toml lacks or misuses {error}; needed are prefix, package, flags, and allowed "
-            f"are libraries, script, [front_end]. Correct it. {path}"
+            f"board.toml lacks or misuses {error}. It needs prefix, package and flags, and may "
+            f"have libraries, script and [front_end]. {path}"
         ) from None
 
 

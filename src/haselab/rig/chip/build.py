@@ -1,4 +1,4 @@
-"""Compiles the firmware and the co-simulation from the sources of a checkout."""
+"""Compile the firmware and the co-simulation from the sources."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _BUILT_IN = "controller_pid.c"  # of firmware/app
 
 @dataclass(frozen=True)
 class Firmware:
-    """A firmware that was built.
+    """A compiled firmware.
 
     Args:
-        elf: program with its symbols.
-        hex: the same for a programmer.
-        flash_bytes: of the program memory.
-        static_bytes: of the RAM, without the stack.
+        elf: program with symbols.
+        hex: the same program for flashing.
+        flash_bytes: used program memory.
+        static_bytes: used RAM, without the stack.
     """
 
     elf: Path
@@ -38,19 +38,19 @@ class Firmware:
 
 
 def find_tool(name: str, package: str) -> str:
-    """Path of a program.
+    """Find a program.
 
     Args:
         name: of the program.
-        package: that brings it.
+        package: package that contains it.
     Returns:
         Its path.
     Raises:
-        InputError: it is not installed.
+        InputError: The program is not installed.
     """
     path = shutil.which(name)
     if path is None:
-        raise InputError(f"{name} is not installed. Type:  sudo apt-get install -y {package}")
+        raise InputError(f"{name} is not installed. Run:  sudo apt-get install -y {package}")
     return path
 
 
@@ -60,8 +60,8 @@ def _run(command: list[str], what: str) -> str:
         said = (done.stderr or done.stdout).strip().splitlines()
         first = [line for line in said if "error" in line] or said
         raise ResultError(
-            f"{what} failed: {first[0] if first else done.returncode}. Correct the source, or "
-            "install the compiler's missing part."
+            f"{what} failed: {first[0] if first else done.returncode}. Fix the source, or install "
+            "the missing part of the compiler."
         )
     return done.stdout
 
@@ -77,14 +77,15 @@ def build_firmware(
 
     Args:
         settings: gains, maps and limits.
-        folder: where settings.h, firmware.elf and firmware.hex go.
+        folder: for settings.h, firmware.elf and firmware.hex.
         board: a folder of firmware/board.
-        extra: more options for the compiler.
+        extra: further compiler options.
     Returns:
         Files and sizes.
     Raises:
-        InputError: no sources, no such board, no compiler, or settings of another converter.
-        ResultError: it does not compile.
+        InputError: Sources, board or compiler are missing, or the settings are for another
+            converter.
+        ResultError: The firmware does not compile.
     """
     root, chosen = checkout(), load_board(board)
     _check_converter(settings, chosen)
@@ -114,20 +115,20 @@ def build_firmware(
 
 
 def _check_converter(settings: ChipSettings, board: Board) -> None:
-    """Settings of another converter would be calibrated wrongly, and their limits with them."""
+    """Refuse settings for another converter, whose calibration and limits would be wrong."""
     have, needed = (
         (front.converter_v, front.converter_codes)
         for front in (settings.front_end, board.front_end)
     )
     if have != needed:
         raise InputError(
-            f"The settings are for a converter of {have[1]} codes over {have[0]:g} V; allowed on "
-            f"{board.name} is {needed[1]} over {needed[0]:g} V. Take the board's front end."
+            f"The settings are for a converter of {have[1]} codes over {have[0]:g} V, but "
+            f"{board.name} has {needed[1]} codes over {needed[0]:g} V. Use the board's front end."
         )
 
 
 def simavr_header() -> str | None:
-    """Where the library is that co-simulations are compiled with; None: it is not installed.
+    """Find the header of libsimavr, for co-simulations; None if it is not installed.
 
     The program `simavr` of the same project is not needed.
     """
@@ -137,21 +138,21 @@ def simavr_header() -> str | None:
 
 
 def build_cosim(folder: Path) -> Path:
-    """Compile the co-simulation: a program of its own, under the licence of libsimavr.
+    """Compile the co-simulation, a separate program under the licence of libsimavr.
 
     Args:
-        folder: where it goes.
+        folder: for the program.
     Returns:
         The program.
     Raises:
-        InputError: no sources, no compiler, no libsimavr.
-        ResultError: it does not compile.
+        InputError: Sources, compiler or libsimavr are missing.
+        ResultError: The program does not compile.
     """
     root = checkout()
     compiler = find_tool("cc", "gcc libc6-dev")
     if simavr_header() is None:
         raise InputError(
-            "libsimavr is not installed. Type:  sudo apt-get install -y libsimavr-dev libelf-dev"
+            "libsimavr is not installed. Run:  sudo apt-get install -y libsimavr-dev libelf-dev"
         )
     folder.mkdir(parents=True, exist_ok=True)
     program = folder / "cosim"

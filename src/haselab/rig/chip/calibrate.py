@@ -1,4 +1,4 @@
-"""What a chip reads of a reference capacitor."""
+"""Calibrate the simulated microcontroller with a reference capacitor."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from haselab.rig.twin.twin_bench import TwinBench
 
 __all__ = ["REFERENCE", "Calibrated", "calibrated_firmware", "chip_correction"]
 
-REFERENCE = (500e-12, 5e3)  # capacitor and resistor in the actuator's place, in F and ohm
+REFERENCE = (500e-12, 5e3)  # capacitor and resistor in place of the actuator, in F and ohm
 _READINGS, _APART_S = 10, 0.1
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A chip ready for co-simulation.
+    """A calibrated microcontroller for co-simulation.
 
     Args:
         program: the co-simulation.
-        firmware: with the correction.
-        settings: that it holds.
-        correction: capacitance of the reference over the one that was reported without it.
+        firmware: firmware with the correction.
+        settings: settings compiled into it.
+        correction: capacitance of the reference over the value reported without correction.
     """
 
     program: Path
@@ -41,18 +41,18 @@ class Calibrated:
 def calibrated_firmware(
     settings: ChipSettings, config: TwinConfig, seed: int, folder: Path
 ) -> Calibrated:
-    """Build, read a reference capacitor, and build again with what it reported.
+    """Build the firmware, measure a reference capacitor, and build again with the correction.
 
     Args:
-        settings: of the chip.
+        settings: of the microcontroller.
         config: of the twin.
         seed: of its noise.
-        folder: where programs go.
+        folder: for the programs.
     Returns:
         Programs and settings.
     Raises:
-        InputError: a compiler or libsimavr is missing.
-        DeviceError: the chip saw no capacitor.
+        InputError: A compiler or libsimavr is missing.
+        DeviceError: The microcontroller measured no capacitor.
     """
     program = build_cosim(folder)
     plain = build_firmware(settings, folder)
@@ -63,17 +63,17 @@ def calibrated_firmware(
 
 
 def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> float:
-    """What a reference capacitor reads, turned over: `FrontEnd.correction`.
+    """Measure `FrontEnd.correction` with a reference capacitor.
 
     Args:
-        program: of the co-simulation.
-        elf: a firmware without a correction.
+        program: the co-simulation.
+        elf: firmware without a correction.
         config: of the twin.
         seed: of its noise.
     Returns:
-        Capacitance of the reference over the one that the chip reports.
+        Capacitance of the reference over the reported value.
     Raises:
-        DeviceError: the chip refused a command, or saw no capacitor.
+        DeviceError: The microcontroller refused a command, or measured no capacitor.
     """
     with CoSim(program, elf, TwinBench(config, seed)) as chip:
         chip.run(0.02)
@@ -81,11 +81,11 @@ def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> 
         chip.arm()
         known = len(chip.messages)
         for _ in range(_READINGS):
-            chip.tell(KeepAlive(), _APART_S)
+            chip.execute(KeepAlive(), _APART_S)
         reported = [m.capacitance_f for m in chip.messages[known:] if isinstance(m, Status)]
     if not reported or min(reported) <= 0.0:
         raise DeviceError(
-            f"The chip saw no capacitor of {REFERENCE[0]:g} F in {reported.count(0.0)} of "
-            f"{len(reported)} readings; every one has to show it. Check the front end's numbers."
+            f"The microcontroller measured no capacitance in {reported.count(0.0)} of "
+            f"{len(reported)} readings of {REFERENCE[0]:g} F. Check the values of [front_end]."
         )
     return REFERENCE[0] / float(np.mean(reported))

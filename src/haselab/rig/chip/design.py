@@ -1,4 +1,4 @@
-"""What a chip is built from: the maps, limits and gains of an actuator file or a run."""
+"""Read the settings of a microcontroller from an actuator file or a run."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from haselab.store.toml import validated
 __all__ = ["ChipDesign", "read_design"]
 
 _NO_GAINS = {"kp": 0.0, "ki": 0.0}
-_HIGHEST_DRIVE_V = 1.9  # of the chip's output, whose converter ends at 2.048 V
+_HIGHEST_DRIVE_V = 1.9  # of the microcontroller's output, whose converter reaches 2.048 V
 
 
 @dataclass(frozen=True)
 class ChipDesign:
-    """A controller for a chip and the actuator that it was designed for.
+    """A controller for a microcontroller and the actuator for which it was designed.
 
     Args:
         tables: the actuator file.
-        settings: what is compiled in.
+        settings: settings to compile in.
         path: of the actuator file or the run, for messages.
     """
 
@@ -40,7 +40,7 @@ class ChipDesign:
         """The identified plant.
 
         Raises:
-            InputError: there is none, or one of another kind.
+            InputError: There is none, or it has another form.
         """
         try:
             return self.tables.plant()
@@ -52,7 +52,7 @@ class ChipDesign:
         """Length of the actuator at zero strain, in m.
 
         Raises:
-            InputError: the file does not hold it.
+            InputError: The file does not contain it.
         """
         length_m = self.tables.actuator.geometry.zero_length_m
         if length_m is None:
@@ -66,20 +66,20 @@ class ChipDesign:
 def read_design(
     path: Path, kind: str | None, front_end: FrontEnd, source: Path | None = None
 ) -> ChipDesign:
-    """The settings of a chip from an actuator file or the folder of a run.
+    """Read the settings of a microcontroller from an actuator file or the folder of a run.
 
     Args:
-        path: of the actuator file or the folder; older runs too.
-        kind: of a controller that the file holds; None: the one of [controller], or with a source
-            that of its name.
-        front_end: of the chip's board.
-        source: C file compiled in place of the PID; None: the C step that the kind brings. PI and
-            PID need none.
+        path: of the actuator file or the folder, also of older runs.
+        kind: of a controller in the file; None: the one of [controller], or with a
+            source that of its name.
+        front_end: of the board.
+        source: C file compiled in place of the PID; None: the C step of the kind. PI and PID need
+            none.
     Returns:
-        The settings; the gains are those of continuous time, stepped at the chip's rate. The drive
-        goes no higher than `[drive] high_v` and the highest field allow.
+        The settings, with continuous-time gains that are stepped at the microcontroller's rate. The
+        drive is limited by `[drive] high_v` and the highest field.
     Raises:
-        InputError: something is missing or unusable, or the kind has no C step.
+        InputError: Something is missing or not valid, or the kind has no C step.
     """
     tables = validated(ActuatorTables, read_run(path), path)
     try:
@@ -99,8 +99,8 @@ def _settings(
         limits = tables.controller.limits
     if limits is None:
         raise InputError(
-            "[controller] has no limits, the range of its output. Design it with haselab design, "
-            "or add limits = {low = -0.05, high = 0.1}."
+            "[controller] has no limits of its output. Design it with haselab design, or add "
+            "limits = {low = -0.05, high = 0.1}."
         )
     gains = _NO_GAINS if step is not None else _gains(controller)
     _, high_v = tables.drive_ends_v()
@@ -123,7 +123,7 @@ def _settings(
 def _controller(
     tables: ActuatorTables, kind: str | None, source: Path | None
 ) -> tuple[ControllerSection, ControllerStep | None]:
-    """The controller of a kind, and its C step; None: the firmware's PID."""
+    """Find the controller of a kind, and its C step; None for the firmware's PID."""
     if source is not None and kind is None:
         held = tables.controller or ControllerSection()
         controller = held.all_kinds.get(source.stem, ControllerSection(kind=source.stem))

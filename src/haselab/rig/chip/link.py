@@ -1,4 +1,4 @@
-"""The chip's link: commands with their answers, on whatever carries the bytes."""
+"""The link to the microcontroller: commands and replies over any transport."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from haselab.firmware.messages import (
     Hello,
     Identity,
     RequestArming,
-    Verdict,
+    Result,
 )
 
 __all__ = ["ChipLink"]
 
-_GREETINGS = 3  # the first one may meet half a frame, or an output that is on its way down
+_HELLO_TRIALS = 3  # the first one may meet half a frame, or an output that is ramping down
 
 
 class ChipLink(ABC):
-    """Speaks the table of `firmware/protocol`. Who inherits moves the bytes.
+    """Sends and receives the messages of `firmware/protocol`; a subclass transports the bytes.
 
-    `messages` holds all that has come in, oldest first; whoever reads them may clear it.
+    `messages` holds all received messages, oldest first; the reader may clear it.
     """
 
-    patience_s = 5e-3  # longer than the chip takes for any answer
+    patience_s = 5e-3  # longer than any reply takes
 
     def __init__(self) -> None:
         self.messages: list[Any] = []
@@ -38,38 +38,38 @@ class ChipLink(ABC):
 
     @abstractmethod
     def put(self, data: bytes) -> None:
-        """Bytes to the chip; no time passes.
+        """Send bytes; no time passes.
 
         Raises:
-            DeviceError: the link is gone.
+            DeviceError: The link is lost.
         """
 
     @abstractmethod
-    def arrivals(self, duration_s: float) -> Iterator[Any]:
-        """What comes in while time passes; it need not pass to the end where nobody asks on.
+    def receive(self, duration_s: float) -> Iterator[Any]:
+        """Yield messages that arrive while time passes; stop early if the caller does.
 
         Args:
             duration_s: in s.
         Raises:
-            DeviceError: the link is gone.
+            DeviceError: The link is lost.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End the link. The chip ramps its output down by itself when it hears nothing."""
+        """Close the link. The microcontroller then ramps its output down by itself."""
 
     @property
     def bad_frames(self) -> int:
-        """Frames of the chip that were not whole."""
+        """Number of received frames that were damaged."""
         return self._reader.bad_frames
 
-    def came(self, data: bytes) -> list[Any]:
-        """Bytes of the chip to messages.
+    def decoded(self, data: bytes) -> list[Any]:
+        """Decode received bytes.
 
         Args:
-            data: as they came.
+            data: received bytes.
         Returns:
-            The messages that they end.
+            The messages that they complete.
         """
         found = [message for message, _ in self._reader.feed(data)]
         self.messages += found
@@ -81,14 +81,14 @@ class ChipLink(ABC):
         Args:
             duration_s: in s.
         Returns:
-            The chip's messages.
+            The received messages.
         Raises:
-            DeviceError: the link is gone.
+            DeviceError: The link is lost.
         """
-        return list(self.arrivals(duration_s))
+        return list(self.receive(duration_s))
 
     def send(self, message: Any, sequence: int | None = None) -> bytes:
-        """Put a command on the wire, and let no time pass.
+        """Send a command; no time passes.
 
         Args:
             message: of `haselab.firmware.messages`.
@@ -103,77 +103,77 @@ class ChipLink(ABC):
         self.put(frame)
         return frame
 
-    def ask(self, message: Any, wait_s: float | None = None) -> Any:
-        """A command and its answer.
+    def query(self, message: Any, wait_s: float | None = None) -> Any:
+        """Send a command and wait for its reply.
 
         Args:
             message: of `haselab.firmware.messages`.
-            wait_s: for the answer, in s; `patience_s` by default.
+            wait_s: longest wait for the reply, in s; `patience_s` by default.
         Returns:
-            `Ack` or `Identity`; None where nothing came.
+            `Ack` or `Identity`; None if there was no reply.
         """
         self.send(message)
         number = self._sequence & 0xFFFF
-        for reported in self.arrivals(self.patience_s if wait_s is None else wait_s):
-            greeted = isinstance(reported, Identity) and isinstance(message, Hello)
-            if greeted or (isinstance(reported, Ack) and reported.answered == number):
+        for reported in self.receive(self.patience_s if wait_s is None else wait_s):
+            is_identity = isinstance(reported, Identity) and isinstance(message, Hello)
+            if is_identity or (isinstance(reported, Ack) and reported.answered == number):
                 return reported
         return None
 
-    def tell(self, message: Any, wait_s: float | None = None) -> Ack:
-        """A command that has to be accepted.
+    def execute(self, message: Any, wait_s: float | None = None) -> Ack:
+        """Send a command that must be accepted.
 
         Args:
             message: of `haselab.firmware.messages`.
-            wait_s: for the answer, in s; `patience_s` by default.
+            wait_s: longest wait for the reply, in s; `patience_s` by default.
         Returns:
             The ack.
         Raises:
-            DeviceError: it was not, or no answer came.
+            DeviceError: The command was refused, or there was no reply.
         """
-        answer = self.ask(message, wait_s)
-        if not isinstance(answer, Ack) or answer.verdict != Verdict.ACCEPTED:
-            what = "nothing" if answer is None else Verdict(answer.verdict).name.lower()
+        answer = self.query(message, wait_s)
+        if not isinstance(answer, Ack) or answer.result != Result.ACCEPTED:
+            what = "no reply" if answer is None else Result(answer.result).name.lower()
             raise DeviceError(
-                f"{type(message).__name__} was answered by {what}, needed is accepted. Look at the "
-                "chip's state, and clear its fault."
+                f"The microcontroller did not accept {type(message).__name__} ({what}). Check its "
+                "state, and clear its fault."
             )
         return answer
 
-    def greet(self) -> Identity:
-        """Say which table is spoken.
+    def hello(self) -> Identity:
+        """Connect with this version of the protocol.
 
         Returns:
-            The chip's word about itself.
+            The microcontroller's identity.
         Raises:
-            DeviceError: no answer: it is on, or no chip of this firmware.
+            DeviceError: No reply: its output is on, or it has other firmware.
         """
-        for _ in range(_GREETINGS):
-            answer = self.ask(Hello(VERSION))
+        for _ in range(_HELLO_TRIALS):
+            answer = self.query(Hello(VERSION))
             if isinstance(answer, Identity):
                 return answer
         raise DeviceError(
-            "The chip does not answer to hello; needed is one that runs this firmware and is off. "
-            "Check port and power, flash it, and wait until its output is down."
+            "The microcontroller does not reply to hello. Check its port and its power, wait until "
+            "its output is off, and flash this firmware."
         )
 
     def arm(self, settle_s: float = 0.06) -> None:
-        """Greet, and arm in two steps.
+        """Connect, and arm in two steps.
 
         Args:
             settle_s: time until the strain is valid, in s.
         Raises:
-            DeviceError: the chip is not off.
+            DeviceError: The output is not off.
         """
-        self.greet()
+        self.hello()
         self.arm_in_two_steps()
         self.run(settle_s)
 
     def arm_in_two_steps(self) -> None:
-        """Ask for a token, and give it back.
+        """Request a token, then confirm arming with it.
 
         Raises:
-            DeviceError: the chip is not off.
+            DeviceError: The output is not off.
         """
-        token = self.tell(RequestArming()).token
-        self.tell(ConfirmArming(token))
+        token = self.execute(RequestArming()).token
+        self.execute(ConfirmArming(token))

@@ -1,4 +1,4 @@
-"""RIG.toml of `kind = "mega"`: a chip on a serial port, or in co-simulation with the twin."""
+"""RIG.toml with `kind = "mega"`: a microcontroller on a serial port, or simulated with the twin."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ __all__ = [
 ]
 
 _MAX_SEED = 2**63 - 1
-_CALL_S = 5.0  # that one call may take: arming, and the ramp to 0 V
-_START_S = 0.02  # from power-up to the first update, and some more
+_CALL_S = 5.0  # longest call: arming, and the ramp to 0 V
+_START_S = 0.02  # longer than from power-up to the first update
 
 
 class FrontEndConfig(PrintableSection):
@@ -61,22 +61,22 @@ class FrontEndConfig(PrintableSection):
     @model_validator(mode="after")
     def _near_one(self) -> Self:
         if not 0.1 <= abs(complex(*self.correction)) <= 10.0:
-            raise ValueError("correction is measured over expected: a tenth to ten times")
+            raise ValueError("correction (measured over expected) must be between 0.1 and 10")
         return self
 
     def front_end(self) -> FrontEnd:
-        """As the firmware takes it."""
+        """The front end for the firmware."""
         return FrontEnd(**self.model_dump() | {"correction": complex(*self.correction)})
 
 
 class SimulatorConfig(PrintableSection):
-    """The twin beside which the chip runs."""
+    """The twin with which the microcontroller is simulated."""
 
-    twin: str | None = Field(None, description="TWIN.toml; else the reading's")
+    twin: str | None = Field(None, description="TWIN.toml; omit: that of the reading")
     reading: Literal["rad", "hz"] | None = None
     seed: int = Field(1, ge=0, le=_MAX_SEED)
     precondition_v: float = Field(
-        0.0, ge=0, le=2, description="drive that the sheet has been through before; 0: a new sheet"
+        0.0, ge=0, le=2, description="highest earlier drive of the sheet; 0: a new sheet"
     )
     supply: SupplyModel | None = Field(
         None, description="a serial high-voltage supply in place of the analogue module"
@@ -85,14 +85,14 @@ class SimulatorConfig(PrintableSection):
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
         if self.twin is not None and self.reading is not None:
-            raise ValueError("twin and reading both given; the twin's file has a reading")
+            raise ValueError("set either twin or reading; the twin's file has a reading")
         return self
 
     def configuration(self, path: Path) -> TwinConfig:
-        """The physical bench.
+        """Load the twin's configuration.
 
         Args:
-            path: of the rig file, from which the twin's is found.
+            path: of the rig file, relative to which the twin's file is found.
         """
         if self.twin is None:
             return twin_of_reading(self.reading or "hz")
@@ -104,30 +104,30 @@ class ChipFile(PrintableSection):
 
     kind: Literal["mega"]
     name: str = "chip"
-    run: str = Field(min_length=1, description="folder of the study whose controller it holds")
+    run: str = Field(min_length=1, description="folder of the study whose controller it runs")
     structure: str | None = Field(
         None,
         min_length=1,
         max_length=64,
-        description="kind or name of the controller; none: [controller] itself",
+        description="kind or name of the controller; omit: [controller] itself",
     )
     controller_source: str | None = Field(
-        None, min_length=1, description="C file of a controller of one's own"
+        None, min_length=1, description="C file of your own controller"
     )
     port: str | None = Field(None, min_length=1, description="/dev/ttyACM0, COM3, ...")
     simulator: SimulatorConfig | None = None
     front_end: FrontEndConfig = FrontEndConfig()
     drive_high_v: float | None = Field(
-        None, gt=0, lt=2.048, description="highest drive, where the module reaches less"
+        None, gt=0, lt=2.048, description="highest drive, if the module reaches less"
     )
     rise_v_per_s: float | None = Field(
-        None, gt=0, le=20, description="fastest change of the drive, where the module is slower"
+        None, gt=0, le=20, description="fastest change of the drive, if the module is slower"
     )
     bandgap_v: float | None = Field(
         None,
         ge=1.0,
         le=1.2,
-        description="of this chip's reference, measured; see docs/control/firmware.md",
+        description="measured reference voltage; see docs/control/firmware.md",
     )
     specimen: SpecimenConfig | None = Field(None, description="of a real bench")
     camera: CameraField = Field(None, description="of a real bench")
@@ -137,18 +137,18 @@ class ChipFile(PrintableSection):
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
         if (self.port is None) == (self.simulator is None):
-            raise ValueError("either port or a table simulator has to be given, and not both")
+            raise ValueError("set either port or a table simulator")
         if self.port is not None and (self.specimen is None or self.camera is None):
-            raise ValueError("a chip on a port needs the tables specimen and camera")
+            raise ValueError("a microcontroller on a port needs the tables specimen and camera")
         if self.simulator is not None and (self.specimen or self.camera):
-            raise ValueError("specimen and camera are the twin's with a table simulator")
+            raise ValueError("remove specimen and camera: with a table simulator the twin has them")
         return self
 
     def limited(self, settings: ChipSettings) -> ChipSettings:
-        """Settings with the limits of this bench's high-voltage module.
+        """Apply the limits of this bench's high-voltage module to settings.
 
         Raises:
-            InputError: the voltage map needs more than the module reaches.
+            InputError: The voltage map needs more than the module reaches.
         """
         high, rise = self.drive_high_v, self.rise_v_per_s
         return replace(
@@ -160,13 +160,13 @@ class ChipFile(PrintableSection):
 
 @dataclass(frozen=True)
 class OpenedChip:
-    """A chip that answers.
+    """An opened microcontroller.
 
     Args:
-        rig: it, as a bench.
-        settings: that it holds.
-        zero_length_m: of the sheet at zero strain, by the study that made the settings.
-        identity: what it says of itself.
+        rig: its bench.
+        settings: settings of its firmware.
+        zero_length_m: length of the sheet at zero strain, from the study that made the settings.
+        identity: its own identification.
     """
 
     rig: Rig
@@ -176,25 +176,25 @@ class OpenedChip:
 
 
 def key_of_port(port: str) -> str:
-    """What identifies the microcontroller on a serial port of this computer."""
+    """Interlock key of the microcontroller on a serial port of this computer."""
     return f"chip {Path(port).resolve()}"
 
 
 @contextlib.contextmanager
 def opened_chip(file: ChipFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
-    """The chip of a rig file; leaving the context is 0 V and the link closed.
+    """Open the microcontroller of a rig file; the context ends at 0 V and closes the link.
 
     In co-simulation the firmware is built, calibrated with a reference capacitor, and built again.
 
     Args:
         file: the rig file.
         path: of it.
-        gate: in front of its driver.
+        gate: wraps its driver.
     Returns:
-        A context with the chip.
+        A context with the microcontroller.
     Raises:
-        DeviceError: no port, no answer, or another program uses it.
-        InputError: another firmware than the file's, a compiler or libsimavr is missing.
+        DeviceError: The port does not exist, there is no reply, or another program uses it.
+        InputError: The firmware is not the file's, or a compiler or libsimavr is missing.
     """
     source = None if file.controller_source is None else path.parent / file.controller_source
     design = read_design(path.parent / file.run, file.structure, file.front_end.front_end(), source)
@@ -253,27 +253,27 @@ def _on_port(
 
 
 class _Sheet(TwinBench):
-    """The twin's camera before a sheet that the co-simulation moves."""
+    """The twin's camera filming a sheet that the co-simulation moves."""
 
-    _passed: int | None = None  # slots; None: the weight is still being hung
+    _passed: int | None = None  # slots; None: before the mass is hung
 
     @property
     def time_s(self) -> float:
-        """By the clock of the chip's bench, in s."""
+        """Time on the clock of the microcontroller's bench, in s."""
         return super().time_s if self._passed is None else self._passed * SLOT_S
 
     def since(self, slots: int) -> None:
-        """From now on the sheet is moved by the co-simulation; its clock shows so many slots."""
+        """Let the co-simulation move the sheet from now on; its clock shows this many slots."""
         self._passed = slots
 
     def moved(self, lengths_m: list[float]) -> None:
-        """Lengths that the sheet has had since, one a slot."""
+        """Add lengths of the sheet, one per slot."""
         self._passed = (self._passed or 0) + len(lengths_m)
         self._remember(np.array(lengths_m))
 
 
 class _SheetCamera:
-    """Fulfils `Camera`."""
+    """Implements `Camera`."""
 
     def __init__(self, chip: CoSim, sheet: _Sheet) -> None:
         self._chip, self._sheet = chip, sheet
@@ -300,7 +300,7 @@ class _SheetCamera:
 
 
 class _SheetWeights:
-    """Fulfils `WeightHandler`: the twin's weight off and on."""
+    """Implements `WeightHandler`: takes the twin's mass off and on."""
 
     def __init__(self, chip: CoSim, mass_kg: float) -> None:
         self._chip, self._mass_kg = chip, mass_kg
@@ -312,8 +312,8 @@ class _SheetWeights:
         """See `WeightHandler`."""
         if mass_kg != self._mass_kg:
             raise LimitError(
-                f"Mass = {mass_kg:g} kg; beside a simulated chip hangs {self._mass_kg:g} kg. Hang "
-                "that, or use the twin's rig."
+                f"The mass is {mass_kg:g} kg, but the simulated microcontroller has only a mass of "
+                f"{self._mass_kg:g} kg. Use that mass, or the twin's rig."
             )
         self._load(mass_kg)
 
@@ -332,7 +332,7 @@ def _simulated(
     simulator: SimulatorConfig,
     settings: ChipSettings,
 ) -> tuple[CoSim, ChipSettings, _Sheet]:
-    """A chip that runs, its calibrated settings, and the sheet that it moves."""
+    """Start a simulated microcontroller; return it, its calibrated settings and its sheet."""
     folder, seed = Path(opened.enter_context(tempfile.TemporaryDirectory())), simulator.seed
     made = calibrated_firmware(settings, config, seed, folder)
     daq = config.acquisition.model_copy(update={"rate_hz": 20.0 / SLOT_S})

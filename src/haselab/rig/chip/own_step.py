@@ -1,4 +1,4 @@
-"""A controller of one's own on the microcontroller: its numbers and its C file."""
+"""Your own controller on the microcontroller: its parameters and its C file."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ __all__ = ["controller_step"]
 
 
 def controller_step(controller: ControllerSection, source: Path | None) -> ControllerStep:
-    """The C step of a controller of the actuator file.
+    """Read the C step of a controller of the actuator file.
 
     Args:
-        controller: its kind and parameters. Where the kind is registered, they are checked and
+        controller: its kind and parameters. If the kind is registered, they are checked and
             passed in the order of the kind, else in that of the section.
-        source: C file; None: the one that the kind brings.
+        source: C file; None: that of the kind.
     Returns:
-        What is compiled in place of the PID.
+        The controller to compile in place of the PID.
     Raises:
-        InputError: an unknown kind, values that it does not accept, or a kind without a C step.
+        InputError: The kind is unknown, refuses the values, or has no C step.
     """
     if source is not None:
         return ControllerStep(controller.kind, _values(controller), _c_text(source))
     chosen = _chosen(controller)
     if chosen.kind.c_source is None:
         raise InputError(
-            f"Controller {chosen.kind.name!r} has no C step, so it runs on the computer alone. "
-            "Name a C file with --controller-source, or choose another kind."
+            f"Controller {chosen.kind.name!r} has no C step, so it runs only on the computer. Give "
+            "a C file with --controller-source, or choose another kind."
         )
     return ControllerStep(chosen.kind.name, chosen.values, _c_text(chosen.kind.c_source))
 

@@ -1,4 +1,4 @@
-"""The chip on a serial port."""
+"""The link to a microcontroller on a serial port."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _POLL_S = 2e-3
 
 
 class SerialChip(ChipLink):
-    """A chip on a serial port; time is the wall clock's.
+    """A microcontroller on a serial port; time is that of the wall clock.
 
     Args:
         port: /dev/ttyACM0, COM3, ...
-        patience_s: for an answer, in s: a computer's port hands bytes on in pieces.
-        reset_s: that the board may take to start once the port is open, in s.
+        patience_s: longest wait for a reply, in s; a computer's port delivers bytes in parts.
+        reset_s: longest start of the board after the port is opened, in s.
     Raises:
-        DeviceError: no driver, or no such port.
+        DeviceError: The driver or the port does not exist.
     """
 
     def __init__(self, port: str, patience_s: float = 0.5, reset_s: float = _RESET_S) -> None:
         super().__init__()
-        serial = load_driver("serial", "The chip")
+        serial = load_driver("serial", "The microcontroller")
         self._name, self.patience_s = port, patience_s
         try:
             self._port: Any = serial.Serial(port, _BAUD, timeout=_POLL_S, write_timeout=patience_s)
@@ -46,26 +46,26 @@ class SerialChip(ChipLink):
 
     def _gone(self, what: str) -> DeviceError:
         return DeviceError(
-            f"The chip's serial port does not work ({what}). Check cable and power, or correct "
-            f"port. {self._name}"
+            f"The microcontroller's serial port does not work ({what}). Check its cable and its "
+            f"power, or change port. {self._name}"
         )
 
     def put(self, data: bytes) -> None:
         """See `ChipLink`."""
         try:
             self._port.write(data)
-        except (OSError, TypeError) as error:  # pyserial: TypeError on a port that is gone
+        except (OSError, TypeError) as error:  # pyserial: TypeError on a port that was removed
             raise self._gone(str(error) or type(error).__name__) from None
 
-    def arrivals(self, duration_s: float) -> Iterator[Any]:
-        """See `ChipLink`; by the wall clock."""
+    def receive(self, duration_s: float) -> Iterator[Any]:
+        """See `ChipLink`; time is that of the wall clock."""
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:
             try:
                 data = self._port.read(max(1, self._port.in_waiting))
             except (OSError, TypeError) as error:
                 raise self._gone(str(error) or type(error).__name__) from None
-            yield from self.came(data)
+            yield from self.decoded(data)
 
     def close(self) -> None:
         """See `ChipLink`."""

@@ -1,4 +1,4 @@
-"""The chip in co-simulation: firmware, instruction by instruction, against the twin's physics."""
+"""Co-simulation of the firmware, instruction by instruction, with the twin's physics."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Output(NamedTuple):
 
     @property
     def on(self) -> bool:
-        """The high-voltage module gets more than 0 V."""
+        """Whether the high-voltage module gets more than 0 V."""
         return bool(self.enable and self.code)
 
 
 class Track(NamedTuple):
-    """Truth: `time_s`, `length_m` of the sheet, `high_v` at the module's output."""
+    """True values: `time_s`, `length_m` of the sheet, `high_v` at the module's output."""
 
     time_s: float
     length_m: float
@@ -44,15 +44,15 @@ class Track(NamedTuple):
 
 
 class CoSim(Closing, ChipLink):
-    """A chip that runs beside a twin. Use as a context: its end ends the process.
+    """A simulated microcontroller with a twin. Use as a context, whose end ends the process.
 
     Args:
         program: of `build_cosim`.
         elf: the firmware.
-        twin: the bench, whose present state the co-simulation starts from; it stays as it is.
-        supply_v: of the chip, in V.
+        twin: bench from whose present state the co-simulation starts; it is not changed.
+        supply_v: supply voltage of the microcontroller, in V.
     Raises:
-        DeviceError: the program does not start.
+        DeviceError: The program does not start.
     """
 
     def __init__(self, program: Path, elf: Path, twin: TwinBench, supply_v: float = 5.0) -> None:
@@ -73,11 +73,14 @@ class CoSim(Closing, ChipLink):
             self._process = subprocess.Popen(
                 [str(program), str(elf), str(physics), str(round(1e3 * supply_v))],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-                start_new_session=True,  # Ctrl-C is for the program, which stops the chip first
+                # Ctrl-C is for the main program, which stops the output first
+                start_new_session=True,
             )  # fmt: skip
         except (OSError, subprocess.CalledProcessError) as error:
             self._folder.cleanup()
-            raise DeviceError(f"The co-simulation does not start ({error}). {program}") from None
+            raise DeviceError(
+                f"The co-simulation does not start ({error}). Build it again. {program}"
+            ) from None
 
     def close(self) -> None:
         """End the process."""
@@ -96,15 +99,15 @@ class CoSim(Closing, ChipLink):
     # ---- the program -----------------------------------------------------------------------------
 
     def command(self, line: str) -> list[list[str]]:
-        """One command of firmware/sim/cosim.c.
+        """Send one command of firmware/sim/cosim.c.
 
         Args:
-            line: see there.
+            line: the command, see there.
         Returns:
-            What it answered beyond outputs, tracks and the link, in words.
+            Its reply without outputs, tracks and link data, split into words.
         Raises:
-            DeviceError: the program ended.
-            InputError: it does not know the command.
+            DeviceError: The program ended.
+            InputError: The program does not know the command.
         """
         stdin, stdout = self._process.stdin, self._process.stdout
         assert stdin is not None
@@ -120,9 +123,11 @@ class CoSim(Closing, ChipLink):
             kind, *words = answer.split()
             if kind == "ok":
                 self.counts = {k: float(v) for k, v in (word.split("=") for word in words)}
-                self.came(bytes(link))
+                self.decoded(bytes(link))
                 if unknown:
-                    raise InputError(f"The co-simulation does not know {line!r}. See cosim.c.")
+                    raise InputError(
+                        f"The co-simulation has no command {line!r}. Use one of cosim.c."
+                    )
                 return other
             if kind == "uart":
                 link.append(int(words[0], 16))
@@ -141,29 +146,29 @@ class CoSim(Closing, ChipLink):
 
     @property
     def time_s(self) -> float:
-        """Since power-up, in s."""
+        """Time since power-up, in s."""
         return self.counts.get("cycle", 0.0) / CLOCK_HZ
 
     @property
     def load(self) -> float:
-        """Share of the cycles that the CPU did not sleep, since power-up."""
+        """Fraction of the cycles since power-up in which the CPU did not sleep."""
         return 1.0 - self.counts["asleep"] / self.counts["cycle"]
 
     def put(self, data: bytes) -> None:
         """See `ChipLink`."""
         self.command(f"send {data.hex()}")
 
-    def arrivals(self, duration_s: float) -> Iterator[Any]:
-        """See `ChipLink`; all of the time passes, rounded to a cycle."""
+    def receive(self, duration_s: float) -> Iterator[Any]:
+        """See `ChipLink`; the whole time passes, rounded to a cycle."""
         known = len(self.messages)
         self.command(f"run {round(duration_s * CLOCK_HZ)}")
         return iter(self.messages[known:])
 
     def fault(self, name: str) -> float:
-        """Break something; see cosim.c.
+        """Inject a fault; see cosim.c.
 
         Returns:
-            When, in s since power-up.
+            Time of the fault, in s since power-up.
         """
         self.command(f"fault {name}")
         return self.time_s

@@ -1,8 +1,8 @@
-"""The chip with an off-the-shelf high-voltage supply in place of an analogue module.
+"""The simulated microcontroller with a serial high-voltage supply instead of an analogue module.
 
-The chip computes phase, strain and controller. The computer reads the output codes of its updates
-from the chip's link and passes the mean of those since the last command on to the supply, as a
-command on its serial line.
+The microcontroller computes phase, strain and controller. The computer reads the output codes of
+its updates from the link and sends the mean of those since the last command to the supply's serial
+port.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _LIVE = (State.RUNNING, State.STOPPING)
 
 
 class SupplyModel(Section):
-    """A supply of the Peta-Pico-Voltron class: what limits it.
+    """Limits of a supply of the Peta-Pico-Voltron family.
 
-    Reach, step of the set point, current and divider are published (HardwareX 2018 e00039,
+    Range, step of the set point, current and divider are published (HardwareX 2018 e00039,
     petapicovoltron.com); the other values are assumptions, to be replaced by measured ones.
     """
 
@@ -55,25 +55,25 @@ class SupplyModel(Section):
 
     @property
     def slew_v_per_s(self) -> float:
-        """What the current leaves for the load at the highest voltage, in V/s."""
+        """Slew rate at the highest voltage, which the current limits, in V/s."""
         return (self.current_a - self.highest_v / self.divider_ohm) / self.load_f
 
     def command_s(self, voltage_v: float) -> float:
-        """From the first byte of a set point to its effect, in s."""
+        """Time from the first byte of a set point to its effect, in s."""
         sent = len(f"SVset {round(voltage_v)}\r")
         return sent * _BITS_PER_BYTE / _BAUD + self.processing_s
 
     @property
     def delay_s(self) -> float:
-        """From the chip's output code to the middle of the voltage's response, in s.
+        """Delay from the output code to the middle of the voltage's response, in s.
 
-        A command, and the regulator's time constant. The hold between two commands is not in it.
+        One command and the regulator's time constant, without the hold between two commands.
         """
         return self.command_s(self.highest_v) + self.response_s
 
 
 class SupplyOutput:
-    """Output voltage of a supply in simulated time: fulfils `Rail`.
+    """Output voltage of a supply in simulated time; implements `Rail`.
 
     Args:
         model: its limits.
@@ -92,7 +92,7 @@ class SupplyOutput:
         return self._output_v
 
     def rail(self, voltage_v: float) -> None:
-        """See `Rail`: it takes effect once the command is over and processed."""
+        """See `Rail`; takes effect once the command has been sent and processed."""
         target_v = min(voltage_v, self._model.highest_v)
         target_v = self._model.step_v * round(target_v / self._model.step_v)
         if target_v == self._target_v:
@@ -104,9 +104,9 @@ class SupplyOutput:
         """Let time pass.
 
         Args:
-            slots: how many, of 125 us each.
+            slots: number of slots of 125 us.
         Returns:
-            The output voltage, one value a slot, in V.
+            The output voltage, one value per slot, in V.
         """
         m = self._model
         share = -math.expm1(-SLOT_S / m.response_s)
@@ -126,20 +126,21 @@ class SupplyOutput:
 
 
 class SuppliedCoSim(CoSim):
-    """A chip in co-simulation whose high voltage comes from a supply on a serial line.
+    """A simulated microcontroller whose high voltage comes from a serial supply.
 
-    The supply's driver speaks to an emulated supply over a pseudo-terminal, byte by byte; time
-    passes in the simulation alone.
+    The supply's driver communicates with an emulated supply over a pseudo-terminal, byte by byte;
+    only simulated time passes.
 
     Args:
         program: of `build_cosim`.
         elf: the firmware.
-        twin: the bench, whose present state the co-simulation starts from.
+        twin: bench from whose present state the co-simulation starts.
         model: of the supply.
-        gain: V at the actuator for one of the chip's output.
+        gain: V at the actuator per V of the microcontroller's output.
         seed: of the supply's ripple.
     Raises:
-        DeviceError: the program does not start, no pseudo-terminals, or no driver for serial ports.
+        DeviceError: The program does not start, or pseudo-terminals or the serial driver are
+            missing.
     """
 
     def __init__(
@@ -153,13 +154,13 @@ class SuppliedCoSim(CoSim):
     ) -> None:
         super().__init__(program, elf, twin)
         self._model, self._gain = model, gain
-        self._codes: list[int] = []  # of the chip's updates since the last command
+        self._codes: list[int] = []  # of the updates since the last command
         self._next_cycle = 0
-        self.commands = 0  # that the supply was sent
+        self.commands = 0  # number of commands sent to the supply
         self.supply = SupplyOutput(model, seed)
         self._end = contextlib.ExitStack()
         try:
-            # its voltage runs down in simulated time, by its own model
+            # its voltage decays in simulated time, by its own model
             server = SupplyServer(self.supply, faults=SupplyFaults(decay_s=0.0))
             self._end.callback(server.close)
             self._driver = PetaPicoVoltron(
@@ -170,18 +171,18 @@ class SuppliedCoSim(CoSim):
             self.close()
             raise
 
-    def came(self, data: bytes) -> list[Any]:
-        """See `ChipLink`; the updates say which voltage the supply has to give."""
-        found = super().came(data)
+    def decoded(self, data: bytes) -> list[Any]:
+        """See `ChipLink`; the updates contain the voltage for the supply."""
+        found = super().decoded(data)
         for message in found:
             if isinstance(message, Trace) and message.state in _LIVE:
                 self._codes.append(message.code)
             elif isinstance(message, Trace):
-                self._codes = [0]  # off, or tripped: nothing of before counts
+                self._codes = [0]  # off or tripped: discard earlier codes
         return found
 
-    def arrivals(self, duration_s: float) -> Iterator[Any]:
-        """See `ChipLink`; every so often the supply gets a command."""
+    def receive(self, duration_s: float) -> Iterator[Any]:
+        """See `ChipLink`; sends the supply a command at regular times."""
         known = len(self.messages)
         cycle = round(self.counts.get("cycle", 0.0))
         end = cycle + round(duration_s * CLOCK_HZ)
@@ -194,7 +195,7 @@ class SuppliedCoSim(CoSim):
         return iter(self.messages[known:])
 
     def _pass_on(self) -> None:
-        """The computer's part: the chip's output codes become the supply's set point."""
+        """Send the mean output code to the supply as its set point."""
         code = float(np.mean(self._codes)) if self._codes else 0.0  # no update: no voltage
         self._codes = []
         volt = code * OUTPUT_V_PER_CODE * self._gain
@@ -204,6 +205,6 @@ class SuppliedCoSim(CoSim):
         self.command("rail " + " ".join(f"{volt / self._gain:.6g}" for volt in volts))
 
     def close(self) -> None:
-        """Supply off, and the process ends."""
+        """Switch the supply off and end the process."""
         self._end.close()
         super().close()

@@ -1,4 +1,4 @@
-"""The chip's analogue supply, from its own reference: the range of every reading."""
+"""Check the microcontroller's supply voltage, which scales all its readings."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ _SHARE = 0.05  # by which the supply may differ from what the front end was calc
 
 
 def check_supply(code: int, wanted_v: float, bandgap_v: float | None = None) -> str:
-    """Whether the chip runs on the voltage that its front end was calculated for.
+    """Check that the microcontroller has the supply voltage for which its front end was designed.
 
-    The converter measures in parts of the supply. In the capacitance it cancels; in the level of
-    the high voltage it does not: with 4.5 V instead of 5 V the actuator gets 10 % less than is
-    reported. Without a measured reference the supply is known to 9 %, so only what no chip of the
-    data sheet could show is refused.
+    The converter measures relative to the supply. The supply cancels in the capacitance, but not in
+    the level of the high voltage: with 4.5 V instead of 5 V the actuator gets 10 % less than
+    reported. Without a measured reference the supply is known to 9 %, so only values outside the
+    range of the data sheet are refused.
 
     Args:
-        code: of the reference against the supply; 0: this board does not measure it.
+        code: of the reference relative to the supply; 0: this board does not measure it.
         wanted_v: range of the converter, in V.
-        bandgap_v: of this chip's reference, measured, in V; None: not measured.
+        bandgap_v: measured voltage of this microcontroller's reference, in V; None: not measured.
     Returns:
-        What to add to the chip's identity.
+        Text to add to the microcontroller's identity.
     Raises:
-        DeviceError: the supply is off by more than 5 %.
+        DeviceError: The supply differs by more than 5 %.
     Example:
         >>> check_supply(225, 5.0), check_supply(225, 5.0, 1.08), check_supply(0, 3.3)
         (', supply 5.01 V to 9 %', ', supply 4.92 V', '')
@@ -44,9 +44,10 @@ def check_supply(code: int, wanted_v: float, bandgap_v: float | None = None) -> 
         or low_v * _CODES / code > (1.0 + _SHARE) * wanted_v
     ):
         raise DeviceError(
-            f"The chip runs on about {supply_v:.2f} V (its reference reads {code} of {_CODES}), "
-            f"needed are {wanted_v:g} V within {100.0 * _SHARE:g} %: the high voltage would be "
-            "another one than it reports. Feed its 5V pin from a regulated supply, not from USB."
+            f"The microcontroller's supply is about {supply_v:.2f} V (its reference reads {code} "
+            f"of {_CODES}), but it must be {wanted_v:g} V within {100.0 * _SHARE:g} %. Otherwise "
+            "the reported high voltage is wrong. Feed its 5V pin from a regulated supply, not "
+            "from USB."
         )
     if bandgap_v is None:
         return f", supply {supply_v:.2f} V to 9 %"

@@ -1,4 +1,4 @@
-"""Drivers of instruments, and what a driver in another package derives from."""
+"""Drivers of instruments, and the base classes for drivers in other packages."""
 
 from haselab.rig.instruments.devices import DaqConnection, DaqDevice, GeneratorDevice, SupplyDevice
 from haselab.rig.instruments.instrument import (

@@ -1,4 +1,4 @@
-"""What an opened instrument can do: the objects that the drivers' `open` returns."""
+"""Protocols of opened instruments, as returned by the drivers' `open`."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class SupplyDevice(HighVoltageSupply, ReportsOutputState, Protocol):
 
     @property
     def identity(self) -> str:
-        """What it reports to be."""
+        """Its own identification."""
 
     @property
     def tolerance_v(self) -> float:
-        """What its meter may show while the output is off, in V."""
+        """Largest reading of its meter while the output is off, in V."""
 
     def close(self) -> None:
-        """Output off, connection closed. Never raises."""
+        """Switch the output off and close the connection. Never raises."""
 
 
 class GeneratorDevice(FunctionGenerator, ReportsOutputState, Protocol):
@@ -37,38 +37,38 @@ class GeneratorDevice(FunctionGenerator, ReportsOutputState, Protocol):
 
     @property
     def identity(self) -> str:
-        """What it reports to be."""
+        """Its own identification."""
 
     def close(self) -> None:
-        """Output off, connection closed. Never raises."""
+        """Switch the output off and close the connection. Never raises."""
 
 
 class DaqConnection(Protocol):
-    """A connection to a data acquisition device on which nothing runs yet."""
+    """A connection to a data acquisition device that is not running yet."""
 
     @property
     def key(self) -> str:
-        """What identifies the device on this computer: product and serial number."""
+        """Key that identifies the device on this computer: product and serial number."""
 
     @property
     def identity(self) -> str:
-        """What it reports to be."""
+        """Its own identification."""
 
     def check_serial(self) -> None:
-        """Refuse another device than the rig file names, with an `InputError`."""
+        """Raise `InputError` if the device is not the one that the rig file names."""
 
     def reset(self) -> None:
-        """Release what a program that has crashed may still hold."""
+        """Release resources that a crashed program may still hold."""
 
     def shut_down(self) -> None:
         """Stop every task of every program on the device, then put out 0 V.
 
         Raises:
-            DeviceError: the device does not confirm it.
+            DeviceError: The device does not confirm it.
         """
 
     def close(self) -> None:
-        """Close it. Never raises."""
+        """Close the connection. Never raises."""
 
 
 class DaqDevice(VoltageSource, Acquisition, GaplessAcquisition, Protocol):
@@ -76,28 +76,28 @@ class DaqDevice(VoltageSource, Acquisition, GaplessAcquisition, Protocol):
 
     @property
     def identity(self) -> str:
-        """What it reports to be."""
+        """Its own identification."""
 
     @property
     def missed_outputs(self) -> int:
-        """Outputs since opening that came too late and were left out."""
+        """Number of outputs since opening that came too late and were skipped."""
 
     @property
     def fetched_s(self) -> float:
-        """End of a block that has come in, on the acquisition's clock; `time_s` may be ahead."""
+        """End of the last block fetched, on the acquisition's clock; `time_s` may be later."""
 
     @property
     def exposures(self) -> ExposureLog | None:
-        """The recorded exposure signal of a camera; None: none is recorded."""
+        """The recorded exposure signal of a camera, or None."""
 
     def pause(self) -> None:
-        """The output stands; blocks pass."""
+        """Hold the output while blocks pass."""
 
     def catch_up(self) -> None:
-        """Pass over the blocks that have passed."""
+        """Skip the blocks that have passed."""
 
     def pass_time(self, duration_s: float) -> None:
         """Let time pass, in s."""
 
     def close(self) -> None:
-        """0 V, connection closed. Never raises."""
+        """Go to 0 V and close the connection. Never raises."""

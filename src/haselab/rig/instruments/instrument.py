@@ -1,4 +1,4 @@
-"""The extension point for instruments: what a driver package has to implement.
+"""The extension point for instruments: the classes that a driver derives from.
 
 A driver is a class that derives from one of `DaqInstrument`, `GeneratorInstrument`,
 `SupplyInstrument` and `CameraInstrument`, and is listed in the entry-point group
@@ -55,13 +55,13 @@ V = TypeVar("V", bound=CameraConfig)
 
 @dataclass(frozen=True)
 class SystemNeeds:
-    """What an instrument needs of the operating system; `haselab doctor` looks at it.
+    """What an instrument needs from the operating system; `haselab doctor` checks it.
 
     Args:
-        serial_ports: that it is on.
-        local_daq: NI's driver on this computer.
-        genicam: name or address of a GenICam camera; empty: the first one; None: it is none.
-        frame_bytes: of one frame of it; None: not known.
+        serial_ports: serial ports that it uses.
+        local_daq: whether it needs NI's driver on this computer.
+        genicam: name or address of a GenICam camera; empty: the first one; None: not a camera.
+        frame_bytes: size of one of its frames; None: unknown.
     """
 
     serial_ports: tuple[str, ...] = ()
@@ -70,7 +70,7 @@ class SystemNeeds:
     frame_bytes: int | None = None
 
     def __or__(self, other: SystemNeeds) -> SystemNeeds:
-        """The needs of both."""
+        """Combine the needs of two instruments."""
         return SystemNeeds(
             (*self.serial_ports, *other.serial_ports),
             self.local_daq or other.local_daq,
@@ -81,7 +81,7 @@ class SystemNeeds:
 
 @dataclass(frozen=True)
 class OpenContext:
-    """What an instrument may know of its bench when it is opened.
+    """What an instrument gets to know about its bench when it is opened.
 
     Args:
         description: of the bench.
@@ -94,11 +94,11 @@ class OpenContext:
 
 @dataclass(frozen=True)
 class CameraContext:
-    """What a camera may know of its bench when it is opened.
+    """What a camera gets to know about its bench when it is opened.
 
     Args:
         clock: of the acquisition, see `BlockClock`.
-        exposures: where the camera's exposure signal is recorded; None: it is not.
+        exposures: log of the camera's exposure signal; None if it is not recorded.
         exposure_line: settings of the camera's exposure output; None: it is not wired.
     """
 
@@ -108,40 +108,40 @@ class CameraContext:
 
 
 class Instrument(ABC, Generic[C]):
-    """One kind of instrument. The registry makes one object of the class, without arguments."""
+    """One kind of instrument. The registry creates one object of the class, without arguments."""
 
     section: ClassVar[str]  # of RIG.toml: daq, generator, supply or camera
     kind: ClassVar[str]  # value of the section's key `kind`, and name of the entry point
     config: type[C]  # model of the section
-    purpose: ClassVar[str] = ""  # what it is for, as `haselab doctor` lists it
+    purpose: ClassVar[str] = ""  # its purpose, for the list of `haselab doctor`
     packages: ClassVar[tuple[str, ...]] = ()  # Python packages that it needs
     library: ClassVar[str] = ""  # another library that `check_driver` looks for
 
     @abstractmethod
     def identify(self, config: C) -> str:
-        """Ask the instrument who it is, and leave its output as it is.
+        """Query the instrument's identity without changing its output.
 
         Args:
             config: its section of the rig file.
         Returns:
             Maker, model, serial number, or what else it reports.
         Raises:
-            DeviceError: the instrument does not answer.
-            InputError: another instrument than the rig file names.
+            DeviceError: The instrument does not reply.
+            InputError: The instrument is not the one that the rig file names.
         """
 
     def check_driver(self) -> list[str]:
-        """Load what the driver needs on this computer; the instrument is left alone.
+        """Load what the driver needs on this computer, without connecting to the instrument.
 
         Returns:
             Names of what was loaded.
         Raises:
-            DeviceError: something is missing.
+            DeviceError: Something is missing.
         """
         return []
 
     def system_needs(self, config: C) -> SystemNeeds:
-        """What `haselab doctor` looks at: ports, permissions, network.
+        """List what `haselab doctor` checks: ports, permissions, network.
 
         Args:
             config: its section of the rig file.
@@ -151,20 +151,20 @@ class Instrument(ABC, Generic[C]):
 
 
 class OutputInstrument(Instrument[C]):
-    """An instrument that puts out a voltage, and so has to be shut down from outside as well.
+    """An instrument with an output, which other processes must be able to shut down.
 
     The two guardian processes and `haselab rig safe` call `shut_down` while the program that uses
     the instrument may hang, be stopped, or still be connected.
     """
 
-    shutdown_attempts: ClassVar[int] = 2  # the program may take an answer that was meant for us
+    shutdown_attempts: ClassVar[int] = 2  # the program may read our reply
 
     @abstractmethod
     def addresses(self, config: C) -> tuple[str, ...]:
-        """What another rig file would call this instrument: ports and network addresses.
+        """Ports and network addresses by which another rig file could name this instrument.
 
-        It shows that two programs use the same instrument on two benches, so the text
-        must be the same for the same instrument.
+        They show that two programs use the same instrument on two benches, so they must be the
+        same for the same instrument.
 
         Args:
             config: its section of the rig file.
@@ -176,9 +176,9 @@ class OutputInstrument(Instrument[C]):
 
         Args:
             config: its section of the rig file.
-            within_s: how long a connection that is refused may be tried again, in s.
+            within_s: how long to retry a refused connection, in s.
         Raises:
-            DeviceError: it is not confirmed off.
+            DeviceError: It is not confirmed off.
         """
 
 
@@ -195,8 +195,8 @@ class SupplyInstrument(OutputInstrument[S]):
             config: its section of the rig file.
             context: the bench.
         Raises:
-            DeviceError: no driver, no answer, or not confirmed off.
-            InputError: another instrument than the rig file names.
+            DeviceError: The driver is missing, there is no reply, or it is not confirmed off.
+            InputError: The instrument is not the one that the rig file names.
         """
 
 
@@ -222,14 +222,14 @@ class DaqInstrument(OutputInstrument[D]):
         Args:
             config: its section of the rig file.
         Raises:
-            DeviceError: no driver, or no such device.
+            DeviceError: The driver or the device is missing.
         """
 
     @abstractmethod
     def key_of(self, config: D) -> str | None:
-        """`DaqConnection.key`, from the rig file alone; None where the file does not hold it.
+        """`DaqConnection.key` from the rig file alone; None if the file does not contain it.
 
-        With it the permission can be revoked while the device cannot be reached.
+        With it the permission can be revoked while the device does not respond.
         """
 
     @abstractmethod
@@ -239,29 +239,29 @@ class DaqInstrument(OutputInstrument[D]):
         Args:
             config: its section of the rig file.
             context: the bench.
-            connection: of `connect`, closed with the device.
+            connection: from `connect`; closed with the device.
         Raises:
-            DeviceError: the device refuses the configuration.
-            InputError: a setting that the device does not have.
+            DeviceError: The device refuses the configuration.
+            InputError: The device does not have a setting.
         """
 
     def route_checks(
         self, config: D, exposure: ExposureConfig | None, connection: Any
     ) -> Iterator[CheckResult]:
-        """What `haselab rig check` asks the device before it is opened; by default nothing.
+        """Checks of the device for `haselab rig check` before it is opened; none by default.
 
         Args:
             config: its section of the rig file.
             exposure: section `exposure`; None: there is none.
             connection: of `connect`.
         Yields:
-            One result for each thing that was verified; no output changes.
+            One result per check; no output changes.
         """
         del config, exposure, connection
         return iter(())
 
     def addresses(self, config: D) -> tuple[str, ...]:
-        """None: a device is known by the key of its connection."""
+        """No addresses: the device is identified by the key of its connection."""
         del config
         return ()
 
@@ -275,7 +275,7 @@ class DaqInstrument(OutputInstrument[D]):
             connection.close()
 
     def shut_down(self, config: D, within_s: float) -> None:
-        """See `OutputInstrument.shut_down`: 0 V is commanded; no meter confirms it."""
+        """See `OutputInstrument.shut_down`; 0 V is commanded, but no meter confirms it."""
         del within_s
         connection = self.connect(config)
         try:
@@ -285,7 +285,7 @@ class DaqInstrument(OutputInstrument[D]):
 
 
 class CameraInstrument(Instrument[V]):
-    """A camera: section `camera`. It puts out no voltage, so it needs no shutdown."""
+    """A camera: section `camera`. It has no output, so it needs no shutdown."""
 
     section = "camera"
 
@@ -297,13 +297,14 @@ class CameraInstrument(Instrument[V]):
             config: its section of the rig file.
             context: the bench's clock and exposure signal.
         Raises:
-            DeviceError: the camera or its driver is missing.
-            InputError: another camera than the rig file names, or no such recording.
-            LimitError: a setting beyond what the camera can do.
+            DeviceError: The camera or its driver is missing.
+            InputError: The camera is not the one that the rig file names, or the recording is
+                missing.
+            LimitError: A setting is outside the camera's limits.
         """
 
     def identify(self, config: V) -> str:
-        """See `Instrument.identify`: opens the camera and closes it again."""
+        """See `Instrument.identify`; opens the camera and closes it again."""
         opened = self.open(config, CameraContext())
         opened.close()
         return opened.identity

@@ -1,16 +1,16 @@
-"""The instruments that rig files can name: those of this package, and those of other packages.
+"""The registry of instruments: built-in drivers, and those of other packages.
 
 Another package lists its drivers in its own `pyproject.toml`:
 
     [project.entry-points."haselab.instruments"]
     mysupply = "mypackage.driver:MySupply"
 
-A rig file then chooses one by `kind = "mysupply"`. Whoever loads a rig file (a run, a guardian
-process, `rig safe`, `doctor`) finds its drivers here. A driver that does not load, or that cannot
-be shut down from outside, is refused while the file is read: before anything is energised.
+A rig file then chooses it by `kind = "mysupply"`. All programs that load a rig file (a run, a
+guardian process, `rig safe`, `doctor`) find its drivers here. A driver that does not load, or that
+other processes cannot shut down, is refused while the file is read, before anything is energised.
 
 The drivers of this package are entry points too, but listed here and not in its metadata: an
-installation that is out of date must not lose the driver that shuts a bench down.
+outdated installation must not lose the driver that shuts a bench down.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ class Driver:
     """One entry of the group.
 
     Args:
-        kind: that a rig file names.
-        package: that it comes from, with its version.
-        entry: leads to the class.
+        kind: its name in a rig file.
+        package: its package, with version.
+        entry: the entry point of the class.
     """
 
     kind: str
@@ -96,36 +96,36 @@ class Driver:
 
     @property
     def is_own(self) -> bool:
-        """It comes with this package."""
+        """Whether it comes with this package."""
         return self.package == _OWN
 
     def load(self) -> Instrument[Any]:
         """Import it and check that it is complete.
 
         Raises:
-            DeviceError: it does not load, or lacks what every instrument needs.
+            DeviceError: It does not load, or is incomplete.
         """
         try:
             found = self.entry.load()
             fault = _fault_of(found, self.kind)
             if not fault:
                 return cast(Instrument[Any], found())
-        except Exception as error:  # whatever somebody else's package does
+        except Exception as error:  # another package may raise anything
             fault = f"it does not load ({type(error).__name__}: {error})"
         raise DeviceError(
             f"Instrument {self.kind!r} of package {self.package} cannot be used: {fault}. Nothing "
-            f"was energised. Repair the package, or remove it. {self.entry.value}"
+            f"was energised. Fix the package, or uninstall it. {self.entry.value}"
         )
 
 
 def _fault_of(found: Any, kind: str) -> str:
-    """What is wrong with a class that an entry point leads to; empty: nothing."""
+    """Return what is wrong with the class of an entry point, or an empty text."""
     names = ", ".join(base.__name__ for base, _ in _ROLES.values())
     if not (inspect.isclass(found) and issubclass(found, Instrument)):
-        return f"it is no class derived from one of {names}"
+        return f"it is not a class derived from one of {names}"
     role = next((each for each in _ROLES.values() if issubclass(found, each[0])), None)
     if role is None:
-        return f"it is derived from none of {names}"
+        return f"it is not derived from any of {names}"
     missing = sorted(getattr(found, "__abstractmethods__", ()))
     if missing:
         return f"it has no {', '.join(missing)}"
@@ -140,7 +140,7 @@ def _fault_of(found: Any, kind: str) -> str:
 
 @functools.cache
 def installed() -> tuple[Driver, ...]:
-    """Every entry of the group, this package's own first; none is imported."""
+    """List all drivers without importing them, those of this package first."""
     own = [Driver(kind, _OWN, EntryPoint(kind, at, GROUP)) for kind, at in _DRIVERS.items()]
     return (*own, *_others())
 
@@ -153,16 +153,17 @@ def _others() -> Iterator[Driver]:
 
 @functools.cache
 def _load(section: str, kind: str) -> Instrument[Any] | None:
-    """The instrument of this kind for this section; None where nobody offers one.
+    """Load the instrument of this kind for this section; None if no package provides one.
 
     Raises:
-        DeviceError: it cannot be used, or more than one package offers it.
+        DeviceError: It cannot be used, or more than one package provides it.
     """
     offered = [driver for driver in installed() if driver.kind == kind]
     if len(offered) > 1:
         raise DeviceError(
-            f"Instrument {kind!r} is offered by {' and '.join(each.package for each in offered)}. "
-            "Nothing was energised. Remove one of the packages."
+            f"Instrument {kind!r} is provided by more than one package: "
+            f"{' and '.join(each.package for each in offered)}. Nothing was energised. Uninstall "
+            "one of them."
         )
     found = [driver.load() for driver in offered]
     return next((each for each in found if each.section == section), None)
@@ -170,12 +171,12 @@ def _load(section: str, kind: str) -> Instrument[Any] | None:
 
 @contextlib.contextmanager
 def reported_faults(config: InstrumentConfig) -> Iterator[None]:
-    """Turn whatever a driver raises into an error of one line.
+    """Turn any exception of a driver into an error of one line.
 
     Args:
         config: section of the instrument whose driver is called.
     Raises:
-        DeviceError: the driver raised something that is no error of haselab.
+        DeviceError: The driver raised an exception that is not one of haselab's.
     """
     try:
         yield
@@ -184,12 +185,12 @@ def reported_faults(config: InstrumentConfig) -> Iterator[None]:
     except Exception as error:
         raise DeviceError(
             f"The driver of instrument {config.kind!r} failed ({type(error).__name__}: {error}). "
-            "Check the instrument; if it is well, report the fault to the authors of the driver."
+            "Check the instrument; if it works, report the fault to the authors of the driver."
         ) from error
 
 
 def forget() -> None:
-    """Look for packages again: some were installed or removed while this program runs."""
+    """Forget the found packages, because some were installed or removed meanwhile."""
     installed.cache_clear()
     _load.cache_clear()
 
@@ -197,7 +198,9 @@ def forget() -> None:
 def _find(section: str, kind: str) -> Instrument[Any]:
     found = _load(section, kind)
     if found is None:
-        raise DeviceError(f"No instrument of kind {kind!r} for section {section}.")
+        raise DeviceError(
+            f"There is no instrument of kind {kind!r} for section {section}. Install its package."
+        )
     return found
 
 
@@ -208,7 +211,7 @@ def instrument_of(section: str, config: InstrumentConfig) -> Instrument[Any]:
         section: daq, generator, supply or camera.
         config: the section.
     Raises:
-        DeviceError: it cannot be used.
+        DeviceError: It cannot be used.
     """
     return _find(section, config.kind)
 
@@ -234,13 +237,13 @@ def camera_of(config: CameraConfig) -> CameraInstrument[Any]:
 
 
 def config_class(section: str, data: Any) -> type[InstrumentConfig] | None:
-    """The model of a section's table; None where its `kind` is missing or not known.
+    """Find the model of a section's table; None if its `kind` is missing or unknown.
 
     Args:
         section: daq, generator, supply or camera.
         data: the table as it was read.
     Raises:
-        DeviceError: the driver cannot be used.
+        DeviceError: The driver cannot be used.
     """
     kind = data.get("kind", DEFAULT_KINDS.get(section)) if isinstance(data, dict) else None
     found = _load(section, kind) if isinstance(kind, str) else None
@@ -249,7 +252,7 @@ def config_class(section: str, data: Any) -> type[InstrumentConfig] | None:
 
 @dataclass(frozen=True)
 class ByKind:
-    """Marks a field of a pydantic model: the table's key `kind` chooses the model of the table.
+    """Annotation of a pydantic field: the table's key `kind` chooses the model of the table.
 
     Args:
         section: daq, generator, supply or camera.
@@ -270,7 +273,7 @@ class ByKind:
 
 
 def _validated(section: str, data: Any) -> Any:
-    """A table as the model of its instrument; what is no table is returned as it is."""
+    """Validate a table by the model of its instrument; return anything else unchanged."""
     if not isinstance(data, dict):
         return data
     model = config_class(section, data)
@@ -280,14 +283,14 @@ def _validated(section: str, data: Any) -> Any:
         what = "no key kind" if kind is None else f"no {section} of kind {str(kind)[:60]!r}"
         raise PydanticCustomError(
             "kind",
-            "{what}; use one of {kinds}, or install the package that offers it",
+            "{what}; use one of {kinds}, or install the package that provides it",
             {"what": what, "kinds": kinds},
         )
     return model.model_validate(data)
 
 
 def _kinds_of(section: str) -> list[str]:
-    """Kinds for one section; those of packages that do not load are left out."""
+    """List the kinds for one section, without those of packages that do not load."""
     found = []
     for driver in installed():
         try:

@@ -1,4 +1,4 @@
-"""Sections of RIG.toml that every instrument of a kind shares; a driver adds its own keys."""
+"""Base sections of RIG.toml for each kind of instrument, to which drivers add their keys."""
 
 from __future__ import annotations
 
@@ -26,27 +26,29 @@ class InstrumentConfig(PrintableSection):
 
 
 class ExposureConfig(PrintableSection):
-    """Section `exposure`: the line on which a camera signals that it exposes."""
+    """Section `exposure`: the line on which a camera signals its exposures."""
 
-    input: str = Field(min_length=1, description="terminal of the board, as PFI0")
-    counter: str = Field("ctr1", min_length=1, description="one that is free")
-    edge: Literal["rising", "falling"] = Field("rising", description="with which it begins")
+    input: str = Field(min_length=1, description="terminal of the board, such as PFI0")
+    counter: str = Field("ctr1", min_length=1, description="a free counter")
+    edge: Literal["rising", "falling"] = Field("rising", description="edge that begins an exposure")
     duration_s: float = Field(
-        gt=0, le=10, description="of one: its middle is the frame's time; as camera.exposure_s"
+        gt=0,
+        le=10,
+        description="of an exposure; same as camera.exposure_s",
     )
     line: str | None = Field(
-        None, min_length=1, description="output of an aravis camera to put the signal on, as Line2"
+        None, min_length=1, description="output of an aravis camera for the signal, such as Line2"
     )
-    inverted: bool | None = Field(None, description="LineInverter of that output; left out: as is")
+    inverted: bool | None = Field(None, description="LineInverter of that output; omit: unchanged")
 
     @property
     def camera_line(self) -> ExposureLine:
-        """What the camera has to know of it."""
+        """Settings for the camera."""
         return ExposureLine(self.duration_s, self.line, self.inverted)
 
 
 class DaqConfig(InstrumentConfig):
-    """Section `daq`: two inputs and one output, whose changes are tied to the blocks."""
+    """Section `daq`: two inputs, and one output synchronised with the blocks."""
 
     range_v: float = Field(10.0, gt=0, le=10)
     bits: int = Field(16, ge=8, le=16)
@@ -54,7 +56,7 @@ class DaqConfig(InstrumentConfig):
     block_samples: int = Field(2000, ge=200, le=65520, multiple_of=40)
     skew_s: float = Field(2.5e-6, ge=0, description="from the voltage to the current sample")
     output_delay_s: float = Field(2e-3, gt=0, description="from a block's end to the new output")
-    ahead_blocks: int = Field(1, ge=0, le=10, description="outputs that wait in the device")
+    ahead_blocks: int = Field(1, ge=0, le=10, description="outputs queued in the device")
     drive_low_v: float = Field(0.0, ge=-10)
     drive_high_v: float = Field(2.0, le=10)
 
@@ -63,11 +65,11 @@ class DaqConfig(InstrumentConfig):
         if self.output_delay_s * self.rate_hz > 0.5 * self.block_samples:
             raise ValueError("output_delay_s must not exceed half a block")
         if self.output_delay_s * self.rate_hz < 2.0:
-            raise ValueError("output_delay_s must be two samples at least, for the counter")
+            raise ValueError("output_delay_s must be at least two samples, for the counter")
         if not self.drive_low_v <= 0.0 <= self.drive_high_v:
-            raise ValueError("drive_low_v and drive_high_v must hold 0 V between them")
+            raise ValueError("drive_low_v must not be above 0 V, and drive_high_v not below 0 V")
         if self.drive_low_v == self.drive_high_v:
-            raise ValueError("drive_low_v and drive_high_v leave no voltage to drive with")
+            raise ValueError("drive_low_v and drive_high_v must not both be 0 V")
         return self
 
     def check_exposure(self, line: ExposureConfig) -> None:
@@ -76,7 +78,7 @@ class DaqConfig(InstrumentConfig):
         Args:
             line: section `exposure` of the same file.
         Raises:
-            ValueError: the device cannot record it; by default no device can.
+            ValueError: The device cannot record it; by default no device can.
         """
         raise ValueError(f"a daq of kind {self.kind!r} cannot record the exposure signal {line}")
 
@@ -108,7 +110,7 @@ class SupplyConfig(InstrumentConfig):
 class CameraConfig(InstrumentConfig):
     """Section `camera`."""
 
-    sets_exposure: ClassVar[bool] = False  # the driver sets exposure time and exposure output
+    sets_exposure: ClassVar[bool] = False  # whether the driver sets exposure time and output line
 
     @property
     def is_timed_by_exposures(self) -> bool:

@@ -1,1 +1,1 @@
-"""The simulated bench: physics behind the same protocols as the instruments."""
+"""The simulated bench (twin), which implements the same protocols as real instruments."""

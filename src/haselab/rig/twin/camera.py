@@ -1,7 +1,7 @@
 """The twin's camera: 8-bit frames of a speckled elastomer sheet hung between two clamps.
 
-The picture is analytic (native/twin/camera.h states every term), so the position of each mark is
-known exactly. x runs right, y runs down, pixel centres lie at integers.
+The image is analytic (native/twin/camera.h states every term), so the position of each mark is
+known exactly. x points right, y points down, pixel centres are at integers.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from haselab.base import InputError, LimitError, Limits
 __all__ = ["TwinCamera", "TwinCameraConfig"]
 
 _TABLE_SIZE = 4096
-_EDGE_REACH = 16.0  # edge widths after which native/twin/camera.c calls an edge over
-_DOT_REACH = 5.0  # standard deviations after which it calls a dot over
+_EDGE_REACH = 16.0  # edge widths at which native/twin/camera.c truncates an edge
+_DOT_REACH = 5.0  # standard deviations at which it truncates a dot
 _SIDE_MARGIN = 0.96  # no particle sits closer to a free side, in half-widths
-_CLAMP_OVERHANG_PX = 14.0  # by which a clamp is wider than what it holds
+_CLAMP_OVERHANG_PX = 14.0  # by which a clamp is wider than the sheet
 
 
 class TwinCameraConfig(BaseModel):
-    """Everything that shapes the twin's pictures, apart from the sheet's own dimensions."""
+    """All settings of the twin's images except the sheet's dimensions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -90,7 +90,7 @@ class TwinCameraConfig(BaseModel):
     def _check_pairs(self) -> TwinCameraConfig:
         if self.exposure_s * self.rate_hz > 1:
             raise ValueError(
-                f"exposure_s = {self.exposure_s:g} s is longer than a frame, "
+                f"exposure_s is {self.exposure_s:g} s, longer than a frame period of "
                 f"{1 / self.rate_hz:g} s. Shorten the exposure, or lower rate_hz."
             )
         for low, high in (
@@ -98,18 +98,18 @@ class TwinCameraConfig(BaseModel):
             ("particle_depth_low_grey", "particle_depth_high_grey"),
         ):
             if getattr(self, low) > getattr(self, high):
-                raise ValueError(f"{low} is above {high}. Exchange the two.")
+                raise ValueError(f"{low} is above {high}. Swap their values.")
         reach = self.fiducial_spacing_px + _DOT_REACH * self.fiducial_sigma_px
         if reach > (self.width_px - 1) / 2:
             raise ValueError(
                 f"fiducial_spacing_px = {self.fiducial_spacing_px:g} px puts dots outside the "
-                f"{self.width_px} columns of the picture. Lower it, or widen the picture."
+                f"{self.width_px} columns of the image. Lower it, or raise width_px."
             )
         return self
 
 
 class TwinCamera:
-    """A camera that looks at the twin's sheet.
+    """A camera that films the twin's sheet.
 
     A material point (S, X), S in [0, 1] along the length and X in [-1, 1] across, is seen at
 
@@ -128,7 +128,7 @@ class TwinCamera:
         seed: chooses the speckle and the noise, 0 to 2^63 - 1.
 
     Raises:
-        LimitError: the sheet is too narrow for the picture, or folds at the longest length seen.
+        LimitError: The sheet is too narrow for the image, or folds at the longest visible length.
 
     Source: reference study, section on the strain distribution (fig. 2), for the field's form.
 
@@ -157,7 +157,7 @@ class TwinCamera:
         self._scene = self._native_scene(seed)
 
     def exposure_times_s(self, frame_times_s: ArrayLike) -> NDArray[np.float64]:
-        """Times at which `render` wants the length; a frame's time is the middle of its exposure.
+        """Times at which `render` needs the length; a frame's time is the middle of its exposure.
 
         Args:
             frame_times_s: in s. Shape `(F,)`.
@@ -176,7 +176,7 @@ class TwinCamera:
         return np.asarray(times[:, np.newaxis] + offsets, dtype=np.float64)
 
     def render(self, lengths_m: ArrayLike, first_index: int) -> NDArray[np.uint8]:
-        """Frames of one stretch of a recording.
+        """Render consecutive frames of a recording.
 
         Args:
             lengths_m: length between the clamp lines at each sample of each exposure, in m.
@@ -189,11 +189,11 @@ class TwinCamera:
             Shape `(F, height_px, width_px)`.
 
         Raises:
-            LimitError: a length puts the lower clamp outside the picture.
-            InputError: the shape is not `(F, samples)`, or the index is negative.
+            LimitError: A length puts the lower clamp outside the image.
+            InputError: The shape is not `(F, samples)`, or the index is negative.
         """
         if first_index < 0:
-            raise InputError(f"first_index = {first_index} is negative. Count frames from 0.")
+            raise InputError(f"first_index is {first_index}, but it must be at least 0.")
         lengths_px = self._lengths_px(lengths_m)
         frames = np.empty(self._shape(lengths_px), dtype=np.uint8)
         self._scene.render(lengths_px, first_index, frames)
@@ -209,8 +209,8 @@ class TwinCamera:
             Mean levels, in grey. Shape `(F, height_px, width_px)`.
 
         Raises:
-            LimitError: a length puts the lower clamp outside the picture.
-            InputError: the shape is not `(F, samples)`.
+            LimitError: A length puts the lower clamp outside the image.
+            InputError: The shape is not `(F, samples)`.
         """
         lengths_px = self._lengths_px(lengths_m)
         levels = np.empty(self._shape(lengths_px), dtype=np.float32)
@@ -218,7 +218,7 @@ class TwinCamera:
         return levels
 
     def true_particle_px(self, length_m: float) -> NDArray[np.float64]:
-        """Exact (x, y) of all particles, seen or not; the hidden truth, for tests only.
+        """Exact (x, y) of all particles, visible or not; true values for tests only.
 
         Args:
             length_m: length between the clamp lines, in m.
@@ -227,12 +227,12 @@ class TwinCamera:
             Positions in px. Shape `(particles, 2)`.
 
         Raises:
-            LimitError: the length puts the lower clamp outside the picture.
+            LimitError: The length puts the lower clamp outside the image.
         """
         return self._positions_px(length_m)[:-6]
 
     def true_fiducials_px(self, length_m: float) -> NDArray[np.float64]:
-        """Exact (x, y) of the clamps' dots, upper row first; the hidden truth, for tests only.
+        """Exact (x, y) of the clamps' dots, upper row first; true values for tests only.
 
         Args:
             length_m: length between the clamp lines, in m.
@@ -241,7 +241,7 @@ class TwinCamera:
             Positions in px. Shape `(6, 2)`.
 
         Raises:
-            LimitError: the length puts the lower clamp outside the picture.
+            LimitError: The length puts the lower clamp outside the image.
         """
         return self._positions_px(length_m)[-6:]
 
@@ -273,8 +273,8 @@ class TwinCamera:
         lengths = np.asarray(lengths_m, dtype=np.float64)
         if lengths.ndim != 2 or lengths.shape[1] == 0:
             raise InputError(
-                f"lengths_m has shape {lengths.shape}, allowed is (frames, samples). "
-                f"Ask exposure_times_s for the times that are wanted."
+                f"lengths_m has shape {lengths.shape}, but it must be (frames, samples), with "
+                "lengths at the times of exposure_times_s."
             )
         self.lengths_m.check(lengths)
         return np.ascontiguousarray(lengths / self.config.scale_m_per_px)
@@ -319,7 +319,7 @@ class TwinCamera:
         return blobs
 
     def _native_scene(self, seed: int) -> _camera.Scene:
-        from scipy.special import expit  # a guardian reads rig files and needs none of this
+        from scipy.special import expit  # imported here so that guardians load faster
 
         c = self.config
         mid = (c.width_px - 1) / 2
@@ -358,14 +358,14 @@ class TwinCamera:
 
 
 def _visible_lengths(config: TwinCameraConfig) -> Limits:
-    """Lengths at which the clamps do not touch and the lower dots are wholly in the picture."""
+    """Lengths at which the clamps do not touch and the lower dots are fully visible."""
     dots = _DOT_REACH * config.fiducial_sigma_px
     low = 2 * max(config.clamp_inside_px + 2 * config.edge_px, dots)
     high = config.height_px - 1 - dots - config.top_px
     if high <= low:
         raise LimitError(
-            f"height_px = {config.height_px} leaves no room for a sheet below top_px = "
-            f"{config.top_px:g}; at least {config.top_px + dots + low + 2:.0f} rows are needed. "
+            f"height_px is {config.height_px}, but a sheet below top_px = {config.top_px:g} needs "
+            f"at least {config.top_px + dots + low + 2:.0f} rows. "
             f"Raise height_px, or lower top_px."
         )
     return Limits("sheet length", low * config.scale_m_per_px, high * config.scale_m_per_px, "m")

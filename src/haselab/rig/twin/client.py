@@ -1,4 +1,4 @@
-"""Client of the twin's stand and camera where the twin is served over the wire."""
+"""Client of a served twin's stand, camera and meters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError, LimitError
+from haselab.base import DeviceError, InputError, JsonObject, LimitError
 from haselab.rig import Frames
 
 __all__ = ["SentFrame", "TwinClient"]
@@ -23,13 +23,13 @@ _KINDS = {"LimitError": LimitError, "InputError": InputError}
 
 @dataclass(frozen=True)
 class SentFrame:
-    """One frame of the twin's camera as it came over a link.
+    """One frame of the twin's camera as it arrived over a link.
 
     Args:
         image: grey levels, shape `(height, width)`.
-        number: of the frame, from 1 on; a gap is a lost one.
+        number: of the frame, starting with 1; a gap is a lost frame.
         ticks: of the camera's clock at the beginning of the exposure.
-        arrival_s: when it came, on the clock of the inputs, in s.
+        arrival_s: arrival on the clock of the inputs, in s.
         exposure_s: the camera's exposure time.
     """
 
@@ -45,9 +45,9 @@ class TwinClient:
 
     Args:
         address: host:port.
-        timeout_s: for one answer.
+        timeout_s: for one reply.
     Raises:
-        DeviceError: nobody answers there.
+        DeviceError: The twin does not reply.
     """
 
     def __init__(self, address: str, timeout_s: float = 30.0) -> None:
@@ -63,18 +63,18 @@ class TwinClient:
             raise self._dead(error) from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._stream = self._socket.makefile("rwb")
-        self._answered = True  # no answer to an earlier request is still to come
+        self._answered = True  # whether the last request has got its reply
 
     def _dead(self, error: BaseException) -> DeviceError:
         return DeviceError(
-            f"The served twin does not answer ({error or type(error).__name__}). Start it with "
-            f"haselab twin serve, or correct stand.address. {self._address}"
+            f"The served twin does not reply ({error or type(error).__name__}). Start it with "
+            f"haselab twin serve, or change stand.address. {self._address}"
         )
 
     def _ask(self, do: str, **values: float) -> tuple[dict[str, Any], bytes]:
         request = json.dumps({"do": do, **values}).encode("ascii") + b"\n"
         try:
-            with self._turn:  # one thread looks at the camera, another one ends the run
+            with self._turn:  # one thread reads the camera, another one ends the run
                 if not self._answered:  # the last request was interrupted, as by Ctrl-C
                     self.close()
                     self._connect()
@@ -93,7 +93,9 @@ class TwinClient:
     def hang(self, mass_kg: float) -> None:
         """See `haselab.rig.LoadStand`."""
         if not math.isfinite(mass_kg):
-            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
+            raise LimitError(
+                f"The mass is {mass_kg:g} kg, but it must be within [0, 20] kg. Use another mass."
+            )
         self._ask("hang", mass_kg=mass_kg)
 
     def lift(self) -> None:
@@ -108,13 +110,13 @@ class TwinClient:
         """See `haselab.rig.Camera`.
 
         Args:
-            rate_hz: frames a second.
-            exposure_s: of each, in s; 0: as in the twin's own file. It moves the edges of the
-                exposure line and the frames' arrival; how much a picture blurs stays.
+            rate_hz: frames per second.
+            exposure_s: of each frame, in s; 0: as in the twin's file. It shifts the edges of the
+                exposure line and the frames' arrival; the blur of the images does not change.
         """
         if not math.isfinite(rate_hz):
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside (0, inf) Hz. Lower the request."
+                f"The frame rate is {rate_hz:g} Hz, but it must be above 0. Change the frame rate."
             )
         self._ask("start_camera", rate_hz=rate_hz, exposure_s=exposure_s)
 
@@ -127,7 +129,7 @@ class TwinClient:
         return Frames(images, np.array(reported["time_s"], dtype=float))
 
     def take_sent(self) -> list[SentFrame]:
-        """Frames as a camera sends them: late, numbered, with stamps of its own clock."""
+        """Return frames as a camera sends them: late, numbered, with stamps of its own clock."""
         reported, data = self._ask("take")
         if not reported["time_s"]:
             return []
@@ -145,16 +147,16 @@ class TwinClient:
         """See `haselab.rig.Camera`.
 
         Raises:
-            DeviceError: the twin is gone.
+            DeviceError: The twin does not reply.
         """
         self._ask("stop_camera")
 
-    def meters(self) -> dict[str, Any]:
-        """Voltmeter and ruler on the bench: `output_v`, `length_m`; `protected`, the reason."""
+    def meters(self) -> JsonObject:
+        """True values of the bench: `output_v`, `length_m`; `protected`, the reason of a trip."""
         return self._ask("meters")[0]
 
     def close(self) -> None:
         """Close the connection."""
-        with contextlib.suppress(OSError):  # what was left to write has no reader any more
+        with contextlib.suppress(OSError):  # nothing reads what was left to write
             self._stream.close()
         self._socket.close()

@@ -1,4 +1,4 @@
-"""Every physical parameter of the twin: TWIN.toml, checked all at once."""
+"""TWIN.toml: all physical parameters of the twin."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ class Viscosity(Section):
     @model_validator(mode="after")
     def _branches(self) -> Self:
         if len(self.share) != len(self.relaxation_s):
-            raise ValueError("share and relaxation_s need one number a branch each")
+            raise ValueError("share and relaxation_s each need one number per branch")
         if any(not 0 <= g < 10 for g in self.share) or any(t <= 1e-3 for t in self.relaxation_s):
             raise ValueError("a branch needs 0 <= share < 10 and relaxation_s > 0.001 s")
         return self
 
 
 class Mullins(Section):
-    """Extra stiffness of the virgin shell, lost for good where the stretch has once been."""
+    """Extra stiffness of a new shell, lost permanently up to the largest stretch reached."""
 
     share: float = Field(0.06, ge=0, lt=2)
     stretch: float = Field(1.45, gt=1, lt=5, description="where half of it is lost, over free")
@@ -78,16 +78,16 @@ class Mullins(Section):
 
 
 class Load(Section):
-    """What hangs on the moving end."""
+    """Load on the moving end."""
 
     mass_kg: float = Field(0.25, gt=0, lt=20)
     added_inertia_kg: float = Field(
-        0.0, ge=0, lt=1000, description="inertia that does not weigh: clamp, oil, linkage"
+        0.0, ge=0, lt=1000, description="inertia without weight: clamp, oil, linkage"
     )
 
 
 class Dielectric(Section):
-    """Oil and silicone between the electrodes."""
+    """Dielectric between the electrodes: oil and silicone."""
 
     oil_volume_m3: float = Field(0.6e-6, ge=0, lt=1e-4)
     permittivity: float = Field(3.0, gt=1, lt=100, description="relative, of the stack")
@@ -104,7 +104,7 @@ class Dielectric(Section):
 class Amplifier(Section):
     """High-voltage amplifier: second order, gain error, limits, two monitors."""
 
-    name: str = Field("twin amplifier", description="a calibration holds for this one alone")
+    name: str = Field("twin amplifier", description="a calibration is valid only for this one")
     gain: float = Field(5000.0, gt=0, description="nominal, V/V")
     gain_error: float = Field(0.0, gt=-0.5, lt=0.5)
     bandwidth_hz: float = Field(6000.0, gt=100, lt=1e5)
@@ -112,7 +112,7 @@ class Amplifier(Section):
     slew_v_per_s: float = Field(350e6, gt=1e3)
     current_limit_a: float = Field(12e-3, gt=1e-6)
     stray_f: float = Field(
-        0.0, ge=0, lt=1e-8, description="cable and fixture, in parallel with what is connected"
+        0.0, ge=0, lt=1e-8, description="cable and fixture, in parallel with the actuator"
     )
     volt_per_monitor_volt: float = Field(5000.0, gt=0)
     ampere_per_monitor_volt: float = Field(2e-3, gt=0)
@@ -121,13 +121,15 @@ class Amplifier(Section):
     v_monitor_lag_s: float = Field(
         0.0, ge=0, lt=1e-3, description="first order: 1 / (2 pi bandwidth)"
     )
-    i_monitor_lag_s: float = Field(0.0, ge=0, lt=1e-3, description="the same of the other one")
+    i_monitor_lag_s: float = Field(
+        0.0, ge=0, lt=1e-3, description="the same for the current monitor"
+    )
     v_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 V of output")
     i_monitor_offset_v: float = Field(0.0, gt=-1, lt=1, description="reading at 0 A of output")
 
 
 class AcquisitionConfig(Section):
-    """Multiplexed converter and the drive output it shares the clock with."""
+    """Multiplexed converter, and the drive output on the same clock."""
 
     rate_hz: float = Field(200e3, ge=1e4, le=1e6)
     block_samples: int = Field(2000, ge=200, le=65520, multiple_of=40)
@@ -147,9 +149,9 @@ class AcquisitionConfig(Section):
         if self.output_delay_s * self.rate_hz > 0.5 * self.block_samples:
             raise ValueError("output_delay_s must not exceed half a block")
         if not self.drive_low_v <= 0.0 <= self.drive_high_v:
-            raise ValueError("drive_low_v and drive_high_v must hold 0 V between them")
+            raise ValueError("drive_low_v must not be above 0 V, and drive_high_v not below 0 V")
         if self.drive_low_v == self.drive_high_v:
-            raise ValueError("drive_low_v and drive_high_v leave no voltage to drive with")
+            raise ValueError("drive_low_v and drive_high_v must not both be 0 V")
         return self
 
 
@@ -204,14 +206,14 @@ class TwinConfig(Section):
         """The physics of the actuator, see `haselab.actuators`."""
         if self.kind == PLANAR_HASEL:
             return self.planar_hasel
-        from haselab.actuators import actuator_law  # a guardian reads rig files without it
+        from haselab.actuators import actuator_law  # imported here so that guardians load faster
 
         return actuator_law(self.kind, self.actuator)
 
     @property
     def planar_hasel(self) -> PlanarHasel:
         """The built-in law with the numbers of the tables."""
-        from haselab.actuators import PlanarHasel  # a guardian reads rig files without it
+        from haselab.actuators import PlanarHasel  # imported here so that guardians load faster
 
         values: dict[str, Any] = {}
         for about in PlanarHasel.described():
@@ -225,7 +227,7 @@ class TwinConfig(Section):
         return self.law.free_length_m
 
 
-# What the two interpretations of the paper's frequency axis require of the bench (ADR 3).
+# Parameters for the two interpretations of the paper's frequency axis (ADR 3).
 READINGS: dict[str, dict[str, dict[str, float]]] = {
     "rad": {"load": {"added_inertia_kg": 9.3}, "viscosity": {"damping_n_s_per_m": 7.5}},
     "hz": {"load": {"added_inertia_kg": 0.0}, "viscosity": {"damping_n_s_per_m": 1.85}},
@@ -240,11 +242,12 @@ def load_twin(path: Path) -> TwinConfig:
     Returns:
         The checked configuration.
     Raises:
-        InputError: no such file, no TOML, an unknown key or a value out of range.
+        InputError: The file is missing or not TOML, or has an unknown key or a value out of range.
     """
     data = read_toml(path, "twin file")
-    if "reading" in data and data["reading"] in READINGS:
-        for section, values in READINGS[data["reading"]].items():
+    reading = data.get("reading")
+    if isinstance(reading, str) and reading in READINGS:
+        for section, values in READINGS[reading].items():
             given = data.setdefault(section, {})
             if isinstance(given, dict):
                 data[section] = {**values, **given}
@@ -252,5 +255,5 @@ def load_twin(path: Path) -> TwinConfig:
 
 
 def twin_of_reading(reading: str) -> TwinConfig:
-    """The default bench under one reading of the paper's frequency axis, `rad` or `hz`."""
+    """Default bench for one interpretation of the paper's frequency axis, `rad` or `hz`."""
     return validated(TwinConfig, {"reading": reading, **READINGS[reading]}, "default twin")

@@ -1,4 +1,4 @@
-"""What a sheet has been through before an experiment."""
+"""Precondition a sheet before an experiment."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ _REST_S = 60.0
 
 
 def precondition(bench: TwinBench, peak_v: float) -> None:
-    """Drive a sheet to a voltage and back once, and let it rest.
+    """Drive a sheet to a voltage and back once, then wait.
 
-    The first stretch softens a new sheet for good (Mullins effect), so a controller that was
-    designed on a sheet after its first cycle is too fast for a new one.
+    The first stretch softens a new sheet permanently (Mullins effect), so a controller designed
+    for a sheet after its first cycle is too fast for a new one.
 
     Args:
-        bench: at 0 V, with its weight.
-        peak_v: highest drive voltage that the sheet gets, in V; 0 leaves the sheet new.
+        bench: at 0 V, with its mass.
+        peak_v: highest drive voltage, in V; 0 leaves the sheet new.
     Raises:
-        LimitError: the voltage is outside the limits of the drive.
+        LimitError: The voltage is outside the limits of the drive.
     """
     if peak_v == 0.0:
         return

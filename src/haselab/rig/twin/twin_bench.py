@@ -1,4 +1,4 @@
-"""The twin as a rig: physics in C behind the protocols of `haselab.rig`."""
+"""The twin as a rig: physics in C that implements the protocols of `haselab.rig`."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ __all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench",
 GRAVITY_M_S2 = 9.81
 _CARRIER_HIGH_V = 1.0  # at the input of the amplifier
 _CLAMP_KG = 0.02  # the lower clamp itself
-_SLOWEST_FRAMES_HZ = 0.01  # a frame later than that is a mistake
+_SLOWEST_FRAMES_HZ = 0.01  # a lower frame rate is a mistake
 _SUB = 20  # samples in one mechanical step, TWIN_SUB of native/twin/twin.h
 _THREADS = os.cpu_count() or 1
 _RAMP_S = 1.0  # a person takes this long to hang or lift a weight
-_SETTLE_S = 120.0  # how long the weight has hung when a study begins
+_SETTLE_S = 120.0  # how long the mass has hung when a study begins
 _LONGEST_WAIT_S = 86400.0
-_SMALLEST_F, _LARGEST_F = 1e-12, 1e-6  # that the fixture takes
-_PIECE = 5_000_000  # mechanical steps in one go, for the memory's sake
+_SMALLEST_F, _LARGEST_F = 1e-12, 1e-6  # of the fixture
+_MOST_STEPS = 5_000_000  # mechanical steps per call, to limit memory
 
 
 def native_bench(
@@ -41,15 +41,15 @@ def native_bench(
     noise: bool = True,
     breakdown_v_per_m: float | None = None,
 ) -> _twin.Bench:
-    """The C bench of a configuration, unloaded, at rest, at its free length.
+    """Create the C bench of a configuration, unloaded and relaxed at its free length.
 
     Args:
         config: of the bench; a law other than the built-in one is sampled into a table.
         seed: of the monitors' noise.
-        noise: False switches it off.
-        breakdown_v_per_m: instead of the law's.
+        noise: False switches the noise off.
+        breakdown_v_per_m: replaces that of the law.
     Raises:
-        InputError: a law that the twin cannot integrate, see `law_table` and `motion_substeps`.
+        InputError: The twin cannot integrate the law, see `law_table` and `motion_substeps`.
     """
     law = config.law
     losses, circuit = law.losses, law.circuit
@@ -99,7 +99,7 @@ def _planar_values(law: PlanarHasel) -> dict[str, float]:
 
 
 def _tabled_values(law: ActuatorLaw) -> dict[str, float]:
-    """The same fields where a table replaces them."""
+    """The same fields for a law given by a table."""
     unused = dict.fromkeys(("electrode_n_m", "electrode_cubic", "capacitance_exponent"), 0.0)
     return unused | {
         "area_m2": law.area_m2,
@@ -130,7 +130,7 @@ def _set_table(bench: _twin.Bench, law: ActuatorLaw, config: TwinConfig) -> None
 
 
 def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:
-    """Generator, amplifier, monitors and converters."""
+    """Parameters of generator, amplifier, monitors and converters."""
     daq, amplifier = config.acquisition, config.amplifier
     return {
         "carrier_v": 0.0,
@@ -156,7 +156,7 @@ def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:
 
 
 def describe(config: TwinConfig) -> RigDescription:
-    """What the user of this bench would know: nominal values only."""
+    """Return the nominal values of this bench, without its errors."""
     daq, amplifier, law = config.acquisition, config.amplifier, config.law
     return RigDescription(
         name=config.name,
@@ -178,7 +178,7 @@ def describe(config: TwinConfig) -> RigDescription:
 
 
 class TwinBench:
-    """All instruments of the twin, on one clock: fulfils every protocol of `haselab.rig`.
+    """All instruments of the twin on one clock; implements every protocol of `haselab.rig`.
 
     Args:
         config: the physical bench.
@@ -207,7 +207,7 @@ class TwinBench:
         self._frame_rate_hz = 0.0
         self._next_frame_s = 0.0
         self._frames_taken = 0
-        self._renderers: ThreadPoolExecutor | None = None  # threads, from the first use on
+        self._renderers: ThreadPoolExecutor | None = None  # threads, created at first use
         self._trace: list[NDArray[np.float64]] = []
         self._trace_start_s = 0.0
         self.hang(config.load.mass_kg)
@@ -227,13 +227,13 @@ class TwinBench:
 
     @property
     def output_v(self) -> float:
-        """Voltage at the amplifier's output, in V: a voltmeter on the bench."""
+        """True voltage at the amplifier's output, in V."""
         return float(self._native.output_v)
 
     # Acquisition
     @property
     def time_s(self) -> float:
-        """Clock at the end of the last block, in s."""
+        """Time at the end of the last block, in s."""
         return float(self._native.time_s)
 
     def read(self) -> NDArray[np.int16]:
@@ -252,15 +252,15 @@ class TwinBench:
         return self._codes.copy()
 
     def sample(self, drive_v: float, samples: int) -> NDArray[np.int16]:
-        """Both monitors while one output holds: for a server that keeps its own account of time.
+        """Sample both monitors at a constant output, for a server that counts the time itself.
 
         Args:
-            drive_v: ahead of the amplifier, in V; not checked against the limits of the output.
+            drive_v: at the amplifier's input, in V; not checked against the output's limits.
             samples: a multiple of 20.
         Returns:
             Codes, shape `(samples, 2)`.
         Raises:
-            SafetyError: the bench protected itself.
+            SafetyError: The bench tripped.
         """
         codes = np.empty((samples, 2), dtype=np.int16)
         lengths = np.empty(samples // _SUB)
@@ -272,38 +272,40 @@ class TwinBench:
 
     @property
     def native(self) -> _twin.Bench:
-        """The C bench, with the addresses of its parameters and state for the co-simulation."""
+        """C bench, with the addresses of its parameters and state for the co-simulation."""
         return self._native
 
     def pull(self, load_n: float) -> None:
-        """Change the load at once, without letting time pass."""
+        """Change the load at once; no time passes."""
         self._load_n = load_n
 
     @property
     def load_n(self) -> float:
-        """What hangs on the lower clamp now, in N."""
+        """Present load on the lower clamp, in N."""
         return self._load_n
 
     @property
     def mass_kg(self) -> float:
-        """The mass that was hung last, whether it is held up or not."""
+        """Mass that was hung last, even if it is lifted now."""
         return self._mass_kg
 
     def weigh(self, mass_kg: float) -> None:
-        """Change the mass that is to hang, and its inertia, without letting time pass.
+        """Set the hung mass and its inertia; no time passes.
 
         Raises:
-            LimitError: no such mass.
+            LimitError: The mass is outside the limits.
         """
         if not 0.0 <= mass_kg <= 20.0:
-            raise LimitError(f"Mass = {mass_kg:g} kg is outside [0, 20] kg. Hang another mass.")
+            raise LimitError(
+                f"The mass is {mass_kg:g} kg, but it must be within [0, 20] kg. Use another mass."
+            )
         self._mass_kg = mass_kg
         added_kg = self._config.load.added_inertia_kg
         self._native.inertia_kg = max(mass_kg, _CLAMP_KG) + added_kg + self._law.moving_mass_kg
 
     @property
     def length_m(self) -> float:
-        """Length of the sheet: a ruler on the bench."""
+        """True length of the sheet, in m."""
         return float(self._native.length_m)
 
     def _guard(self) -> None:
@@ -313,13 +315,13 @@ class TwinBench:
         if self._native.outside:
             limits = self._law.length_limits_m
             raise SafetyError(
-                f"The {self._law.kind} left the lengths of {1e3 * limits.low:.4g} to "
-                f"{1e3 * limits.high:.4g} mm for which its law is valid; the output is at 0 V. "
+                f"The {self._law.kind} left the range of {1e3 * limits.low:.4g} to "
+                f"{1e3 * limits.high:.4g} mm in which its law is valid. The output is at 0 V. "
                 "Lower the voltage or the load."
             )
         raise SafetyError(
-            f"Dielectric breakdown at {self._native.field_v_m / 1e6:.3g} kV/mm, allowed "
-            f"{self._law.circuit.breakdown_v_per_m / 1e6:.3g} kV/mm; the output is at "
+            f"Dielectric breakdown at {self._native.field_v_m / 1e6:.3g} kV/mm (limit "
+            f"{self._law.circuit.breakdown_v_per_m / 1e6:.3g} kV/mm). The output is at "
             "0 V. Lower the voltage or the load."
         )
 
@@ -345,13 +347,13 @@ class TwinBench:
             capacitance_f, series_ohm = 0.0, 0.0
         elif not (_SMALLEST_F <= capacitance_f <= _LARGEST_F and 0.0 <= series_ohm <= 1e8):
             raise LimitError(
-                f"Reference of {capacitance_f:g} F, {series_ohm:g} ohm is outside "
-                f"[{_SMALLEST_F:g}, {_LARGEST_F:g}] F, [0, 1e8] ohm. Connect another one."
+                f"The reference of {capacitance_f:g} F, {series_ohm:g} ohm is outside "
+                f"[{_SMALLEST_F:g}, {_LARGEST_F:g}] F, [0, 1e8] ohm. Use another one."
             )
         if self._after_v != 0.0 or self._before_v != 0.0 or self._native.carrier_v != 0.0:
             raise LimitError(
-                f"Output = {self._after_v:g} V with {self._native.carrier_v:g} V of carrier, "
-                "which must be 0 V each before the fixture is touched. Switch both off first."
+                f"Do not touch the fixture: the output is {self._after_v:g} V and the carrier "
+                f"{self._native.carrier_v:g} V. Switch both off first."
             )
         self._native.connect(capacitance_f, series_ohm)
 
@@ -361,7 +363,7 @@ class TwinBench:
         limit_hz = self._config.camera.rate_hz
         if not _SLOWEST_FRAMES_HZ <= rate_hz <= limit_hz:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside [{_SLOWEST_FRAMES_HZ:g}, {limit_hz:g}] "
+                f"The frame rate is {rate_hz:g} Hz, outside [{_SLOWEST_FRAMES_HZ:g}, {limit_hz:g}] "
                 "Hz. Lower the request."
             )
         self._frame_rate_hz = rate_hz
@@ -406,12 +408,12 @@ class TwinBench:
         return starts_s + 0.5 * exposure_s, positions
 
     def render(self, positions: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """The next frames, of the lengths that `exposures` gave, by several threads.
+        """Render the next frames, from the lengths of `exposures`, in several threads.
 
-        The bits do not depend on how many.
+        The result does not depend on their number.
         """
         first, parts = self._frames_taken, min(_THREADS, len(positions))
-        if parts == 1:  # a thread takes longer to start
+        if parts == 1:  # starting a thread takes longer
             taken = self._camera.render(positions, first)
         else:
             pieces = np.array_split(np.arange(len(positions)), parts)
@@ -454,11 +456,11 @@ class TwinBench:
         """See `haselab.rig.LoadStand`."""
         if not 0.0 <= duration_s <= _LONGEST_WAIT_S:
             raise LimitError(
-                f"Waiting time = {duration_s:g} s is outside [0, {_LONGEST_WAIT_S:g}] s. "
-                "Wait in parts."
+                f"The waiting time is {duration_s:g} s, but it must be within [0, "
+                f"{_LONGEST_WAIT_S:g}] s. Split it."
             )
-        whole, rest = divmod(round(duration_s / self._step_s), _PIECE)
-        for steps in [_PIECE] * whole + [rest]:
+        whole, rest = divmod(round(duration_s / self._step_s), _MOST_STEPS)
+        for steps in [_MOST_STEPS] * whole + [rest]:
             self._let_pass(steps)
 
     def _let_pass(self, steps: int) -> None:
@@ -477,10 +479,10 @@ class TwinBench:
 
 
 def make_twin(config: TwinConfig, seed: int) -> Rig:
-    """A bench made of physics, ready for a study: the weight has hung for two minutes at 0 V."""
+    """Create a simulated bench that is ready for a study: its mass has hung for two minutes."""
     return rig_of(TwinBench(config, seed), config)
 
 
 def rig_of(bench: TwinBench, config: TwinConfig) -> Rig:
-    """The bundle of protocols that one bench fulfils."""
+    """Bundle the protocols that one bench implements as a rig."""
     return Rig(describe(config), bench, bench, bench, bench, bench, bench, simulated=True)

@@ -130,7 +130,7 @@ class _Process:
 class Guardians:
     """Two independent processes that make the bench safe when this program or one of them dies.
 
-    Use as a context: at its end they are told to stop and leave the bench as it is.
+    Use as a context: at its end they stop and leave the bench unchanged.
 
     Args:
         command: of one guardian; slot and log are appended.

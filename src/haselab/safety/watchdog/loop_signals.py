@@ -96,7 +96,7 @@ class Jumps:
         self._last: list[float] = []
 
     def clear(self) -> None:
-        """Start anew: the next value does not follow the last one."""
+        """Restart: the next value does not follow the last one."""
         self._last = []
 
     def fault(self, strain: float, blocks: int) -> str:

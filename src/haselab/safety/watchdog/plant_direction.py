@@ -140,7 +140,7 @@ class Reaction:
         self._odd = False
 
     def clear(self) -> None:
-        """Start anew: the next value does not follow the last one."""
+        """Restart: the next value does not follow the last one."""
         self._static.clear()
         self._strain.clear()
         self._sums, self._against, self._rest = [0.0, 0.0, 0], 0, None
@@ -199,7 +199,7 @@ class Reaction:
         return float(np.ptp(recent)) > self._share * self._move + 8.0 * noise
 
     def _dead(self, static: Floats, strain: Floats) -> str:
-        """Check that the strain moved if the drive has left its value of 0.4 s ago for good."""
+        """Check that the strain moved if the drive has left its value of 0.4 s ago permanently."""
         before, after = static[: POINTS // 5], static[2 * POINTS // 5 :]
         move = max(float(after.min() - before.max()), float(before.min() - after.max()))
         if move < self._move:

@@ -79,7 +79,7 @@ class Member:
 
 
 def number_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The type that pieces of such a column have: its own in native byte order, or float64."""
+    """The type that chunks of such a column have: its own in native byte order, or float64."""
     native = dtype.newbyteorder("=")
     return native if native in _OWN_TYPES else np.dtype(np.float64)
 
@@ -174,11 +174,11 @@ def take_each(members: Sequence[Member], opened: contextlib.ExitStack) -> Take:
 def plain_reader(stream: io.FileIO, offset: int, dtype: np.dtype[Any]) -> Read:
     """Reads values that lie one after the other in a file of its own handle.
 
-    A piece that the system holds in memory is mapped, not copied; one that has to come from the
+    A chunk that the system holds in memory is mapped, not copied; one that has to come from the
     disk is read, which the disk does faster.
 
     Args:
-        stream: opened without buffer, used by nobody else.
+        stream: opened without buffer, used only here.
         offset: of the first value, in bytes.
         dtype: of the values.
     Returns:

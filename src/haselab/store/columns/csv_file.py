@@ -29,7 +29,7 @@ __all__ = ["CsvArchive"]
 _RATE_LINE = re.compile(
     r"^#\s*(?:rate_hz|sample_rate_hz|fs)\s*[=:]\s*([-+.\deE]+)\s*$", re.MULTILINE
 )
-_PIECE_BYTES = 1 << 22
+_CHUNK_BYTES = 1 << 22
 
 
 class CsvArchive(Archive):
@@ -159,7 +159,7 @@ class CsvArchive(Archive):
             nonlocal skip, carry, ended
             if ended:
                 return None
-            data = stream.read(_PIECE_BYTES)
+            data = stream.read(_CHUNK_BYTES)
             ended = not data
             self._read_bytes += len(data)
             text = carry + decoder.decode(data, final=ended)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.io import loadmat, savemat
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.store.folder import drafted
 from haselab.store.text_file import check_regular
 
@@ -43,7 +43,7 @@ def write_mat_structs(path: Path, structs: Mapping[str, Mapping[str, Any]]) -> N
         savemat(file, plain, format="5", oned_as="row", appendmat=False)
 
 
-def read_mat_struct(path: Path, name: str) -> dict[str, Any]:
+def read_mat_struct(path: Path, name: str) -> JsonObject:
     """Fields of one struct: text as text, all else as arrays.
 
     Args:

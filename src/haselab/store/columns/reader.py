@@ -234,11 +234,11 @@ class ColumnStream(Closing):
             return self.rows_read / self.rows
         return self._archive.share_read() or 0.0
 
-    def pieces(self, rows: int) -> Iterator[tuple[NDArray[Any], ...]]:
+    def chunks(self, rows: int) -> Iterator[tuple[NDArray[Any], ...]]:
         """The columns from their first row on.
 
         Args:
-            rows: of each piece but the last.
+            rows: of each chunk but the last.
         Returns:
             One array a column, in the order asked for, shape `(rows,)`: int16, float32 or float64
             in native byte order, whichever the file holds, float64 for other numbers. Contiguous,
@@ -337,7 +337,7 @@ def open_columns(
 ) -> ColumnStream:
     """Open named columns of a file for reading in parts.
 
-    Memory is needed for a piece alone, whatever the file's length; of a compressed HDF5 file also
+    Memory is needed for a chunk alone, whatever the file's length; of a compressed HDF5 file also
     for one chunk of each column.
 
     Args:
@@ -358,7 +358,7 @@ def open_columns(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     np.savez(Path(folder) / "a.npz", u=np.arange(5.0), y=np.ones(5), rate_hz=400.0)
         ...     with open_columns(Path(folder) / "a.npz", ["y", "u"]) as stream:
-        ...         print(stream.rows, stream.rate_hz, [u.tolist() for _, u in stream.pieces(3)])
+        ...         print(stream.rows, stream.rate_hz, [u.tolist() for _, u in stream.chunks(3)])
         5 400.0 [[0.0, 1.0, 2.0], [3.0, 4.0]]
     """
     archive = open_archive(path)

@@ -61,7 +61,7 @@ class _CodesArchive(Archive):
         return int(self._codes.shape[0] * self._codes.shape[1])
 
     def start(self, names: Sequence[str]) -> Take:
-        """Begin at the first block; pieces are whole blocks."""
+        """Begin at the first block; chunks are whole blocks."""
         del names
         read, (left, length, _) = chunked_reader(self._codes, 0, self._open), self._codes.shape
 
@@ -107,7 +107,7 @@ class SessionColumns(SessionReader):
         return self._file["experiments"][experiment]
 
     def columns(self) -> ColumnStream:
-        """Codes of both monitors, int16; ask for pieces of whole blocks."""
+        """Codes of both monitors, int16; ask for chunks of whole blocks."""
         archive = _CodesArchive(self._path, self._opened, self._codes)
         return ColumnStream(archive, _NAMES, use_times=False)
 

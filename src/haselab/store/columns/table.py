@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,17 @@ from haselab.store.columns.selection import (
     time_column,
 )
 from haselab.store.columns.units import Unit
+from haselab.store.optional import library
 
-__all__ = ["Table", "read_table"]
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+__all__ = ["Table", "read_every_column", "read_table"]
 
 Floats = NDArray[np.float64]
-_PIECE_ROWS = 1 << 20
+_CHUNK_ROWS = 1 << 20
+_SHOWN_ROWS = 5
 _LARGEST = 1e30  # powers of it do not overflow in a fit
 
 
@@ -56,6 +63,74 @@ class Table:
     def __iter__(self) -> Iterator[str]:
         return iter(self.columns)
 
+    def to_pandas(self) -> pandas.DataFrame:
+        """The columns as a pandas DataFrame, its attributes the rate and the units.
+
+        Returns:
+            A row for each row of the table.
+        Raises:
+            InputError: pandas is not installed.
+        """
+        frame: pandas.DataFrame = library("pandas").DataFrame(dict(self.columns))
+        if self.rate_hz is not None:
+            frame.attrs["rate_hz"] = self.rate_hz
+        return frame
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The columns as an xarray Dataset over the time, or over `row` where there is none.
+
+        Returns:
+            The data set; each variable states its unit where the table knows it.
+        Raises:
+            InputError: xarray is not installed.
+        """
+        over = "row" if self.time_name is None else self.time_name
+        columns = {n: (over, v, _unit_of(n)) for n, v in self.columns.items() if n != over}
+        times = {} if self.time_s is None else {over: (over, self.time_s, {"units": "s"})}
+        known = {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
+        dataset: xarray.Dataset = library("xarray").Dataset(columns, times, known)
+        return dataset
+
+    def _repr_html_(self) -> str:
+        """First rows, as a notebook shows them."""
+        shown = "".join(f"<th>{html.escape(name)}</th>" for name in self.columns)
+        head = np.stack([values[:_SHOWN_ROWS] for values in self.columns.values()], axis=1)
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{value:.6g}</td>" for value in row) + "</tr>" for row in head
+        )
+        count = next(iter(self.columns.values())).size
+        rate = "" if self.rate_hz is None else f" at {self.rate_hz:g} Hz"
+        return f"<table><tr>{shown}</tr>{rows}</table><p>{count} rows{rate}</p>"
+
+
+_UNITS = {"_v": "V", "_s": "s", "_f": "F", "_ohm": "ohm", "_m": "m", "_px": "px", "_n": "N",
+          "_pa": "Pa", "_rad": "rad", "_hz": "Hz"}  # fmt: skip
+
+
+def _unit_of(name: str) -> dict[str, str]:
+    return next(({"units": unit} for end, unit in _UNITS.items() if name.endswith(end)), {})
+
+
+def read_every_column(path: Path | str) -> Table:
+    """Read all columns of numbers of a file.
+
+    Args:
+        path: as `read_table`.
+    Returns:
+        The table in SI units, without the rows that a column `valid` marks with 0.
+    Raises:
+        InputError: no such file, unknown kind, or no column of numbers.
+    """
+    with open_archive(path) as archive:
+        names = [archive.plain_name(full) for full in archive.names]
+        found = {name: _column(archive, name) for name in dict.fromkeys(names) if name != "valid"}
+        columns = {name: values for name, values in found.items() if values is not None}
+        longest = max((values.size for values in columns.values()), default=0)
+        wanted = [name for name, values in columns.items() if values.size == longest]
+    if not longest:
+        raise InputError(f"The file has no column of numbers. {path}")
+    return read_table(path, wanted)
+
 
 def read_table(
     path: Path | str, columns: Sequence[str], options: ColumnOptions = AS_THE_FILE_STATES
@@ -80,8 +155,8 @@ def read_table(
     wanted = list(dict.fromkeys(columns))
     with open_archive(path) as archive:
         stream = ColumnStream(archive, wanted, use_times=False, options=options)
-        pieces = list(stream.pieces(_PIECE_ROWS))
-        whole = {name: np.concatenate([p[k] for p in pieces]) for k, name in enumerate(wanted)}
+        chunks = list(stream.chunks(_CHUNK_ROWS))
+        whole = {name: np.concatenate([p[k] for p in chunks]) for k, name in enumerate(wanted)}
         kept = _valid_rows(archive, wanted, len(whole[wanted[0]]))
         values = {name: _finite(name, column[kept], archive.file) for name, column in whole.items()}
         left_out = int(np.count_nonzero(~kept))
@@ -116,7 +191,7 @@ def _column(
         if archive.locate(name) is None:
             return None
         stream = ColumnStream(archive, [name], use_times=False, options=options)
-        return np.concatenate([piece for (piece,) in stream.pieces(_PIECE_ROWS)])
+        return np.concatenate([chunk for (chunk,) in stream.chunks(_CHUNK_ROWS)])
     except InputError:
         return None
 

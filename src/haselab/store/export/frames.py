@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import numpy as np
 from haselab.base import InputError
 from haselab.store.export.session import Derived, nothing_derived
 from haselab.store.export.tables import event_table, tables_of
+from haselab.store.optional import library
 from haselab.store.session.layout import Sampling
 from haselab.store.session.reader import SessionReader, session_file
 
@@ -22,15 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["session_dataset", "session_tables"]
 
 _UNITS = {"_v": "V", "_s": "s", "_f": "F", "_ohm": "ohm", "_m": "m", "_kg": "kg", "_px": "px"}
-
-
-def _library(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise InputError(
-            f"This needs {name}, which is not installed. Install haselab[frames]."
-        ) from None
 
 
 def _scales(reader: SessionReader, path: Path) -> tuple[float, float]:
@@ -63,7 +54,7 @@ def session_tables(
     Raises:
         InputError: no session, no such experiment, or pandas is not installed.
     """
-    pandas = _library("pandas")
+    frames = library("pandas")
     path = session_file(path)
     with SessionReader(path) as reader:
         reader.experiment(experiment)  # refuses an unknown name
@@ -73,10 +64,10 @@ def session_tables(
         tables["events"] = event_table(reader)
         found = {}
         for name, table in tables.items():
-            pieces = [pandas.DataFrame(piece) for piece in table.pieces()]
-            found[name] = pandas.concat(pieces, ignore_index=True) if pieces[1:] else pieces[0]
+            chunks = [frames.DataFrame(chunk) for chunk in table.chunks()]
+            found[name] = frames.concat(chunks, ignore_index=True) if chunks[1:] else chunks[0]
         for name, columns in derived(reader, experiment).items():
-            found[name] = pandas.DataFrame(columns)
+            found[name] = frames.DataFrame(columns)
     return found
 
 
@@ -100,7 +91,7 @@ def session_dataset(
     Raises:
         InputError: no session, no such experiment, or xarray is not installed.
     """
-    library = _library("xarray")
+    xarray_library = library("xarray")
     path = session_file(path)
     with SessionReader(path) as reader:
         record = reader.experiment(experiment)
@@ -130,7 +121,7 @@ def session_dataset(
         "kind": record.kind,
         "settings": json.dumps(record.settings),
     }
-    dataset: xarray.Dataset = library.Dataset(data, coordinates, attributes)
+    dataset: xarray.Dataset = xarray_library.Dataset(data, coordinates, attributes)
     for key, variable in dataset.variables.items():
         unit = next((unit for end, unit in _UNITS.items() if str(key).endswith(end)), None)
         if unit is not None:

@@ -18,7 +18,7 @@ from haselab.store.session.writer import ExperimentPlan, SessionWriter
 __all__ = ["ImportPlan", "Imported", "import_session"]
 
 _LARGEST = 32767
-_PIECE_BLOCKS = 200
+_CHUNK_BLOCKS = 200
 _FULL_SCALE_V = 10.0  # of a monitor that stands for values at the actuator
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
 
@@ -187,8 +187,8 @@ def _scale(file: Path, plan: ImportPlan) -> _Scale:
 def _peaks(file: Path, plan: ImportPlan) -> tuple[float, float]:
     peaks = [0.0, 0.0]
     with _open(file, plan) as stream:
-        for piece in stream.pieces(_PIECE_BLOCKS * plan.block_samples):
-            for k, column in enumerate(piece[:2]):
+        for chunk in stream.chunks(_CHUNK_BLOCKS * plan.block_samples):
+            for k, column in enumerate(chunk[:2]):
                 if np.issubdtype(column.dtype, np.integer):
                     raise InputError(
                         f"The columns contain integers, codes of a converter. Add --volt-per-code. "
@@ -199,9 +199,9 @@ def _peaks(file: Path, plan: ImportPlan) -> tuple[float, float]:
 
 
 def _codes(
-    piece: tuple[NDArray[Any], ...], scale: _Scale, first: int, file: Path
+    chunk: tuple[NDArray[Any], ...], scale: _Scale, first: int, file: Path
 ) -> tuple[NDArray[np.int16], float]:
-    values = np.stack(piece, axis=1)
+    values = np.stack(chunk, axis=1)
     if np.issubdtype(values.dtype, np.integer):
         return values.astype(np.int16), 0.0
     volt = scale.volt_per_code
@@ -228,11 +228,11 @@ def _copy(
 ) -> tuple[int, int, float]:
     samples, count, worst_v = plan.block_samples, 0, 0.0
     rest, rest_v = np.empty((0, 2), np.int16), np.empty(0)
-    for piece in stream.pieces(_PIECE_BLOCKS * samples):
-        codes, lost_v = _codes(piece[:2], scale, stream.rows_read - len(piece[0]), file)
+    for chunk in stream.chunks(_CHUNK_BLOCKS * samples):
+        codes, lost_v = _codes(chunk[:2], scale, stream.rows_read - len(chunk[0]), file)
         worst_v = max(worst_v, lost_v)
         codes = np.concatenate([rest, codes])
-        drive_v = piece[2].astype(np.float64) if plan.drive else np.full(len(piece[0]), np.nan)
+        drive_v = chunk[2].astype(np.float64) if plan.drive else np.full(len(chunk[0]), np.nan)
         drive_v = np.concatenate([rest_v, drive_v])
         whole = len(codes) // samples
         shape = (whole, samples)

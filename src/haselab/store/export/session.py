@@ -37,7 +37,7 @@ __all__ = ["FOLDERS", "FORMS", "Derived", "Exported", "export_session", "nothing
 # Tables of columns that follow from the experiment of a name.
 Derived = Callable[[SessionReader, str], Mapping[str, Columns]]
 
-_PIECE_BLOCKS = 500
+_CHUNK_BLOCKS = 500
 _MAT_BYTES = 2**31 - 2**20  # of one variable in a file of version 5
 _SESSION = "session"  # the variable of a MATLAB file with header and events
 _RAW_INPUT = 0xFFFFFFFF  # of LabVIEW's scales: the numbers as they are stored
@@ -291,7 +291,7 @@ def _tdms(source: _Source, out: Path) -> Iterator[Path]:
 def _pieces(reader: SessionReader, name: str) -> Iterator[Any]:
     first = 0
     while True:
-        rows = reader.follow(name, first, _PIECE_BLOCKS)
+        rows = reader.follow(name, first, _CHUNK_BLOCKS)
         if not rows.start_s.size:
             return
         yield rows

@@ -32,33 +32,33 @@ Columns = dict[str, NDArray[Any]]
 ENDINGS = ("", "-blocks", "-tracks")  # of the recorded tables of an experiment
 DERIVED = ("-capacitance", "-strain")  # of those that follow from them
 EVENTS = "events"
-_PIECE_BLOCKS = 500
+_CHUNK_BLOCKS = 500
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of equal length, in pieces.
+    """Columns of equal length, in chunks.
 
     Args:
         name: of the file, without its ending.
-        pieces: the rows from the first on; at least one piece, perhaps empty.
+        chunks: the rows from the first on; at least one chunk, perhaps empty.
     """
 
     name: str
-    pieces: Callable[[], Iterator[Columns]]
+    chunks: Callable[[], Iterator[Columns]]
 
 
 def event_table(reader: SessionReader) -> Table:
     """The events with their times."""
 
-    def pieces() -> Iterator[Columns]:
+    def chunks() -> Iterator[Columns]:
         events = reader.events()
         yield {
             "time_s": np.array([time_s for time_s, _ in events], float),
             "what": np.array([what for _, what in events], dtype=np.str_),
         }
 
-    return Table(EVENTS, pieces)
+    return Table(EVENTS, chunks)
 
 
 def table_of(name: str, columns: Columns) -> Table:
@@ -86,7 +86,7 @@ def tables_of(
     def monitors() -> Iterator[Columns]:
         first, count = 0, 1
         while count:
-            rows = reader.follow(name, first, _PIECE_BLOCKS)
+            rows = reader.follow(name, first, _CHUNK_BLOCKS)
             count = rows.start_s.size
             if count or not first:
                 sample_s = np.arange(rows.codes.shape[1]) / rate_hz
@@ -117,7 +117,7 @@ def tables_of(
         } | {field: rows.tracks[field].ravel() for field in rows.tracks.dtype.names or ()}
 
     parts = zip(ENDINGS, (monitors, blocks, tracks), strict=True)
-    return [Table(table + ending, pieces) for ending, pieces in parts]
+    return [Table(table + ending, chunks) for ending, chunks in parts]
 
 
 def _cells(column: NDArray[Any]) -> list[str]:
@@ -134,7 +134,7 @@ def write_csv(table: Table, folder: Path) -> Path:
     """Write a table as CSV with a header row; digits enough to get each number back."""
     path = folder / f"{table.name}.csv"
     with drafted(path) as draft, draft.open("w", encoding="utf-8", newline="\n") as file:
-        for k, columns in enumerate(table.pieces()):
+        for k, columns in enumerate(table.chunks()):
             if k == 0:
                 file.write(",".join(columns) + "\n")
             cells = [_cells(column) for column in columns.values()]
@@ -159,10 +159,10 @@ def write_parquet(table: Table, folder: Path, header: str) -> Path:
     writer: Any = None
     with drafted(path) as draft:
         try:
-            for columns in table.pieces():
-                piece = arrow.table(columns, metadata={"haselab": header})
-                writer = writer or parquet.ParquetWriter(draft, piece.schema, compression="zstd")
-                writer.write_table(piece)
+            for columns in table.chunks():
+                chunk = arrow.table(columns, metadata={"haselab": header})
+                writer = writer or parquet.ParquetWriter(draft, chunk.schema, compression="zstd")
+                writer.write_table(chunk)
         finally:
             if writer is not None:
                 writer.close()

@@ -1,7 +1,7 @@
-"""Checksums inside a session file, for one that has no seal yet: recorded, killed, or cut off.
+"""Checksums inside a session file, for files without a seal: being written, killed or truncated.
 
-Blocks, frames and events carry a CRC-32 each, settings one in their text, and all that never
-changes after the start (attributes, scales, layout) one SHA-256 together.
+Each block, frame and event has a CRC-32, settings have one in their text. Everything that never
+changes after the start (attributes, scales, layout) has one SHA-256.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import JsonObject
 from haselab.store.text_file import decode_json
 
 __all__ = [
@@ -32,7 +33,7 @@ __all__ = [
 
 STATIC = "static_sha256"
 _SETTINGS_CHECK = "crc32"
-# Written by HDF5's dimension scales as references: places in this file, which carry no number.
+# Written by HDF5's dimension scales as references: positions in this file, not data.
 _REFERENCES = ("DIMENSION_LIST", "REFERENCE_LIST")
 _CHANGING = ("settings", "tail")  # fixed in size, but written to while recording
 
@@ -61,15 +62,15 @@ def frame_checks(
 
 
 def compare(stated: NDArray[Any], found: NDArray[Any], first: int, what: str) -> None:
-    """Refuse rows whose checksums are not the stated ones.
+    """Refuse rows whose checksums differ from the stated ones.
 
     Args:
         stated: shape `(N,)`.
         found: shape `(N,)`.
         first: number of the first row.
-        what: a row is called.
+        what: name of a row, for the message.
     Raises:
-        ValueError: with the first row that is wrong.
+        ValueError: names the first wrong row.
     """
     wrong = np.flatnonzero(stated != found)
     if wrong.size:
@@ -82,18 +83,18 @@ def event_check(row: int, time_s: float, what: bytes) -> int:
 
 
 def write_settings(settings: Mapping[str, Any]) -> bytes:
-    """Settings as JSON text with the CRC-32 of the text without it as last entry."""
+    """Settings as JSON text, with the CRC-32 of the rest as the last entry."""
     text = json.dumps(settings)
     return json.dumps({**settings, _SETTINGS_CHECK: zlib.crc32(text.encode())}).encode()
 
 
-def read_settings(text: bytes) -> tuple[dict[str, Any], bool]:
+def read_settings(text: bytes) -> tuple[JsonObject, bool]:
     """Settings from their text.
 
     Returns:
         The settings, and whether they match their checksum.
     Raises:
-        ValueError: no JSON.
+        ValueError: not JSON.
     """
     settings = decode_json(text.decode())
     stated = settings.pop(_SETTINGS_CHECK, None)
@@ -128,7 +129,7 @@ def _bytes_of(value: Any) -> bytes:
 
 
 def static_digest(file: h5py.File) -> str:
-    """SHA-256 of all that is fixed when a recording starts: attributes, scales, layout.
+    """SHA-256 of everything that is fixed when a recording starts: attributes, scales, layout.
 
     Args:
         file: open; without links, see `check_links`.

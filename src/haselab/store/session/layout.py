@@ -1,4 +1,4 @@
-"""Where things lie in a session file: datasets, their attributes, and how to read them."""
+"""Layout of a session file: datasets, their attributes, and how to read them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.store.names import check_name
 from haselab.store.session.checksums import compare, frame_checks, read_settings, write_settings
 from haselab.store.session.tail import TailReader, block_checks
@@ -50,41 +50,41 @@ FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8"), ("check", "u4")])
 TRACK = np.dtype(
     [("x_px", "f8"), ("y_px", "f8"), ("std_x_px", "f4"), ("std_y_px", "f4"), ("valid", "?")]
 )
-# In the order in which they are written: what the last one holds is whole in all of them.
+# In the order of writing: rows in the last dataset are complete in all of them.
 BLOCK_ORDER = ("codes", "blocks", "start_s")
 FRAME_ORDER = ("tracks", "frames", "frame_s")
 _SETTINGS_BYTES = 65000
 _CHUNK_S = 0.1
-_BLOCKS_PER_CHUNK = 10  # where the rate is not known
+_BLOCKS_PER_CHUNK = 10  # if the rate is unknown
 
 
 @dataclass(frozen=True)
 class ExperimentPlan:
-    """What one experiment will record; all datasets are made before the first block.
+    """The recording of one experiment; all datasets are created before the first block.
 
     Args:
         name: unique in the session.
         kind: of the study's step.
         points: tracked points per frame.
-        settings: anything that JSON holds: signals, loads, gains.
+        settings: signals, loads, gains and others, as JSON types.
     """
 
     name: str
     kind: str
     points: int
-    settings: dict[str, Any]
+    settings: JsonObject
 
 
 @dataclass(frozen=True)
 class ExperimentRecord:
-    """What one experiment recorded; B blocks of N samples, F frames of P points.
+    """The recorded data of one experiment: B blocks of N samples, F frames of P points.
 
     Args:
         name: of the experiment.
         kind: of the study's step.
         settings: as planned, and as completed in the run.
         codes: ADC codes, shape `(B, N, 2)`.
-        drive_v: output asked for in each block, shape `(B,)`.
+        drive_v: output requested in each block, shape `(B,)`.
         reference: desired strain in each block, NaN in open loop, shape `(B,)`.
         block_start_s: clock at each block's first sample, shape `(B,)`.
         frame_time_s: middle of the exposures, shape `(F,)`.
@@ -94,7 +94,7 @@ class ExperimentRecord:
 
     name: str
     kind: str
-    settings: dict[str, Any]
+    settings: JsonObject
     codes: NDArray[np.int16]
     drive_v: NDArray[np.float64]
     reference: NDArray[np.float64]
@@ -110,7 +110,7 @@ class BlockRows:
 
     Args:
         codes: ADC codes, shape `(B, N, 2)`.
-        drive_v: output asked for, shape `(B,)`.
+        drive_v: requested output, shape `(B,)`.
         reference: desired strain, NaN in open loop, shape `(B,)`.
         start_s: clock at each block's first sample, shape `(B,)`.
     """
@@ -123,12 +123,12 @@ class BlockRows:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How blocks are sampled, as far as the session's header tells.
+    """Sampling of the blocks, as far as the session's header states it.
 
     Args:
         block_samples: samples per channel in one block.
-        rate_hz: samples per second and channel; None: not known.
-        volt_per_code: None: not known.
+        rate_hz: samples per second and channel; None: unknown.
+        volt_per_code: None: unknown.
     """
 
     block_samples: int
@@ -137,10 +137,10 @@ class Sampling:
 
     @classmethod
     def of_header(cls, block_samples: int, header: Mapping[str, Any]) -> Sampling:
-        """From `header["rig"]`, as `RigDescription` has it."""
+        """Read the sampling from `header["rig"]`, see `RigDescription`."""
         rig = header.get("rig")
-        told = [rig.get(key) if isinstance(rig, dict) else None for key in cls._KEYS]
-        rate_hz, volt = (float(x) if isinstance(x, (int, float)) else None for x in told)
+        stated = [rig.get(key) if isinstance(rig, dict) else None for key in cls._KEYS]
+        rate_hz, volt = (float(x) if isinstance(x, (int, float)) else None for x in stated)
         return cls(block_samples, rate_hz, volt)
 
     @property
@@ -154,7 +154,7 @@ class Sampling:
 
 
 def create_root(file: h5py.File, plans: list[ExperimentPlan], header: Mapping[str, Any]) -> None:
-    """Attributes of the whole, the event table, and the group of experiments."""
+    """Create the attributes of the file, the event table, and the group of experiments."""
     file.attrs["format"] = FORMAT
     file.attrs["header"] = json.dumps(header)
     file.attrs["NX_class"] = "NXroot"
@@ -171,7 +171,7 @@ def settings_text(name: str, settings: Mapping[str, Any]) -> bytes:
     """Settings as the file holds them.
 
     Raises:
-        InputError: they are too long; nothing is ever cut.
+        InputError: they are too long.
     """
     text = write_settings(settings)
     if len(text) > _SETTINGS_BYTES:
@@ -185,12 +185,12 @@ def settings_text(name: str, settings: Mapping[str, Any]) -> bytes:
 def create_experiment(
     file: h5py.File, number: int, plan: ExperimentPlan, sampling: Sampling, text: bytes
 ) -> None:
-    """All datasets of one experiment, with dimension scales and NeXus attributes.
+    """Create all datasets of one experiment, with dimension scales and NeXus attributes.
 
-    Only the codes are compressed: a table that grows row by row would be packed again and again.
+    Only the codes are compressed: a table that grows row by row would be compressed repeatedly.
 
     Raises:
-        InputError: the name could not be that of a file.
+        InputError: the name cannot be a file name.
     """
     check_name(plan.name)
     group = file.create_group(f"experiments/{plan.name}")
@@ -253,7 +253,7 @@ def _create_scales(
 
 
 def whole_rows(group: h5py.Group, order: tuple[str, ...]) -> int:
-    """Rows that are written in every dataset: a dataset grows before its new rows are written."""
+    """Number of complete rows: a dataset grows before its new rows are written."""
     return min(int(group[name].shape[0]) for name in order if name in group)
 
 
@@ -265,14 +265,14 @@ def read_blocks(
     *,
     verify: bool = False,
 ) -> BlockRows:
-    """Blocks from a row on: those of the datasets, then those that still lie in the tail.
+    """Read blocks from a row on: those in the datasets, then those still in the tail.
 
     Args:
         group: of the experiment.
         tail: of its file.
         first: row.
         most: of the datasets' blocks.
-        verify: compare the datasets' blocks with their checksums, too.
+        verify: also compare the blocks in the datasets with their checksums.
     Raises:
         ValueError: a checksum does not match.
     """
@@ -293,9 +293,9 @@ def read_blocks(
 
 
 def _rows_and_tail(group: h5py.Group, tail: TailReader, first: int) -> tuple[int, NDArray[np.void]]:
-    """How many rows the datasets hold, and what follows them in the tail.
+    """Number of rows in the datasets, and the blocks that follow them in the tail.
 
-    What this reader was too slow to find in the tail has reached the datasets meanwhile.
+    Blocks that have left the tail in the meantime have reached the datasets.
     """
     count = whole_rows(group, BLOCK_ORDER)
     # A session of the first release has no tail.
@@ -310,14 +310,14 @@ def _rows_and_tail(group: h5py.Group, tail: TailReader, first: int) -> tuple[int
         for name in reversed(BLOCK_ORDER):
             group[name].id.refresh()
         before, count = count, whole_rows(group, BLOCK_ORDER)
-        if count <= before:  # its writer was killed amid a slot
+        if count <= before:  # its writer was killed while it wrote a slot
             return count, late
 
 
 def read_experiment(
     file: h5py.File, name: str, tail: TailReader, *, verify: bool = False
 ) -> ExperimentRecord:
-    """Everything of one experiment; with `verify` its checksums are compared.
+    """Read all data of one experiment; with `verify` compare its checksums.
 
     Raises:
         ValueError: a checksum does not match.
@@ -344,7 +344,7 @@ def read_experiment(
     )
 
 
-def settings_of(group: h5py.Group) -> tuple[dict[str, Any], bool]:
+def settings_of(group: h5py.Group) -> tuple[JsonObject, bool]:
     """Settings of an experiment, and whether they match their checksum."""
     return read_settings(bytes(np.ravel(group["settings"][()])[0]))
 

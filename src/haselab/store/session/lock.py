@@ -1,4 +1,4 @@
-"""Who writes a session holds a lock on it, which the system takes back however the writer ends."""
+"""A lock that the writer of a session holds, and that the system releases when it ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 __all__ = ["CAN_TELL", "hold", "is_held"]
 
-CAN_TELL = sys.platform == "linux"  # whether `is_held` knows
+CAN_TELL = sys.platform == "linux"  # whether `is_held` works
 
 # A lock of the open file, not of the process: HDF5's own locks are of another kind, and a reader
 # in the same process does not take it away. Linux has it.
@@ -32,7 +32,7 @@ def hold(descriptor: int) -> None:
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process still writes this session; False where the system cannot tell.
+    """Whether a process still writes this session; False if the system does not report it.
 
     Args:
         path: of the session file.

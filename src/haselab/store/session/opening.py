@@ -1,4 +1,4 @@
-"""How a session file is opened: by what it is known to be, and never so that HDF5 can hang.
+"""Open a session file safely: depending on its state, and so that HDF5 cannot hang.
 
 | file | how it is checked | how it is opened |
 |---|---|---|
@@ -39,7 +39,7 @@ class OpenedSession:
     Args:
         file: of HDF5.
         live: a program still writes it.
-        doubt: why its numbers are not verified; empty when they are.
+        doubt: why its data are not verified; empty if they are.
     """
 
     file: h5py.File
@@ -48,7 +48,7 @@ class OpenedSession:
 
 
 def is_session(path: Path) -> bool:
-    """Whether a file is a session, perhaps a damaged one; told from its first and last bytes.
+    """Whether a file is a session, perhaps a damaged one, from its first and last bytes.
 
     Args:
         path: of any file.
@@ -62,14 +62,14 @@ def is_session(path: Path) -> bool:
 
 
 class _Closed(io.RawIOBase):
-    """A session file as if its writer had closed it; the file itself is not changed."""
+    """A view of a session file as if its writer had closed it; the file is not changed."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         try:
             self._head = closed_superblock(path)
         except ValueError:
-            self._head = b""  # HDF5 says what is wrong with it
+            self._head = b""  # HDF5 reports what is wrong
         self._file = path.open("rb", buffering=0)
         self._size = path.stat().st_size
 
@@ -86,7 +86,7 @@ class _Closed(io.RawIOBase):
         return self._file.tell()
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Fill the buffer; HDF5 takes a short answer for a whole one."""
+        """Fill the buffer completely; HDF5 treats a short read as a full one."""
         place, view = self._file.tell(), memoryview(buffer).cast("B")
         if place + len(view) > self._size:
             raise OSError(f"truncated: {self._size} bytes of {place + len(view)}")
@@ -116,12 +116,12 @@ def open_session(path: Path, *, unverified: bool = False) -> OpenedSession:
 
     Args:
         path: of the file.
-        unverified: go on, with a doubt, where a checksum does not match.
+        unverified: continue, with a doubt, if a checksum does not match.
     Returns:
-        The file, and what is known of it.
+        The file and its state.
     Raises:
         ValueError: truncated or changed, or HDF5 could not read it within bounds.
-        OSError: the system or HDF5 refuses.
+        OSError: the system or HDF5 cannot open it.
     """
     if is_held(path) or (not CAN_TELL and _is_marked(path)):
         return OpenedSession(h5py.File(path, "r", libver="latest", swmr=True), True, "")
@@ -145,7 +145,7 @@ def _is_marked(path: Path) -> bool:
 
 
 def _read_in_child(path: Path, *, unverified: bool) -> str:
-    """Read a file once in a process of its own, whose time and memory are limited.
+    """Read a file once in a separate process with limited time and memory.
 
     Returns:
         Why the numbers are not verified; empty when they are.
@@ -165,7 +165,7 @@ def _read_in_child(path: Path, *, unverified: bool) -> str:
 
 
 def probed(path: Path, patience_s: float) -> str:
-    """What a process of its own says of a file, see session_probe; empty where it did not end.
+    """Check a file in a separate process, see `probe`; empty if that did not end.
 
     Args:
         path: of the file.

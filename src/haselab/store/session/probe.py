@@ -1,9 +1,8 @@
-"""Reads a session file in full and compares every checksum in it, in a process with limits.
+"""Read a whole session file and compare all its checksums, in a process with limits.
 
-HDF5 may compute for ever, or ask for all memory, on metadata that were changed. Here that ends this
-process alone. The last line of its output is `whole`, `unchecked WHY`, `changed WHY` or
-`damaged WHY`. Of a changed file everything has been tried all the same, so that it can be read on
-request.
+With changed metadata HDF5 may compute for ever, or request all memory. Here only this process ends.
+The last line of its output is `whole`, `unchecked WHY`, `changed WHY` or `damaged WHY`. Even in a
+changed file everything is tried, so that it can be read on request.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ from haselab.store.session.tail import TailReader, block_checks
 
 __all__ = ["main", "verify"]
 
-_MEMORY_BYTES = 1 << 30  # beside what the interpreter takes
+_MEMORY_BYTES = 1 << 30  # in addition to the interpreter's
 _CPU_S, _CPU_S_PER_BYTE = 5, 1e-7
-_PIECE_ROWS = 200
+_CHUNK_ROWS = 200
 
 
 def _limit(size: int) -> None:
-    """Bound the time and the memory of this process; where the system can."""
+    """Limit the time and the memory of this process, if the system supports it."""
     if sys.platform == "win32":
         return
     import resource
@@ -63,7 +62,7 @@ def _limit(size: int) -> None:
 
 
 def _lower(kind: int, limit: int) -> None:
-    """Set a limit, unless a lower one holds already."""
+    """Set a limit, unless a lower one is already set."""
     if sys.platform != "win32":
         import resource
 
@@ -74,8 +73,8 @@ def _lower(kind: int, limit: int) -> None:
 
 def _verify_blocks(name: str, group: h5py.Group, tail: TailReader) -> None:
     number, count = int(group.attrs["number"]), whole_rows(group, BLOCK_ORDER)
-    for first in range(0, count, _PIECE_ROWS):
-        until = min(count, first + _PIECE_ROWS)
+    for first in range(0, count, _CHUNK_ROWS):
+        until = min(count, first + _CHUNK_ROWS)
         rows = group["blocks"][first:until]
         blocks = {field: rows[field] for field in ("drive_v", "reference", "start_s")}
         blocks["codes"] = group["codes"][first:until]
@@ -89,8 +88,8 @@ def _verify_blocks(name: str, group: h5py.Group, tail: TailReader) -> None:
 
 def _verify_frames(name: str, group: h5py.Group) -> None:
     number, count = int(group.attrs["number"]), whole_rows(group, FRAME_ORDER)
-    for first in range(0, count, _PIECE_ROWS):
-        until = min(count, first + _PIECE_ROWS)
+    for first in range(0, count, _CHUNK_ROWS):
+        until = min(count, first + _CHUNK_ROWS)
         rows, tracks = group["frames"][first:until], group["tracks"][first:until]
         time_s = np.ascontiguousarray(rows["time_s"])
         found = frame_checks(number, first, time_s, rows["mass_kg"], tracks)
@@ -111,8 +110,8 @@ def _verify_events(file: h5py.File) -> None:
 def _read_all(group: h5py.Group) -> None:
     """Read every dataset of an experiment of format 1, whose rows carry no checksum."""
     for data in group.values():
-        for first in range(0, data.shape[0] if data.shape else 0, _PIECE_ROWS):
-            data[first : first + _PIECE_ROWS]
+        for first in range(0, data.shape[0] if data.shape else 0, _CHUNK_ROWS):
+            data[first : first + _CHUNK_ROWS]
 
 
 def _verify_settings(name: str, group: h5py.Group) -> None:
@@ -126,7 +125,7 @@ def _verify_static(file: h5py.File) -> None:
 
 
 class _Problems:
-    """What was wrong, so far; the rest is read all the same."""
+    """Collects problems; the rest of the file is still read."""
 
     def __init__(self) -> None:
         self.found: list[str] = []
@@ -135,7 +134,7 @@ class _Problems:
         """Make one check.
 
         Raises:
-            MemoryError: it needs more than a session can.
+            MemoryError: the check needs more memory than a session can.
         """
         try:
             check(*arguments)
@@ -147,12 +146,12 @@ class _Problems:
 
 
 def verify(path: Path) -> tuple[str, list[str]]:
-    """Read a session file that nobody writes in full, and compare its checksums.
+    """Read a whole session file that no program writes, and compare its checksums.
 
     Args:
         path: of the file.
     Returns:
-        Why it could not be verified, empty where it could; and what does not match.
+        Why it could not be verified, empty if it could; and what does not match.
     Raises:
         ValueError: no session, or one with links; HDF5 raises others.
     """
@@ -180,7 +179,7 @@ def verify(path: Path) -> tuple[str, list[str]]:
 
 
 def main(path: Path) -> str:
-    """What is to be said of a file: see above."""
+    """Return the last line of the output, see above."""
     _limit(path.stat().st_size)
     try:
         doubt, problems = verify(path)

@@ -15,14 +15,14 @@ __all__ = ["JobQueue", "QueueRule"]
 
 @dataclass(frozen=True)
 class QueueRule:
-    """How much may wait for the disk, and for how long.
+    """Limits for data that wait for the disk.
 
     Args:
-        chunks: that may wait, of 0.1 s each.
-        patience_s: how long one who records waits for room; 0 on a rig in real time, where a full
-            queue is a fault at once. The twin waits with its recorder.
-        sync_s: between two calls that put the data on the disk itself, in s: what a power cut may
-            take.
+        chunks: number of chunks of 0.1 s that may wait.
+        patience_s: how long the recorder waits for room; 0 on a rig in real time, where a full
+            queue is an error at once. The twin waits with its recorder.
+        sync_s: interval at which the data are synchronised to the disk, in s: a power cut may lose
+            this much.
         clock_s: any steady clock.
     """
 
@@ -35,11 +35,11 @@ class QueueRule:
 class JobQueue:
     """A bounded queue and the thread that empties it.
 
-    After a job has failed the others are dropped, until `put` or `drain` has told of it.
+    After a job has failed the others are dropped, until `put` or `drain` has raised the error.
 
     Args:
         rule: how many jobs may wait, and for how long.
-        full: the error when there is no room in time.
+        full: makes the error if there is no room in time.
     """
 
     def __init__(self, rule: QueueRule, full: Callable[[], DeviceError]) -> None:
@@ -58,44 +58,46 @@ class JobQueue:
 
         Args:
             job: done after all that came before it.
-            always: also after another one has failed.
+            always: do it even after another job has failed.
         Raises:
             DeviceError: there is no room in time.
         """
         with self._changed:
-            self._tell(quiet=always)
+            if not always:
+                self._raise_failure()
             if not (self._changed.wait_for(self._has_room, self._rule.patience_s) or always):
                 raise self._full()
-            self._tell(quiet=always)
+            if not always:
+                self._raise_failure()
             self._jobs.append((job, always))
             self.most_waiting = max(self.most_waiting, len(self._jobs))
             self._changed.notify_all()
 
     def settle(self) -> None:
-        """Wait until all jobs are done; what failed is told later."""
+        """Wait until all jobs are done; an error is raised later."""
         with self._changed:
             self._changed.wait_for(lambda: not self._jobs and not self._busy)
 
     def drain(self) -> None:
-        """Wait until all jobs are done; what failed is raised."""
+        """Wait until all jobs are done; raise the error of a failed one."""
         self.settle()
         with self._changed:
-            self._tell(quiet=False)
+            self._raise_failure()
 
     def close(self) -> None:
-        """Do what waits and end the thread; what failed is raised. Safe to call twice."""
+        """Do the waiting jobs and end the thread; raise an error. Safe to call twice."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
         self._thread.join()
         with self._changed:
-            self._tell(quiet=False)
+            self._raise_failure()
 
     def _has_room(self) -> bool:
         return len(self._jobs) < self._rule.chunks
 
-    def _tell(self, *, quiet: bool) -> None:
-        if self._failure is not None and not quiet:
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
 

@@ -1,4 +1,4 @@
-"""Reading a session, also one whose writer was killed or still writes."""
+"""Read a session, even if its writer was killed or is still writing."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ from haselab.store.text_file import decode_json
 __all__ = ["SessionReader", "session_file"]
 
 
-# HDF5 shares between all handles of a process what it knows of a dataset: while one of them is
-# open another one is not told of new chunks, and reads rows of old ones. So no handle outlives a
-# call, and calls take turns.
+# HDF5 shares the state of a dataset between all handles of a process: while one is open, another
+# one does not see new chunks and reads rows of old ones. So no handle outlives a call, and calls
+# are serialised.
 _TURN = threading.RLock()
 
 
 def session_file(path: str | Path) -> Path:
-    """The session of a run's folder; a file is taken as it is."""
+    """The session file in a run's folder; a path of a file is returned unchanged."""
     path = Path(path)
     return path / "session.h5" if path.is_dir() else path
 
 
 class SessionReader(Closing):
-    """Reads a session, also one whose writer was killed or still writes.
+    """Reads a session, even if its writer was killed or is still writing.
 
     Several readers may be open in one process; a handle of h5py's own on the same growing file may
     not.
 
     Args:
         path: of session.h5 or the folder that holds it.
-        unverified: read on where a checksum does not match; `doubt` then says so.
+        unverified: continue if a checksum does not match; `doubt` then gives the reason.
 
-    `doubt` says why the numbers are not verified: they were changed, or recorded before sessions
-    had checksums. It is empty when every byte is as it was recorded.
+    `doubt` says why the data are not verified: they were changed, or recorded before sessions had
+    checksums. It is empty if every byte is as recorded.
     Raises:
         InputError: no such file, not a session, truncated, or changed since it was recorded.
     """
@@ -98,7 +98,7 @@ class SessionReader(Closing):
         )
 
     def experiment(self, name: str) -> ExperimentRecord:
-        """Everything one experiment recorded.
+        """Read all data of one experiment.
 
         Raises:
             InputError: no such experiment, or its data cannot be read.
@@ -119,13 +119,13 @@ class SessionReader(Closing):
             ) from None
 
     def follow(self, name: str, first: int, most: int | None = None) -> BlockRows:
-        """The blocks that have come in from a row on, while the session is written.
+        """Read the blocks from a row on, while the session is being written.
 
         Args:
-            name: of the experiment; one that has not begun has no blocks.
-            first: the row to go on from.
-            most: of the stored blocks, for a file larger than memory; what still lies in the tail
-                comes on top.
+            name: of the experiment; before it begins it has no blocks.
+            first: the first row to read.
+            most: maximum number of stored blocks, for a file larger than memory; blocks in the tail
+                are added.
         Raises:
             InputError: no such experiment, or its data cannot be read.
         """
@@ -158,10 +158,10 @@ class SessionReader(Closing):
             raise self._damaged(error) from None
 
     def stated(self, *keys: str) -> Any:
-        """What the header holds under these keys.
+        """The value of the header under these keys.
 
         Raises:
-            InputError: nothing.
+            InputError: there is no value.
         """
         found: Any = self.header
         for key in keys:
@@ -175,7 +175,7 @@ class SessionReader(Closing):
         return found
 
     def states(self, *keys: str) -> bool:
-        """Whether the header holds anything under these keys."""
+        """Whether the header has a value under these keys."""
         found: Any = self.header
         for key in keys:
             if not (isinstance(found, dict) and key in found):

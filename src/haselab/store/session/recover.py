@@ -25,15 +25,15 @@ __all__ = ["Recovery", "recover"]
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was found, and what was done.
+    """Summary of a recovery.
 
     Args:
-        state: of the manifest now.
+        state: of the manifest after the recovery.
         blocks: of each experiment.
         blocks_from_ring_buffer: how many of all blocks came from the ring buffer (`tail`).
-        writer_mark_cleared: the mark of a writer was taken away.
-        changed_files: files that are not those that had been sealed.
-        videos_encoded: made of raw frames that were still waiting.
+        writer_mark_cleared: the mark of a writer was removed.
+        changed_files: files that were changed after sealing.
+        videos_encoded: videos made from raw frames that were left.
     """
 
     state: str
@@ -45,18 +45,18 @@ class Recovery:
 
 
 def recover(folder: Path) -> Recovery:
-    """Make an ordinary file of what a killed writer left, verify it, and say so in the manifest.
+    """Repair the recording of a killed writer, verify it, and update the manifest.
 
-    A sealed recording that is whole is left as it is. Nothing is written before all of the file
-    has been read.
+    A complete, sealed recording is not changed. Nothing is written before the whole file has been
+    read.
 
     Args:
         folder: of the recording, or its session.h5.
     Returns:
-        What was found and done.
+        A summary.
     Raises:
         InputError: no session, or an unreadable one.
-        DeviceError: it is still being written, or the disk refuses.
+        DeviceError: it is still being written, or a file cannot be written.
     """
     if folder.is_file():
         if folder.name != "session.h5":
@@ -75,7 +75,7 @@ def recover(folder: Path) -> Recovery:
         sealed = is_sealed(path)
         if sealed and manifest["state"] != "OPEN":
             changed = changed_files(folder, manifest)
-            return Recovery(manifest["state"], counts, 0, False, changed, 0)
+            return Recovery(str(manifest["state"]), counts, 0, False, changed, 0)
         marked = is_marked_open(path)
         late = 0 if sealed else _mend(path)
     except HDF5_ERRORS as error:
@@ -104,9 +104,9 @@ def _still_written(path: Path) -> DeviceError:
 
 
 def _mend(path: Path) -> int:
-    """Close and seal the file of a killed writer; how many blocks came from its tail.
+    """Close and seal the file of a killed writer; return how many blocks came from its tail.
 
-    The only place where an existing session is opened for writing.
+    This is the only place where an existing session is opened for writing.
     """
     with path.open("r+b", buffering=0) as raw:
         try:
@@ -121,7 +121,7 @@ def _mend(path: Path) -> int:
 
 
 def _verified(path: Path) -> dict[str, int]:
-    """Blocks of each experiment, after every one of them has been read."""
+    """Read all blocks, and return their number for each experiment."""
     counts = {}
     with SessionReader(path) as session:
         session.events()
@@ -134,7 +134,7 @@ def _verified(path: Path) -> dict[str, int]:
 
 
 def _take_tail(path: Path) -> int:
-    """Put what still lies in the tail where it belongs."""
+    """Move the blocks in the tail to their datasets."""
     taken, last_s = 0, 0.0
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         tail = TailReader(file, path)
@@ -166,6 +166,6 @@ def _take_tail(path: Path) -> int:
 
 
 def _written_events(events: h5py.Dataset) -> int:
-    """Events without the one that was being written when the end came."""
+    """Number of events, without one that was only partly written."""
     rows = events[:]
     return len(rows) - bool(len(rows) and not rows[-1].tobytes().strip(b"\0"))

@@ -1,8 +1,7 @@
-"""The line at the end of a finished session file: the SHA-256 of every byte before it.
+"""The seal of a finished session file: a last line with the SHA-256 of all bytes before it.
 
-HDF5 ignores bytes behind its own data, so every other program still opens the file. A reader
-compares the line with the file before HDF5 sees a single byte: whatever was changed, HDF5 never
-parses it.
+HDF5 ignores bytes after its own data, so other programs can still open the file. A reader compares
+the line with the file first, so that HDF5 never parses a changed file.
 """
 
 from __future__ import annotations
@@ -22,24 +21,24 @@ _LENGTH = len(_FORM.format(0, "0" * 64))
 _SEAL = re.compile(
     _FORM.format(0, "x").replace("0" * 20, r"(\d{20})").replace("x", "([0-9a-f]{64})")
 )
-_PIECE_BYTES = 1 << 20
-# Files that were found sealed, by their place, size and time of change: a command opens one often.
+_CHUNK_BYTES = 1 << 20
+# Files with a valid seal, by path, size and time of change: a command opens a file repeatedly.
 _Key = tuple[int, int, int, int]
 _KNOWN: set[_Key] = set()
 _MOST_KNOWN = 1000
 
 
 class ChangedError(ValueError):
-    """A sealed file is complete, and at least one of its bytes is another one."""
+    """A sealed file is complete, but at least one of its bytes was changed."""
 
 
 def _digest(file: BinaryIO, size: int) -> str:
     """SHA-256 of the first bytes of a file."""
     digest = hashlib.sha256()
     file.seek(0)
-    while size and (piece := file.read(min(size, _PIECE_BYTES))):
-        digest.update(piece)
-        size -= len(piece)
+    while size and (chunk := file.read(min(size, _CHUNK_BYTES))):
+        digest.update(chunk)
+        size -= len(chunk)
     return digest.hexdigest()
 
 
@@ -49,7 +48,7 @@ def write_seal(file: BinaryIO) -> None:
     Args:
         file: open for reading and writing.
     Raises:
-        OSError: the disk refuses.
+        OSError: the file cannot be written.
     """
     size = file.seek(0, os.SEEK_END)
     line = _FORM.format(size, _digest(file, size)).encode()
@@ -59,7 +58,7 @@ def write_seal(file: BinaryIO) -> None:
 
 
 def is_sealed(path: Path) -> bool:
-    """Whether a session file was finished, after every byte of it has been compared.
+    """Whether a session file is finished; compares every byte of it.
 
     Args:
         path: of the session file, which no program writes.
@@ -68,7 +67,7 @@ def is_sealed(path: Path) -> bool:
     Raises:
         ChangedError: changed.
         ValueError: truncated.
-        OSError: the system refuses.
+        OSError: the file cannot be read.
     """
     with path.open("rb") as file:
         status = os.fstat(file.fileno())

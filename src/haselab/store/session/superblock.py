@@ -97,7 +97,7 @@ def is_marked_open(path: Path) -> bool:
 
 
 def closed_superblock(path: Path) -> bytes:
-    """The superblock without the writer's mark, with the size that the file has.
+    """The superblock without the writer's mark, and with the actual size of the file.
 
     While blocks are appended the superblock in the file keeps the size of the start.
 

@@ -1,9 +1,9 @@
-"""The last blocks of a session, written at once and in place: a sudden end loses none of them.
+"""The last blocks of a session, written at once and in place, so that a sudden end loses none.
 
-Blocks reach their dataset in compressed chunks of 0.1 s. Until then they lie in the dataset `tail`,
-a ring of slots of fixed size whose place in the file never changes. A slot is written by one call
-to the system, so it survives the end of the process. Its number stands before and after the data:
-where the last one is missing the write was cut off, where both agree the checksum must match.
+Blocks reach their dataset in compressed chunks of 0.1 s. Until then they are in the dataset `tail`,
+a ring of slots of fixed size at a fixed position in the file. A slot is written with one system
+call, so it survives the end of the process. Its number is stored before and after the data: if the
+last one is missing, the write was interrupted; if both agree, the checksum must match.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 __all__ = ["TAIL", "TailReader", "TailWriter", "block_checks", "create_tail"]
 
 TAIL = "tail"
-_CHECKED = slice(12, -8)  # bytes of a slot that its checksum covers
+_CHECKED = slice(12, -8)  # bytes of a slot that the checksum covers
 
 
 def _slot_dtype(block_samples: int) -> np.dtype[np.void]:
@@ -43,7 +43,7 @@ def _slot_dtype(block_samples: int) -> np.dtype[np.void]:
 
 
 def block_checks(experiment: int, first: int, blocks: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """CRC-32 of each block: of its experiment, its row and all that was recorded of it.
+    """CRC-32 of each block, over its experiment, its row and all its data.
 
     Args:
         experiment: its number in the session, from 1.
@@ -61,11 +61,11 @@ def block_checks(experiment: int, first: int, blocks: Mapping[str, NDArray[Any]]
 
 
 def create_tail(file: h5py.File, slots: int, block_samples: int) -> None:
-    """Make the ring's dataset; nothing of HDF5 writes to it afterwards.
+    """Create the dataset of the ring; HDF5 does not write to it afterwards.
 
     Args:
         file: open for writing.
-        slots: blocks that it holds.
+        slots: number of blocks in the ring.
         block_samples: samples per channel in one block.
     """
     dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -81,11 +81,11 @@ def create_tail(file: h5py.File, slots: int, block_samples: int) -> None:
 
 
 class TailWriter:
-    """Writes slots in turn.
+    """Writes the slots of the ring.
 
     Args:
-        file: with the ring, all of it flushed.
-        raw: the same file without buffer, open for reading and writing; closed with the tail.
+        file: with the ring, flushed.
+        raw: the same file, unbuffered, open for reading and writing; closed with the tail.
     """
 
     def __init__(self, file: h5py.File, raw: io.FileIO) -> None:
@@ -95,25 +95,25 @@ class TailWriter:
         self._offset, self._slots = int(tail.id.get_offset()), int(tail.shape[0])
         self._written = 0
         self._raw = raw
-        if hasattr(os, "posix_fallocate"):  # a full disk then takes the last blocks all the same
+        if hasattr(os, "posix_fallocate"):  # so that the last blocks fit even on a full disk
             with contextlib.suppress(OSError):
                 os.posix_fallocate(raw.fileno(), self._offset, tail.nbytes)
 
     @property
     def raw(self) -> io.FileIO:
-        """The session file without buffer."""
+        """The session file, unbuffered."""
         return self._raw
 
     def append(
         self, experiment: int, row: int, drive_v: float, reference: float, start_s: float,
         codes: NDArray[np.int16],
     ) -> int:  # fmt: skip
-        """Write one block; it is in the file when this returns.
+        """Write one block; it is in the file when this method returns.
 
         Returns:
-            Its checksum, as `block_checks` has it.
+            Its checksum, see `block_checks`.
         Raises:
-            OSError: the system refuses.
+            OSError: the file cannot be written.
         """
         slot = self._slot
         slot["experiment"], slot["row"] = experiment, row
@@ -133,7 +133,7 @@ class TailWriter:
 
 
 class TailReader:
-    """Reads the ring, also while it is written.
+    """Reads the ring, even while it is written.
 
     Args:
         file: open for reading.
@@ -149,14 +149,14 @@ class TailReader:
                 self._slots = np.memmap(path, tail.dtype, "r", int(offset), shape)
 
     def newest(self, experiment: int) -> int:
-        """The highest row of an experiment that lies here; -1: none."""
+        """The highest row of an experiment in the ring; -1: none."""
         if self._slots is None:
             return -1
         ours = self._slots["row"][self._slots["experiment"] == experiment]
         return int(ours.max()) if ours.size else -1
 
     def rows(self, experiment: int, first: int) -> NDArray[Any]:
-        """Whole slots of an experiment, in order, from this row on without a gap.
+        """Complete slots of an experiment, in order, from a row on without a gap.
 
         Args:
             experiment: its number in the session, from 1.
@@ -185,9 +185,9 @@ class TailReader:
         return bool(slot["sequence"] == slot["end"] and check == slot["check"])
 
     def verify(self) -> None:
-        """Check every slot of a ring that nobody writes any more.
+        """Check every slot of a ring that is no longer written.
 
-        One slot may be cut off: the one behind the newest, where the writer was killed.
+        One slot may be incomplete: the one after the newest, where the writer was killed.
 
         Raises:
             ValueError: a slot is damaged.
@@ -208,5 +208,5 @@ class TailReader:
             raise ValueError(f"slot {place} of the tail does not match its checksum")
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Release the file."""
         self._slots = None

@@ -1,4 +1,4 @@
-"""The session file: raw blocks, tracks, events and configuration, readable while it is written."""
+"""Write a session file: raw blocks, tracks, events, configuration; readable meanwhile."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError
+from haselab.base import DeviceError, InputError, JsonObject
 from haselab.store.session.checksums import STATIC, event_check, frame_checks, static_digest
 from haselab.store.session.layout import (
     BLOCK,
@@ -45,7 +45,7 @@ if sys.platform != "win32":
 
 __all__ = ["ExperimentPlan", "ExperimentRecord", "QueueRule", "SessionReader", "SessionWriter"]
 
-_RESERVE_BYTES = 8_000_000  # left free, so that the file can be finished
+_RESERVE_BYTES = 8_000_000  # kept free, so that the file can be finished
 _SPARE_CHUNKS = 3  # of the tail, beside those that wait: one is filled, one packed, one torn
 
 
@@ -62,13 +62,13 @@ def _size_limit() -> int:
 
 
 def _packed(codes: NDArray[np.int16]) -> bytes:
-    """A chunk as HDF5's shuffle and gzip leave it; zlib lets other threads run meanwhile."""
+    """Compress a chunk like HDF5's shuffle and gzip; zlib lets other threads run meanwhile."""
     planes = codes.reshape(-1).view(np.uint8).reshape(-1, codes.itemsize).T
     return zlib.compress(planes.tobytes(), 1)
 
 
 class _Pending:
-    """Blocks of the chunk that is being filled, and how many rows there were before."""
+    """Blocks of the chunk that is being filled, and the number of rows before it."""
 
     def __init__(self) -> None:
         self.first = 0
@@ -77,21 +77,21 @@ class _Pending:
 
 
 class SessionWriter:
-    """Writes a session. A block is in the file when `append_block` returns, whatever comes then.
+    """Writes a session. A block is in the file when `append_block` returns.
 
-    A thread of its own packs blocks by 0.1 s and writes tracks and events. What it could not write
-    is raised by the next call, at the latest by `flush` or `close`.
+    A background thread compresses blocks of 0.1 s and writes tracks and events. Its errors are
+    raised by the next call, at the latest by `flush` or `close`.
 
     Args:
-        path: of the new file; an existing one is refused, and nothing in it is changed.
+        path: of the new file; an existing one is refused and not changed.
         plans: all experiments that may be recorded.
         block_samples: samples per channel in one block.
-        header: configuration, versions and hashes, as JSON holds them; scale and rate of the codes
+        header: configuration, versions and hashes as JSON types; scale and rate of the codes
             come from its `rig`.
-        queue: how much may wait for the disk; on a rig in real time with a patience of 0.
+        queue: limits for data that wait for the disk; on a rig in real time with a patience of 0.
     Raises:
-        InputError: there is a file already, or an experiment's name could not be that of a file.
-        DeviceError: the disk refuses, for instance because it is full.
+        InputError: the file exists, or an experiment's name cannot be a file name.
+        DeviceError: the file cannot be written, for example because the disk is full.
     Example:
         >>> import tempfile
         >>> folder = tempfile.TemporaryDirectory()
@@ -105,7 +105,7 @@ class SessionWriter:
     """
 
     def __init__(
-        self, path: Path, plans: list[ExperimentPlan], block_samples: int, header: dict[str, Any],
+        self, path: Path, plans: list[ExperimentPlan], block_samples: int, header: JsonObject,
         queue: QueueRule | None = None,
     ) -> None:  # fmt: skip
         self._path = path
@@ -122,7 +122,7 @@ class SessionWriter:
             undo.callback(raw.close)
             try:
                 # v110: readable by HDF5 1.10 and later, and by others while it is being written.
-                # The file is this process's own and empty: "w" takes nothing away.
+                # The file is empty and belongs to this process: "w" deletes nothing.
                 self._file = h5py.File(path, "w", libver=("v110", "v110"))
             except OSError as error:
                 raise self._failed(error) from None
@@ -137,7 +137,7 @@ class SessionWriter:
             undo.pop_all()
 
     def _claimed(self, path: Path) -> io.FileIO:
-        """The new file, made by this process alone and locked."""
+        """Create and lock the new file."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -175,8 +175,8 @@ class SessionWriter:
         if isinstance(error, DeviceError):
             return error
         return DeviceError(
-            f"The session file cannot be written ({_first_line(error)}); what was written before "
-            f"is kept. Free disk space or choose another folder. {self._path}"
+            f"The session file cannot be written ({_first_line(error)}). The data written so far "
+            f"are kept. Free disk space, or choose another folder. {self._path}"
         )
 
     def _behind(self) -> DeviceError:
@@ -194,18 +194,18 @@ class SessionWriter:
             raise InputError(f"{error} {self._path}") from None
 
     def _check_room(self) -> None:
-        """Stop while HDF5 can still finish the file: it cannot once a write has failed."""
+        """Stop while HDF5 can still finish the file, which it cannot after a failed write."""
         free = shutil.disk_usage(self._path.parent).free
         free = min(free, _size_limit() - self._path.stat().st_size)
         if free < _RESERVE_BYTES:
             raise DeviceError(
-                f"The disk is full: {free / 1e6:.0f} MB left, {_RESERVE_BYTES / 1e6:.0f} MB "
-                "are needed; what was recorded is kept. Free disk space or choose another folder. "
-                f"{self._path}"
+                f"The disk is full: {free / 1e6:.0f} MB are left, {_RESERVE_BYTES / 1e6:.0f} MB "
+                "are needed. The recorded data are kept. Free disk space, or choose another "
+                f"folder. {self._path}"
             )
 
     def _put(self, job: Callable[[], None], *, always: bool = False) -> None:
-        """Queue a job; after a failure only those that always run."""
+        """Queue a job; after a failure only jobs with `always` run."""
 
         def guarded() -> None:
             try:
@@ -228,7 +228,7 @@ class SessionWriter:
         """Add one block.
 
         Raises:
-            DeviceError: the disk refuses, or is too slow.
+            DeviceError: the disk fails, or is too slow.
         """
         if self._failure is not None:
             raise self._failure
@@ -242,7 +242,7 @@ class SessionWriter:
                 f"{getattr(codes, 'dtype', type(codes).__name__)}, but the session takes {wanted}, "
                 f"int16. Check the driver of the acquisition. {self._path}"
             )
-        codes = codes.copy()  # its thread writes later; the acquisition may use its array again
+        codes = codes.copy()  # the thread writes later; the acquisition may reuse its array
         pending = self._pending[name]
         row = pending.first + len(pending.codes)
         try:
@@ -268,12 +268,12 @@ class SessionWriter:
         pending.first, pending.codes, pending.rows = first + len(codes), [], []
 
     def flush(self, name: str) -> None:
-        """Write what is pending of one experiment, and wait for it.
+        """Write the pending data of one experiment, and wait.
 
         Raises:
-            DeviceError: the disk refused this, or something before.
+            DeviceError: this or an earlier write failed.
         """
-        self._drain()  # here a full queue is waited for, in real time too
+        self._drain()  # wait here for a full queue, also in real time
         self._hand_over(name)
         self._drain()
 
@@ -292,7 +292,7 @@ class SessionWriter:
         """Add the tracks of frames: `time_s` `(F,)`, `tracks` `(F, P)` of `track_dtype()`.
 
         Raises:
-            DeviceError: the disk is full, or refused something before.
+            DeviceError: the disk is full, or an earlier write failed.
         """
         frames = np.empty(time_s.size, dtype=FRAME)
         frames["time_s"], frames["mass_kg"] = time_s, mass_kg
@@ -304,8 +304,8 @@ class SessionWriter:
         """Fields of one tracked point."""
         return TRACK
 
-    def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
-        """Replace the settings of an experiment by what was really used."""
+    def complete_settings(self, name: str, settings: JsonObject) -> None:
+        """Replace the settings of an experiment by those that were really used."""
         text = self._text(name, settings)
 
         def replace() -> None:
@@ -314,9 +314,9 @@ class SessionWriter:
         self._put(replace)
 
     def event(self, time_s: float, what: str) -> None:
-        """Note that something happened; also after blocks could no longer be written.
+        """Record an event, even after blocks could no longer be written.
 
-        It is in the file when this returns, unless the rig is in real time.
+        It is in the file when this method returns, unless the rig is in real time.
         """
         text = what.encode()[: EVENT["what"].itemsize]
 
@@ -372,7 +372,7 @@ class SessionWriter:
     # ---- what was recorded ------------------------------------------------------------------
 
     def experiment(self, name: str) -> ExperimentRecord:
-        """Everything one experiment has recorded so far, as the file holds it."""
+        """Read all data of one experiment so far from the file."""
         self._drain()
         return read_experiment(self._file, name, self._read_tail)
 
@@ -383,14 +383,14 @@ class SessionWriter:
 
     @property
     def most_waiting(self) -> int:
-        """The most jobs that have waited for the disk at once."""
+        """Largest number of jobs that have waited for the disk at once."""
         return self._jobs.most_waiting
 
     def close(self) -> None:
-        """Write all that is pending, close, and seal the file; safe to call twice.
+        """Write all pending data, close and seal the file; safe to call twice.
 
         Raises:
-            DeviceError: the disk refuses what is pending.
+            DeviceError: pending data cannot be written.
         """
         if not self._file:
             return

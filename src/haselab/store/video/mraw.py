@@ -100,7 +100,7 @@ class MrawReader(VideoReader):
     """Frames of an `.mraw` file: 8 bit, 16 bit, or 12 bit packed two pixels in three bytes.
 
     Args:
-        path: of the `.mraw` file; its header stands beside it.
+        path: of the `.mraw` file; its header is beside it.
 
     Raises:
         InputError: the header is missing or damaged, or the frames are colour; in `timed`, after

@@ -14,11 +14,11 @@ __all__ = ["VideoReader", "open_video"]
 
 
 def open_video(path: Path | str) -> VideoReader:
-    """Opens a video, a folder of images (in natural name order), a TIFF stack, `.cine` or `.mraw`.
+    """Open a video, a folder of images (in natural name order), a TIFF stack, `.cine` or `.mraw`.
 
     Grey levels are as stored: plane 0 (luma) of YUV and grey video, in whichever range, limited
     or full, the file carries, never stretched. A constant stretch does not move a point. Colour
-    coded as RGB is turned to luma (ITU-R BT.601 weights, full range). `levels` tells which.
+    coded as RGB is converted to luma (ITU-R BT.601 weights, full range). `levels` states which.
 
     Args:
         path: of the file or folder.

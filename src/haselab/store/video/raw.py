@@ -1,4 +1,4 @@
-"""Frames as they come, in real time; lossless video with a hash a frame after the run."""
+"""Write raw frames in real time, and convert them to lossless video after the run."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def _failed(error: OSError, path: Path) -> DeviceError:
 
 
 class RawVideoWriter:
-    """Writes 8-bit frames as they are: as fast as the disk, and whole up to a sudden end.
+    """Writes raw 8-bit frames as fast as the disk allows; a sudden end loses none of them.
 
-    Beside `NAME.raw` stand `NAME.raw.json` with the size and `NAME.raw.csv` with time and hash of
-    each frame. `transcode` makes NAME.mkv of it once there is time.
+    `NAME.raw.json` has the size of the frames of `NAME.raw`, and `NAME.raw.csv` the time and the
+    hash of each. `transcode` converts them to NAME.mkv later.
 
     Args:
-        path: of the video that is to be, `.mkv`.
+        path: of the final video, `.mkv`.
         rate_hz: nominal frame rate, for players.
     Raises:
         DeviceError: the disk refuses.
@@ -55,7 +55,7 @@ class RawVideoWriter:
 
     @property
     def recorded(self) -> Path | None:
-        """The raw frames, for `transcode`; None: not one so far."""
+        """The raw frames, for `transcode`; None: there are none so far."""
         return self._path if self._count else None
 
     def append(self, images: NDArray[np.uint8], time_s: NDArray[np.float64]) -> None:
@@ -82,7 +82,7 @@ class RawVideoWriter:
             raise _failed(error, self._path) from None
 
     def close(self) -> None:
-        """Close; files without a single frame are taken away. Safe to call twice.
+        """Close the files; remove them if there is no frame. Safe to call twice.
 
         Raises:
             DeviceError: the disk refuses.
@@ -98,18 +98,18 @@ class RawVideoWriter:
 
 
 def waiting_videos(folder: Path) -> list[Path]:
-    """Raw frames that are still to be made into videos, also those of a run that was killed."""
+    """Raw frames that are not yet converted to videos, also those of a killed run."""
     return sorted(path for path in folder.glob("*.raw") if path.with_suffix(".raw.json").is_file())
 
 
 def transcode(raw: Path) -> Path:
-    """Make a lossless video of raw frames, read it back, compare every hash, then drop the raw.
+    """Convert raw frames to a lossless video, compare every hash, then delete the raw frames.
 
     Args:
         raw: a file of `waiting_videos`.
     Returns:
-        The video, FFV1 in Matroska; beside it stands a table with time and hash of each frame. It
-        is not there where not one frame was whole.
+        The video, FFV1 in Matroska, beside a table with time and hash of each frame. It does not
+        exist if no frame was complete.
     Raises:
         InputError: the raw frames are not those that were recorded.
         DeviceError: the disk refuses, or the video does not give the frames back.

@@ -1,4 +1,4 @@
-"""What every video reader offers: grey frames one by one, with their times."""
+"""The interface of video readers: grey frames one by one, with their times."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _BT601 = (19595, 38470, 7471)  # sums to 2^16, so grey comes back as it was
 
 
 def broken(what: str, todo: str, path: Path) -> InputError:
-    """The error of a file that cannot be read."""
+    """Make the error for a file that cannot be read."""
     return InputError(f"{what}. {todo} {path}")
 
 
@@ -57,10 +57,10 @@ def luma_of_colour(image: NDArray[Any]) -> Frame:
 
 
 def alike(items: Iterator[tuple[float, Frame]], path: Path) -> Iterator[tuple[float, Frame]]:
-    """The same times and frames, as long as their size and depth stay.
+    """Yield times and frames, and check that their size and depth do not change.
 
     Raises:
-        InputError: a frame that differs from the first; those before it have been given out.
+        InputError: a frame differs from the first; raised after the frames before it.
     """
     first: Frame | None = None
     for index, (time_s, frame) in enumerate(items):
@@ -87,11 +87,11 @@ class VideoReader(Closing, ABC):
 
     Args:
         path: of the file or folder.
-        rate_hz: frames per second of recorded time, `None` when the file does not say.
-        lossy: whether compression has changed grey levels; `None` where the file does not tell.
+        rate_hz: frames per second of recorded time; `None`: unknown.
+        lossy: whether compression has changed grey levels; `None`: unknown.
         bit_depth: significant bits of a pixel (the values are as stored, never rescaled).
         codec: name of the compression, as FFmpeg calls it.
-        levels: what a grey level is, in words.
+        levels: description of the grey levels.
     """
 
     def __init__(
@@ -118,16 +118,16 @@ class VideoReader(Closing, ABC):
 
     @property
     def frames_expected(self) -> int:
-        """About how many frames there are, at no cost; 0 where nothing tells."""
+        """Approximate number of frames, without reading them; 0 if unknown."""
         return self.frame_count
 
     def number(self, index: int) -> int:
-        """Place of a frame of the file in its recording: the same where none is missing."""
+        """Index of a frame in the recording; the same as in the file if none is missing."""
         return index
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Places in the recording of frames that the file does not hold."""
+        """Indices in the recording of frames that are missing in the file."""
         return ()
 
     @abstractmethod
@@ -143,5 +143,5 @@ class VideoReader(Closing, ABC):
         return self.number(index) / self.rate_hz if self.rate_hz else float("nan")
 
     def close(self) -> None:
-        """Give the file back; a no-op for readers that hold none open between frames."""
+        """Close the file; does nothing for readers that keep none open between frames."""
         return

@@ -1,4 +1,4 @@
-"""Camera frames to a lossless file: FFV1 in Matroska, exact to the grey level."""
+"""Write camera frames to a lossless video: FFV1 in Matroska, exact to the grey level."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 class VideoWriter:
-    """Writes 8-bit frames in the background; the time of each stands beside the file as CSV.
+    """Writes 8-bit frames in the background, and their times to a CSV file beside the video.
 
     Args:
         path: of the new `.mkv` file.
         rate_hz: nominal frame rate, for players.
-        hashed: the table holds the hash of each frame, too.
+        hashed: also write the hash of each frame to the table.
     Raises:
         DeviceError: the disk refuses.
     """
@@ -115,7 +115,7 @@ class VideoWriter:
     def close(self) -> None:
         """Finish the file and write the table of times.
 
-        A file without a single frame is taken away.
+        A file without any frame is removed.
 
         Raises:
             DeviceError: a frame or the table could not be written.

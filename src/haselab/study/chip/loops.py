@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _core
+from haselab.base import JsonObject
 from haselab.control import PidGains, margins, step_metrics
 from haselab.controllers import (
     ChosenController,
@@ -273,12 +274,12 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     with CoSim(program, elf, _sheet(config, seed, plan)) as chip:
         chip.run(0.02)
         chip.arm()
-        chip.tell(Run(plan.before))
+        chip.execute(Run(plan.before))
         chip.command(f"track {_SLOTS}")
         start, asleep = chip.counts["cycle"], chip.counts["asleep"]
         for wanted, duration_s in ((plan.before, plan.hold_s), (plan.after, plan.last_s)):
             for _ in range(round(duration_s / _ALIVE_S)):
-                chip.tell(SetReference(wanted), _ALIVE_S)
+                chip.execute(SetReference(wanted), _ALIVE_S)
         load = 1.0 - (chip.counts["asleep"] - asleep) / (chip.counts["cycle"] - start)
         length_m = np.array([track.length_m for track in chip.tracks])
         status = [m for m in chip.messages if isinstance(m, Status)]
@@ -294,7 +295,7 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     )
 
 
-def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> dict[str, Any]:
+def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> JsonObject:
     """Metrics of a loop's step, and the margins of the fitted plant with its rate and delay.
 
     Args:
@@ -318,7 +319,7 @@ def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> dict[str, A
     }
 
 
-def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any]:
+def section_of(runs: list[LoopRun], rows: list[JsonObject]) -> JsonObject:
     """Section of analysis.json about the loops, from 1 s before the step.
 
     Args:
@@ -335,7 +336,7 @@ def section_of(runs: list[LoopRun], rows: list[dict[str, Any]]) -> dict[str, Any
         "desired": shown(runs[-1], runs[-1].reference),
         "loops": {run.name: shown(run, run.strain) for run in runs},
         "metrics": {
-            row["loop"]: {
+            str(row["loop"]): {
                 "rise_time_s": row["rise_time_s"],
                 "settling_time_s": row["settling_time_s"],
                 "overshoot": row["overshoot"],

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from haselab.base import Estimate, InputError
+import numpy as np
+
+from haselab.base import Estimate, InputError, JsonObject, table_at
 from haselab.control import LoopSetting, PidGains
 from haselab.firmware import RATE_HZ
 from haselab.rig.chip import SupplyModel
@@ -46,7 +48,7 @@ class ChipRows:
 
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
 
 def with_chip_rows(found: Findings, folder: Path | None) -> Findings:
@@ -105,7 +107,7 @@ def _add(
 ) -> None:
     with SessionReader(folder / "session.h5") as session:
         found, header = analyse_chip_session(session)
-    row, settings = recorded_row(header), Chip.from_dict(header["chip"]).settings
+    row, settings = recorded_row(header), Chip.from_dict(table_at(header, "chip")).settings
     gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
     loop = _setting(header)
     margins = margin_estimates(gains, dynamics, loop, ("phase_margin",))
@@ -135,14 +137,16 @@ def _setting(header: Mapping[str, Any]) -> LoopSetting:
 def _section(
     name: str, found: Comparison, loop: LoopSetting, phase_margin_deg: float
 ) -> dict[str, Any]:
-    steps = found.figures["steps"]
-    (group, drawn), (metrics,) = next(iter(steps["groups"].items())), steps["metrics"].values()
-    del group
-    shown = steps["time_s"] > _SHOWN_FROM_S
-    time_s = steps["time_s"][shown]
+    steps = table_at(found.figures, "steps")
+    groups, by_loop = table_at(steps, "groups"), table_at(steps, "metrics")
+    drawn, metrics = table_at(groups, next(iter(groups))), table_at(by_loop, *by_loop)
+    time_s, desired, mean = (
+        np.asarray(values) for values in (steps["time_s"], steps["desired"], drawn["mean"])
+    )
+    shown = time_s > _SHOWN_FROM_S
     return {
-        "desired": {"time_s": time_s, "strain": steps["desired"][shown]},
-        "loops": {_NAMES[name]: {"time_s": time_s, "strain": drawn["mean"][shown]}},
+        "desired": {"time_s": time_s[shown], "strain": desired[shown]},
+        "loops": {_NAMES[name]: {"time_s": time_s[shown], "strain": mean[shown]}},
         "metrics": {
             _NAMES[name]: {
                 **metrics,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from haselab.base import InputError, Progress
+from haselab.base import InputError, JsonObject, Progress
 from haselab.firmware import CARRIER_HZ, RATE_HZ, ChipSettings, settings_from_dict
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.rig import Rig, RigDescription
@@ -62,7 +62,7 @@ class Chip:
     settings: ChipSettings
     zero_length_m: float
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Convert to JSON types."""
         settings = asdict(self.settings)
         correction = self.settings.front_end.correction
@@ -160,7 +160,7 @@ def _compare(
 
 def run_on_chip(
     study: StepStudy, rig: Rig, chip: Chip, options: RunOptions, progress: Progress
-) -> tuple[Comparison, dict[str, Any]]:
+) -> tuple[Comparison, JsonObject]:
     """Play step trials on a rig that closes its own loop; the session file grows block by block.
 
     Args:
@@ -193,7 +193,7 @@ def is_chip_session(header: Mapping[str, Any]) -> bool:
     return "chip" in header
 
 
-def analyse_chip_session(session: SessionReader) -> tuple[Comparison, dict[str, Any]]:
+def analyse_chip_session(session: SessionReader) -> tuple[Comparison, JsonObject]:
     """Repeat the analysis of `run_on_chip` from the recorded session.
 
     Args:
@@ -215,7 +215,7 @@ def analyse_chip_session(session: SessionReader) -> tuple[Comparison, dict[str, 
 
 def write_chip_findings(
     folder: Path, found: Comparison, header: Mapping[str, Any], doubt: str = ""
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write results.json and analysis.json.
 
     Args:
@@ -228,7 +228,7 @@ def write_chip_findings(
     Raises:
         DeviceError: a file cannot be written.
     """
-    results = {
+    results: JsonObject = {
         "quantities": quantity_rows(found.quantities, {}, header["rig_config"]),
         "simulated": is_simulated(header["rig_config"]),
         "verdict_rule": VERDICT_RULE,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.frequency.response import estimate_frequency_response
 from haselab.identify.record import Record
 from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
@@ -43,7 +43,7 @@ class Dynamics:
     plant: Plant
     second_order: TransferFit
     quantities: dict[str, Estimate]
-    figures: dict[str, Any]
+    figures: JsonObject
     posterior: PlantPosterior
     residual_std: float
 
@@ -81,7 +81,7 @@ def fit_chirp_and_steps(
     """
     sweep = _record(chirp, maps, rig, 0.0)
     printed = _second_order(sweep)
-    fast = printed.estimates
+    fast = printed.parameters
     trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
     slow = _checked(
         fit_transfer(
@@ -110,7 +110,7 @@ def fit_chirp_and_steps(
         ),
         "chirp, second order plus slow branch",
     )
-    e = both.estimates
+    e = both.parameters
     gain, wn, zeta = e["gain"], e["natural_frequency_rad_s"], e["damping_ratio"]
     plant = Plant(
         gain.value, wn.value, zeta.value, max(e["delay_s"].value, 0.0),
@@ -188,7 +188,7 @@ def _second_order(sweep: Record) -> TransferFit:
 
 
 def _second_order_results(printed: TransferFit) -> dict[str, Estimate]:
-    fast = printed.estimates
+    fast = printed.parameters
     return {
         "S20.eq8_gain": fast["gain"],
         "S20.eq8_omega_n": fast["natural_frequency_rad_s"],
@@ -224,7 +224,7 @@ def _chirp_figure(
     u = sweep.u[np.minimum(index, sweep.u.size - 1)]
     frame_rate_hz = 1.0 / float(np.median(np.diff(sweep.output_time_s)))
     measured = estimate_frequency_response(u, sweep.y, frame_rate_hz).answer()
-    swept = measured["frequency_hz"] <= stop_hz
+    swept = np.asarray(measured["frequency_hz"]) <= stop_hz
     words = ("status", "notes")
     lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key not in words}
     omega_rad_s = 2.0 * np.pi * lines["frequency_hz"]

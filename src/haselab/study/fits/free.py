@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.control import over_trials
 from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
 from haselab.study.fits.observe import Observation
@@ -93,7 +93,7 @@ class Free:
 
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
 
 def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
@@ -170,7 +170,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     hulls = (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s)
     if not fit.succeeded or hulls[0] is None or hulls[1] is None:
         raise ResultError(f"Free response: {fit.status}; {' '.join(fit.notes)}")
-    e = fit.estimates
+    e = fit.parameters
     printed = [
         fit_printed(record, e["damped_frequency_rad_s"].value, e["decay_rate_per_s"].value)
         for record in records
@@ -238,7 +238,7 @@ def _creep_m(fit: FreeResponseFit) -> float:
     moved = []
     for k, modelled in enumerate(fit.modelled):
         alone = fit.trials[k] if fit.trials else fit
-        e = {name: estimate.value for name, estimate in alone.estimates.items()}
+        e = {name: estimate.value for name, estimate in alone.parameters.items()}
         time_s = fit.time_s[k] - fit.time_s[k][0]
         swing_m = e["amplitude"] * np.exp(-e["decay_rate_per_s"] * time_s)
         slow_m = modelled - swing_m * np.cos(e["damped_frequency_rad_s"] * time_s - e["phase_rad"])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from haselab.base import Estimate
+from haselab.base import Estimate, JsonObject
 from haselab.control import StepNumbers, over_trials
 from haselab.signals import constant
 from haselab.study.definition import Study
@@ -45,7 +45,7 @@ def further_trials(
     loops: Loops,
     study: Study,
     scale_m_per_px: float,
-) -> tuple[dict[str, Estimate], dict[str, str], dict[str, Any]]:
+) -> tuple[dict[str, Estimate], dict[str, str], JsonObject]:
     """Results S10, S22 and S24 of the further trials, notes, and data for figure S7.
 
     Args:

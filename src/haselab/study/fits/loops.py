@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.control import (
     DesignSpec,
     LoopSetting,
@@ -67,7 +67,7 @@ class Loops:
     setting: LoopSetting
     delayed_pi: PidGains
     quantities: dict[str, Estimate]
-    figures: dict[str, Any]
+    figures: JsonObject
     notes: dict[str, str]
 
 

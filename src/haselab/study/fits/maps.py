@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
@@ -43,7 +43,7 @@ class Maps:
     strain_map: StrainMap
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
 
 def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
@@ -77,15 +77,15 @@ def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:
         strain_map=to_strain,
         quantities={
             **repeatability(cycles, length_m),
-            **{f"S14.{key}": to_volt.estimates[f"{key}_v" if key[0] == "a" else key]
+            **{f"S14.{key}": to_volt.parameters[f"{key}_v" if key[0] == "a" else key]
                for key in ("a1", "b1", "a2", "b2")},
             "S14.rms_difference": curve,
             "S14.zero": Estimate.normal(
                 float(to_volt.map.voltage_v(0.0)), float(to_volt.curve_std(0.0)), "V"
             ),
             **in_time.quantities,
-            "S15.slope_at_strain": at_strain.estimates["slope"],
-            "S15.offset_at_strain": at_strain.estimates["offset"],
+            "S15.slope_at_strain": at_strain.parameters["slope"],
+            "S15.offset_at_strain": at_strain.parameters["offset"],
         },
         notes={"S14.rms_difference": note},
         figures={},

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import JsonObject
 from haselab.rig import RigDescription
 from haselab.runtime.observer import FIDUCIALS
 from haselab.runtime.runner import printed_chain_of
@@ -49,7 +49,7 @@ class Observation:
     """
 
     name: str
-    settings: dict[str, Any]
+    settings: JsonObject
     block_start_s: NDArray[np.float64]
     drive_v: NDArray[np.float64]
     reference: NDArray[np.float64]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.sensing import Sensed, relative_capacitance
 from haselab.study.tables import Sensing
@@ -65,7 +64,7 @@ class PrintedChain:
     strain_map: StrainMap
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
 
 def read_chain(sensed: Sensed, sensing: Sensing, volt_per_code: float) -> Chain:

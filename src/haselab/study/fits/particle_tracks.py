@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.rig import RigDescription
 from haselab.store.session.writer import ExperimentRecord
 from haselab.tracking import homogeneity
@@ -19,7 +17,7 @@ _BANDS = 8
 
 def sheet_figure(
     particles: ExperimentRecord, fiducials: ExperimentRecord, rig: RigDescription, picture: str
-) -> dict[str, Any]:
+) -> JsonObject:
     """Data of figure 2: tracks, strain along the length, lateral motion from the mid-line.
 
     The profiles compare the frame with the largest elongation with the first one.

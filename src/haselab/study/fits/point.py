@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, ResultError, table_at
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
 from haselab.study.fits.cycles import Cycles
@@ -79,9 +79,10 @@ class _Held:
 
 def _better_kg(held: _Held, static: Static, mass_kg: float) -> float | None:
     """The mass whose strain is centred at the middle one of the held voltages."""
-    drawn = static.figures["static"]
+    drawn = table_at(static.figures, "static")
     at_middle = held.at(0.5 * (held.drive_v[0] + held.drive_v[-1]))
-    loads = np.interp([static.centre.value, at_middle], drawn["stretch"], drawn["load_n"])
+    stretch, load_n = np.asarray(drawn["stretch"]), np.asarray(drawn["load_n"])
+    loads = np.interp([static.centre.value, at_middle], stretch, load_n)
     better_kg = mass_kg + float(loads[0] - loads[1]) / GRAVITY_M_S2
     return float(f"{better_kg:.2g}") if better_kg > 0.0 else None
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.statics.hyperelastic import HyperelasticFit, fit_hyperelastic
 from haselab.identify.statics.regions import Region, RegionsFit, find_regions
 from haselab.rig import RigDescription
@@ -41,7 +40,7 @@ class Static:
     region: Region
     quantities: dict[str, Estimate]
     notes: dict[str, str]
-    figures: dict[str, Any]
+    figures: JsonObject
 
     @property
     def centre(self) -> Estimate:
@@ -97,8 +96,8 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
         free_length_m=free_length_m,
         region=chosen,
         quantities={
-            "S16.mu": law.best.estimates["mu_pa"],
-            "S16.lambda_m": law.best.estimates["lambda_m"],
+            "S16.mu": law.best.parameters["mu_pa"],
+            "S16.lambda_m": law.best.parameters["lambda_m"],
             "S17.region_low": with_resolution(chosen.low, finest * chosen.low.value),
             "S17.region_high": with_resolution(chosen.high, finest * chosen.high.value),
         },
@@ -116,7 +115,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
                 "regions": [
                     {
                         "stretch": [r.low.value, r.high.value],
-                        "load_n": _line(r, stretch, load_n - regions.residuals),
+                        "load_n": _line(r, stretch, load_n - regions.residuals[0]),
                     }
                     for r in regions.regions
                 ],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate
+from haselab.base import Estimate, JsonObject
 from haselab.base.estimate import Z95
 from haselab.control import StepMetrics, step_metrics
 from haselab.models.actuator.strain_map import StrainMap
@@ -114,7 +114,7 @@ class Comparison:
 
     groups: dict[str, Trials]
     quantities: dict[str, Estimate]
-    figures: dict[str, Any]
+    figures: JsonObject
     sensing_error: float
     notes: dict[str, str] = field(default_factory=dict)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+from haselab.base import JsonObject
 from haselab.study.definition import Study, builtin_study
 from haselab.study.results import rows_of
 from haselab.study.simulated.truth import with_default_twin
@@ -38,7 +39,7 @@ def not_played(
     figures: Mapping[str, Any],
     study: Study,
     missing: Mapping[str, str] | None = None,
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """List results of a study's experiments that a run does not have, with the reasons.
 
     Args:

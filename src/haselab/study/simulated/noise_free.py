@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import JsonObject
 from haselab.rig import Rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
@@ -91,7 +92,7 @@ class NoiseFreeBench:
         if verb == "drop":
             self._recordings.setdefault(name, _Recording()).drop_s = time_s
 
-    def complete_settings(self, name: str, settings: dict[str, Any]) -> None:
+    def complete_settings(self, name: str, settings: JsonObject) -> None:
         """Store the settings that were really used."""
         self._settings[name] = settings
 

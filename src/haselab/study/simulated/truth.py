@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from haselab.base import JsonObject
 from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig, twin_of_reading
 
 __all__ = [
@@ -71,7 +72,7 @@ def twin_of(rig_config: Mapping[str, Any]) -> TwinConfig | None:
 
 def with_default_twin(
     rig_config: Mapping[str, Any],
-) -> tuple[dict[str, Any], dict[str, Any]] | None:
+) -> tuple[JsonObject, JsonObject] | None:
     """Parameters of the default twin with the same reading, and of the twin of a session.
 
     Args:

@@ -1,7 +1,7 @@
-"""Features of a GenICam camera beyond what Aravis' own calls know, by their standard names.
+"""Features of a GenICam camera for which Aravis has no function, by their standard names.
 
-Names are those of the Standard Features Naming Convention (SFNC) of the EMVA, and vendors' own
-where they differ; a feature that a camera does not have is None.
+Names are those of the Standard Features Naming Convention (SFNC) of the EMVA, or the vendors' own
+if they differ; a feature that a camera does not have is None.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from haselab.rig.cameras.data_rate import LinkLoad
 
 __all__ = ["AravisFeatures"]
 
-# What a camera says that it will really do, by vendors: Basler ace U and Hikrobot; FLIR and Lucid;
-# Basler ace 2 and boost; Basler ace GigE.
+# The frame rate that a camera will really reach, by vendors: Basler ace U and Hikrobot; FLIR and
+# Lucid; Basler ace 2 and boost; Basler ace GigE.
 _RESULTING = (
     "ResultingFrameRate",
     "AcquisitionResultingFrameRate",
@@ -23,13 +23,13 @@ _RESULTING = (
     "ResultingFrameRateAbs",
 )
 _LIMIT = "DeviceLinkThroughputLimit"
-_LINK_HZ = 1e9  # of an Ethernet link that the camera says nothing about
-_BUSY = 0.8  # share of a link beyond which a burst or a second program costs frames
-_LONG_SHARE = 0.98  # of a period, beyond which an exposure leaves no time to read out
+_LINK_HZ = 1e9  # assumed speed of an Ethernet link that the camera does not report
+_BUSY = 0.8  # load of a link above which a burst or a second program causes lost frames
+_LONG_SHARE = 0.98  # fraction of a period above which an exposure leaves no time to read out
 
 
 class AravisFeatures:
-    """What one camera can be asked, and what follows from it for a frame rate.
+    """Reads features of one camera and derives what limits its frame rate.
 
     Args:
         library: Aravis.
@@ -45,14 +45,14 @@ class AravisFeatures:
         return self._library.call(f"camera_{name}", self._camera, *arguments)
 
     def has(self, name: str) -> bool:
-        """The camera has this feature now."""
+        """Whether the camera has this feature now."""
         try:
             return bool(self._call("is_feature_available", name.encode()))
         except DeviceError:
             return False
 
     def number(self, name: str) -> float | None:
-        """A feature that is a float or an integer."""
+        """Value of a float or integer feature."""
         if not self.has(name):
             return None
         for kind in ("get_float", "get_integer"):
@@ -63,7 +63,7 @@ class AravisFeatures:
         return None
 
     def text(self, name: str) -> str | None:
-        """A feature that is an entry of a list."""
+        """Value of an enumeration feature."""
         if not self.has(name):
             return None
         try:
@@ -74,11 +74,11 @@ class AravisFeatures:
     # ---- frame rate ----------------------------------------------------------------------------
 
     def resulting_hz(self) -> float | None:
-        """The frame rate that the camera itself expects with its settings; None: it does not say.
+        """Frame rate that the camera predicts for its settings; None if it does not report one.
 
-        `AcquisitionFrameRate` is a wish: an exposure, the sensor's readout or the link may allow
-        less, and the camera then leaves it as it was set (Basler's manual, "Acquisition Frame
-        Rate": use "Resulting Acquisition Frame Rate" for the actual one).
+        `AcquisitionFrameRate` is only a request: the exposure, the sensor's readout or the link may
+        allow less, and the camera does not change the feature then (Basler's manual, "Acquisition
+        Frame Rate": use "Resulting Acquisition Frame Rate" for the actual one).
         """
         for name in _RESULTING:
             value = self.number(name)
@@ -87,40 +87,40 @@ class AravisFeatures:
         return None
 
     def link_limit_byte_s(self) -> float | None:
-        """Bytes a second that the camera sends at most; None: as many as the link carries."""
+        """Most bytes per second that the camera sends; None: not limited by the camera."""
         if self.text(f"{_LIMIT}Mode") == "Off":
             return None
         return self.number(_LIMIT)
 
     def why_slow(self, rate_hz: float, exposure_s: float, payload_bytes: int) -> str:
-        """What to change so that frames come at this rate."""
+        """What to change to reach this frame rate."""
         if exposure_s * rate_hz > _LONG_SHARE:
             return (
-                f"The exposure of {1e3 * exposure_s:.3g} ms is longer than a period of "
-                f"{1e3 / rate_hz:.3g} ms: shorten camera.exposure_s."
+                f"The exposure of {1e3 * exposure_s:.3g} ms is longer than a frame period of "
+                f"{1e3 / rate_hz:.3g} ms. Shorten camera.exposure_s."
             )
         limit = self.link_limit_byte_s()
         needed = payload_bytes * rate_hz
         if limit is not None and needed > limit:
             return (
-                f"The frames are {needed / 1e6:.4g} MB/s and {_LIMIT} is {limit / 1e6:.4g} MB/s: "
-                f"raise it (arv-tool-0.8 control {_LIMIT}={needed * 1.1:.0f}), or make "
-                "camera.height_px smaller."
+                f"The frames need {needed / 1e6:.4g} MB/s, but {_LIMIT} is {limit / 1e6:.4g} MB/s. "
+                f"Raise it (arv-tool-0.8 control {_LIMIT}={needed * 1.1:.0f}), or lower "
+                "camera.height_px."
             )
         return (
-            "Shorten camera.exposure_s, take fewer lines (camera.height_px), or larger packets "
+            "Shorten camera.exposure_s, lower camera.height_px, or use larger packets "
             "(camera.packet_bytes)."
         )
 
     # ---- network -------------------------------------------------------------------------------
 
     def set_packets(self, packet_bytes: int | None) -> str:
-        """Make packets as large as the network lets through, or as large as asked for.
+        """Set the packet size to the given one, or to the largest that the network accepts.
 
         Returns:
-            A remark, empty where there is nothing to say.
+            A remark, or an empty text.
         Raises:
-            DeviceError: the camera refuses the size.
+            DeviceError: The camera refuses the size.
         """
         if not self.is_gige:
             return ""
@@ -130,11 +130,11 @@ class AravisFeatures:
         try:
             self._call("gv_auto_packet_size")
         except DeviceError as error:
-            return f"The largest packet could not be found ({error}) Set camera.packet_bytes."
+            return f"The largest packet size was not found ({error}) Set camera.packet_bytes."
         return ""
 
     def load(self, payload_bytes: int, rate_hz: float) -> LinkLoad | None:
-        """What frames take of the network; None: the camera is at no network."""
+        """Network load of the frames; None if the camera is not on a network."""
         if not self.is_gige:
             return None
         megabit = self.number("GevLinkSpeed")
@@ -144,12 +144,12 @@ class AravisFeatures:
         return LinkLoad(payload_bytes, rate_hz, packet, link)
 
     def check_load(self, payload_bytes: int, rate_hz: float) -> str:
-        """Whether the network can carry the frames.
+        """Check that the network can carry the frames.
 
         Returns:
-            A remark where they take most of it, else empty.
+            A remark if they take most of it, else an empty text.
         Raises:
-            LimitError: they do not fit.
+            LimitError: They exceed the network's capacity.
         """
         load = self.load(payload_bytes, rate_hz)
         if load is None or load.share < _BUSY:
@@ -160,12 +160,12 @@ class AravisFeatures:
         )
         if load.share > 1.0:
             raise LimitError(
-                f"{reported}. Lower the frame rate to {load.most_hz:.4g} Hz or less, or make "
-                "camera.height_px smaller."
+                f"{reported}. Lower the frame rate to {load.most_hz:.4g} Hz or less, or lower "
+                "camera.height_px."
             )
         return (
-            f"{reported}: wire the camera directly to a port of its own and raise the port's "
-            "MTU to 8192 or more."
+            f"{reported}. Connect the camera directly to its own network port, and raise the "
+            "port's MTU to 8192 or more."
         )
 
     # ---- exposure line -------------------------------------------------------------------------
@@ -175,9 +175,9 @@ class AravisFeatures:
 
         Args:
             line: its name in `LineSelector`.
-            inverted: None: as the camera is.
+            inverted: LineInverter; None: unchanged.
         Raises:
-            DeviceError: the camera has no such line, or not that signal.
+            DeviceError: The camera has no such line, or not that signal.
         """
         try:
             self._call("set_string", b"LineSelector", line.encode())
@@ -188,12 +188,13 @@ class AravisFeatures:
                 self._call("set_boolean", b"LineInverter", int(inverted))
         except DeviceError as error:
             raise DeviceError(
-                f"exposure.line = {line!r} does not take the exposure signal: {error} Correct "
+                f"exposure.line = {line!r} cannot output the exposure signal: {error} Change "
                 "exposure.line (arv-tool-0.8 features lists LineSelector and LineSource), or "
-                "leave it out and set the line with the vendor's program."
+                "remove it and set the line with the vendor's program."
             ) from None
         reported = self.text("LineSource")
         if reported != "ExposureActive":
             raise DeviceError(
-                f"exposure.line = {line!r} has LineSource = {reported} instead of ExposureActive."
+                f"exposure.line = {line!r} has LineSource = {reported} instead of ExposureActive. "
+                "Choose another line."
             )

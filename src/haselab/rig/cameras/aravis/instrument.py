@@ -26,7 +26,7 @@ class AravisInstrument(CameraInstrument[AravisConfig]):
         return ["aravis"]
 
     def system_needs(self, config: AravisConfig) -> SystemNeeds:
-        """See `Instrument`: the network, or the USB port, and how large a frame is."""
+        """See `Instrument`: the network or the USB port, and the size of a frame."""
         frame_bytes = None
         if config.width_px is not None and config.height_px is not None:
             frame_bytes = config.width_px * config.height_px

@@ -1,7 +1,7 @@
-"""The library Aravis by ctypes: the few of its functions that a camera needs.
+"""The functions of the Aravis library that a camera needs, called through ctypes.
 
-Aravis' Python binding is PyGObject, which is built for the system's own Python and has to be
-compiled for any other. The C library alone is one package of 0.2 MB, and two dozen calls.
+Aravis' Python binding is PyGObject, which is built for the system's own Python and must be
+compiled for any other. The C library alone is one package of 0.2 MB with two dozen calls.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _DO = {
     "win32": "conda install -c conda-forge aravis",
 }
 _PLATFORM = sys.platform if sys.platform in _NAMES else "linux"
-INSTALL = f"Type: {_DO[_PLATFORM]}"
+INSTALL = f"Run: {_DO[_PLATFORM]}"
 
 
 class _GError(ctypes.Structure):
@@ -46,7 +46,7 @@ _U64 = ctypes.c_uint64
 _SIZE_OUT = ctypes.POINTER(ctypes.c_size_t)
 _ERROR_OUT = ctypes.POINTER(ctypes.POINTER(_GError))
 
-# name: answer, arguments. Those of _FAILING take a GError after them.
+# name: result, arguments. Those in _FAILING take a GError after them.
 _FAILING: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "camera_new": (_POINTER, (_TEXT,)),
     "camera_create_stream": (_POINTER, (_POINTER, _POINTER, _POINTER)),
@@ -110,10 +110,10 @@ class _GValue(ctypes.Structure):
 
 
 class AravisLibrary:
-    """Loads Aravis; its functions by `call` (those that may fail) and `get`.
+    """Loads Aravis and calls its functions: `call` for those that may fail, `get` for others.
 
     Raises:
-        DeviceError: it is not installed.
+        DeviceError: Aravis is not installed.
     """
 
     def __init__(self) -> None:
@@ -148,7 +148,8 @@ class AravisLibrary:
             function = getattr(self._aravis, f"arv_{name}")
         except AttributeError:
             raise DeviceError(
-                f"The installed Aravis has no arv_{name}: it is older than 0.8. {INSTALL}"
+                f"The installed Aravis has no function arv_{name}, so it is older than 0.8. "
+                f"{INSTALL}"
             ) from None
         function.restype, function.argtypes = answer, arguments
         self._functions[name] = function
@@ -158,9 +159,9 @@ class AravisLibrary:
 
         Args:
             name: without `arv_`.
-            arguments: as the library takes them.
+            arguments: as for the C function.
         Returns:
-            Its answer.
+            Its result.
         """
         return self._functions[name](*arguments)
 
@@ -169,11 +170,11 @@ class AravisLibrary:
 
         Args:
             name: without `arv_`.
-            arguments: as the library takes them, without the error.
+            arguments: as for the C function, without the error.
         Returns:
-            Its answer.
+            Its result.
         Raises:
-            DeviceError: the library's own words.
+            DeviceError: The function failed; the text is the library's.
         """
         error = ctypes.POINTER(_GError)()
         answer = self._functions[name](*arguments, ctypes.byref(error))
@@ -184,12 +185,12 @@ class AravisLibrary:
         return answer
 
     def integers(self, name: str, camera: Any, count: int) -> list[int]:
-        """What a function writes into so many integers.
+        """Call a function that returns several integers.
 
         Args:
             name: of a function that may fail.
-            camera: it is asked of.
-            count: of integers.
+            camera: its first argument.
+            count: number of integers.
         Returns:
             The integers.
         """
@@ -198,11 +199,11 @@ class AravisLibrary:
         return [value.value for value in values]
 
     def bounds(self, name: str, camera: Any) -> tuple[float, float]:
-        """The lowest and the highest value of a setting.
+        """Get the lowest and the highest value of a setting.
 
         Args:
             name: of a function that may fail.
-            camera: it is asked of.
+            camera: its first argument.
         Returns:
             Low and high.
         """
@@ -217,7 +218,7 @@ class AravisLibrary:
             thing: the object.
             name: of the property.
             type_name: function that gives the enumeration's type, without `arv_`.
-            value: one of it.
+            value: a value of that enumeration.
         """
         boxed = _GValue()
         self._gobject.g_value_init(ctypes.byref(boxed), self.get(type_name))
@@ -225,5 +226,5 @@ class AravisLibrary:
         self._gobject.g_object_set_property(thing, name.encode(), ctypes.byref(boxed))
 
     def release(self, thing: Any) -> None:
-        """Give a camera or a stream back."""
+        """Release a camera or a stream."""
         self._gobject.g_object_unref(thing)

@@ -21,28 +21,28 @@ from haselab.rig.drivers import quietly
 __all__ = ["AravisSource"]
 
 _OFF, _CONTINUOUS, _SUCCESS = 0, 0, 0  # of ArvAuto, ArvAcquisitionMode, ArvBufferStatus
-_RATE_SHARE = 0.01  # by which the camera's rate may differ from the one asked for
-_EXPOSURE_SHARE = 0.05  # exposures come in steps of the camera's line time
+_RATE_SHARE = 0.01  # largest relative difference from the requested frame rate
+_EXPOSURE_SHARE = 0.05  # exposures are multiples of the camera's line time
 _FEWEST_BUFFERS = 4
 _MOST_BYTES = 2**30  # of all buffers
 _SOCKET_AUTO = 1  # of ArvGvStreamSocketBuffer: as large as a frame
-_ID_RANGE = 2**16  # of the frame numbers of GigE Vision 1, which leave 0 out
+_ID_RANGE = 2**16  # range of the frame numbers of GigE Vision 1, which skip 0
 
 
 class AravisSource:
-    """One camera: fulfils `FrameSource`.
+    """One camera; implements `FrameSource`.
 
-    Aravis' own thread receives the frames into buffers; `take` copies what is there.
-    A frame's time is when its first packet came, half an exposure earlier, its scatter taken out by
-    the camera's own clock.
+    Aravis' own thread receives the frames into buffers; `take` copies the complete ones. A frame's
+    time is half an exposure before the arrival of its first packet, with the scatter removed by
+    means of the camera's own clock.
 
     Args:
         config: section `camera` of the rig file.
-        line: where its exposures are recorded; None: they are not.
+        line: output line on which its exposures are recorded; None: they are not recorded.
     Raises:
-        DeviceError: no library, no camera, or it refuses the configuration.
-        InputError: another camera than the rig file names.
-        LimitError: a setting beyond what the camera can do.
+        DeviceError: The library or the camera is missing, or the camera refuses the configuration.
+        InputError: The camera is not the one that the rig file names.
+        LimitError: A setting is outside the camera's limits.
     """
 
     def __init__(self, config: AravisConfig, line: ExposureLine | None = None) -> None:
@@ -54,9 +54,10 @@ class AravisSource:
         self._last_id: int | None = None
         self._before_s = 0.0
         self._exposure_s = 0.0
-        self._found: tuple[float, str | None] | None = None  # exposure in us and its automatic
+        # exposure in us and its automatic mode before opening
+        self._found: tuple[float, str | None] | None = None
         self._payload = 0
-        self._packets = (0, 0)  # missing and sent again, of the last stream
+        self._packets = (0, 0)  # missing and resent packets of the last stream
         self._counts = (0, 0)  # failures and underruns
         self._remarks: list[str] = []
         self._clock = self._new_clock()
@@ -92,8 +93,8 @@ class AravisSource:
         if not camera:
             missing = "No camera found" if name is None else f"Camera {name} is not found"
             raise DeviceError(
-                f"{missing}: {reason.rstrip('.')}. Check its cable and its address, or correct "
-                "camera.name: arv-tool-0.8 (aravis-tools-cli) lists them."
+                f"{missing}: {reason.rstrip('.')}. Check its cable and its address, or change "
+                "camera.name; arv-tool-0.8 (aravis-tools-cli) lists the cameras."
             )
         return camera
 
@@ -105,8 +106,8 @@ class AravisSource:
         wanted = self._config.serial_number
         if wanted is not None and wanted != serial:
             raise InputError(
-                f"Serial number of camera {self._called} = {serial}, expected {wanted} by the rig "
-                "file. Connect that camera, or correct camera.serial_number."
+                f"Camera {self._called} has the serial number {serial}, but the rig file names "
+                f"{wanted}. Connect that camera, or change camera.serial_number."
             )
         self.identity = f"{vendor} {model}, serial number {serial}"
 
@@ -132,7 +133,7 @@ class AravisSource:
             self._call("set_trigger", config.trigger.encode())
             mode = (self._call("get_string", b"TriggerMode") or b"").decode(errors="replace")
             if mode != "On":
-                raise DeviceError(f"TriggerMode = {mode}, asked for was On (camera.trigger).")
+                raise DeviceError(f"TriggerMode is {mode} after it was set to On (camera.trigger).")
         if self._line is not None and self._line.line is not None:
             self._features.put_exposure_on(self._line.line, self._line.inverted)
 
@@ -147,9 +148,9 @@ class AravisSource:
         if got != wanted:
             across, down = self._library.integers("camera_get_sensor_size", self._camera, 2)
             raise LimitError(
-                f"Region (x, y, width, height) = {wanted} px is not what camera {self._called} "
-                f"takes, it made {got} of it; its sensor has {across} x {down} px. Correct "
-                "camera.x_px, y_px, width_px, height_px."
+                f"Camera {self._called} does not accept the region (x, y, width, height) = "
+                f"{wanted} px and set {got}; its sensor has {across} x {down} px. Change "
+                "camera.x_px, y_px, width_px and height_px."
             )
 
     def _set_exposure(self, exposure_s: float) -> None:
@@ -160,13 +161,13 @@ class AravisSource:
         self._call("set_exposure_time", 1e6 * exposure_s)
         got_s = 1e-6 * self._call("get_exposure_time")
         if abs(got_s / exposure_s - 1.0) > _EXPOSURE_SHARE:
-            raise DeviceError(f"exposure = {got_s:g} s, asked for were {exposure_s:g} s.")
+            raise DeviceError(f"the exposure is {got_s:g} s, but {exposure_s:g} s was requested.")
 
     def _restore_exposure(self) -> None:
-        """Leave the camera with the exposure that it had: another rig file may leave it as it is.
+        """Restore the exposure from before opening, which another rig file may rely on.
 
         Raises:
-            DeviceError: it does not answer.
+            DeviceError: The camera does not reply.
         """
         if self._found is None:
             return
@@ -181,14 +182,14 @@ class AravisSource:
         if not low <= value <= high:
             raise LimitError(
                 f"{what.capitalize()} = {value:g}{unit} is outside [{low:g}, {high:g}]{unit} of "
-                f"camera {self._called}. Correct camera.{what}."
+                f"camera {self._called}. Change camera.{what}."
             )
 
     # ---- FrameSource ---------------------------------------------------------------------------
 
     @property
     def dropped(self) -> int:
-        """See `FrameSource`: gaps in the frames' numbers, or what Aravis reports if it is more."""
+        """See `FrameSource`: gaps in the frame numbers, or Aravis' count if it is larger."""
         self._read_statistics()
         return max(self._lost, sum(self._counts))
 
@@ -205,7 +206,7 @@ class AravisSource:
 
     @property
     def jitter_s(self) -> float:
-        """See `FrameSource`: scatter of the arrivals about the camera's clock."""
+        """See `FrameSource`: scatter of the arrival times relative to the camera's clock."""
         return self._clock.jitter_s
 
     @property
@@ -214,18 +215,22 @@ class AravisSource:
         found = list(self._remarks)
         if self._clock.has_no_clock:
             found.append(
-                f"Camera {self._called} gives no time stamps: its frames are timed by their "
+                f"Camera {self._called} sends no time stamps, so its frames are timed by their "
                 "arrival, which scatters. Use the exposure line (section exposure)."
             )
         missing, resent = self._packets
         if resent and not missing:
-            found.append(f"{resent} packets were sent again and none is missing: the link is full.")
+            found.append(
+                f"{resent} packets were resent and none is missing: the link is almost full."
+            )
         return tuple(found)
 
     def why_slow(self, rate_hz: float) -> str:
         """See `KnowsCauses`."""
         if self._config.trigger is not None:
-            return f"Its trigger at {self._config.trigger} sets the rate: correct that signal's."
+            return (
+                f"Its trigger at {self._config.trigger} sets the rate. Change that signal's rate."
+            )
         return self._features.why_slow(rate_hz, self._exposure_s, self._payload)
 
     def why_lost(self) -> str:
@@ -235,13 +240,13 @@ class AravisSource:
         failures, underruns = self._counts
         if missing:
             return (
-                f"{missing} packets never came and {resent} were sent again: wire the camera "
-                "directly, raise the port's MTU, and net.core.rmem_max (haselab doctor)."
+                f"{missing} packets were lost and {resent} were resent. Connect the camera "
+                "directly, raise the port's MTU, and raise net.core.rmem_max (haselab doctor)."
             )
         if underruns > failures:
-            return f"{underruns} frames found no free buffer: raise camera.buffer_s."
+            return f"{underruns} frames found no free buffer. Raise camera.buffer_s."
         if failures:
-            return f"{failures} frames came incomplete: check the cable, or lower the frame rate."
+            return f"{failures} frames were incomplete. Check the cable, or lower the frame rate."
         return ""
 
     def start(self, rate_hz: float) -> None:
@@ -252,7 +257,8 @@ class AravisSource:
             self._set_rate(rate_hz)
         elif not 0.0 < rate_hz < math.inf:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside (0, inf) Hz. Name the trigger's rate."
+                f"The frame rate is {rate_hz:g} Hz, but it must be above 0. Give the trigger's "
+                "rate."
             )
         self._read_exposure()
         self._prepare_link(rate_hz)
@@ -270,8 +276,8 @@ class AravisSource:
         ):
             return
         raise LimitError(
-            f"exposure.duration_s = {line.duration_s:g} s, but camera {self._called} exposes for "
-            f"{self._exposure_s:g} s. Give camera.exposure_s, and leave exposure.duration_s out."
+            f"exposure.duration_s is {line.duration_s:g} s, but camera {self._called} exposes "
+            f"for {self._exposure_s:g} s. Set camera.exposure_s, and remove exposure.duration_s."
         )
 
     def _prepare_link(self, rate_hz: float) -> None:
@@ -287,22 +293,22 @@ class AravisSource:
         low_hz, high_hz = self._library.bounds("camera_get_frame_rate_bounds", self._camera)
         if not low_hz <= rate_hz <= high_hz:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside [{low_hz:g}, {high_hz:g}] Hz of camera "
-                f"{self._called}. Change the request, the exposure or the picture's size."
+                f"The frame rate is {rate_hz:g} Hz, but camera {self._called} allows {low_hz:g} to "
+                f"{high_hz:g} Hz. Change the frame rate, the exposure or the image size."
             )
         self._call("set_frame_rate", rate_hz)
         got_hz = self._call("get_frame_rate")
         if abs(got_hz / rate_hz - 1.0) > _RATE_SHARE:
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is outside what camera {self._called} does: it takes "
-                f"{got_hz:g} Hz. Ask for that, or shorten camera.exposure_s."
+                f"Camera {self._called} set a frame rate of {got_hz:g} Hz instead of {rate_hz:g} "
+                "Hz. Request that rate, or shorten camera.exposure_s."
             )
         real_hz = self._features.resulting_hz()
         if real_hz is not None and real_hz < (1.0 - _RATE_SHARE) * rate_hz:
             self._read_exposure()
             self._payload = int(self._call("get_payload"))
             raise LimitError(
-                f"Frame rate = {rate_hz:g} Hz is set, but camera {self._called} reaches "
+                f"The frame rate is set to {rate_hz:g} Hz, but camera {self._called} reaches only "
                 f"{real_hz:.4g} Hz with these settings. {self.why_slow(rate_hz)}"
             )
 
@@ -310,7 +316,9 @@ class AravisSource:
         payload = self._payload
         self._stream = self._call("create_stream", None, None)
         if not self._stream:
-            raise DeviceError(f"Camera {self._called}: no stream. Is it used by another program?")
+            raise DeviceError(
+                f"Camera {self._called} opens no stream. Close other programs that use it."
+            )
         if self._features.is_gige:  # larger than the system's default, up to net.core.rmem_max
             self._library.set_enum(
                 self._stream, "socket-buffer", "gv_stream_socket_buffer_get_type", _SOCKET_AUTO
@@ -330,7 +338,7 @@ class AravisSource:
         shots: list[Shot] = []
         if self._stream is None:
             return shots
-        # Aravis stamps by the time of day, read first: what comes between makes frames seem late,
+        # Aravis stamps by the time of day. Read it first, so that a delay makes frames seem late,
         # which `ClockOffset` expects, and never early.
         day_s = time.time()
         to_host_s = time.monotonic() - day_s
@@ -345,7 +353,7 @@ class AravisSource:
 
     def _shot(self, buffer: Any, to_host_s: float) -> Shot | None:
         if self._library.get("buffer_get_status", buffer) != _SUCCESS:
-            return None  # counted as lost by Aravis, and by the gap in the numbers
+            return None  # counted as lost by Aravis and by the gap in the frame numbers
         self._count(self._library.get("buffer_get_frame_id", buffer))
         day_ns = self._library.get("buffer_get_system_timestamp", buffer)
         stamp_ns = self._library.get("buffer_get_timestamp", buffer)
@@ -371,8 +379,8 @@ class AravisSource:
         data = self._library.get("buffer_get_image_data", buffer, size)
         if not data or size.value < width * height:
             raise DeviceError(
-                f"Camera {self._called}: {size.value} bytes in a picture of {width} x {height} px "
-                "of 8 bit. Set its pixel format to Mono8."
+                f"Camera {self._called} sent {size.value} bytes for an image of {width} x {height} "
+                "px, which is not 8 bit. Set its pixel format to Mono8."
             )
         pixels = (ctypes.c_uint8 * (width * height)).from_address(data)
         return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width).copy()
@@ -387,7 +395,7 @@ class AravisSource:
         self._library.release(stream)
 
     def close(self) -> None:
-        """See `FrameSource`; the exposure is the one from before. Never raises."""
+        """See `FrameSource`; restores the exposure from before opening. Never raises."""
         self.stop()
         quietly(self._restore_exposure)
         if self._camera is not None:

@@ -1,13 +1,13 @@
-"""Keysight 33500B as sensing signal: PyMeasure's driver over PyVISA, every setting read back.
+"""Keysight 33500B for the sensing signal: PyMeasure's driver over PyVISA, with read-back.
 
-Whoever used the instrument before may have left burst, sweep, modulation, gate, polarity, limits
-or coupling; each of them changes what comes out, and none of them the amplitude that is read back.
-So it is reset first, asked for all of them, and its error queue is read.
+An earlier user may have left burst, sweep, modulation, gate, polarity, limits or coupling on; each
+of them changes the output, but not the amplitude that is read back. So the instrument is reset
+first, all of them are queried, and its error queue is read.
 
-Instruments of this family take few connections at once: the EDU33210 series two in all (user's
+Instruments of this family accept few connections at once: the EDU33210 series two in all (user's
 guide, "SCPI Socket Services"), the E4360 series four; the limit of the 33500B is inferred. So the
-program holds one, and whoever switches the output off from outside uses another one for a single
-line (`switch_generator_off`).
+program uses one, and a process that switches the output off uses another one for a single line
+(`switch_generator_off`).
 
 PyMeasure's `shutdown()` leaves the output on, so nothing here relies on it: `off` sets `OUTP OFF`
 and `is_off` asks the instrument.
@@ -24,19 +24,23 @@ from typing import Any
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.drivers import load_driver, quietly
 from haselab.rig.instruments.keysight33500.section import KeysightConfig
-from haselab.rig.instruments.keysight33500.state import check_rest, is_two_channel, rest_question
+from haselab.rig.instruments.keysight33500.state import (
+    check_settings,
+    is_two_channel,
+    settings_query,
+)
 
 __all__ = ["KeysightGenerator", "identify_generator", "switch_generator_off"]
 
 _SMALLEST_VPP, _LARGEST_VPP = 10e-3, 10.0  # that PyMeasure sends
 _MODEL = "335"  # 33509B to 33522B
-_OPEN_LOAD_OHM = 1e30  # the answer to a load of INF is 9.9E+37
+_OPEN_LOAD_OHM = 1e30  # the reply to a load of INF is 9.9E+37
 _OFF = {"0", "OFF"}
-_CLOSE = 1e-4  # relative: settings go over the wire with six digits
-_RESET_S = 5.0  # that *RST may take
+_CLOSE = 1e-4  # relative: settings are sent with six digits
+_RESET_S = 5.0  # longest time for *RST
 _ERRORS = 25  # more than its queue holds
-_SOCKET_S = 0.25  # for an answer on a bare socket, at least
-_AGAIN_S = 0.03  # between two trials of a connection
+_SOCKET_S = 0.25  # shortest wait for a reply on a socket
+_AGAIN_S = 0.03  # between two attempts to connect
 
 
 class _Link:
@@ -65,13 +69,13 @@ class _Link:
             self.identity = str(self.driver.id).strip()
         except Exception as error:
             self.close()
-            raise self.dead(error) from None
+            raise self.no_reply(error) from None
 
     def patience(self, wait_s: float) -> None:
         """Limit the time of a read.
 
-        pyvisa-py waits for an answer with `select`, then reads a socket without a limit: where
-        nothing is to be read then, as was seen under load, it would wait for ever.
+        pyvisa-py waits for a reply with `select`, then reads the socket without a timeout: if there
+        is nothing to read then, as was seen under load, it would wait forever.
         """
         connection = self.driver.adapter.connection
         connection.timeout = round(1e3 * wait_s)
@@ -80,68 +84,68 @@ class _Link:
         if isinstance(interface, socket.socket):
             interface.settimeout(wait_s)
 
-    def dead(self, error: object) -> DeviceError:
-        """The error of a generator that does not answer."""
+    def no_reply(self, error: object) -> DeviceError:
+        """Make the error of a generator that does not reply."""
         text = str(error).partition("\n")[0] or type(error).__name__
         return DeviceError(
-            f"The function generator does not answer ({text}). Switch it on, check the cable, "
-            "close other programs that are connected to it, or correct generator.address. "
+            f"The function generator does not reply ({text}). Switch it on, check the cable, "
+            "close other programs that are connected to it, or change generator.address. "
             f"{self._config.address}"
         )
 
     def check_identity(self) -> None:
-        """Refuse another instrument than the rig file names.
+        """Check that the instrument is the one that the rig file names.
 
         Raises:
-            InputError: it is one.
+            InputError: It is another one.
         """
         fields = [part.strip() for part in self.identity.split(",")]
         if len(fields) < 3 or not fields[1].startswith(_MODEL):
             raise InputError(
-                f"The instrument identifies as {self.identity!r}, expected a Keysight 33500B. "
-                f"Correct generator.address. {self._config.address}"
+                f"The instrument identifies as {self.identity!r}, but a Keysight 33500B is needed. "
+                f"Change generator.address. {self._config.address}"
             )
         wanted = self._config.serial_number
         if wanted is not None and fields[2] != wanted:
             raise InputError(
-                f"Serial number of the function generator = {fields[2]}, expected {wanted} by the "
-                "rig file. Connect that one, or correct generator.serial_number. "
+                f"The function generator has the serial number {fields[2]}, but the rig file names "
+                f"{wanted}. Connect that one, or change generator.serial_number. "
                 f"{self._config.address}"
             )
 
     @property
     def channels(self) -> int:
-        """One or two."""
+        """Number of channels, one or two."""
         return 2 if is_two_channel(self.identity.split(",")[1].strip()) else 1
 
-    def ask(self, question: str) -> str:
-        """The answer to one line."""
+    def query(self, question: str) -> str:
+        """Send one line and return the reply."""
         return str(self.driver.ask(question)).strip()
 
     def errors(self) -> list[str]:
-        """What stands in its error queue, which is empty then."""
+        """Read and empty its error queue."""
         found: list[str] = []
         while len(found) < _ERRORS:
-            reported = self.ask("SYST:ERR?")
+            reported = self.query("SYST:ERR?")
             number = reported.partition(",")[0]
             if not number.lstrip("+-").isdecimal():
-                raise self.dead(f"SYST:ERR? is answered by {reported!r}")
+                raise self.no_reply(f"the reply to SYST:ERR? is {reported!r}")
             if int(number) == 0:
                 return found
             found.append(reported)
         return found
 
     def close(self) -> None:
-        """End the connection; the output stays as it is. Never raises.
+        """Close the connection without changing the output. Never raises.
 
-        PyVISA's manager is one for the process and would end all other connections too: it stays.
+        PyVISA's manager is shared by the process and would close all connections, so it stays open.
         """
         if self.driver is not None:
             quietly(self.driver.adapter.close)
 
 
 def identify_generator(config: KeysightConfig) -> str:
-    """What a generator says it is; it is left as it is.
+    """Query a generator's identity without changing it.
 
     Args:
         config: section `generator` of the rig file.
@@ -158,24 +162,24 @@ def identify_generator(config: KeysightConfig) -> str:
 
 
 def switch_generator_off(config: KeysightConfig, within_s: float) -> None:
-    """Switch a generator off that another program may be using, with one short connection.
+    """Switch off a generator that another program may be using, over one short connection.
 
-    A socket is used without a driver, which takes 50 ms to open. Where the connection is refused,
-    as by an instrument whose connections are all in use, it is tried again.
+    A socket is used without the driver, which needs 50 ms to open. A connection that is refused,
+    for example because all connections are in use, is tried again.
 
     Args:
         config: section `generator` of the rig file.
-        within_s: how long it is tried, in s.
+        within_s: how long to try, in s.
     Raises:
-        DeviceError: not confirmed off, or another instrument than the rig file names.
+        DeviceError: It is not confirmed off, or is not the instrument that the rig file names.
     """
-    # *IDN? comes last: what it answers has no end but that of the line (IEEE 488.2, error -440).
+    # *IDN? comes last: its reply ends only with the line (IEEE 488.2, error -440).
     line = f"OUTP{config.channel} OFF;:OUTP{config.channel}?;*IDN?"
     kind, *place, last = config.address.split("::")
     if not (kind.upper().startswith("TCPIP") and last.upper() == "SOCKET"):
         link = _Link(config)
         try:
-            _check_off(config, link.ask(line))
+            _check_off(config, link.query(line))
         finally:
             link.close()
         return
@@ -189,16 +193,16 @@ def switch_generator_off(config: KeysightConfig, within_s: float) -> None:
             fault = str(error) or type(error).__name__
         if time.monotonic() >= end_s:
             raise DeviceError(
-                f"The connection to the function generator failed ({fault}), so its output was "
-                "not confirmed off. Check its cable, close other programs that are connected to "
-                f"it, or switch its output off by hand. {config.address}"
+                "Switch the function generator's output off by hand: the connection failed "
+                f"({fault}), so it was not confirmed off. Check its cable, and close other "
+                f"programs that are connected to it. {config.address}"
             )
         time.sleep(_AGAIN_S)
     _check_off(config, answer)
 
 
 def _over_socket(host: str, port: int, line: str, wait_s: float) -> str:
-    """The answer to one line.
+    """Send one line and return the reply.
 
     Raises:
         OSError: none.
@@ -232,16 +236,16 @@ def _check_off(config: KeysightConfig, answer: str) -> None:
 
 
 class KeysightGenerator:
-    """One channel: fulfils `FunctionGenerator` and `ReportsOutputState`.
+    """One channel; implements `FunctionGenerator` and `ReportsOutputState`.
 
     Opening resets the instrument with all of its channels and leaves the output off.
 
     Args:
         config: section `generator` of the rig file.
     Raises:
-        DeviceError: no driver, no answer, a setting that does not read back, or an error in the
-            instrument's queue.
-        InputError: another instrument than the rig file names.
+        DeviceError: The driver is missing, there is no reply, a setting does not read back, or the
+            instrument reports an error.
+        InputError: The instrument is not the one that the rig file names.
     """
 
     def __init__(self, config: KeysightConfig) -> None:
@@ -260,25 +264,25 @@ class KeysightGenerator:
         return self._link.driver.channels[self._config.channel]
 
     def _prepare(self) -> None:
-        """Off; reset; the load before the amplitudes that depend on it; no offset."""
+        """Switch off, reset, then set the load before the amplitudes that depend on it."""
         try:
             self._set_off()
             self._link.patience(max(_RESET_S, self._config.timeout_s))
-            self._link.ask("*RST;*CLS;*OPC?")
+            self._link.query("*RST;*CLS;*OPC?")
             self._link.patience(self._config.timeout_s)
             channel = self._channel
             channel.output_load = self._config.load
             channel.shape = "SIN"
             channel.amplitude_unit = "VPP"
             channel.offset = 0.0
-            load_ohm = float(self._link.ask(f"OUTP{self._config.channel}:LOAD?"))
+            load_ohm = float(self._link.query(f"OUTP{self._config.channel}:LOAD?"))
             unit = str(channel.amplitude_unit).strip().upper()
             shape = str(channel.shape).strip().upper()
             offset_v = float(channel.offset)
-            rest = self._rest()
+            rest = self._other_settings()
             errors = self._link.errors()
         except Exception as error:
-            raise self._link.dead(error) from None
+            raise self._link.no_reply(error) from None
         wanted_ohm = math.inf if self._config.load == "INF" else float(self._config.load)
         measured_ohm = math.inf if load_ohm > _OPEN_LOAD_OHM else load_ohm
         self._confirm("load in ohm", wanted_ohm, measured_ohm)
@@ -286,7 +290,7 @@ class KeysightGenerator:
         if unit != "VPP" or shape != "SIN":
             raise DeviceError(
                 f"The function generator reports {shape} in {unit} after SIN in VPP was set. "
-                f"Switch it to remote control. {self._config.address}"
+                f"Switch it to remote control, then run the command again. {self._config.address}"
             )
         self._judge(rest, errors)
         if not self.is_off():
@@ -295,17 +299,17 @@ class KeysightGenerator:
                 f"{self._config.address}"
             )
 
-    def _rest(self) -> str:
-        """What it says of everything else that changes its output."""
-        return self._link.ask(rest_question(self._config.channel, self._link.channels))
+    def _other_settings(self) -> str:
+        """Query all other settings that change its output."""
+        return self._link.query(settings_query(self._config.channel, self._link.channels))
 
     def _judge(self, rest: str, errors: list[str]) -> None:
-        """Refuse a signal that is not the one that was set.
+        """Check that the signal is the one that was set; otherwise switch it off.
 
         Raises:
-            DeviceError: something stands otherwise, or the instrument reports errors; it is off.
+            DeviceError: A setting differs, or the instrument reports errors; the output is off.
         """
-        fault = check_rest(rest, self._link.channels, self._config.load)
+        fault = check_settings(rest, self._link.channels, self._config.load)
         if errors:
             fault = f"it reports {'; '.join(errors)}"
         if fault:
@@ -325,20 +329,21 @@ class KeysightGenerator:
             self.off()
             reported = f" and it reports {'; '.join(errors)}" if errors else ""
             raise DeviceError(
-                f"The function generator's {what} reads back as {found:g}, set was {wanted:g}"
-                f"{reported}; its output is off. Look at its front panel for an error. "
+                f"The function generator's {what} was set to {wanted:g} but reads back as {found:g}"
+                f"{reported}; its output is off. Check its front panel for an error. "
                 f"{self._config.address}"
             )
 
     # ---- FunctionGenerator ---------------------------------------------------------------------
 
     def sine(self, frequency_hz: float, amplitude_v: float) -> None:
-        """See `haselab.rig.FunctionGenerator`; an amplitude of 0 is the output off.
+        """See `haselab.rig.FunctionGenerator`; an amplitude of 0 switches the output off.
 
         Raises:
-            LimitError: beyond the rig file or the instrument; the old sine stays.
-            DeviceError: no answer, a setting that does not read back, a signal that somebody has
-                changed at the front panel, or an error in the queue; the output is off.
+            LimitError: The sine is outside the limits of rig file or instrument, and is not
+                changed.
+            DeviceError: There is no reply, a setting does not read back, the signal was changed at
+                the front panel, or the instrument reports an error; the output is off.
         """
         config = self._config
         vpp = 2.0 * amplitude_v / config.volt_per_volt
@@ -357,14 +362,14 @@ class KeysightGenerator:
         try:
             channel = self._channel
             channel.frequency = frequency_hz
-            # Its unit goes with it: one that was set at the panel must not come out, nor for ms.
+            # Send the unit too: one set at the front panel must never take effect.
             self._link.driver.write(f"SOUR{config.channel}:VOLT {vpp:.6f} VPP")
             measured_hz, measured_vpp = float(channel.frequency), float(channel.amplitude)
-            rest, errors = self._rest(), self._link.errors()
+            rest, errors = self._other_settings(), self._link.errors()
         except Exception as error:
             self.off()
-            raise self._link.dead(error) from None
-        self._judge(rest, [])  # first: the unit of the amplitude
+            raise self._link.no_reply(error) from None
+        self._judge(rest, [])  # first, because it checks the unit of the amplitude
         self._confirm("frequency in Hz", frequency_hz, measured_hz)
         self._confirm("amplitude in Vpp", vpp, measured_vpp)
         self._judge(rest, errors)
@@ -376,25 +381,25 @@ class KeysightGenerator:
             state = self._is_on()
         except Exception as error:
             self.off()
-            raise self._link.dead(error) from None
+            raise self._link.no_reply(error) from None
         if state is not on:
             self.off()
             raise DeviceError(
-                f"The function generator's output is {'on' if state else 'off'}, set was "
-                f"{'on' if on else 'off'}. Look at its front panel. {self._config.address}"
+                f"The function generator's output was switched {'on' if on else 'off'} but is "
+                f"{'on' if state else 'off'}. Check its front panel. {self._config.address}"
             )
 
     def _is_on(self) -> bool:
-        return self._link.ask(f"OUTP{self._config.channel}?").upper() not in _OFF
+        return self._link.query(f"OUTP{self._config.channel}?").upper() not in _OFF
 
     def _set_off(self) -> None:
         self._link.driver.write(f"OUTP{self._config.channel} OFF")
 
     def off(self) -> None:
-        """See `haselab.rig.FunctionGenerator`: `OUTP OFF`, once more where it is not confirmed.
+        """See `haselab.rig.FunctionGenerator`: `OUTP OFF`, repeated if it is not confirmed.
 
-        Setting and question go in one line at first: a question sent by itself waits for the
-        receipt of the setting, 40 ms over TCP.
+        Setting and query are sent in one line first: a separate query waits for the
+        acknowledgement of the setting, 40 ms over TCP.
         """
         if quietly(self._off_in_one_line) is None:
             return
@@ -403,21 +408,21 @@ class KeysightGenerator:
 
     def _off_in_one_line(self) -> None:
         output = f"OUTP{self._config.channel}"
-        if self._link.ask(f"{output} OFF;:{output}?").upper() not in _OFF:
-            raise self._link.dead("the output is on after OUTP OFF")
+        if self._link.query(f"{output} OFF;:{output}?").upper() not in _OFF:
+            raise self._link.no_reply("the output is on after OUTP OFF")
 
     def _check_off(self) -> None:
         if self._is_on():
-            raise self._link.dead("the output is on after OUTP OFF")
+            raise self._link.no_reply("the output is on after OUTP OFF")
 
     def is_off(self) -> bool:
         """See `haselab.rig.ReportsOutputState`."""
         try:
             return not self._is_on()
         except Exception as error:
-            raise self._link.dead(error) from None
+            raise self._link.no_reply(error) from None
 
     def close(self) -> None:
-        """Output off, connection closed. Never raises."""
+        """Switch the output off and close the connection. Never raises."""
         self.off()
         self._link.close()

@@ -22,7 +22,7 @@ class KeysightInstrument(GeneratorInstrument[KeysightConfig]):
     config = KeysightConfig
     packages = ("PyVISA", "PyVISA-py", "PyMeasure")
     purpose = "function generators"
-    shutdown_attempts = 1  # it takes few connections, and `shut_down` tries again by itself
+    shutdown_attempts = 1  # it accepts few connections, and `shut_down` retries by itself
 
     def check_driver(self) -> list[str]:
         """See `Instrument`."""

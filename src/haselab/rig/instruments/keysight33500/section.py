@@ -19,5 +19,5 @@ class KeysightConfig(GeneratorConfig):
     serial_number: str | None = Field(None, description="third field of *IDN?")
     channel: Literal[1, 2] = 1
     load: Literal["INF", "50"] = "INF"
-    volt_per_volt: float = Field(1.0, gt=0, description="at the amplifier's input per volt set")
+    volt_per_volt: float = Field(1.0, gt=0, description="V at the amplifier's input per V set")
     timeout_s: float = Field(1.0, gt=0, le=30)

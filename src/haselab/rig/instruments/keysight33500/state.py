@@ -1,4 +1,4 @@
-"""Settings other than frequency and amplitude that change a 33500B's output.
+"""Check the settings other than frequency and amplitude that change a 33500B's output.
 
 Source: 33500 Series Operating and Service Guide (33500-90901), the subsystems named below. The
 defaults of `*RST` are those of each command's table there.
@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["check_rest", "is_two_channel", "rest_question"]
+__all__ = ["check_settings", "is_two_channel", "settings_query"]
 
-_SETTINGS = (  # header after SOURce, answers at rest, what it is otherwise
+_SETTINGS = (  # header after SOURce, replies without effect, text for any other reply
     ("BURS:STAT", {"0", "OFF"}, "burst mode is on"),
     ("SWE:STAT", {"0", "OFF"}, "a frequency sweep is on"),
     ("FREQ:MODE", {"CW", "FIX"}, "its frequency follows a sweep or a list"),
@@ -27,14 +27,14 @@ _OUTPUT = (
     ("MODE", {"NORM"}, "its output is gated by the trigger input"),
     ("POL", {"NORM"}, "its output is inverted"),
 )
-_SIGNAL = (  # question, its number of the channel in braces
+_SIGNAL = (  # query with braces for the channel
     "OUTP{}:LOAD?",  # the amplitude is stated for this load
     "SOUR{}:VOLT:UNIT?",
     "SOUR{}:FUNC?",
     "SOUR{}:VOLT:OFFS?",
 )
 _OPEN_LOAD_OHM = 1e30  # the answer to a load of INF is 9.9E+37
-_NO_OFFSET_V = 1e-4  # the panel's smallest step (inferred): 0.5 V behind an amplifier of 5000 V/V
+_NO_OFFSET_V = 1e-4  # the panel's smallest step (inferred): 0.5 V after an amplifier of 5000 V/V
 _COUPLED = (  # of an instrument with two channels
     ("FREQ:COUP:STAT", {"0", "OFF"}, "the frequencies of both channels are coupled"),
     ("VOLT:COUP:STAT", {"0", "OFF"}, "the amplitudes of both channels are coupled"),
@@ -56,42 +56,42 @@ def is_two_channel(model: str) -> bool:
     return bool(number) and int(number) % 2 == 0
 
 
-def _questions(channels: int) -> tuple[tuple[str, set[str], str], ...]:
+def _queries(channels: int) -> tuple[tuple[str, set[str], str], ...]:
     return (*_OUTPUT, *_SETTINGS, *(_COUPLED if channels == 2 else ()))
 
 
-def rest_question(channel: int, channels: int) -> str:
-    """One line that asks for all of it.
+def settings_query(channel: int, channels: int) -> str:
+    """Build one line that queries all of these settings.
 
     Args:
         channel: whose output is used.
         channels: of the instrument.
     """
     outputs = [f"OUTP{channel}:{header}?" for header, _, _ in _OUTPUT]
-    settings = [f"SOUR{channel}:{header}?" for header, _, _ in _questions(channels)[len(_OUTPUT) :]]
+    settings = [f"SOUR{channel}:{header}?" for header, _, _ in _queries(channels)[len(_OUTPUT) :]]
     return ";:".join([*(each.format(channel) for each in _SIGNAL), *outputs, *settings])
 
 
-def check_rest(answer: str, channels: int, load: str) -> str:
-    """What of it changes the output.
+def check_settings(answer: str, channels: int, load: str) -> str:
+    """Find the settings that change the output.
 
     Args:
-        answer: to `rest_question`.
+        answer: reply to `settings_query`.
         channels: of the instrument.
         load: as in the rig file: INF, or ohms.
     Returns:
-        What is wrong; empty if nothing is.
+        What is wrong, or an empty text.
     Example:
-        >>> check_rest("9.9E+37;VPP;SIN;0;NORM;NORM;1;0;CW;0;0;0;0;0;0;0;0", 1, "INF")
+        >>> check_settings("9.9E+37;VPP;SIN;0;NORM;NORM;1;0;CW;0;0;0;0;0;0;0;0", 1, "INF")
         'burst mode is on'
-        >>> check_rest("50;VRMS;SIN;0.3;NORM;NORM;0;0;CW;0;0;0;0;0;0;0;0", 1, "50")
+        >>> check_settings("50;VRMS;SIN;0.3;NORM;NORM;0;0;CW;0;0;0;0;0;0;0;0", 1, "50")
         'its amplitude is in VRMS, an offset of 0.3 V is added'
     """
     reported = [part.strip().upper() for part in answer.split(";")]
-    questions = _questions(channels)
-    asked = len(_SIGNAL) + len(questions)
-    if len(reported) != asked:
-        return f"{len(reported)} of {asked} settings were answered"
+    questions = _queries(channels)
+    wanted = len(_SIGNAL) + len(questions)
+    if len(reported) != wanted:
+        return f"{len(reported)} of {wanted} settings were reported"
     found = _signal(reported[: len(_SIGNAL)], load)
     rest_reported = reported[len(_SIGNAL) :]
     found += [
@@ -103,7 +103,7 @@ def check_rest(answer: str, channels: int, load: str) -> str:
 
 
 def _signal(reported: list[str], load: str) -> list[str]:
-    """What differs of load, unit, waveform and offset."""
+    """Find differences of load, unit, waveform and offset."""
     ohm, unit, shape, offset_v = (
         _number(reported[0]),
         reported[1],
@@ -117,7 +117,7 @@ def _signal(reported: list[str], load: str) -> list[str]:
         found.append(f"its amplitude is in {unit}")
     if shape != "SIN":
         found.append(f"its waveform is {shape}")
-    if not abs(offset_v) <= _NO_OFFSET_V:  # also where it is no number
+    if not abs(offset_v) <= _NO_OFFSET_V:  # also if it is not a number
         found.append(f"an offset of {offset_v:g} V is added")
     return found
 

@@ -1,11 +1,11 @@
 """NI-DAQmx as source and acquisition: blocks without gaps, outputs clocked by the inputs.
 
-The inputs run for as long as the bench is open. A counter that starts with them divides the clock
-that theirs comes from by the length of a block, and clocks the output, so that each output begins
-at the same sample of its block: one value is queued for every block that is read. Where no block is
-read the output stands still. Between experiments blocks may be passed over; while `keep` is on,
-none may: an output that comes too late is then left out and counted, the output stands meanwhile,
-and the blocks go on.
+The inputs run as long as the bench is open. A counter that starts with them divides their timebase
+by the length of a block and clocks the output, so that each output begins at the same sample of its
+block: one value is queued for every block that is read. While no block is read, the output is
+constant. Between experiments blocks may be skipped; while `keep` is on, no block is skipped: an
+output that comes too late is skipped and counted, the output is constant meanwhile, and the blocks
+continue.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ from haselab.rig.instruments.sections import ExposureConfig
 
 __all__ = ["NidaqBoard"]
 
-_PASS_BLOCKS = 50  # that pass in one call while nobody reads: half a second, for Ctrl-C's sake
-_STARTS = 12  # trials to start the output in step
-_LOOKS = 100  # at the device's counts, until both belong to one block
-_LEAD, _AT_ONCE = 50, 10  # known values that wait in the device, and that one call takes there
-_FEWEST = 2  # values that a stream is started with
-_USB_LOOKS = 8  # packets after a start over USB at which the device's counts are looked at
+# most blocks per call of `pass_time` without reading: 0.5 s, so that Ctrl-C works
+_PASS_BLOCKS = 50
+_STARTS = 12  # attempts to start the output synchronously
+_LOOKS = 100  # readings of the device's counts, until both belong to one block
+_LEAD, _AT_ONCE = 50, 10  # known values queued in the device, and most that one call queues
+_FEWEST = 2  # number of values with which a stream is started
+_USB_LOOKS = 8  # packets after a start over USB after which the device's counts are read
 
 
 class NidaqBoard:
@@ -46,12 +47,12 @@ class NidaqBoard:
         config: section `daq` of the rig file.
         limits: of the drive output.
         monitor_gain: volts at the voltage monitor per volt of drive, for the read-back.
-        exposure: line on which a camera says that it exposes; None: there is none.
+        exposure: line that signals a camera's exposures; None: there is none.
         link: to the device, closed with the board; None: it is made here.
     Raises:
-        DeviceError: no driver, no device, or it refuses the configuration.
-        InputError: another device than the rig file names; a rate that the block clock cannot
-            divide; another skew than the device's.
+        DeviceError: Driver or device is missing, or the device refuses the configuration.
+        InputError: The device is not the one that the rig file names, or the rate does not divide
+            the timebase, or the skew is not the device's.
     """
 
     def __init__(
@@ -67,16 +68,16 @@ class NidaqBoard:
         self._monitor_gain = monitor_gain
         self._volts = np.empty((2, config.block_samples))
         self._one = np.empty((2, 1))
-        self._requested_v = 0.0  # by the last write
-        self._queued_v = 0.0  # the last value that the device has been given
-        self._coming: deque[float] = deque()  # known values of the blocks after those given
-        self._early: deque[float] = deque()  # values that were given before their block was read
+        self._requested_v = 0.0  # of the last write
+        self._queued_v = 0.0  # last value that was written to the device
+        self._coming: deque[float] = deque()  # known values of later blocks
+        self._early: deque[float] = deque()  # values that were written before their block was read
         self._silent_until = 0  # outputs of blocks before this sample came too late
         self.missed_outputs = 0
-        self.fetched_s = 0.0  # end of a block that has come in; `time_s` may be ahead of it
-        self._position = 0  # samples read or passed over since the start
-        self._place = 0  # where the driver reads on
-        self._offset = 0  # that it has to add
+        self.fetched_s = 0.0  # end of the last fetched block; `time_s` may be later
+        self._position = 0  # samples read or skipped since the start
+        self._place = 0  # position at which the driver continues to read
+        self._offset = 0  # offset that it adds
         self._kept = False
         self._streaming = False
         self._exposures: ExposureCounter | None = None
@@ -85,7 +86,7 @@ class NidaqBoard:
         try:
             self._link.check_serial()
             self._tasks = NidaqTasks(self._link, config)
-            with self._link.words():
+            with self._link.translated_errors():
                 if exposure is not None:
                     self._exposures = ExposureCounter(self._link, config, exposure)
                 self._open()
@@ -112,10 +113,10 @@ class NidaqBoard:
             self._exposures.start(self._tasks.first_sample_s(self._inputs))
         self._inputs.start()
         if self._link.usb:
-            self._idle = IdlePoll(self._ask_aside)
+            self._idle = IdlePoll(self._query_idle)
 
     def close(self) -> None:
-        """0 V, then let go of the board. Never raises."""
+        """Go to 0 V, then close the board. Never raises."""
         self.zero()
         if self._idle is not None:
             self._idle.close()
@@ -123,22 +124,23 @@ class NidaqBoard:
 
     @property
     def exposures(self) -> ExposureLog | None:
-        """When the camera exposed, as far as blocks have been read; None: not recorded."""
+        """Exposures of the camera in the blocks read so far; None if they are not recorded."""
         return None if self._exposures is None else self._exposures.log
 
     # ---- VoltageSource -------------------------------------------------------------------------
 
     def write(self, voltage_v: float) -> None:
-        """See `haselab.rig.VoltageSource`: given to the device when the next block is read."""
+        """See `haselab.rig.VoltageSource`; written to the device when the next block is read."""
         self._limits.check(voltage_v)
         self._requested_v = float(voltage_v)
 
     def zero(self) -> None:
-        """See `haselab.rig.VoltageSource`: what is queued is thrown away. Never raises."""
+        """See `haselab.rig.VoltageSource`; discards what is queued. Never raises."""
         self._requested_v = self._queued_v = 0.0
         self._forget()
-        self._let_go()
-        if quietly(lambda: self._put_out(0.0)) is not None:  # whoever holds the output loses it
+        self._end_stream()
+        # take the output from any program that holds it
+        if quietly(lambda: self._put_out(0.0)) is not None:
             quietly(self._link.reset)
             quietly(lambda: self._put_out(0.0))
 
@@ -156,9 +158,9 @@ class NidaqBoard:
         self._early.clear()
 
     def read_back(self) -> float:
-        """See `haselab.rig.ReportsOutput`: mean of the voltage monitor over a new block."""
+        """See `haselab.rig.ReportsOutput`; mean of the voltage monitor over a new block."""
         self.pause()
-        self.read()  # may have begun before the output went where it stands
+        self.read()  # this block may have begun before the last change of the output
         codes = self.read()
         self.pause()
         return float(codes[:, 0].mean()) * self._config.volt_per_code / self._monitor_gain
@@ -171,39 +173,39 @@ class NidaqBoard:
         return self._position / self._config.rate_hz
 
     def keep(self, on: bool) -> None:
-        """Whether every block is wanted; without it, blocks that nobody reads are passed over."""
+        """Start or stop keeping every block; otherwise blocks that are not read are skipped."""
         self._kept = on
         if not on:
             self.pause()
         elif not self._streaming:
             self.catch_up()
-            with self._link.words():
+            with self._link.translated_errors():
                 self._position = self._start_stream()
 
     def pause(self) -> None:
-        """The output stands at the last one asked for; blocks pass until the next one is read."""
-        self._stand_at(self._requested_v)
+        """Hold the last requested output; blocks are skipped until the next one is read."""
+        self._hold_output(self._requested_v)
 
-    def _stand_at(self, voltage_v: float) -> None:
+    def _hold_output(self, voltage_v: float) -> None:
         self._forget()
         if not self._streaming and voltage_v == self._queued_v:
             return
-        self._let_go()
-        with self._link.words():
+        self._end_stream()
+        with self._link.translated_errors():
             self._put_out(voltage_v)
         self._queued_v = voltage_v
 
-    def _let_go(self) -> None:
-        """End the stream. Writing has committed its task: stopped, it would still hold the output.
+    def _end_stream(self) -> None:
+        """End the stream and its task, which would hold the output even when stopped.
 
-        Never raises: stopping reports an underflow, which idle time may bring.
+        Never raises: stopping reports an underflow, which idle time may cause.
         """
         self._streaming = False
         quietly(self._stream.stop)
         quietly(lambda: self._stream.control(self._link.constants.TaskMode.TASK_UNRESERVE))
 
     def _put_out(self, voltage_v: float) -> None:
-        """On demand: the device puts it out when the call arrives, and holds it."""
+        """Write the output on demand; the device puts it out at once and holds it."""
         try:
             self._at_once.write_one_sample(voltage_v, self._config.timeout_s)
         finally:
@@ -211,40 +213,41 @@ class NidaqBoard:
             quietly(lambda: self._static.control(self._link.constants.TaskMode.TASK_UNRESERVE))
 
     def catch_up(self) -> None:
-        """Pass over what has come in since the last block, up to the last whole one."""
-        with self._link.words():
+        """Skip what has arrived since the last block, up to the last complete one."""
+        with self._link.translated_errors():
             passed = (self._acquired() - self._position) // self._config.block_samples
         if passed > 0:
-            self._stand_at(self._queued_v)
+            self._hold_output(self._queued_v)
             self._position += passed * self._config.block_samples
             self.fetched_s = self._position / self._config.rate_hz
-        if self._exposures is not None:  # even so: `pass_time` has not looked, and a camera starts
-            with self._link.words():
+        # still needed: `pass_time` has not read it, and a camera starts
+        if self._exposures is not None:
+            with self._link.translated_errors():
                 self._exposures.collect(self._position)
 
     def acquired(self) -> int:
-        """Samples that have come in since the start, by the driver's count.
+        """Number of samples acquired since the start, counted by the driver.
 
         Raises:
-            DeviceError: the board does not answer.
+            DeviceError: The board does not reply.
         """
-        with self._link.words():
+        with self._link.translated_errors():
             return self._acquired()
 
     def _acquired(self) -> int:
         if self._idle is not None:
-            self._idle.asked()
+            self._idle.note_query()
         return int(self._inputs.in_stream.total_samp_per_chan_acquired)
 
-    def _ask_aside(self) -> int:
-        self._link.asks_aside()
+    def _query_idle(self) -> int:
+        self._link.ignore_silence()
         return int(self._inputs.in_stream.total_samp_per_chan_acquired)
 
     def read(self) -> NDArray[np.int16]:
-        """See `haselab.rig.Acquisition`. Readings beyond the range stand at its end."""
+        """See `haselab.rig.Acquisition`. Readings outside the range are set to its end."""
         if not (self._kept and self._streaming):
             self.catch_up()
-        with self._link.words():
+        with self._link.translated_errors():
             if not self._streaming:
                 self._position = self._start_stream()
             self._give()
@@ -256,13 +259,13 @@ class NidaqBoard:
         return np.clip(codes, -top, top - 1).astype(np.int16, order="C")
 
     def _give(self) -> None:
-        """Queue the output of the block that comes, and those of later ones that are known."""
+        """Queue the output of the next block, and known outputs of later blocks."""
         values: list[float] = []
         if self._early:
             if self._early.popleft() != self._requested_v:
                 raise DeviceError(
                     f"NI board {self._config.device}: the queued output differs from the requested "
-                    f"one, {self._requested_v:g} V. This is a bug: report it."
+                    f"one, {self._requested_v:g} V. This is a bug in haselab. Please report it."
                 )
         else:
             if self._coming:
@@ -281,25 +284,25 @@ class NidaqBoard:
         try:
             self._ahead.write_many_sample(np.array(values + some), self._config.timeout_s)
         except Exception as error:
-            if not self._link.ran_out(error):
+            if not self._link.is_late_output(error):
                 raise
-            self._go_on(bool(values))
+            self._restart_stream(bool(values))
             return
         self._queued_v = (values + some)[-1]
         self._early.extend(some)
         for _ in some:
             self._coming.popleft()
 
-    def _go_on(self, owed: bool) -> None:
-        """The queue ran out, all that it held was put out: start the output anew.
+    def _restart_stream(self, owed: bool) -> None:
+        """Restart the output after its queue ran out.
 
-        The blocks until then are passed over, or where none may be their outputs are left out.
+        The blocks until then are skipped; if all blocks are kept, only their outputs are skipped.
 
         Args:
-            owed: the device has not been given the output of the block that comes.
+            owed: whether the output of the next block has not been written yet.
         """
         early, coming = self._early.copy(), self._coming.copy()
-        self._stand_at(self._queued_v)
+        self._hold_output(self._queued_v)
         if not self._kept:
             self._position = self._start_stream()
             self._ahead.write_many_sample(np.array([self._requested_v]), self._config.timeout_s)
@@ -310,13 +313,13 @@ class NidaqBoard:
         self.missed_outputs += owed
 
     def _start_stream(self) -> int:
-        """Start the output so that it is known which edge of its clock puts out the first value.
+        """Start the output so that the clock edge of its first value is known.
 
-        The device counts on while the calls are under way: unless a block has just begun, it is
-        waited for until a quarter of a block after an edge. A start that took until the next edge
-        is looked at by the device's own counts, or taken back; the next trial has twice as many
-        values of the standing output to live on. Over USB both the start and the counts are late by
-        what waits on the bus, so there the device's own counts decide, once a value has come out.
+        The device keeps counting during the calls, so unless a block has just begun, this waits
+        until a quarter of a block after an edge. A start that took until the next edge is resolved
+        from the device's counts, or undone; the next attempt queues twice as many values of the
+        present output. Over USB both the start and the counts are delayed by the bus, so there the
+        device's counts decide, once a value has been put out.
 
         Returns:
             First sample of the first block whose output will not be late.
@@ -343,22 +346,22 @@ class NidaqBoard:
                 first = self._first_edge(queued)
             if first is not None:
                 return first - switch + (queued - ahead) * block
-            self._stand_at(self._queued_v)
+            self._hold_output(self._queued_v)
         slow, advice = "the computer", "Close other programs."
         if usb:
             slow = "the computer or the USB connection"
-            advice = "Close other programs, use a USB port of its own, or raise daq.block_samples."
+            advice = "Close other programs, use a separate USB port, or raise daq.block_samples."
         raise DeviceError(
-            f"NI board {self._config.device}: the output could not be started in step with the "
-            f"blocks in {_STARTS} trials: {slow} is too slow. {advice}"
+            f"NI board {self._config.device}: the output could not be synchronised with the blocks "
+            f"in {_STARTS} attempts, because {slow} is too slow. {advice}"
         )
 
     def _first_edge_usb(self, queued: int) -> int | None:
-        """The same where samples come late and in packets: looked at when a packet has just come.
+        """Find the first edge if samples are late and in packets, just after a packet arrived.
 
-        Its last sample is then new, so the counts belong together. A look until half a block after
-        an edge leaves half a block for a packet that was on its way, and for writing the next value
-        where only one is left; where no packet comes then, two other looks have to agree.
+        Its last sample is then new, so the counts belong together. A reading up to half a block
+        after an edge leaves half a block for a packet on its way, and for writing the next value
+        if only one is left; if no packet arrives then, two other readings must agree.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
         others: list[int] = []
@@ -379,19 +382,19 @@ class NidaqBoard:
                     if others[-2:] == [first, first]:
                         return first
         except Exception as error:
-            if not (isinstance(error, DeviceError) or self._link.ran_out(error)):
+            if not (isinstance(error, DeviceError) or self._link.is_late_output(error)):
                 raise
         return None
 
     def _first_edge(self, queued: int) -> int | None:
-        """Sample of the edge that put out, or will, the first value of a stream that runs.
+        """Find the sample of the edge that puts out the first value of a running stream.
 
-        It follows from how many values and readings there have been, where both belong to one block
-        beyond doubt; None: they do not, or the values do not last for the next block.
+        It follows from the counts of values and readings if both certainly belong to one block;
+        None if they do not, or if too few values are left for the next block.
         """
         block, switch = self._config.block_samples, self._config.switch_in_block
         try:
-            with self._link.words():
+            with self._link.translated_errors():
                 for _ in range(_LOOKS):
                     edges, since = divmod(self._acquired() - switch, block)
                     put_out = int(self._stream.out_stream.total_samp_per_chan_generated)
@@ -400,12 +403,12 @@ class NidaqBoard:
                         return None
                     if block // 8 <= since <= after <= block - block // 8:
                         return (edges + 1 - put_out) * block + switch
-        except DeviceError:  # it ran out meanwhile
+        except DeviceError:  # the stream ran out meanwhile
             pass
         return None
 
     def _wait_for(self, sample: int) -> None:
-        """Wait until this many samples have come in, by the device's own count."""
+        """Wait until the device has counted this many samples."""
         self._fetch_at(sample - 1, self._one)
 
     def _fetch(self) -> None:
@@ -414,25 +417,25 @@ class NidaqBoard:
         self.fetched_s = self._position / self._config.rate_hz
 
     def _fetch_at(self, start: int, target: NDArray[np.float64]) -> None:
-        """Readings from this sample on; the driver's own place is moved where it is not there."""
+        """Read from this sample on; move the driver's read position if necessary."""
         config, samples = self._config, target.shape[1]
         offset = start - self._place
         if offset != self._offset:
             self._inputs.in_stream.offset = offset
             self._offset = offset
         if self._idle is not None:
-            self._idle.asked()
+            self._idle.note_query()
         wait_s = max(offset + samples, 0) / config.rate_hz + config.timeout_s
         self._reader.read_many_sample(target, samples, timeout=wait_s)
         self._place = start + samples
 
     def pass_time(self, duration_s: float) -> None:
-        """Let whole blocks pass, `duration_s` at least: read while they are kept, else skipped.
+        """Let whole blocks pass for at least `duration_s`; read them if kept, else skip them.
 
         Args:
             duration_s: in s.
         Raises:
-            DeviceError: the board does not go on.
+            DeviceError: The board does not continue.
         """
         blocks = math.ceil(duration_s * self._config.rate_hz / self._config.block_samples - 1e-9)
         if self._kept:
@@ -444,6 +447,6 @@ class NidaqBoard:
         while blocks > 0:
             some = min(blocks, _PASS_BLOCKS)
             self._position += (some - 1) * self._config.block_samples
-            with self._link.words():
+            with self._link.translated_errors():
                 self._fetch()
             blocks -= some

@@ -1,8 +1,8 @@
-"""When a camera exposed, by a counter of the NI board: each edge latches the count of a clock.
+"""Time a camera's exposures with a counter of the NI board, which each edge latches.
 
 The counter counts the 20 MHz timebase from the start of the inputs on, and the camera's exposure
-line clocks what is kept of it. So an exposure needs no analogue input and is known to 50 ns,
-however late it is read.
+line latches the count. So an exposure needs no analogue input and is known to 50 ns, however late
+it is read.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ __all__ = ["ExposureCounter", "unrolled"]
 _FASTEST_HZ = 10e3  # of the frames, for the driver's buffer
 _BUFFER = 100_000
 _ROUND = 1 << 32  # a counter has 32 bits: 215 s of 20 MHz
-_UNSURE_S = 40.0  # after that long without a look it is not known how often the counter overflowed
+_UNSURE_S = 40.0  # after so long without reading, the number of counter overflows is unknown
 _TICK_S = 1.0 / TIMEBASE_HZ
 _LONGEST_START_S = 0.3e-6  # from the start trigger to the first conversion, if not reported
 
 
 class ExposureCounter:
-    """Tells a log of the exposures of one camera; `task` is the driver's.
+    """Adds the exposures of one camera to a log; `task` is the driver's.
 
     Args:
         link: to the board.
         daq: section `daq` of the rig file.
         exposure: section `exposure`.
     Raises:
-        InputError: the sample rate does not divide the timebase.
+        InputError: The sample rate does not divide the timebase.
     """
 
     def __init__(self, link: NidaqLink, daq: NidaqConfig, exposure: ExposureConfig) -> None:
@@ -42,9 +42,10 @@ class ExposureCounter:
         self._daq = daq
         self._half_s = 0.5 * exposure.duration_s
         self._start_s = 0.0  # from the start trigger to the first sample
-        self._looked = 0  # samples there were at the last look
+        self._looked = 0  # number of samples at the last reading
         self._logged = 0  # exposures added or dropped
-        self._place = self._offset = 0  # where the driver reads on, and what it adds
+        # position at which the driver continues to read, and its offset
+        self._place = self._offset = 0
         constants, tasks = link.constants, NidaqTasks(link, daq)
         self._ticks = tasks.ticks
         self.task = link.task()
@@ -57,7 +58,7 @@ class ExposureCounter:
             sample_mode=constants.AcquisitionType.CONTINUOUS,
             samps_per_chan=_BUFFER,
         )
-        # A task that counts has no start trigger; this is its counterpart.
+        # A counting task has no start trigger; this is its counterpart.
         arm = self.task.triggers.arm_start_trigger
         arm.trig_type = constants.TriggerType.DIGITAL_EDGE
         arm.dig_edge_src = tasks.start_trigger
@@ -66,10 +67,10 @@ class ExposureCounter:
         self._reader = link.counter_reader(self.task)
 
     def start(self, first_sample_s: float | None) -> None:
-        """Wait for the inputs, which are started after this.
+        """Start before the inputs, and wait for their start trigger.
 
         Args:
-            first_sample_s: from their start trigger to their first sample; None: not known.
+            first_sample_s: from their start trigger to their first sample; None: unknown.
         """
         self._start_s = first_sample_s or 0.0
         if first_sample_s is None:
@@ -77,13 +78,13 @@ class ExposureCounter:
         self.task.start()
 
     def collect(self, position: int) -> None:
-        """Tell the log what has been latched.
+        """Add what has been latched to the log.
 
-        Exposures of a long time in which nobody looked are dropped, since the counter may have gone
-        round: frames of that time are nobody's.
+        After a long time without reading, exposures are dropped, since the counter may have
+        overflowed; frames of that time have no exposure.
 
         Args:
-            position: samples read so far; an edge is added one block after it at the latest.
+            position: number of samples read so far; an edge is added at most one block later.
         """
         total = int(self.task.in_stream.total_samp_per_chan_acquired)
         idle_s = (position - self._looked) / self._daq.rate_hz
@@ -92,7 +93,7 @@ class ExposureCounter:
         self._looked = position
         latched = self._read(total - self._logged)
         settled_s = (position - self._daq.block_samples) / self._daq.rate_hz
-        # An edge lies between the last tick that was counted and the next one.
+        # An edge is between the last counted tick and the next one.
         ticks = unrolled(latched, position * self._ticks) + 0.5
         edges_s = ticks / np.float64(TIMEBASE_HZ) - self._start_s
         self.log.add(edges_s + self._half_s, settled_s + self._half_s)
@@ -111,11 +112,11 @@ class ExposureCounter:
 
 
 def unrolled(latched: NDArray[np.uint32], position: int) -> NDArray[np.int64]:
-    """Counts of a counter that has gone round, nearest to a known one.
+    """Unwrap counts of a counter that overflowed, nearest to a known count.
 
     Args:
-        latched: what the counter showed, shape `(n,)`.
-        position: about what it should have counted.
+        latched: latched counts, shape `(n,)`.
+        position: approximate true count.
     Returns:
         Shape `(n,)`.
     Example:

@@ -1,9 +1,9 @@
-"""Looks at an NI device on USB while nobody reads.
+"""Query an idle NI device on USB, so that it keeps sending.
 
-A USB device that is asked too rarely stops sending, though no buffer has overflowed
+A USB device that is queried too rarely stops sending, though no buffer has overflowed
 (nidaqmx-python, issue 931). Whether `OVERWRITE_UNREAD_SAMPLES` alone prevents that is not
-documented, so a thread asks for the count of samples. It only asks: it reads nothing, moves no
-position and touches no output, and NI-DAQmx allows calls from several threads.
+documented, so a thread queries the number of samples. It reads no samples and does not change
+position or output, and NI-DAQmx allows calls from several threads.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from haselab.rig.drivers import quietly
 __all__ = ["IdlePoll"]
 
 _PERIOD_S = 0.02
-_LEAVE_S = 0.1  # that closing waits for a question under way
+_LEAVE_S = 0.1  # longest wait for a running query when closing
 
 
 class IdlePoll:
-    """Asks in a thread of its own, where nobody else has asked for a while.
+    """Queries the device in a thread if there was no other query for a while.
 
-    It ends with the first question that fails: the next read raises the reason.
+    It ends with the first query that fails: the next read raises the reason.
 
     Args:
-        ask: the question.
-        period_s: longest time without one, in s.
+        ask: the query.
+        period_s: longest time without a query, in s.
     """
 
     def __init__(self, ask: Callable[[], object], period_s: float = _PERIOD_S) -> None:
@@ -37,8 +37,8 @@ class IdlePoll:
         self._thread = threading.Thread(target=self._run, name="nidaq idle poll", daemon=True)
         self._thread.start()
 
-    def asked(self) -> None:
-        """Somebody else has just asked the device."""
+    def note_query(self) -> None:
+        """Note that the device has just been queried elsewhere."""
         self._asked_s = time.monotonic()
 
     def _run(self) -> None:
@@ -49,6 +49,6 @@ class IdlePoll:
                 return
 
     def close(self) -> None:
-        """No more questions. Never raises."""
+        """Stop querying. Never raises."""
         self._ended.set()
         self._thread.join(_LEAVE_S)

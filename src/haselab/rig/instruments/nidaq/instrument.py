@@ -53,7 +53,7 @@ class NidaqInstrument(DaqInstrument[NidaqConfig]):
     def route_checks(
         self, config: NidaqConfig, exposure: ExposureConfig | None, connection: NidaqLink
     ) -> Iterator[CheckResult]:
-        """See `DaqInstrument`: every task is verified, reserved and committed."""
+        """See `DaqInstrument`; verifies, reserves and commits every task."""
         for row in verify_routes(config, exposure, connection):
             found, recommended = "accepted", {}
             if row.skew_s is not None:

@@ -1,4 +1,4 @@
-"""The way to an NI board, by the local driver or NI's gRPC server, and the words of its errors."""
+"""Connect to an NI board by the local driver or NI's gRPC server, and explain its errors."""
 
 from __future__ import annotations
 
@@ -15,62 +15,77 @@ from haselab.rig.instruments.nidaq.section import NidaqConfig
 
 __all__ = ["NidaqLink", "key_of"]
 
-_LATE_READ = "readings were overwritten before they were fetched: the computer was late"
+_LATE_READ = "samples were overwritten before they were read, because the computer was late"
 _RAN_OUT = -200290
 _TOO_FAST = -200332
 _FULL_V = 10.0  # range of the analogue outputs
 _END = re.compile(r"(Source|Destination) Terminal:")  # of a route, in DAQmx's text
-_ROUTE = "the device cannot route a signal as it is needed"
-_ROUTE_ADVICE = "Correct the terminals and counters of the rig file, or use another device."
-_SILENT_S = 2e-3  # for the next call, once a server has not answered: the guardian has to know
-# DAQmx status: what it means here, what to do.
-_WORDS = {
+_ROUTE = "the device cannot route a required signal"
+_ROUTE_ADVICE = "Change the terminals and counters of the rig file, or use another device."
+_SILENT_S = 2e-3  # timeout after a server has not replied once, so that the guardian acts soon
+# DAQmx status: meaning, what to do.
+_EXPLANATIONS = {
     -200279: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
     -200222: (_LATE_READ, "Close other programs, or raise daq.buffer_s."),
-    -200361: ("the device's own memory overflowed: the bus was late", "Use a port of its own."),
+    -200361: (
+        "the device's memory overflowed, because the bus was late",
+        "Use a separate USB port.",
+    ),
     _RAN_OUT: (
-        "an output did not arrive before its time: the computer was late",
+        "an output did not arrive in time, because the computer was late",
         "Close other programs, or raise daq.ahead_blocks.",
     ),
     -200284: (
-        "no readings came in time: the sample clock stands still, or a USB device has stopped",
-        "Check the device and its cable, and open the rig again.",
+        "no samples arrived in time: the sample clock or a USB device has stopped",
+        "Check the device and its cable, then open the rig again.",
     ),
-    -200220: ("no such device", "Correct daq.device: the name that NI MAX or nilsdev shows."),
-    -200170: ("no such channel on this device", "Correct the channels of section daq."),
+    -200220: (
+        "the device does not exist",
+        "Set daq.device to the name that NI MAX or nilsdev shows.",
+    ),
+    -200170: ("the device has no such channel", "Change the channels of section daq."),
     _TOO_FAST: ("the rate exceeds the device's limit for two channels", "Lower daq.rate_hz."),
     -200077: (
-        "a setting is beyond what the device can do",
-        "Correct channels, wiring, range and rate of section daq.",
+        "a setting is outside the device's limits",
+        "Change channels, wiring, range and rate of section daq.",
     ),
     -200292: (
-        "the output's buffer is full: its clock stands still",
+        "the output's buffer is full, because its clock has stopped",
         "Check daq.counter, and that no other program uses it.",
     ),
-    -200462: ("an output was started without values", "Report this."),
-    -200547: ("an output was written to a buffer of unknown size", "Report this."),
-    -200609: ("the output's buffer is too small to start", "Report this."),
+    -200462: (
+        "an output was started without values",
+        "This is a bug in haselab. Please report it.",
+    ),
+    -200547: (
+        "an output was written to a buffer of unknown size",
+        "This is a bug in haselab. Please report it.",
+    ),
+    -200609: (
+        "the output's buffer is too small to start",
+        "This is a bug in haselab. Please report it.",
+    ),
     -89120: (
-        "no such terminal on this device",
-        "Correct exposure.input, daq.counter or exposure.counter.",
+        "the device has no such terminal",
+        "Change exposure.input, daq.counter or exposure.counter.",
     ),
     -89125: (_ROUTE, _ROUTE_ADVICE),
     -89136: (_ROUTE, _ROUTE_ADVICE),
     -89137: (
-        "a route that is needed is in use",
+        "a required route is in use",
         "Close other programs that use the device, or choose another counter.",
     ),
     -89139: (_ROUTE, _ROUTE_ADVICE),
     -50103: (
         "the device is reserved by a program, possibly one that crashed",
-        "Close that program; if there is none, type: haselab rig safe RIG.toml",
+        "Close that program; if there is none, run: haselab rig safe RIG.toml",
     ),
-    -201003: ("the device cannot be reached", "Check its cable and its power."),
+    -201003: ("the device does not respond", "Check its cable and its power."),
 }
 
 
 def key_of(serial_number: str) -> str:
-    """What identifies an NI device on this computer.
+    """Interlock key of an NI device on this computer.
 
     Args:
         serial_number: hexadecimal.
@@ -84,7 +99,7 @@ class NidaqLink:
     Args:
         config: section `daq` of the rig file.
     Raises:
-        DeviceError: no driver, no server, no such device.
+        DeviceError: Driver, server or device is missing.
     """
 
     def __init__(self, config: NidaqConfig) -> None:
@@ -94,32 +109,34 @@ class NidaqLink:
         self.constants = load_driver("nidaqmx.constants", "The NI board")
         self._errors = load_driver("nidaqmx.errors", "The NI board")
         self._channel: Any = None
-        self._aside = threading.local()  # `asks`: this thread's calls are nobody's business
+        # threads whose timeouts are ignored, see `ignore_silence`
+        self._ignoring = threading.local()
         if config.server is not None:
             grpc = load_driver("grpc", "NI's gRPC device server")
             channel = grpc.insecure_channel(config.server)
             self._stack.callback(quietly, channel.close)
-            self._channel = grpc.intercept_channel(channel, _patient(grpc, config, self._aside))
-        with self.words():
+            timeouts = _with_timeouts(grpc, config, self._ignoring)
+            self._channel = grpc.intercept_channel(channel, timeouts)
+        with self.translated_errors():
             device = self._device()
             self.product = str(device.product_type)
             self.serial_number = f"{int(device.serial_num):08X}"
 
     @property
     def key(self) -> str:
-        """What identifies the device on this computer, see `key_of`."""
+        """Interlock key of the device, see `key_of`."""
         return key_of(self.serial_number)
 
     @functools.cached_property
     def usb(self) -> bool:
-        """Samples travel over USB: they come in packets, and late."""
-        with self.words():
+        """Whether samples come over USB, late and in packets."""
+        with self.translated_errors():
             return bool(self._device().bus_type is self.constants.BusType.USB)
 
     @functools.cached_property
     def simultaneous(self) -> bool:
-        """Each input has a converter of its own."""
-        with self.words():
+        """Whether each input has its own converter."""
+        with self.translated_errors():
             return bool(self._device().ai_simultaneous_sampling_supported)
 
     @property
@@ -127,9 +144,9 @@ class NidaqLink:
         """Product and serial number."""
         return f"{self.product}, serial number {self.serial_number}"
 
-    def asks_aside(self) -> None:
-        """Calls of this thread, if they are not answered, do not shorten the wait of others."""
-        self._aside.asks = True
+    def ignore_silence(self) -> None:
+        """Ignore timeouts of this thread's calls, so that they do not shorten those of others."""
+        self._ignoring.timeouts = True
 
     def _options(self, name: str) -> dict[str, Any]:
         if self._channel is None:
@@ -141,81 +158,81 @@ class NidaqLink:
         return system.Device(self._config.device, **self._options(""))
 
     def check_serial(self) -> None:
-        """Refuse another device than the rig file names.
+        """Check that the device is the one that the rig file names.
 
         Raises:
-            InputError: the serial number differs.
+            InputError: The serial number differs.
         """
         wanted = self._config.serial_number
         if wanted is not None and int(wanted, 16) != int(self.serial_number, 16):
             raise InputError(
-                f"Serial number of {self._config.device} = {self.serial_number}, expected {wanted} "
-                f"by the rig file. Connect that device, or correct daq.serial_number."
+                f"{self._config.device} has the serial number {self.serial_number}, but the rig "
+                f"file names {wanted}. Connect that device, or change daq.serial_number."
             )
 
     def task(self) -> Any:
-        """A new task; it is closed with the link."""
+        """Create a task, which is closed with the link."""
         task = self._nidaqmx.Task(**self._options(""))
         self._stack.callback(quietly, task.close)
         return task
 
     def reader(self, task: Any) -> Any:
-        """A reader of all channels of a task into one array."""
+        """Create a reader of all channels of a task into one array."""
         readers = load_driver("nidaqmx.stream_readers", "The NI board")
         reader = readers.AnalogMultiChannelReader(task.in_stream)
-        reader.verify_array_shape = False  # which would ask the device at every block
+        reader.verify_array_shape = False  # it would query the device for every block
         return reader
 
     def counter_reader(self, task: Any) -> Any:
-        """A reader of the one counter of a task."""
+        """Create a reader of the only counter of a task."""
         readers = load_driver("nidaqmx.stream_readers", "The NI board")
         reader = readers.CounterReader(task.in_stream)
         reader.verify_array_shape = False
         return reader
 
     def writer(self, task: Any, *, auto_start: bool) -> Any:
-        """A writer of the one channel of a task."""
+        """Create a writer of the only channel of a task."""
         writers = load_driver("nidaqmx.stream_writers", "The NI board")
         writer = writers.AnalogSingleChannelWriter(task.out_stream, auto_start=auto_start)
         writer.verify_array_shape = False
         return writer
 
-    def ran_out(self, error: Exception) -> bool:
-        """Whether an error of the driver says that an output did not arrive before its time."""
+    def is_late_output(self, error: Exception) -> bool:
+        """Whether a driver error means that an output did not arrive in time."""
         return isinstance(error, self._errors.DaqError) and int(error.error_code) == _RAN_OUT
 
     def reset(self) -> None:
         """Abort all tasks of all programs on the device; its outputs go to their power-up state.
 
         Raises:
-            DeviceError: the device does not answer.
+            DeviceError: The device does not reply.
         """
-        with self.words():
+        with self.translated_errors():
             self._device().reset_device()
 
     def shut_down(self) -> None:
-        """Reset the device, then put out 0 V: a power-up state may be set to another voltage.
+        """Reset the device, then put out 0 V, since its power-up state may be another voltage.
 
         Raises:
-            DeviceError: the device does not answer.
+            DeviceError: The device does not reply.
         """
         self.reset()
-        with self.words():
+        with self.translated_errors():
             task = self.task()
             output = f"{self._config.device}/{self._config.output}"
             task.ao_channels.add_ao_voltage_chan(output, min_val=-_FULL_V, max_val=_FULL_V)
             try:
                 self.writer(task, auto_start=True).write_one_sample(0.0)
             finally:
-                task.stop()  # the output stays, and is not held against another program
+                task.stop()  # the output stays, and is free for other programs
 
     def close(self) -> None:
         """Close tasks and connection. Never raises."""
         self._stack.close()
 
     @contextlib.contextmanager
-    def words(self) -> Iterator[None]:
-        """Turn the driver's errors into one line."""
+    def translated_errors(self) -> Iterator[None]:
+        """Translate the driver's errors into one line with advice."""
         try:
             yield
         except HaselabError:
@@ -223,24 +240,24 @@ class NidaqLink:
         except self._errors.DaqNotFoundError:
             raise DeviceError(
                 "The NI-DAQmx driver is not installed on this computer. Install it from ni.com, or "
-                "name a computer that has it in daq.server."
+                "set daq.server to a computer that has it."
             ) from None
         except self._errors.DaqError as error:
             code = int(error.error_code)
-            what, advice = self._words_of(code, str(error))
+            what, advice = self._explain(code, str(error))
             raise DeviceError(
                 f"NI board {self._config.device}: {what} (status {code}). {advice}"
             ) from None
         except self._errors.Error as error:
             text = str(error).partition("\n")[0]
             raise DeviceError(
-                f"NI board {self._config.device} does not answer ({text}). Start the device "
-                f"server, or correct daq.server. {self._config.server or 'local driver'}"
+                f"NI board {self._config.device} does not reply ({text}). Start the device "
+                f"server, or change daq.server. {self._config.server or 'local driver'}"
             ) from None
 
-    def _words_of(self, code: int, text: str) -> tuple[str, str]:
-        """What a status means here, and what to do."""
-        what, advice = _WORDS.get(code, (text.partition("\n")[0], "See NI's error list."))
+    def _explain(self, code: int, text: str) -> tuple[str, str]:
+        """Return what a status means here, and what to do."""
+        what, advice = _EXPLANATIONS.get(code, (text.partition("\n")[0], "See NI's error list."))
         ends = [line.partition(":")[2].strip() for line in text.splitlines() if _END.match(line)]
         if len(ends) == 2:
             what = f"{what}, {ends[0]} to {ends[1]}"
@@ -252,15 +269,15 @@ class NidaqLink:
                 limit = f"the {self.product}'s limit of {each_hz:g} Hz for two channels"
                 what = f"the rate exceeds {limit}"
                 advice = (
-                    f"Lower daq.rate_hz to {each_hz:g} or less, it is {self._config.rate_hz:g}."
+                    f"daq.rate_hz is {self._config.rate_hz:g}. Lower it to {each_hz:g} or less."
                 )
         return what, advice
 
 
-def _patient(grpc: Any, config: NidaqConfig, aside: threading.local) -> Any:
-    """Ends each call that a silent server does not answer, beyond the time that it asks for."""
+def _with_timeouts(grpc: Any, config: NidaqConfig, ignoring: threading.local) -> Any:
+    """Make an interceptor that ends calls to which a server does not reply in time."""
 
-    class Patient(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
+    class Timeouts(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc]
         silent = False  # at the last call
 
         def intercept_unary_unary(self, go_on: Any, call: Any, request: Any) -> Any:
@@ -270,8 +287,8 @@ def _patient(grpc: Any, config: NidaqConfig, aside: threading.local) -> Any:
                 limit_s = min(limit_s, _SILENT_S)
             answer = go_on(call._replace(timeout=limit_s), request)
             late = answer.code() is grpc.StatusCode.DEADLINE_EXCEEDED
-            if not getattr(aside, "asks", False):
+            if not getattr(ignoring, "timeouts", False):
                 self.silent = late
             return answer
 
-    return Patient()
+    return Timeouts()

@@ -1,4 +1,4 @@
-"""Whether an NI board takes every task of a bench; no output changes."""
+"""Check that an NI board accepts every task of a bench, without changing an output."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["RouteStatus", "verify_routes"]
 
 
 class RouteStatus(NamedTuple):
-    """Whether a device takes one task.
+    """Whether a device accepts one task.
 
     Args:
         task: inputs, block clock, output, exposure counter; or channel skew.
-        fault: one line with DAQmx's status and what to do; empty: it takes it.
-        skew_s: of the row channel skew: what the device does, in s; None: it is not reported.
+        fault: one line with DAQmx's status and what to do; empty if it accepts it.
+        skew_s: in the row channel skew the device's skew, in s; None: not reported.
     """
 
     task: str
@@ -32,27 +32,27 @@ class RouteStatus(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """The device takes it."""
+        """Whether the device accepts the task."""
         return not self.fault
 
 
 def verify_routes(
     daq: NidaqConfig, exposure: ExposureConfig | None = None, link: NidaqLink | None = None
 ) -> list[RouteStatus]:
-    """Make all tasks of a bench together, verify, reserve and commit each, and let go of them.
+    """Create all tasks of a bench; verify, reserve and commit each; then release them.
 
     No value is written and no task is started, so no output changes.
 
     Args:
         daq: section `daq` of the rig file.
         exposure: section `exposure`; None: there is none.
-        link: to the device, which no task of this program may hold; None: it is made here.
+        link: to the device, which no task of this program may use; None: it is made here.
     Returns:
-        One row a task, in the order in which a bench makes them. What was refused before a task
-        could be made stands in its row.
+        One row per task, in the order in which a bench creates them. A refusal before a task could
+        be created is in its row.
     Raises:
-        DeviceError: no driver, no server, no such device.
-        InputError: the sample rate does not divide the counters' timebase.
+        DeviceError: Driver, server or device is missing.
+        InputError: The sample rate does not divide the counters' timebase.
     Example:
         `[row for row in verify_routes(file.daq, file.exposure) if not row.ok]`
     """
@@ -89,7 +89,7 @@ def _fault(link: NidaqLink, make: Callable[[], Any], made: list[Any]) -> str:
     modes = link.constants.TaskMode
 
     def take() -> None:
-        with link.words():
+        with link.translated_errors():
             task = make()
             made.append(task)
             for mode in (modes.TASK_VERIFY, modes.TASK_RESERVE, modes.TASK_COMMIT):

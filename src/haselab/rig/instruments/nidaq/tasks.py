@@ -1,7 +1,7 @@
 """The tasks on an NI board: two inputs, an output, the counter that clocks it, and their timing.
 
 Block clock and sample clock come from one oscillator. The counter divides the 20 MHz timebase by
-the samples of a block and starts with the inputs, so its edges keep their sample for ever. Counting
+the samples of a block and starts with the inputs, so its edges stay at their sample. Counting
 the sample clock itself would need a route that most devices lack.
 """
 
@@ -24,7 +24,7 @@ _SKEW_S = 50e-9  # a tick of the timebase
 
 
 def ticks_per_sample(config: NidaqConfig) -> int:
-    """Ticks of the 20 MHz timebase in one sample.
+    """Compute the ticks of the 20 MHz timebase per sample.
 
     Args:
         config: section `daq` of the rig file.
@@ -57,7 +57,7 @@ class NidaqTasks:
         link: to the board.
         config: section `daq` of the rig file.
     Raises:
-        InputError: the sample rate does not divide the timebase.
+        InputError: The sample rate does not divide the timebase.
     """
 
     def __init__(self, link: NidaqLink, config: NidaqConfig) -> None:
@@ -66,7 +66,7 @@ class NidaqTasks:
 
     @property
     def timebase(self) -> str:
-        """Terminal of the clock that the counters count."""
+        """Terminal of the counters' timebase."""
         return f"/{self._config.device}/20MHzTimebase"
 
     @property
@@ -75,7 +75,7 @@ class NidaqTasks:
         return f"/{self._config.device}/ai/StartTrigger"
 
     def output(self) -> Any:
-        """The output on demand, which a clock may be given."""
+        """Create the task of the output on demand, which can be given a clock."""
         task = self._link.task()
         task.ao_channels.add_ao_voltage_chan(
             f"{self._config.device}/{self._config.output}", min_val=-_FULL_V, max_val=_FULL_V
@@ -83,7 +83,7 @@ class NidaqTasks:
         return task
 
     def inputs(self) -> Any:
-        """Both monitors."""
+        """Create the task of both monitors."""
         config, constants = self._config, self._link.constants
         task = self._link.task()
         for name in (config.v_monitor, config.i_monitor):
@@ -98,12 +98,12 @@ class NidaqTasks:
             sample_mode=constants.AcquisitionType.CONTINUOUS,
             samps_per_chan=round(config.buffer_s * config.rate_hz),
         )
-        # So that idle time is no fault; what was lost while it was wanted still is (-200279).
+        # Idle time is then not an error; losing samples that are read still is (-200279).
         task.in_stream.overwrite = constants.OverwriteMode.OVERWRITE_UNREAD_SAMPLES
         return task
 
     def clock(self) -> Any:
-        """A rising edge at the same sample of every block, from the start of the inputs on."""
+        """Create the block clock: a rising edge at the same sample of every block."""
         config = self._config
         task = self._link.task()
         high = config.block_samples // 2
@@ -119,7 +119,7 @@ class NidaqTasks:
         return task
 
     def stream(self) -> Any:
-        """The output, one value an edge of the block clock, none of them twice."""
+        """Create the task of the clocked output: one value per edge of the block clock."""
         config, constants = self._config, self._link.constants
         task = self.output()
         task.timing.cfg_samp_clk_timing(
@@ -133,11 +133,11 @@ class NidaqTasks:
         return task
 
     def skew_s(self, inputs: Any) -> float | None:
-        """From the conversion of one channel to that of the next, in s; None: not reported."""
+        """Time between the conversions of the two channels, in s; None: not reported."""
         if self._link.simultaneous:
             return 0.0
         rates_hz: list[float] = []
-        with self._link.words():  # asking verifies the task, which may be refused
+        with self._link.translated_errors():  # the query verifies the task, which may be refused
             inputs.control(self._link.constants.TaskMode.TASK_VERIFY)
         quietly(lambda: rates_hz.append(float(inputs.timing.ai_conv_rate)))
         return 1.0 / rates_hz[0] if rates_hz and rates_hz[0] > 0.0 else None
@@ -159,12 +159,12 @@ class NidaqTasks:
             )
 
     def first_sample_s(self, inputs: Any) -> float | None:
-        """From the start trigger to the first conversion, in s; None: it is not reported."""
+        """Time from the start trigger to the first conversion, in s; None: not reported."""
         reported: list[float] = []
         quietly(lambda: reported.append(float(inputs.timing.samp_clk_timebase_rate)))
         quietly(lambda: reported.append(float(inputs.triggers.start_trigger.delay)))
         if len(reported) < 2:
             return None
-        # Simultaneous devices have no convert clock, and none of this delay.
+        # Simultaneous devices have no convert clock and thus not this delay.
         quietly(lambda: reported.append(float(inputs.timing.delay_from_samp_clk_delay)))
         return sum(reported[1:]) / reported[0]

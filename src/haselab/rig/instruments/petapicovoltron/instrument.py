@@ -43,7 +43,7 @@ class PetaPicoVoltronInstrument(SupplyInstrument[PetaPicoVoltronConfig]):
         return (os.path.realpath(config.port),)
 
     def shut_down(self, config: PetaPicoVoltronConfig, within_s: float) -> None:
-        """See `OutputInstrument`: everything that could keep it on, until it has run down."""
+        """See `OutputInstrument`; waits until the supply has discharged."""
         del within_s
         switch_supply_off(config)
 

@@ -1,18 +1,18 @@
-"""The serial line of a Peta-Pico-Voltron: request and response matching, and switching off.
+"""The serial port of a Peta-Pico-Voltron: request and response matching, and switching off.
 
-ASCII at 115,200 baud, 8N1; a command ends with CR, its answer with CR LF. `S...` sets and echoes,
-`Q...` asks, anything else is answered by `Err` (petapicovoltron.com, "Direct communication with
-the HVPS").
+ASCII at 115,200 baud, 8N1; a command ends with CR, its reply with CR LF. `S...` sets and echoes,
+`Q...` queries, and the reply to anything else is `Err` (petapicovoltron.com, "Direct communication
+with the HVPS").
 
 Several programs share the port: ModemManager sends AT commands to every new one, and the guardians
-use it while the program does. So a request begins with filler and ends with `QVer`, whose answer
-nothing else gives: what was on the line before does not count. The firmware never clears its
-buffer, and an empty line repeats the last command; 19 characters of filler replace whatever
-fragment it holds by one that is answered with `Err`, without executing it.
+use it while the program does. So a request begins with filler and ends with `QVer`, whose reply is
+unique, and everything before the request is ignored. The firmware never clears its buffer, and an
+empty line repeats the last command; 19 characters of filler replace any fragment in it by one to
+which it replies `Err` without executing anything.
 
-An echo does not mean that something was done: the output switch follows `SSwMode` only while the
-switch source is the firmware's own, and `SSwSrc` by itself does not open it. `SSwMode 0` goes out
-twice, since after the waveform mode the set point counts again only then; `SCycle 0`, since the
+An echo does not mean that a command took effect: the output switch follows `SSwMode` only while the
+switch source is the firmware's own, and `SSwSrc` by itself does not open it. `SSwMode 0` is sent
+twice, since after the waveform mode the set point is used again only then; `SCycle 0`, since the
 button would otherwise start the cycles again.
 """
 
@@ -36,13 +36,13 @@ _FILLER = b"x" * 19 + b"\r"  # the length of the firmware's buffer
 _VERSION = re.compile(r"slave \d+")
 _DEBUG = re.compile(r"\d+, .*|Kill")  # lines of the firmware's debug mode
 _OFF = ("SSwSrc 0", "SSwMode 0", "SVMode 0", "SVset 0", "SCycle 0", "SSwMode 0")
-_STATE = {  # what is asked: its answer while the output is off, and its name for a person
+_STATE = {  # query: its reply while the output is off, and its name for messages
     "QSwSrc": ("0", "the switch source"),
     "QSwMode": ("0", "the switching mode"),
     "QVMode": ("0", "the voltage mode"),
     "QVset": ("0", "the set point"),
 }
-_MOST_LINES = 40  # that are read over before an answer
+_MOST_LINES = 40  # most lines skipped before a reply
 _TRIALS = 3
 _LOOK_S = 0.05
 _IGNORE = (
@@ -51,18 +51,18 @@ _IGNORE = (
 
 
 class SupplyLine:
-    """Commands to a supply, whichever it is; opening it changes nothing.
+    """Sends commands to any supply of this family; opening the port changes nothing.
 
     Args:
         config: section `supply` of the rig file.
     Raises:
-        DeviceError: no driver, no port.
+        DeviceError: The driver or the port is missing.
     """
 
     def __init__(self, config: PetaPicoVoltronConfig) -> None:
         self._config = config
         self.version = ""
-        self._heard = b""  # since the last request
+        self._received = b""  # since the last request
         serial = load_driver("serial", "The high-voltage supply")
         try:
             self._port: Any = serial.Serial(
@@ -70,22 +70,22 @@ class SupplyLine:
             )
         except (OSError, ValueError) as error:
             busy = getattr(error, "errno", None) == errno.EBUSY
-            raise self.dead(f"{error}; {_IGNORE}" if busy else str(error)) from None
+            raise self.no_reply(f"{error}; {_IGNORE}" if busy else str(error)) from None
 
-    def dead(self, what: str) -> DeviceError:
-        """The error of a supply that does not answer."""
+    def no_reply(self, what: str) -> DeviceError:
+        """Make the error of a supply that does not reply correctly."""
         return DeviceError(
-            f"The high-voltage supply does not answer as it should ({what}). Check cable and "
-            f"power, or correct supply.port. {self._config.port}"
+            f"The high-voltage supply does not reply correctly ({what}). Check its cable and its "
+            f"power, or change supply.port. {self._config.port}"
         )
 
     # ---- requests ------------------------------------------------------------------------------
 
-    def ask(self, command: str) -> str:
-        """The answer to one command, which is repeated once where it makes no sense.
+    def query(self, command: str) -> str:
+        """Send one command and return its reply; repeat it once if the reply is not valid.
 
         Raises:
-            DeviceError: no answer, or `Err`.
+            DeviceError: There is no reply, or the reply is `Err`.
         """
         try:
             self._send(command.encode("ascii") + b"\r")
@@ -94,13 +94,13 @@ class SupplyLine:
                 return answer
         except DeviceError:
             pass
-        return self._sound(command, self.ask_all([command])[0])
+        return self._sound(command, self.query_all([command])[0])
 
-    def ask_all(self, commands: Sequence[str]) -> list[str]:
-        """The answers to several commands, sent in one go; what was on the line does not count.
+    def query_all(self, commands: Sequence[str]) -> list[str]:
+        """Send several commands at once and return their replies; ignore earlier data.
 
         Raises:
-            DeviceError: no answer.
+            DeviceError: There is no reply.
         """
         whole = "".join(f"{command}\r" for command in (*commands, "QVer"))
         self._send(_FILLER + whole.encode("ascii"))
@@ -111,99 +111,99 @@ class SupplyLine:
                 self.version = line
                 if len(lines) >= len(commands):
                     return lines[len(lines) - len(commands) :]
-                raise self.dead(f"{len(lines)} answers to {len(commands)} commands; {_IGNORE}")
+                raise self.no_reply(f"{len(lines)} replies to {len(commands)} commands; {_IGNORE}")
             if not _DEBUG.fullmatch(line):
                 lines.append(line)
-        raise self.dead(f"{_MOST_LINES} lines and no answer to QVer; {_IGNORE}")
+        raise self.no_reply(f"{_MOST_LINES} lines and no reply to QVer; {_IGNORE}")
 
     def synchronise(self) -> str:
-        """Find the end of what others have left on the line; for once it is opened.
+        """Skip what other programs have left in the port's buffers, after opening it.
 
         Returns:
-            Its version, as it reports it.
+            The version that the supply reports.
         Raises:
-            DeviceError: nothing that answers like such a supply.
+            DeviceError: Nothing replies like such a supply.
         """
         for trial in range(_TRIALS):
-            error = quietly(lambda: self.ask_all([]))
+            error = quietly(lambda: self.query_all([]))
             if error is None:
                 return self.version
-            if trial == _TRIALS - 1 or not self._heard:
+            if trial == _TRIALS - 1 or not self._received:
                 raise error
         raise AssertionError("unreachable")
 
     def _send(self, data: bytes) -> None:
-        self._heard = b""
+        self._received = b""
         try:
             self._port.reset_input_buffer()
             self._port.write(data)
-        except (OSError, TypeError) as error:  # pyserial: TypeError on a port that is gone
-            raise self.dead(str(error) or type(error).__name__) from None
+        except (OSError, TypeError) as error:  # pyserial: TypeError on a port that was removed
+            raise self.no_reply(str(error) or type(error).__name__) from None
 
     def _line(self, command: str) -> str:
         try:
             answer = self._port.read_until(b"\r\n", 128)
         except (OSError, TypeError) as error:
-            raise self.dead(str(error) or type(error).__name__) from None
-        self._heard += answer
+            raise self.no_reply(str(error) or type(error).__name__) from None
+        self._received += answer
         if not answer.endswith(b"\r\n"):
-            raise self.dead(f"{command}: {len(answer)} bytes and no end of line")
+            raise self.no_reply(f"{command}: {len(answer)} bytes without an end of line")
         try:
             return str(answer[:-2].decode("ascii").strip())
         except UnicodeDecodeError:
-            raise self.dead(f"{command}: garbage") from None
+            raise self.no_reply(f"{command}: not ASCII") from None
 
     def _sound(self, command: str, answer: str) -> str:
         if answer == "Err":
-            raise self.dead(f"{command}: Err")
+            raise self.no_reply(f"{command}: Err")
         return answer
 
     def number(self, command: str) -> float:
-        """The answer to a command as a finite number.
+        """Send a command and return its reply as a finite number.
 
         Raises:
-            DeviceError: none.
+            DeviceError: The reply is not a finite number.
         """
-        answer = self.ask(command)
+        answer = self.query(command)
         try:
             value = float(answer)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise self.dead(f"{command}: {answer!r}")
+            raise self.no_reply(f"{command}: {answer!r}")
         return value
 
     def set(self, command: str, value: int) -> None:
-        """Set something to a value that has to be echoed.
+        """Set a value and check its echo.
 
         Raises:
-            DeviceError: another echo.
+            DeviceError: The echo differs.
         """
         echo = self.number(f"{command} {value}")
         if echo != value:
-            raise self.dead(f"{command} {value} is echoed as {echo:g}")
+            raise self.no_reply(f"{command} {value} is echoed as {echo:g}")
 
     # ---- switching off -------------------------------------------------------------------------
 
     def switch_off(self) -> None:
-        """Everything that takes the output to 0 V, sent in one go, then verified. Never waits.
+        """Send all commands that take the output to 0 V, then verify them, without waiting.
 
         Raises:
-            DeviceError: an echo or a setting that is not the one of an output that is off.
+            DeviceError: An echo or a setting is not that of an output that is off.
         """
-        echoes = self.ask_all(_OFF)
+        echoes = self.query_all(_OFF)
         if any(echo != "0" for echo in echoes):
-            raise self.dead(f"{'; '.join(_OFF)} are echoed as {'; '.join(echoes)}")
+            raise self.no_reply(f"{'; '.join(_OFF)} are echoed as {'; '.join(echoes)}")
         if fault := self.not_off():
             raise DeviceError(f"The high-voltage supply is not off: {fault}. {self._config.port}")
 
     def not_off(self) -> str:
-        """By its settings, asked for now: what could still put out a voltage; empty if nothing.
+        """Query the settings for anything that could still put out a voltage; empty if nothing.
 
         Raises:
-            DeviceError: no answer.
+            DeviceError: There is no reply.
         """
-        answers = self.ask_all([*_STATE, "QCycle"])
+        answers = self.query_all([*_STATE, "QCycle"])
         found = [
             f"{name} is {answer}, expected 0"
             for (expected, name), answer in zip(_STATE.values(), answers, strict=False)
@@ -217,9 +217,9 @@ class SupplyLine:
         """Wait until the supply's own meter shows no voltage.
 
         Args:
-            within_s: for so long, in s.
+            within_s: longest wait, in s.
         Raises:
-            DeviceError: it still does, or it does not answer.
+            DeviceError: It still shows a voltage, or does not reply.
         """
         end_s = time.monotonic() + within_s
         while True:
@@ -228,12 +228,12 @@ class SupplyLine:
                 return
             if time.monotonic() >= end_s:
                 raise DeviceError(
-                    f"The high-voltage supply is not confirmed off: its meter shows {left_v:g} V "
-                    f"{within_s:g} s after it was switched off (limit "
-                    f"{self._config.tolerance_v:g} V). Pull its power jack. {self._config.port}"
+                    "Pull the power jack of the high-voltage supply, which is not confirmed off: "
+                    f"its meter shows {left_v:g} V {within_s:g} s after it was switched off (limit "
+                    f"{self._config.tolerance_v:g} V). {self._config.port}"
                 )
             time.sleep(_LOOK_S)
 
     def close(self) -> None:
-        """Close the port and leave the supply as it is. Never raises."""
+        """Close the port without changing the supply. Never raises."""
         quietly(self._port.close)

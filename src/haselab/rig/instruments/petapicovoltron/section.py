@@ -16,5 +16,5 @@ class PetaPicoVoltronConfig(SupplyConfig):
 
     kind: Literal["petapicovoltron"] = "petapicovoltron"
     port: str = Field(min_length=1, description="/dev/ttyACM0, COM3, ...")
-    serial_number: str | None = Field(None, description="what QName answers")
+    serial_number: str | None = Field(None, description="reply to QName")
     timeout_s: float = Field(1.0, gt=0, le=30)

@@ -1,1 +1,1 @@
-"""The twin behind the instruments' own protocols, on loopback."""
+"""Serve the twin through the instruments' own protocols, on loopback."""

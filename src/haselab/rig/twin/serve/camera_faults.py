@@ -1,4 +1,4 @@
-"""Faults of the served twin's camera, its link and its exposure line, for tests that plant them."""
+"""Faults of the served twin's camera, its link and its exposure line, for tests."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _SEED = 11
 
 @dataclass(frozen=True)
 class CameraFaults:
-    """What is wrong with the camera; by default nothing.
+    """Faults of the camera; none by default.
 
     Args:
-        lost_share: of the frames that never come, drawn at random.
-        real_rate_hz: the highest rate that it reaches, whatever it was set to; None: any.
-        stamps_in_ticks: ticks a second of its time stamps, which should be nanoseconds; None: they
-            are. 0: it stamps nothing.
-        late_s: by which frames come later than they should.
+        lost_share: fraction of the frames that are lost at random.
+        real_rate_hz: highest rate that it reaches; None: any.
+        stamps_in_ticks: ticks per second of its time stamps, instead of nanoseconds; None:
+            nanoseconds; 0: no time stamps.
+        late_s: extra delay of the frames, in s.
         exposure_line_dead: its line shows no edges.
         exposure_line_inverted: the edge that should begin an exposure ends it.
     Raises:
-        InputError: a number that is none of these.
+        InputError: A value is out of range.
     """
 
     lost_share: float = 0.0
@@ -42,7 +42,7 @@ class CameraFaults:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.lost_share < 1.0:
-            raise InputError(f"lost_share = {self.lost_share:g} is outside [0, 1).")
+            raise InputError(f"lost_share is {self.lost_share:g}, but must be in [0, 1).")
         if self.real_rate_hz is not None and not self.real_rate_hz > 0.0:
             raise InputError(f"real_rate_hz = {self.real_rate_hz:g} is not above 0.")
         if self.stamps_in_ticks is not None and not self.stamps_in_ticks >= 0.0:
@@ -53,7 +53,7 @@ class CameraFaults:
 
 @dataclass(frozen=True)
 class SentFrames:
-    """Frames that have come, rows in order.
+    """Frames that have arrived, in order.
 
     Args:
         images: shape `(n, height, width)`.
@@ -71,7 +71,7 @@ class SentFrames:
 
 
 class CameraLink:
-    """The way of the frames from the sensor to the computer.
+    """The link from the camera's sensor to the computer.
 
     Args:
         faults: of it.

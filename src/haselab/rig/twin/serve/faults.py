@@ -1,4 +1,4 @@
-"""What can be wrong with a served bench: to practise finding it, and to test what finds it."""
+"""Faults of a served bench, to practise finding them and to test the checks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["FAULTS", "BenchFaults"]
 
 @dataclass(frozen=True)
 class BenchFaults:
-    """Everything that is wrong with a bench; by default nothing.
+    """Faults of a bench; none by default.
 
     Args:
         wiring: between the instruments.
@@ -23,7 +23,7 @@ class BenchFaults:
         generator: of the function generator.
         supply: of the high-voltage supply.
         camera: of the camera, its link and its exposure line.
-        at_amplifier_f: capacitor in the actuator's place, in F; None: the actuator is.
+        at_amplifier_f: capacitor in place of the actuator, in F; None: the actuator.
     """
 
     wiring: Wiring = field(default_factory=Wiring)

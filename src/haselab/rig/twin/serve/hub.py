@@ -1,7 +1,7 @@
-"""One bench of physics that several servers share: its clock, its inputs and its outputs.
+"""One simulated bench shared by several servers: its clock, its inputs and its outputs.
 
 Time is counted in samples. With a pace it follows the wall clock, as instruments do; without one
-(lock-step) it goes only as far as somebody asks for readings, so that tests need not hurry.
+(lock-step) it advances only as far as samples are requested, so that tests have no deadlines.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
 
 
 class TwinHub(Closing):
-    """The physics, and what the instruments of the bench are set to.
+    """The physics, and the settings of the bench's instruments.
 
     Args:
         config: the physical bench.
@@ -47,12 +47,12 @@ class TwinHub(Closing):
         self, config: TwinConfig, seed: int, pace: float = 1.0, wiring: Wiring = _RIGHT
     ) -> None:
         if not 0.0 <= pace <= 1000.0:
-            raise LimitError(f"Pace = {pace:g} is outside [0, 1000]. Choose another one.")
+            raise LimitError(f"The pace is {pace:g}, but it must be within [0, 1000]. Change it.")
         self.description = describe(config)
         if self.description.switch_sample % TICKS:
             raise LimitError(
-                f"acquisition.output_delay_s = {config.acquisition.output_delay_s:g} s is not a "
-                f"multiple of {TICKS} samples. Round it."
+                f"acquisition.output_delay_s is {config.acquisition.output_delay_s:g} s, but it "
+                f"must be a multiple of {TICKS} samples. Round it."
             )
         self.bench = TwinBench(config, seed)
         self.wiring = wiring
@@ -93,15 +93,15 @@ class TwinHub(Closing):
 
     @property
     def lock_step(self) -> bool:
-        """Time passes only as it is asked for."""
+        """Whether time passes only as samples are requested."""
         return self._pace == 0.0
 
     def _behind(self) -> int:
-        """Samples that the wall clock is ahead, a multiple of 20.
+        """Samples by which the wall clock is ahead, a multiple of 20.
 
-        An instrument does not stand still when the computer is busy; this one does when its process
-        is not run. What is more than a block is then taken off its clock, and counted, rather than
-        blamed on its user.
+        An instrument does not stop when the computer is busy, but this one does when its process
+        does not run. A delay above one block is therefore subtracted from its clock, and counted,
+        so that it does not cause errors in the program under test.
         """
         elapsed_s = (time.monotonic() - self._started) * self._pace
         behind = int(elapsed_s * self.rate_hz) // TICKS * TICKS - self._total
@@ -121,7 +121,7 @@ class TwinHub(Closing):
             self._closed.wait(min(max(wait_s, 1e-4), _IDLE_S))
 
     def _next_event(self) -> int:
-        """Samples until something has to happen at its time: an output, the end of a block."""
+        """Samples until the next event: an output, or the end of a block."""
         block = self.description.block_samples
         until = [block - self._acquired % block]
         if self._period:
@@ -154,7 +154,7 @@ class TwinHub(Closing):
         try:
             codes = self.bench.sample(drive_v, samples)
         except SafetyError as error:
-            # As on a real bench: both monitors read nothing any more, and the supply has tripped.
+            # As on a real bench: both monitors read 0, and the supply has tripped.
             self.protected = str(error)
             self._drive_v = self._rail_v = self._offset_v = 0.0
             self._streaming = False
@@ -194,7 +194,7 @@ class TwinHub(Closing):
     # ---- inputs --------------------------------------------------------------------------------
 
     def start_inputs(self, clock: tuple[int, int] | None = None) -> None:
-        """The sample clock starts: sample 0 is now.
+        """Start the sample clock: sample 0 is now.
 
         Args:
             clock: first edge and period of an output's clock that waits for this start.
@@ -216,7 +216,7 @@ class TwinHub(Closing):
         return self._started + self._before / (self.rate_hz * self._pace)
 
     def stop_inputs(self) -> None:
-        """The sample clock stops."""
+        """Stop the sample clock."""
         with self._lock:
             self._sampling = False
             self._lock.notify_all()
@@ -242,7 +242,7 @@ class TwinHub(Closing):
             start: first sample.
             samples: how many.
             timeout_s: in s.
-            until: so many samples have to have been taken, as they come in packets.
+            until: number of samples that must have been taken, as they come in packets.
         Returns:
             The codes; none if they did not come in time.
         Raises:
@@ -274,11 +274,11 @@ class TwinHub(Closing):
             self._first_edge, self._period = self._total + first, period
 
     def set_output(self, drive_v: float) -> None:
-        """An output at once, ahead of the amplifier."""
+        """Put an output out at once, at the amplifier's input."""
         with self._lock:
             self._catch_up()
             self._drive_v = drive_v
-            if self.lock_step:  # such a call takes its time, and the output may be looked at then
+            if self.lock_step:  # such a call takes time, after which the output may be read
                 self._advance(self.description.block_samples)
 
     def queue_output(self, values_v: list[float], under_way: int = 0) -> None:
@@ -294,11 +294,11 @@ class TwinHub(Closing):
 
     @property
     def queued(self) -> int:
-        """Values that wait for an edge."""
+        """Number of values waiting for an edge."""
         return len(self._queue)
 
     def stream(self, on: bool, repeated_v: tuple[float, ...] = ()) -> None:
-        """The queue is clocked out, or thrown away; the output stands.
+        """Start clocking the queue out, or discard it and keep the output.
 
         Args:
             on: which.
@@ -323,7 +323,7 @@ class TwinHub(Closing):
         self.wait_until(lambda: self._total >= end, samples / (self.rate_hz * self._pace) + 1.0)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait for something to be so; in lock-step, where nothing passes, it is or is not."""
+        """Wait for a condition; in lock-step no time passes, so it is only checked."""
         with self._lock:
             if self.lock_step:
                 return condition()
@@ -331,14 +331,14 @@ class TwinHub(Closing):
 
     @property
     def put_out(self) -> int:
-        """Values that were clocked out since the stream was started."""
+        """Number of values clocked out since the stream was started."""
         with self._lock:
             self._catch_up()
             return self._put_out
 
     @property
     def streaming(self) -> bool:
-        """The queue is being clocked out."""
+        """Whether the queue is being clocked out."""
         return self._streaming
 
     def carrier(self, frequency_hz: float, amplitude_v: float, offset_v: float = 0.0) -> None:
@@ -365,13 +365,13 @@ class TwinHub(Closing):
 
     @property
     def output_v(self) -> float:
-        """Voltage at the actuator, in V: a voltmeter on the bench."""
+        """True voltage at the actuator, in V."""
         with self._lock:
             return self.bench.output_v
 
     @property
     def length_m(self) -> float:
-        """Length of the sheet, in m: a ruler on the bench."""
+        """True length of the sheet, in m."""
         with self._lock:
             return self.bench.length_m
 
@@ -385,11 +385,11 @@ class TwinHub(Closing):
         self._ramp(mass_kg * GRAVITY_M_S2)
 
     def lift(self) -> None:
-        """Take the weight off, over a second."""
+        """Lift the mass off, over a second."""
         self._ramp(0.0)
 
     def drop(self) -> None:
-        """Let go, at once."""
+        """Release the mass at once."""
         with self._lock:
             self._catch_up()
             self.bench.pull(self.bench.mass_kg * GRAVITY_M_S2)
@@ -407,14 +407,14 @@ class TwinHub(Closing):
                 self._closed.wait(_RAMP_S / _RAMP_PIECES / self._pace)
 
     def start_camera(self, rate_hz: float) -> None:
-        """Frames from now on."""
+        """Start taking frames."""
         with self._lock:
             self._catch_up()
             self.bench.start(rate_hz)
             self._taken = []
 
     def stop_camera(self) -> None:
-        """No more frames."""
+        """Stop taking frames."""
         with self._lock:
             self.bench.stop()
             self._taken = []
@@ -431,7 +431,7 @@ class TwinHub(Closing):
         return Frames(self.bench.render(lengths), time_s - origin_s)
 
     def _expose(self) -> None:
-        """Take over the exposures that have ended."""
+        """Record the exposures that have ended."""
         exposed = self.bench.exposures()
         if exposed is None:
             return
@@ -452,7 +452,7 @@ class TwinHub(Closing):
     # ---- the end -------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Stop the clock; everything at 0 V."""
+        """Stop the clock and take everything to 0 V."""
         self._closed.set()
         if self._keeper is not None:
             self._keeper.join()

@@ -1,4 +1,4 @@
-"""A server of text lines on a loopback port: one thread a client."""
+"""A server for text lines on a loopback port, with one thread per client."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _NO_WAIT = getattr(socket, "MSG_DONTWAIT", 0)
 
 
 class LineProtocol(Protocol):
-    """What an instrument says to lines."""
+    """An instrument that replies to lines."""
 
     def answer(self, line: str) -> bytes:
-        """The reply to a line without its end; `b""`: none. Must not raise, whatever it is."""
+        """The reply to a line without its end; `b""`: none. Must never raise."""
 
     def refuse_line(self, longest: int) -> bytes:
         """The reply to a line that is longer than this many bytes."""
@@ -68,7 +68,7 @@ class LineServer:
         while not self._closed:
             try:
                 client, address = self._listener.accept()
-            except ConnectionError:  # the client has gone again
+            except ConnectionError:  # the client has disconnected
                 continue
             except OSError:
                 return
@@ -96,13 +96,13 @@ class LineServer:
                     too_long = False
                     if reply:
                         client.sendall(reply)
-                if len(pending) > _LONGEST:  # its end is waited for, but nothing of it is kept
+                if len(pending) > _LONGEST:  # wait for its end, but discard it
                     pending, too_long = b"", True
 
     def _reply(self, line: bytes) -> bytes:
         try:
             return self._protocol.answer(line.decode("ascii", errors="replace").strip())
-        except Exception:  # a defect: shown, and the client is served on
+        except Exception:  # a defect: print it, and keep serving the client
             traceback.print_exc(file=sys.stderr)
             return self._protocol.fail()
 

@@ -1,7 +1,7 @@
-"""Which user of this computer is at the other end of a loopback connection.
+"""Find the user of this computer at the other end of a loopback connection.
 
-The system knows it: Linux lists every TCP socket with its owner in /proc/net/tcp and tcp6. Other
-systems have no such list, and there the servers cannot distinguish users.
+Linux lists every TCP socket with its owner in /proc/net/tcp and tcp6. Other systems have no such
+list, so there the servers cannot distinguish users.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MOST_KEPT = 64
 
 
 def can_tell_users() -> bool:
-    """Whether this system says who owns a connection."""
+    """Whether this system reports the owner of a connection."""
     return sys.platform == "linux"
 
 
@@ -58,7 +58,7 @@ def uid_of_client(client: tuple[str, int], server: tuple[str, int]) -> int | Non
 
 
 class LocalUserFilter:
-    """Lets in the connections of the user who runs this program.
+    """Accepts only connections of the user who runs this program.
 
     The list is read once a connection. gRPC reports only the address of a client with each call, so
     an address is looked up again after half a second without a call: less than the second for which

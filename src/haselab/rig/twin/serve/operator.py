@@ -1,7 +1,7 @@
-"""The twin's stand, camera and meters over a socket: what has no instrument's protocol of its own.
+"""Serve the twin's stand, camera and meters, which have no instrument protocol, over a socket.
 
-A request is a line of JSON, `{"do": "hang", "mass_kg": 0.25}`; the answer is a line of JSON,
-followed by as many bytes as its `bytes` says: frames.
+A request is a line of JSON, `{"do": "hang", "mass_kg": 0.25}`; the reply is a line of JSON,
+followed by frames with as many bytes as its `bytes` states.
 """
 
 from __future__ import annotations

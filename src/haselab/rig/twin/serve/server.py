@@ -1,4 +1,4 @@
-"""All instruments of one twin, served together, and the rig file that leads to them."""
+"""Serve all instruments of one twin together, and write the rig file for them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Ports:
 
 
 def suited_to(config: TwinConfig, board: str) -> TwinConfig:
-    """A bench whose inputs are sampled as a board can: its rate, and the skew of its channels.
+    """Adapt a bench to a board: its sample rate and the skew of its channels.
 
     Args:
         config: the physical bench.
@@ -122,7 +122,7 @@ class ServedTwin(Closing):
 
     @property
     def addresses(self) -> dict[str, str]:
-        """Where each instrument answers."""
+        """Address of each instrument."""
         return {
             "daq": self.daq.address,
             "generator": self.generator.address,
@@ -131,16 +131,16 @@ class ServedTwin(Closing):
         }
 
     def rig_file(self, *, ahead_blocks: int = 1, exposure_line: bool = False) -> str:
-        """RIG.toml that leads to these servers.
+        """Write RIG.toml for these servers.
 
         Args:
-            ahead_blocks: outputs that wait in the device.
-            exposure_line: frames come late, and the camera's exposure line is wired.
+            ahead_blocks: number of outputs queued in the device.
+            exposure_line: whether frames arrive late and the camera's exposure line is wired.
         """
         config, serial = self._config, f"{self.daq.serial_number:08X}"
         acquisition, amplifier, law = config.acquisition, config.amplifier, config.law
         width_m = law.width_m / law.lateral_stretch
-        return f"""# A served twin, behind the drivers of the real instruments.
+        return f"""# A served twin, used through the drivers of the real instruments.
 kind = "bench"
 name = "{config.name} over the wire"
 scale_m_per_px = {config.camera.scale_m_per_px!r}
@@ -191,5 +191,5 @@ address = "{self.client.address}"
 {_LINE.format(exposure_s=config.camera.exposure_s) if exposure_line else ""}"""
 
     def close(self) -> None:
-        """Everything at 0 V, all ports closed."""
+        """Take everything to 0 V and close all ports."""
         self._opened.close()

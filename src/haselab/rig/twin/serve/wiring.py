@@ -1,4 +1,4 @@
-"""How the served bench is wired between its instruments, and what can be wrong there."""
+"""The wiring between the instruments of a served bench, and its faults."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class Wiring:
     hum_hz: float = 50.0
 
     def amplifier_input(self, output_v: float) -> float:
-        """What of the board's output comes to the amplifier, in V."""
+        """Voltage at the amplifier's input due to the board's output, in V."""
         return 0.0 if self.loop_back else output_v * self.output_gain
 
     def read(
         self, codes: NDArray[np.int16], output_v: float, volt_per_code: float, time_s: float,
         sample_s: float,
     ) -> NDArray[np.int16]:  # fmt: skip
-        """What the board converts.
+        """Compute the codes that the board reads.
 
         Args:
             codes: of both monitors, `(n, 2)`, wired as the rig file says.

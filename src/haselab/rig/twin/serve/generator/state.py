@@ -1,4 +1,4 @@
-"""The settings of an emulated Keysight 33522B, and what they make of its output.
+"""The settings of an emulated Keysight 33522B, and their effect on its output.
 
 Source: 33500 Series Operating and Service Guide (33500-90901): output termination p. 62, burst
 p. 177, channel tracking p. 315, voltage limits p. 323, amplitude limits p. 215 (10 Vpp into 50 ohm,
@@ -27,7 +27,7 @@ class ConflictError(Exception):
 
 @dataclass(frozen=True)
 class GeneratorFaults:
-    """What is wrong with an emulated generator; the defaults are one that is as it should be.
+    """Faults of an emulated generator; none by default.
 
     Args:
         panel: SCPI lines that stand for what its last user has set.
@@ -48,7 +48,7 @@ class GeneratorFaults:
 
 @dataclass(frozen=True)
 class Sine:
-    """What comes out, into an open circuit.
+    """Output into an open circuit.
 
     Args:
         frequency_hz: frequency, in Hz.
@@ -97,7 +97,7 @@ class Channel:
 
     @property
     def shown(self) -> float:
-        """Part of the open-circuit voltage that the panel shows."""
+        """Fraction of the open-circuit voltage that the panel shows."""
         if self.load_ohm >= INFINITE_OHM:
             return 1.0
         return self.load_ohm / (self.load_ohm + _OUTPUT_OHM)
@@ -145,7 +145,7 @@ class Channel:
             raise ConflictError
 
     def output(self, triggers: bool) -> Sine:
-        """What comes out of it.
+        """Compute its output.
 
         Args:
             triggers: something is at the trigger input.
@@ -161,7 +161,7 @@ class Channel:
         return Sine(self.frequency_hz, amplitude_v * self._left(triggers), self.offset_v)
 
     def _left(self, triggers: bool) -> float:
-        """Part of the carrier that burst or modulation leaves."""
+        """Fraction of the carrier that remains with burst or modulation."""
         if self.running == "BURS":
             return self._burst(triggers)
         if self.running == "AM":
@@ -185,6 +185,6 @@ class Channel:
 
 
 def _bessel(depth: float) -> float:
-    """What a phase that swings by +-depth leaves of a carrier: |J0|."""
+    """Remaining carrier with phase modulation of +-depth: |J0|."""
     phases = (depth * math.sin(2.0 * math.pi * k / _AVERAGED) for k in range(_AVERAGED))
     return abs(sum(math.cos(phase) for phase in phases)) / _AVERAGED

@@ -1,4 +1,4 @@
-"""Between an emulated NI device and its driver: what waits on the bus, and planted faults.
+"""The bus between an emulated NI device and its driver, with faults.
 
 On a plug-in board a sample is in the computer's memory when it has been taken, and a value in the
 device when it has been written. Over USB both travel in packets (USB-621x User Manual p. 5-3: in
@@ -21,14 +21,14 @@ _WRITE_S = 1e-3
 
 @dataclass(frozen=True)
 class BoardFaults:
-    """What is wrong with a served board; as it stands nothing is.
+    """Faults of a served board; none by default.
 
     Args:
         usb_lag_samples: by which counts and samples, and values to put out, come later still.
-        stall_s: a USB device that nobody asks for this long sends nothing more until its task is
+        stall_s: a USB device that is not queried for this long sends nothing until its task is
             started again (nidaqmx-python issue 931); 0: it goes on.
         refuse_routes: terminals, or `source>destination` as `ai/StartTrigger>Ctr1ArmStartTrigger`.
-        orphaned_tasks: a program that has died holds inputs, output and counters.
+        orphaned_tasks: a crashed program still holds inputs, output and counters.
         slow_transfer: samples that travel in one packet, in place of the usual number; 0: usual.
     Raises:
         LimitError: a number below zero.

@@ -1,4 +1,4 @@
-"""What the emulated NI devices have and accept: rates, counters, timebases, terminals, routes.
+"""Capabilities of the emulated NI devices: rates, counters, timebases, terminals, routes.
 
 Sources, by the letters used below:
 
@@ -183,7 +183,7 @@ DEVICES: dict[str, NiDevice] = {
 def check_route(
     device: NiDevice, name: str, source: str, destination: str, refused: tuple[str, ...] = ()
 ) -> str:
-    """Refuse what the device is not wired for.
+    """Refuse a route that the device does not have.
 
     Args:
         device: the product.

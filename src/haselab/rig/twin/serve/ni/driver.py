@@ -1,4 +1,4 @@
-"""The emulated NI driver: its tasks, their states, and what they do to the twin's bench.
+"""The emulated NI driver: its tasks, their states, and their effect on the twin's bench.
 
 The voltage monitor is at ai0, the current monitor at ai1, the amplifier at ao0 and the camera's
 exposure line at PFI0; nothing is at the other terminals. The twin samples at its own rate only.
@@ -27,7 +27,7 @@ _ORPHAN = {"ai", "ao0", "ctr0", "ctr1"}
 
 
 class NiDriver:
-    """One device and the tasks on it; they outlive the client that made them.
+    """One device and its tasks, which remain after their client has disconnected.
 
     Args:
         hub: the bench behind it.

@@ -87,7 +87,7 @@ class NiSamples:
             self._driver.hub.set_output(value)
 
     def _prime(self, task: Task, values: list[float]) -> None:
-        """The first write sizes a buffer that nobody has sized, and one value is too few for it."""
+        """Size the buffer by the first write unless it has a size; one value is too few."""
         if not task.buffer_size:
             if len(values) < _FEWEST_VALUES:
                 raise StatusError(StatusNumber.ONE_VALUE_WITHOUT_BUFFER, 0)

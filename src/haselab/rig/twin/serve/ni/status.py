@@ -1,4 +1,4 @@
-"""Statuses of NI-DAQmx that the emulated board answers with.
+"""Statuses of NI-DAQmx that the emulated board returns.
 
 The numbers are those of `nidaqmx.error_codes`. Where a document says which condition gives which
 status it is named beside the check; the rest is inferred from the status's name there.

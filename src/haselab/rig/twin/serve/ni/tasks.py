@@ -1,4 +1,4 @@
-"""A task of the emulated NI driver: what it consists of, what it needs, and its states.
+"""A task of the emulated NI driver: its contents, its resources and its states.
 
 States and transitions follow NI-DAQmx Key Concepts, "Task State Model", "Operations That Require
 State Transitions" and "Transitioning the State Backwards": a question about a property verifies a
@@ -38,7 +38,7 @@ def default_buffer(rate_hz: float) -> int:
 
 @dataclass
 class Task:
-    """What the driver knows of one task.
+    """State of one task in the driver.
 
     Args:
         name: of the session.

@@ -35,7 +35,7 @@ _STORED = ("vset", "source", "mode", "vmode", "frequency_hz", "latch", "cycles")
 
 @dataclass(frozen=True)
 class SupplyFaults:
-    """What is wrong with an emulated supply; the defaults are one that is as it should be.
+    """Faults of an emulated supply; none by default.
 
     Args:
         left_by: commands that another program had sent before.
@@ -46,14 +46,14 @@ class SupplyFaults:
         stored_cycles: number of cycles in its EEPROM.
         jack_used: it takes its power from the jack (`QPowJack`).
         jack_in: the power jack is plugged in (`QJack`).
-        enabled: its main switch is on; it cannot be asked for.
-        button_down: somebody presses the button.
+        enabled: its main switch is on; this cannot be queried.
+        button_down: the button is pressed.
         external_high: level at the input of the external switch source.
         external_v: what the input of the external set point asks for, in V.
         version: what it answers to `QVer`.
         relays_open: a switchboard, whose relays are between it and the output.
         reach_v: highest voltage, in V.
-        stale: answers to somebody else that are still under way when it is opened.
+        stale: replies to another program that still arrive after opening.
         fragment: what another program has written without an end of line.
         debug: it sends a line of its regulator's values before every answer.
         meter_error_v: of `QVnow`, in V.
@@ -85,7 +85,7 @@ class SupplyFaults:
 
 
 class SupplyFirmware:
-    """Commands in, answers out, and the state of converter and output switch.
+    """Interpreter of its commands, with the state of converter and output switch.
 
     Args:
         name: what it answers to `QName`.
@@ -112,7 +112,7 @@ class SupplyFirmware:
         self._fill(faults.fragment)
 
     def power_on(self) -> None:
-        """What happens when it gets power: the stored settings are taken over."""
+        """Start at power-on with the stored settings."""
         self._buffer, self._end = bytearray(_BUFFER + 1), 0
         stored = {key: self._eeprom[key] for key in _STORED}
         self.vset = int(stored["vset"])
@@ -133,7 +133,7 @@ class SupplyFirmware:
 
     @property
     def converter_v(self) -> float:
-        """What the converter is asked for, in V."""
+        """Set point of the converter, in V."""
         if not (self.enabled and (not self.power_jack or self.jack_in)):
             return 0.0
         if self.vmode in (_REGULATED, _OPEN_LOOP):
@@ -165,7 +165,7 @@ class SupplyFirmware:
             self.closed = True  # half of the time
 
     def meter_v(self, voltage_v: float) -> int:
-        """What the converter's divider and the ten bits behind it make of a voltage."""
+        """Reading of a voltage by the converter's divider and the 10-bit ADC."""
         share = (voltage_v + self.faults.meter_error_v) / self.reach_v
         code = min(max(round(_ADC_TOP * share), 0), _ADC_TOP)
         return 0 if code < _ADC_LEAST else int(code / _ADC_TOP * self.reach_v + 0.5)
@@ -190,7 +190,7 @@ class SupplyFirmware:
                 self._end = 0
 
     def answer(self, command: str, now_v: float) -> str:
-        """Do what a command says.
+        """Execute a command.
 
         Args:
             command: without its end.

@@ -1,4 +1,4 @@
-"""The twin's high-voltage rail as a Peta-Pico-Voltron on a pseudo-terminal."""
+"""Serve the twin's high-voltage supply as a Peta-Pico-Voltron on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class SupplyServer:
         self.faults = faults or SupplyFaults()
         self.firmware = SupplyFirmware(NAME, self.faults)
         self._lock = threading.RLock()
-        self._left_v, self._since_s = 0.0, clock()  # above what the converter is asked for
+        self._left_v, self._since_s = 0.0, clock()  # above the converter's set point
         self._stale = self.faults.stale
         with self._lock:
             self._apply(0.0)
@@ -141,19 +141,19 @@ class SupplyServer:
         self._hub.rail(requested_v if self._on else 0.0)
 
     def press(self, down: bool) -> None:
-        """Somebody presses its button, or lets go of it."""
+        """Press or release its button."""
         self._outside(lambda: self.firmware.press(down))
 
     def external(self, high: bool) -> None:
-        """Somebody else drives the input of the external switch source."""
+        """Set the input of the external switch source."""
         self._outside(lambda: self.firmware.external(high))
 
     def plug(self, jack_in: bool) -> None:
-        """Somebody pulls the power jack, or plugs it in; the USB cable feeds the rest."""
+        """Unplug or plug in the power jack; the USB cable powers the rest."""
         self._outside(lambda: setattr(self.firmware, "jack_in", jack_in))
 
     def power_on(self) -> None:
-        """Its USB cable was out: it starts with what its EEPROM says."""
+        """Reconnect its USB cable, so that it starts with its stored settings."""
         self._outside(self.firmware.power_on)
 
     def _outside(self, act: Callable[[], None]) -> None:

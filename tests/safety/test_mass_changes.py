@@ -85,16 +85,16 @@ def test_load_meets_no_drive_and_no_carrier_and_restores_the_carrier(
 
 
 @pytest.mark.parametrize(
-    ("shows_v", "told"),
+    ("shows_v", "reported"),
     [(0.5, r"2500 V"), (OSError("cable"), "OSError: cable")],
 )
 def test_nobody_is_sent_to_a_bench_that_is_not_confirmed_at_zero(
-    shows_v: float | Exception, told: str
+    shows_v: float | Exception, reported: str
 ) -> None:
     rig, person, _ = bench(shows_v)
     guarded = guard(rig)
     guarded.safety.arm(guarded.safety.request())
-    with pytest.raises(SafetyError, match=rf"Do not touch.*before the mass is changed: .*{told}"):
+    with pytest.raises(SafetyError, match=rf"Do not touch.*mass is changed: .*{reported}"):
         guarded.stand.hang(0.25)
     assert person.met == []
     assert guarded.safety.stage is Stage.TRIPPED

@@ -1,18 +1,22 @@
-"""The figures of the identify commands: measured and modelled data, and residuals."""
+"""Figures of fits: measured and modelled data, and residuals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base.chart import Chart, Curve, Panel
-from haselab.identify.frequency.response import FrequencyResponse
 from haselab.identify.record import Record
+
+if TYPE_CHECKING:
+    from haselab.identify.frequency.response import FrequencyResponse
 
 __all__ = [
     "curve_chart",
+    "lines_chart",
     "loop_chart",
     "odds_chart",
     "records_chart",
@@ -101,6 +105,35 @@ def response_chart(
         Panel(axis, "Phase (°)", phase, log_x=True),
         Panel(axis, "Coherence", (Curve(hz, of("coherence")),), log_x=True),
     ))  # fmt: skip
+
+
+def lines_chart(
+    title: str,
+    frequency_hz: Floats,
+    measured: NDArray[np.complex128],
+    modelled: NDArray[np.complex128],
+) -> Chart:
+    """Measured lines of a frequency response, and the model's.
+
+    Args:
+        title: of the figure.
+        frequency_hz: in Hz. Shape `(K,)`.
+        measured: complex gain. Shape `(K,)`.
+        modelled: the same of the model. Shape `(K,)`.
+    Returns:
+        The chart.
+    """
+    panels = []
+    for label, of, log_y in (
+        ("Magnitude", np.abs, True),
+        ("Phase (°)", lambda g: np.degrees(np.unwrap(np.angle(g))), False),
+    ):
+        curves = (
+            Curve(frequency_hz, np.asarray(of(measured)), "measured", "points"),
+            Curve(frequency_hz, np.asarray(of(modelled)), "fit"),
+        )
+        panels.append(Panel("Frequency (Hz)", label, curves, log_x=True, log_y=log_y))
+    return Chart(title, panels)
 
 
 def curve_chart(

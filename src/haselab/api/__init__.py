@@ -1,0 +1,1 @@
+"""What `import haselab as hl` offers: short calls for notebooks and scripts."""

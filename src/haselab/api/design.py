@@ -1,0 +1,152 @@
+"""From a model to a controller, and what is known of one actuator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from haselab.base import InputError
+from haselab.control import (
+    Design,
+    DesignSpec,
+    LoopSetting,
+    Saturation,
+    design_pi,
+    design_pid,
+    design_plausible,
+)
+from haselab.control.plausible_design import Structure
+from haselab.controllers import ChosenController
+from haselab.controllers.registry import chosen_controller
+from haselab.identify import TransferFit
+from haselab.models import Plant, RationalModel, VoltageMap
+from haselab.models.actuator.sections import ActuatorTables, missing
+from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.posterior import PlantPosterior
+from haselab.runtime.loop import LoopSettings
+from haselab.store.actuator_file import read_run
+from haselab.store.toml import validated
+
+__all__ = ["Actuator", "design"]
+
+
+def design(
+    model: TransferFit | PlantPosterior | Plant | RationalModel,
+    spec: DesignSpec | Mapping[str, float | bool] | None = None,
+    *,
+    controller: Structure = "pi",
+    limits: tuple[float, float] = (-0.05, 0.1),
+    rate_hz: float = 100.0,
+    delay_s: float = 0.005,
+    probability: float | None = None,
+    seed: int = 0,
+) -> Design:
+    """Design a PI or PID controller for a model, with margins that include the loop's delay.
+
+    Args:
+        model: a fit, which also gives the share of plausible plants that keep the margins; or a
+            plant.
+        spec: demands; None: the usual ones.
+        controller: "pi" or "pid".
+        limits: lowest and highest output of the controller, in the unit of the model's input.
+        rate_hz: updates of the loop a second, in Hz.
+        delay_s: age of a measurement when the controller uses it, in s.
+        probability: share of the plausible plants that has to keep the margins; a fit only.
+        seed: of the search.
+    Returns:
+        Gains, margins and the predicted step; `shortfalls` names the demands that are not met.
+    Raises:
+        InputError: an unknown kind, or a probability for a plant without covariance.
+        ResultError: the fit has no result, or a number that is not identifiable.
+    Example:
+        >>> found = design(Plant(1.0, 32.0, 0.3), {"phase_margin_deg": 60.0})
+        >>> found.shortfalls, found.nominal.margins.phase_margin_deg >= 60.0
+        ((), True)
+    """
+    if controller not in ("pi", "pid"):
+        raise InputError(f"controller is {controller!r}. Use pi or pid.")
+    demands = spec if isinstance(spec, DesignSpec) else DesignSpec.from_mapping(spec or {})
+    loop, rng = LoopSetting(rate_hz, delay_s, Saturation(*limits)), np.random.default_rng(seed)
+    posterior = model.posterior if isinstance(model, TransferFit) else model
+    if isinstance(posterior, PlantPosterior):
+        return design_plausible(
+            posterior, demands, loop, rng=rng, structure=controller, probability=probability
+        )
+    if probability is not None:
+        raise InputError(
+            "probability needs the covariance of the model. Give a fit instead of a plant."
+        )
+    search = design_pi if controller == "pi" else design_pid
+    return search(posterior, demands, loop, rng=rng)
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """What a closed loop needs to know of one actuator.
+
+    Args:
+        voltage_map: from strain to drive voltage; None: not known yet.
+        strain_map: from capacitance to strain; None: not known yet.
+        controller: a design, or a controller of any registered kind; None: not known yet.
+        saturation: limits of the controller's output, in strain. None: those of the design, else
+            those of the reference study.
+        plant: the model; None: not known yet.
+    """
+
+    voltage_map: VoltageMap | None = None
+    strain_map: StrainMap | None = None
+    controller: Design | ChosenController | None = None
+    saturation: Saturation | None = None
+    plant: Plant | None = None
+
+    @classmethod
+    def load(cls, path: str | Path) -> Actuator:
+        """Read an actuator file, or the folder of a run.
+
+        Args:
+            path: actuator.toml, or a folder that holds one.
+        Returns:
+            What the file knows.
+        Raises:
+            InputError: no such file, or values that cannot be.
+        """
+        tables = validated(ActuatorTables, read_run(Path(path)), Path(path))
+        drive, sensing, model, section = (
+            tables.drive, tables.sensing, tables.model, tables.controller,
+        )  # fmt: skip
+        chosen = limits = None
+        if section is not None and section.is_known:
+            chosen = chosen_controller(section.model_dump(), path)
+        if section is not None and section.limits is not None:
+            limits = Saturation(section.limits.low, section.limits.high)
+        return cls(
+            None if drive.voltage_map is None else drive.voltage_map.map(),
+            None if sensing.strain_map is None else sensing.strain_map.map(),
+            chosen,
+            limits,
+            None if model is None or not model.model_extra else model.plant(),
+        )
+
+    def loop(self) -> LoopSettings:
+        """The settings of a closed loop.
+
+        Returns:
+            Controller, saturation and both maps.
+        Raises:
+            InputError: one of them is not known yet.
+        """
+        if self.voltage_map is None:
+            raise missing("drive.voltage_map", "haselab identify voltage-map FILE")
+        if self.strain_map is None:
+            raise missing("sensing.strain_map", "haselab identify capacitance-map FILE")
+        if self.controller is None:
+            raise missing("controller", "haselab design")
+        if isinstance(self.controller, Design):
+            limits = self.saturation or self.controller.setting.saturation
+            chosen = self.controller.gains.controller()
+        else:
+            limits, chosen = self.saturation or Saturation(), self.controller
+        return LoopSettings(chosen, limits, self.voltage_map, self.strain_map)

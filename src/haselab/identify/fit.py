@@ -1,0 +1,312 @@
+"""What all fits share: numbers with their covariance, a summary, a figure, new data."""
+
+from __future__ import annotations
+
+import html
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base.chart import Chart
+from haselab.identify.noise import fit_percent
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["CurveFit", "Fit", "Prediction", "RecordFit", "propagated", "rescaled", "several"]
+
+Floats = NDArray[np.float64]
+Recorded = TypeVar("Recorded")
+_QUALITIES = ("fit_percent", "r_squared", "residual_whiteness_p", "chi_squared_ratio")
+_NAME_WIDTH = 28
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Measured data beside what a model says of them.
+
+    Args:
+        fit_percent: NRMSE fit: 100 is perfect, 0 no better than the mean.
+        rms_error: root mean square of measured minus predicted, in the unit of the output.
+        inside_band: share of the samples inside the 95 % band; NaN where there is no band.
+        predicted: of all records, one after the other. Shape `(M,)`.
+        half_band: half the width of the band at each sample. Shape `(M,)`; empty without a band.
+        measured: of all records. Shape `(M,)`.
+    """
+
+    fit_percent: float
+    rms_error: float
+    inside_band: float
+    predicted: Floats
+    half_band: Floats
+    measured: Floats
+
+    @classmethod
+    def of(
+        cls,
+        measured: Sequence[Floats],
+        modelled: Sequence[Floats],
+        half_band: Floats | None = None,
+    ) -> Prediction:
+        """Judge the modelled outputs of some records.
+
+        Args:
+            measured: outputs of each record. Shape `(M_r,)` each.
+            modelled: the same by the model. Shape `(M_r,)` each.
+            half_band: half the width of the band, of all records. None: there is no band.
+        Returns:
+            Both, with the error between them.
+        """
+        error = np.abs(np.concatenate(list(measured)) - np.concatenate(list(modelled)))
+        half = np.zeros(0) if half_band is None else half_band
+        return cls(
+            fit_percent=fit_percent(measured, modelled),
+            rms_error=float(np.sqrt(np.mean(error**2))),
+            inside_band=float(np.mean(error <= half)) if half.size else math.nan,
+            predicted=np.concatenate(list(modelled)),
+            half_band=half,
+            measured=np.concatenate(list(measured)),
+        )
+
+
+def _no_covariance() -> Floats:
+    return np.zeros((0, 0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(ABC):
+    """A fitted model.
+
+    Args:
+        status: "ok", or why there is no result.
+        parameters: every number by name. One that is not identifiable is NaN with an infinite
+            interval.
+        covariance: of `parameters`, in their order; infinite where one is not identifiable.
+            Shape `(P, P)`.
+        residuals: measured minus modelled, of each record. Shape `(M_r,)` each.
+        notes: what the reader of the numbers should know, a sentence each.
+    """
+
+    status: str
+    parameters: dict[str, Estimate] = field(default_factory=dict)
+    covariance: Floats = field(default_factory=_no_covariance, repr=False)
+    residuals: tuple[Floats, ...] = field(default=(), repr=False)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the numbers may be used."""
+        return self.status == "ok"
+
+    @abstractmethod
+    def answer(self) -> JsonObject:
+        """The result by name, as the commands write it.
+
+        Returns:
+            Numbers, estimates, texts, and tables of them; `haselab.base.to_plain` makes JSON of it.
+        """
+
+    @abstractmethod
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """Measured data, model and residuals as data of a figure.
+
+        Args:
+            names: of what the model maps from and to. None: its usual names.
+        Returns:
+            The chart.
+        Raises:
+            ResultError: the fit has no result.
+        """
+
+    def plot(self) -> Figure:
+        """Draw measured data, model and residuals.
+
+        Returns:
+            A matplotlib figure: a notebook shows it, and `savefig` writes it.
+        Raises:
+            ResultError: the fit has no result.
+        """
+        return self.chart().plot()
+
+    def summary(self) -> str:
+        """The numbers with their 95 % intervals and units, as a table of plain text.
+
+        Returns:
+            Lines for `print`.
+        """
+        lines = [f"{type(self).__name__}: {self.status}"]
+        if self.parameters:
+            head = f"{'':{_NAME_WIDTH}s} {'value':>12s}  {'95 % interval':^27s} unit"
+            lines += [head, *(_row(*row) for row in self._rows())]
+        lines += [f"{name:{_NAME_WIDTH}s} {value:12.5g}" for name, value in self._qualities()]
+        return "\n".join([*lines, *(f"Note: {note}" for note in self.notes)])
+
+    def _repr_html_(self) -> str:
+        """The summary as a notebook shows it."""
+        cells = ["<tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>"]
+        for row in self._rows():
+            cells.append(
+                "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+            )
+        qualities = ", ".join(f"{name} {value:.5g}" for name, value in self._qualities())
+        notes = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
+        return (
+            f"<p><b>{type(self).__name__}</b>: {html.escape(self.status)}</p>"
+            f"<table>{''.join(cells)}</table><p>{qualities}</p><ul>{notes}</ul>"
+        )
+
+    def _rows(self) -> Iterator[tuple[str, str, str, str]]:
+        """Name, value, interval and unit of each parameter."""
+        for name, estimate in self.parameters.items():
+            if math.isnan(estimate.value):
+                yield name, "", "not identifiable", estimate.unit
+                continue
+            low, high = estimate.ci95
+            yield name, f"{estimate.value:.6g}", f"{low:.6g} to {high:.6g}", estimate.unit
+
+    def _qualities(self) -> Iterator[tuple[str, float]]:
+        """Name and value of each figure of merit that this fit has."""
+        for name in _QUALITIES:
+            value = getattr(self, name, math.nan)
+            if not math.isnan(value):
+                yield name, value
+
+    def _require(self) -> None:
+        """Refuse to use a fit that has no result."""
+        if not self.succeeded:
+            raise ResultError(f"The fit has no result: {self.status}")
+
+
+def _row(name: str, value: str, interval: str, unit: str) -> str:
+    return f"{name:{_NAME_WIDTH}s} {value:>12s}  {interval:^27s} {unit}".rstrip()
+
+
+class RecordFit(Fit, Generic[Recorded]):
+    """A fit of what an input does to an output in time."""
+
+    @abstractmethod
+    def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
+        """Output of the model for a new input.
+
+        Args:
+            u: input, held between its samples. Shape `(N,)`.
+            rate_hz: samples a second, in Hz. None: as in the record of the fit.
+        Returns:
+            Output at the same moments, from rest. Shape `(N,)`.
+        Raises:
+            ResultError: the fit has no result.
+            InputError: a wrong shape, or a rate that the model cannot take.
+        """
+
+    @abstractmethod
+    def _modelled(self, record: Recorded) -> tuple[Floats, Floats]:
+        """Measured and modelled output of a record, initial state and constant fitted to it."""
+
+    def compare(self, records: Recorded | Sequence[Recorded]) -> Prediction:
+        """Predict records that were not used for the fit, and compare with their outputs.
+
+        The initial state and the constant of each record are fitted to it first, because they
+        are no property of the model.
+
+        Args:
+            records: new ones, of the kind that the fit took.
+        Returns:
+            The fit in percent, the error, and the predicted output.
+        Raises:
+            ResultError: the fit has no result.
+            InputError: no record.
+        """
+        self._require()
+        pairs = [self._modelled(record) for record in several(records)]
+        return Prediction.of([y for y, _ in pairs], [m for _, m in pairs])
+
+
+class CurveFit(Fit):
+    """A fit of a curve through pairs of numbers."""
+
+    @abstractmethod
+    def simulate(self, x: ArrayLike) -> Floats:
+        """Value of the curve.
+
+        Args:
+            x: abscissas, as the fit took them. Shape `(N,)`.
+        Returns:
+            Values. Shape `(N,)`.
+        Raises:
+            ResultError: the fit has no result.
+        """
+
+    def compare(self, x: ArrayLike, y: ArrayLike) -> Prediction:
+        """Predict pairs that were not used for the fit, and compare.
+
+        Args:
+            x: abscissas. Shape `(N,)`.
+            y: measured values. Shape `(N,)`.
+        Returns:
+            The fit in percent, the error, and the predicted values.
+        Raises:
+            ResultError: the fit has no result.
+            InputError: unequal lengths.
+        """
+        self._require()
+        measured = np.asarray(y, dtype=np.float64)
+        modelled = self.simulate(x)
+        if measured.shape != modelled.shape:
+            raise InputError(
+                f"x has shape {modelled.shape} and y {measured.shape}. Give one y for each x."
+            )
+        return Prediction.of([measured], [modelled])
+
+
+def several(records: Recorded | Sequence[Recorded]) -> list[Recorded]:
+    """One record, or several, as a list.
+
+    Args:
+        records: a record or a sequence of them.
+    Returns:
+        At least one record.
+    Raises:
+        InputError: an empty sequence.
+    """
+    found = list(records) if isinstance(records, Sequence) else [records]
+    if not found:
+        raise InputError("records is empty. Give one record or more.")
+    return found
+
+
+def propagated(slopes: Floats, covariance: Floats) -> Floats:
+    """Covariance of numbers that follow from others, to first order.
+
+    Args:
+        slopes: derivatives of the new numbers by the old ones. Shape `(Q, P)`.
+        covariance: of the old ones; infinite where one is not identifiable. Shape `(P, P)`.
+    Returns:
+        Covariance; NaN where a number depends on one that is not identifiable. Shape `(Q, Q)`.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray(slopes @ covariance @ slopes.T)
+
+
+def rescaled(covariance: Floats, std: Floats) -> Floats:
+    """A covariance with other standard deviations and the same correlations.
+
+    Args:
+        covariance: to be changed. Shape `(P, P)`.
+        std: standard deviations wanted. Infinite: not identifiable. Shape `(P,)`.
+    Returns:
+        Covariance, infinite in the rows and columns of an infinite `std`. Shape `(P, P)`.
+    """
+    blind = ~np.isfinite(std)
+    own = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    usable = (own > 0.0) & np.isfinite(own) & ~blind
+    factor = np.where(usable, np.where(blind, 0.0, std) / np.where(usable, own, 1.0), 0.0)
+    scaled = np.where(np.isfinite(covariance), covariance, 0.0) * np.outer(factor, factor)
+    np.fill_diagonal(scaled, np.where(blind, 0.0, std) ** 2)
+    scaled[blind] = scaled[:, blind] = np.inf
+    return np.asarray(scaled)

@@ -1,0 +1,91 @@
+"""Files, pandas, xarray and dictionaries give the same tables and records."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import haselab as hl
+from haselab.base import InputError
+
+TIME_S = np.arange(200) / 50.0
+U = np.repeat(np.random.default_rng(1).normal(size=20), 10)
+Y = np.cumsum(U)
+
+
+def csv(folder: Path) -> Path:
+    path = folder / "record.csv"
+    rows = np.column_stack([TIME_S, U, Y, np.arange(200) != 7])
+    np.savetxt(path, rows, "%.17g", ",", header="time_s,u,y,valid", comments="")
+    return path
+
+
+SOURCES = {
+    "dictionary": {"time_s": TIME_S, "u": U, "y": Y},
+    "frame with a column of times": pd.DataFrame({"time_s": TIME_S, "u": U, "y": Y, "word": "a"}),
+    "frame with an index of times": pd.DataFrame(
+        {"u": U, "y": Y}, index=pd.Index(TIME_S, name="time_s")
+    ),
+    "frame with an index of clock times": pd.DataFrame(
+        {"u": U, "y": Y}, index=pd.Timestamp("2026-01-01") + pd.to_timedelta(TIME_S, unit="s")
+    ),
+    "data set": xr.Dataset({"u": ("time_s", U), "y": ("time_s", Y)}, {"time_s": TIME_S}),
+    "table": hl.table({"time_s": TIME_S, "u": U, "y": Y}),
+}
+
+
+@pytest.mark.parametrize("data", SOURCES.values(), ids=SOURCES.keys())
+def test_every_source_gives_the_same_record(data):
+    (record,) = hl.records(data)
+    assert np.array_equal(record.u, U) and np.array_equal(record.y, Y)
+    assert record.input_rate_hz == pytest.approx(50.0, rel=1e-9)
+    assert record.input_before is None
+
+
+def test_a_rate_comes_from_the_argument_or_the_attribute():
+    frame = pd.DataFrame({"drive": U, "out": Y})
+    with pytest.raises(InputError, match="no sampling rate"):
+        hl.records(frame, "drive", "out")
+    assert hl.records(frame, "drive", "out", rate_hz=20.0)[0].input_rate_hz == 20.0
+    frame.attrs["rate_hz"] = 30.0
+    assert hl.records(frame, "drive", "out")[0].input_rate_hz == 30.0
+
+
+def test_a_gap_in_the_times_begins_a_new_record():
+    frame = pd.DataFrame({"time_s": TIME_S, "u": U, "y": Y}).drop(index=range(90, 105))
+    first, second = hl.records(frame)
+    assert (first.y.size, second.y.size) == (90, 95)
+    assert np.array_equal(second.y, Y[105:])
+
+
+def test_wrong_data_are_refused_with_what_to_do(tmp_path):
+    with pytest.raises(InputError, match="no column 'drive'; the data have time_s, u, y"):
+        hl.records(SOURCES["dictionary"], "drive")
+    with pytest.raises(InputError, match="columns of one length"):
+        hl.table({"u": U, "y": Y[1:]})
+    with pytest.raises(InputError, match="no column of numbers"):
+        (tmp_path / "words.csv").write_text("a,b\nx,y\nz,w\n")
+        hl.load(tmp_path / "words.csv")
+
+
+def test_a_file_is_loaded_without_its_invalid_rows_and_goes_out_again(tmp_path):
+    table = hl.load(csv(tmp_path))
+    assert isinstance(table, hl.Table)
+    assert list(table) == ["time_s", "u", "y"] and table.left_out == 1
+    kept = np.arange(200) != 7
+    assert np.array_equal(table["y"], Y[kept])
+    frame = table.to_pandas()
+    assert list(frame.columns) == ["time_s", "u", "y"] and len(frame) == 199
+    dataset = table.to_xarray()
+    assert np.array_equal(dataset.u.values, U[kept])
+    assert np.array_equal(dataset.time_s.values, TIME_S[kept])
+    assert dataset.time_s.attrs["units"] == "s"
+    assert "<th>u</th>" in table._repr_html_()
+
+
+def test_records_pass_through():
+    records = hl.records(SOURCES["dictionary"])
+    assert hl.records(records) == records
+    assert hl.records(records[0]) == records

@@ -1,0 +1,76 @@
+"""A design from a fit, and what an actuator file knows."""
+
+import numpy as np
+import pytest
+
+import haselab as hl
+from haselab.base import InputError
+from haselab.controllers.builtin import pid_controller
+from haselab.models import VoltageMap
+from haselab.models.actuator.strain_map import StrainMap
+
+PLANT = hl.Plant(1.0, 32.0, 0.3)
+TO_VOLT = VoltageMap(1.3, 3.1, -0.28, -26.9)
+TO_STRAIN = StrainMap(4.9e8, -0.27)
+FILE = """
+[drive.voltage_map]
+a1_v = 1.3
+b1 = 3.1
+a2_v = -0.28
+b2 = -26.9
+[sensing.strain_map]
+slope_per_f = 4.9e8
+offset = -0.27
+[model]
+gain = 1.0
+natural_frequency_rad_s = 32.0
+damping_ratio = 0.3
+delay_s = 0.0
+slow_modes = []
+[controller]
+kind = "pi"
+parameters = { kp = 0.5, ki = 2.0 }
+limits = { low = -0.02, high = 0.08 }
+"""
+
+
+@pytest.mark.long
+def test_a_fit_brings_the_plausible_plants_with_it():
+    u = np.random.default_rng(1).normal(size=1500)
+    time_s = np.arange(1500) / 100.0
+    y = PLANT.simulate(u, 100.0, time_s) + 0.01 * np.random.default_rng(2).normal(size=1500)
+    fit = hl.fit_transfer(hl.Record(u, 100.0, y, time_s))
+    found = hl.design(fit, {"phase_margin_deg": 60.0}, limits=(-0.02, 0.08))
+    assert found.plausible is not None
+    assert found.setting.saturation.high == 0.08
+    assert hl.Actuator(TO_VOLT, TO_STRAIN, found).loop().saturation.low == -0.02
+    assert "phase_margin_deg" in found._repr_html_()
+
+
+def test_what_cannot_be_designed_is_refused():
+    with pytest.raises(InputError, match="controller is 'lqg'"):
+        hl.design(PLANT, controller="lqg")
+    with pytest.raises(InputError, match="needs the covariance"):
+        hl.design(PLANT, probability=0.9)
+
+
+def test_an_actuator_file_gives_its_maps_model_and_controller(tmp_path):
+    path = tmp_path / "actuator.toml"
+    path.write_text(FILE)
+    found = hl.Actuator.load(path)
+    assert found.plant == PLANT
+    loop = found.loop()
+    assert loop.controller.summary() == "pi, kp = 0.5, ki = 2 1/s"
+    assert (loop.saturation.low, loop.saturation.high) == (-0.02, 0.08)
+    assert loop.voltage_map.voltage_v(0.01) == pytest.approx(TO_VOLT.voltage_v(0.01))
+
+
+def test_a_loop_needs_both_maps_and_a_controller():
+    chosen = pid_controller(0.5, 2.0, 0.0, 0.0)
+    for known, lacks in (
+        (hl.Actuator(None, TO_STRAIN, chosen), r"drive\.voltage_map"),
+        (hl.Actuator(TO_VOLT, None, chosen), r"sensing\.strain_map"),
+        (hl.Actuator(TO_VOLT, TO_STRAIN), "controller"),
+    ):
+        with pytest.raises(InputError, match=lacks):
+            known.loop()

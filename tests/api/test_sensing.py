@@ -1,0 +1,74 @@
+"""Capacitance and displacements from arrays: against what made them."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import haselab as hl
+from haselab.base import InputError
+
+RATE_HZ, CARRIER_HZ = 200_000.0, 2000.0
+CAPACITANCE_F, RESISTANCE_OHM = 1.2e-9, 50e3
+
+
+def monitors() -> pd.DataFrame:
+    """5 kV/V and 2 mA/V monitors of a capacitor with a resistor in series, at the carrier."""
+    phase = 2.0 * np.pi * CARRIER_HZ * np.arange(20_000) / RATE_HZ
+    impedance_ohm = RESISTANCE_OHM + 1.0 / (2j * np.pi * CARRIER_HZ * CAPACITANCE_F)
+    volts, amperes = 100.0, 100.0 / impedance_ohm
+    frame = pd.DataFrame({
+        "v_monitor_v": (volts * np.exp(1j * phase)).real / 5000.0,
+        "i_monitor_v": (amperes * np.exp(1j * phase)).real / 2e-3,
+    })  # fmt: skip
+    rng = np.random.default_rng(1)
+    return frame + 1e-5 * rng.normal(size=frame.shape)
+
+
+def test_the_capacitor_and_its_resistor_are_found():
+    sensed = hl.sense(monitors(), carrier_hz=CARRIER_HZ, rate_hz=RATE_HZ)
+    assert sensed["valid"].all() and sensed["time_s"].size == 10
+    for name, truth in (("capacitance", CAPACITANCE_F), ("resistance", RESISTANCE_OHM)):
+        unit = "f" if name == "capacitance" else "ohm"
+        off = np.abs(sensed[f"{name}_{unit}"] - truth)
+        assert (off < 5.0 * sensed[f"{name}_std_{unit}"]).all()
+    assert sensed.to_xarray().resistance_ohm.attrs["units"] == "ohm"
+
+
+def test_what_is_missing_is_named():
+    frame = monitors()
+    with pytest.raises(InputError, match="no sampling rate"):
+        hl.sense(frame, carrier_hz=CARRIER_HZ)
+    with pytest.raises(InputError, match="no column 'U'"):
+        hl.sense(frame, carrier_hz=CARRIER_HZ, rate_hz=RATE_HZ, v="U")
+    with pytest.raises(InputError, match="one block has 2000"):
+        hl.sense(frame[:1000], carrier_hz=CARRIER_HZ, rate_hz=RATE_HZ)
+
+
+def frames(shifts_px: list[float]) -> list[np.ndarray]:
+    """A smooth pattern that moves to the right."""
+    x, y = np.meshgrid(np.arange(120.0), np.arange(90.0))
+    waves = np.random.default_rng(2).uniform([0.2, 0.2, 0.0], [0.7, 0.7, 6.28], (12, 3))
+    images = []
+    for shift_px in shifts_px:
+        bright = sum(np.cos(a * (x - shift_px) + b * y + c) for a, b, c in waves)
+        images.append(np.clip(127.0 + 12.0 * bright, 0, 255).round().astype(np.uint8))
+    return images
+
+
+def test_points_follow_a_moving_pattern():
+    shifts_px = [0.0, 0.5, 1.25, 2.0]
+    points = pd.DataFrame({"x_px": [40.0, 80.0], "y_px": [45.0, 45.0]})
+    found = hl.track(frames(shifts_px), points, rate_hz=50.0, scale_mm_per_px=0.1)
+    frame = found.to_pandas()
+    assert frame["valid"].all() and len(frame) == 8
+    moved_px = frame["x_px"] - np.tile([40.0, 80.0], 4)
+    # Grey levels are whole numbers: the deviation that is given counts their rounding.
+    off = np.abs(moved_px - np.repeat(shifts_px, 2))
+    assert (off < 5.0 * np.maximum(frame["std_x_px"], 0.005)).all()
+    assert frame["time_s"].iloc[-1] == pytest.approx(3 / 50.0)
+    assert np.array_equal(frame["x_mm"], 0.1 * frame["x_px"])
+
+
+def test_a_video_without_frames_is_refused():
+    with pytest.raises(InputError, match="no frame"):
+        hl.track([], np.zeros((1, 2)))

@@ -19,7 +19,7 @@ NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] n
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fuzz help study test check test-all setup lint ctest tools bench clean
+.PHONY: fuzz help study test check test-all setup lint ctest tools bench bench-full clean
 .DELETE_ON_ERROR:
 
 help:
@@ -29,7 +29,8 @@ help:
 	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
-	@echo 'make bench   reproduce every published figure and compare it with other libraries'
+	@echo 'make bench   measure the published figures on a part of the cases: 10 minutes'
+	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment and extensions only'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
@@ -71,7 +72,10 @@ fuzz: setup
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(FUZZ_S) --state out/fuzz
 
 bench: setup $(VENV)/.bench
-	$(BIN)/python benchmarks/bench.py
+	$(BIN)/python -m benchmarks
+
+bench-full: setup $(VENV)/.bench
+	$(BIN)/python -m benchmarks --full
 
 setup: $(VENV)/.built
 
@@ -102,9 +106,9 @@ $(VENV)/.built: $(NATIVE) $(VENV)/.packages
 	@touch $@
 
 $(VENV)/.bench: pyproject.toml $(VENV)/.packages
-	@$(PIP) install --no-build-isolation --editable '.[bench,peers]'
-	@echo 'bench: peers of the transfer fit, which need an older numpy of their own'
-	@$(BIN)/python -m venv $(VENV)/peers && $(VENV)/peers/bin/pip --disable-pip-version-check \
+	@$(PIP) install --no-build-isolation --editable '.[bench,comparison]'
+	@echo 'bench: other libraries for transfer functions, which need an older numpy of their own'
+	@$(BIN)/python -m venv $(VENV)/libraries && $(VENV)/libraries/bin/pip --disable-pip-version-check \
 	  --quiet install sippy_unipi sysidentpy pysib control || \
 	  echo 'bench: not all of them could be installed; the table shows the rest' >&2
 	@touch $@

@@ -95,11 +95,11 @@ def permitted() -> type:
 
 @pytest.fixture(scope="session")
 def benchmarks() -> Iterator[Path]:
-    """The folder of the benchmarks, whose scenes some tests share, on the path of imports."""
-    folder = _TESTS.parent / "benchmarks"
-    sys.path.insert(0, str(folder))
-    yield folder
-    sys.path.remove(str(folder))
+    """The folder of the benchmarks, whose scenes some tests share; `benchmarks` can be imported."""
+    checkout = _TESTS.parent
+    sys.path.insert(0, str(checkout))
+    yield checkout / "benchmarks"
+    sys.path.remove(str(checkout))
 
 
 @pytest.fixture(scope="session")

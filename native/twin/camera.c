@@ -80,8 +80,9 @@ static void add_span(float *cover, int width, double left_px, double right_px, d
     }
 }
 
-static void fill_surfaces(const camera_scene *s, const double *lengths_px, size_t samples,
-                          const float *sheet, const float *clamps, float *cover, float *level)
+HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths_px, size_t samples,
+                                    const float *sheet, const float *clamps, float *cover,
+                                    float *level)
 {
     float falloff[FALLOFF_SIZE];
     for (int i = 0; i < FALLOFF_SIZE; i++) {
@@ -134,8 +135,8 @@ static int fill_profile(double centre_px, double sigma_px, int reach, float *pro
 }
 
 /* Subtracts one blob at one position; window, or NULL, is its visibility along y. */
-static void subtract_blob(const camera_scene *s, const camera_blob *blob, double x_px, double y_px,
-                          float depth, const float *window, float *level)
+HS_CLONES static void subtract_blob(const camera_scene *s, const camera_blob *blob, double x_px,
+                                    double y_px, float depth, const float *window, float *level)
 {
     const int reach = (int)ceil(BLOB_REACH * blob->sigma_px);
     if (!(x_px > -reach && x_px < s->width - 1 + reach && y_px > -reach &&

@@ -320,14 +320,21 @@ static void amplify(const twin_parameters *p, twin_state *s, double target_v, do
 /* What is connected to the output. */
 typedef struct {
     double farad, series_ohm, leakage_ohm;
+    double decay; /* of the voltage across the series resistance, over one sample */
 } element;
 
 static element connected(const twin_parameters *p, const twin_state *s)
 {
-    const element actuator = {twin_capacitance(p, s->length_m, s->plate_v), p->series_ohm,
-                              p->leakage_ohm};
-    const element reference = {s->reference_f, s->reference_ohm, INFINITY};
-    return s->reference_f > 0.0 ? reference : actuator;
+    element load = {s->reference_f, s->reference_ohm, INFINITY, 0.0};
+    double rc;
+    if (!(s->reference_f > 0.0)) {
+        load.farad = twin_capacitance(p, s->length_m, s->plate_v);
+        load.series_ohm = p->series_ohm;
+        load.leakage_ohm = p->leakage_ohm;
+    }
+    rc = load.series_ohm * load.farad;
+    load.decay = rc > 0.02 * p->sample_s ? exp(-p->sample_s / rc) : 0.0;
+    return load;
 }
 
 /* Series R-C with leakage, and the stray capacitance beside them, for one sample in which the
@@ -335,7 +342,7 @@ static element connected(const twin_parameters *p, const twin_state *s)
 static void charge(const twin_parameters *p, twin_state *s, double v0, double v1, element load)
 {
     const double dt = p->sample_s, farad = load.farad, rc = load.series_ohm * farad;
-    const double decay = rc > 0.02 * dt ? exp(-dt / rc) : 0.0;
+    const double decay = load.decay;
     const double slope = (v1 - v0) / dt;
     const double plate = v1 - slope * rc * (1.0 - decay) + (s->plate_v - v0) * decay;
     s->current_a =
@@ -364,6 +371,7 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
     const double turn_s = sin(p->carrier_rad_s * p->sample_s);
     const double later = p->skew_s / p->sample_s; /* 0 to 1: place of the second channel */
     const double phase = fmod(p->carrier_rad_s * s->time_s, 6.283185307179586);
+    const int noisy = p->v_noise_v != 0.0 || p->i_noise_v != 0.0;
     double c = cos(phase), q = sin(phase);
     int32_t n = 0, step;
 
@@ -379,14 +387,16 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
             const double drive = n < switch_at ? before_v : after_v;
             const double v0 = s->amp_v, i0 = s->current_a;
             const double now = q;
-            float noise_v, noise_i;
+            float noise_v = 0.0f, noise_i = 0.0f;
             double amps;
             amplify(p, s, s->broken ? 0.0 : p->gain * (drive + p->carrier_v * now), reach);
             charge(p, s, v0, s->amp_v, load);
             /* the mean current of a sample is that of its middle */
             amps = later < 0.5 ? i0 + (s->current_a - i0) * (later + 0.5)
                                : s->current_a;
-            normal_pair(s->random, &noise_v, &noise_i);
+            if (noisy) {
+                normal_pair(s->random, &noise_v, &noise_i);
+            }
             codes[2 * n] = convert(follow(&p->v_lag, &s->v_shown, &s->v_seen, v0) * p->v_monitor +
                                        p->v_noise_v * (double)noise_v + p->v_offset_v,
                                    p->lsb_v);

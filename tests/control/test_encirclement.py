@@ -9,7 +9,7 @@ from haselab.control import PidGains, loop_response, margins
 from haselab.models import Plant
 from haselab.models.rational import RationalModel
 
-LOOPS = 150  # of each kind; benchmarks/identify_margins.py takes 10,000
+LOOPS = 150  # of each kind; benchmarks/control/margins.py takes 10,000
 HIGHEST = 1e3  # rad/s: collocation is exact up to there
 MANY = 8
 NEAR = 1e-4  # relative distance from the axis at which either count may be right
@@ -122,7 +122,7 @@ def sampled_poles(model, gains, delay_s, rate_hz):
 
 
 def agrees(kind, seed):
-    """Whether both counts are the same; None where a pole is too near the axis to tell."""
+    """Whether both counts are the same; None where a pole is too near the axis to decide."""
     rng = np.random.default_rng([21, seed])
     delay_s = 0.0 if kind == "continuous" else float(np.exp(rng.uniform(-4.0, 0.5)))
     model, gains = random_model(rng, 0.5 * delay_s), random_gains(rng)
@@ -151,9 +151,9 @@ def agrees(kind, seed):
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["continuous", "delayed", "sampled"])
 def test_the_encirclement_count_is_the_number_of_unstable_closed_loop_poles(kind):
-    told = [agrees(kind, seed) for seed in range(LOOPS)]
-    assert [seed for seed, same in enumerate(told) if same is False] == []
-    assert sum(same is True for same in told) > 0.9 * LOOPS
+    agree = [agrees(kind, seed) for seed in range(LOOPS)]
+    assert [seed for seed, same in enumerate(agree) if same is False] == []
+    assert sum(same is True for same in agree) > 0.9 * LOOPS
 
 
 def test_an_integrating_loop_around_a_negative_gain_is_unstable():

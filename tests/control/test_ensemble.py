@@ -1,4 +1,4 @@
-"""Many loops at once: the bits of the C core, the plant's physics, and what is told of a run."""
+"""Many loops at once: the bits of the C core, the plant's physics, and the summary of a run."""
 
 import itertools
 
@@ -86,17 +86,17 @@ def test_every_vector_unit_gives_the_bits_of_the_sequential_loop(problem, thread
     table, reference, noise = problem
     cuts = sorted({1, reference.size // 3, reference.size // 2, reference.size} - {0})
     alone = run_traces(table, reference, noise, bits=0)
-    told = run_summaries(table, reference, cuts, noise, bits=0)
+    summaries = run_summaries(table, reference, cuts, noise, bits=0)
     for bits in VECTORS:
         found = run_traces(table, reference, noise, bits=bits, threads=threads)
         for one, many in zip(alone, found, strict=True):
             np.testing.assert_array_equal(many, one)
         kept = run_summaries(table, reference, cuts, noise, bits=bits, threads=threads)
-        np.testing.assert_array_equal(kept, told)
+        np.testing.assert_array_equal(kept, summaries)
 
 
 @pytest.mark.parametrize("kind", ["silent", "values", "generated"])
-def test_long_runs_give_the_same_bits_where_they_are_cut_into_pieces(kind):
+def test_long_runs_give_the_same_bits_where_they_are_cut_into_segments(kind):
     spread, laws = random_loops(137, 8)
     setting = LoopSetting(1000.0, 0.0017)
     table = LoopTable.of(spread, laws, setting, np.linspace(0.0, 0.02, 137))
@@ -109,12 +109,12 @@ def test_long_runs_give_the_same_bits_where_they_are_cut_into_pieces(kind):
     }[kind]
     cuts = [5, 1100, 2700]
     alone = run_traces(table, reference, noise, bits=0, threads=1)
-    told = run_summaries(table, reference, cuts, noise, bits=0, threads=1)
+    summaries = run_summaries(table, reference, cuts, noise, bits=0, threads=1)
     for bits in VECTORS:
         for one, many in zip(alone, run_traces(table, reference, noise, bits=bits), strict=True):
             np.testing.assert_array_equal(many, one)
         kept = run_summaries(table, reference, cuts, noise, bits=bits)
-        np.testing.assert_array_equal(kept, told)
+        np.testing.assert_array_equal(kept, summaries)
 
 
 @settings(max_examples=40, deadline=None)
@@ -331,16 +331,22 @@ MANY_BRANCHES = Plant(0.5, 5.0, 0.1, slow_modes=(SlowMode(0.1, 1.0),) * 4)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"plants": []}, r"0 plants and 1 controllers; allowed: one controller each"),
+        ({"plants": []}, r"0 plants and 1 controllers; there must be one controller per plant"),
         ({"plants": [CREEPING] * 2}, r"2 plants and 1 controllers"),
-        ({"plants": [MANY_BRANCHES]}, r"a plant has 4 slow modes; allowed: 3"),
-        ({"plants": [Plant(0.5, 5.0, 0.1, 2000.0)]}, r"the longest delay takes 2000006 samples"),
-        ({"gains": [PidGains(1e39, 0.0)]}, r"a loop holds 1e\+39; allowed: what single precision"),
-        ({"reference": [0.0, np.nan]}, r"reference has shape \(2,\) or holds NaN"),
+        ({"plants": [MANY_BRANCHES]}, r"a plant has 4 slow modes; at most 3"),
+        ({"plants": [Plant(0.5, 5.0, 0.1, 2000.0)]}, r"the longest delay is 2000006 samples"),
+        (
+            {"gains": [PidGains(1e39, 0.0)]},
+            r"a loop contains the value 1e\+39; it must be in the range of single precision",
+        ),
+        ({"reference": [0.0, np.nan]}, r"reference has shape \(2,\) or contains NaN"),
         ({"reference": []}, r"reference has shape \(0,\)"),
-        ({"measurement_noise": [0.0]}, r"measurement_noise has shape \(1,\) or holds an infinity"),
+        (
+            {"measurement_noise": [0.0]},
+            r"measurement_noise has shape \(1,\) or contains an infinity",
+        ),
         ({"measurement_noise": [0.0, np.inf]}, r"measurement_noise has shape \(2,\)"),
-        ({"threads": -1}, r"threads = -1; allowed: 1 or more, or 0 for those of the machine"),
+        ({"threads": -1}, r"threads = -1; must be 1 or more, or 0 for all of the machine"),
         ({"measurement_noise": WhiteNoise([1.0, 2.0])}, r"noise has 2 standard deviations"),
     ],
 )
@@ -360,5 +366,5 @@ def test_noise_that_cannot_be_is_refused(std):
 
 
 def test_a_seed_below_zero_is_refused():
-    with pytest.raises(InputError, match=r"seed = -1; allowed: 0 or more"):
+    with pytest.raises(InputError, match=r"seed = -1; must be 0 or more"):
         WhiteNoise(1.0, seed=-1)

@@ -97,7 +97,7 @@ def test_prediction_of_an_unstable_loop_has_no_step_metrics():
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ({"rise": 1.0}, "specification has 'rise'"),
+        ({"rise": 1.0}, "specification has the unknown key 'rise'"),
         ({"rise_time_s": "fast"}, "rise_time_s = 'fast'"),
         ({"phase_margin_deg": 120}, "phase_margin_deg = 120"),
         ({"rise_time_tolerance": 0.1}, "without rise_time_s"),

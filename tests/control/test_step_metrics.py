@@ -19,10 +19,10 @@ LN9 = math.log(9.0)
 
 
 def record(moved, rate_hz, before_s=1.0):
-    """A step at time zero with a quiet second before it."""
-    quiet = round(before_s * rate_hz)
-    time_s = np.arange(-quiet, moved.size) / rate_hz
-    return time_s, np.r_[np.zeros(quiet), moved], np.where(time_s < 0, 0.0, STEP)
+    """A step at time zero with a constant second before it."""
+    before = round(before_s * rate_hz)
+    time_s = np.arange(-before, moved.size) / rate_hz
+    return time_s, np.r_[np.zeros(before), moved], np.where(time_s < 0, 0.0, STEP)
 
 
 def test_a_first_order_step_rises_in_ln9_time_constants():

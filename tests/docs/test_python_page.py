@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from tests.docs.page import Page
 
 PAGE = Page("python.md")

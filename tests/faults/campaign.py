@@ -1,4 +1,4 @@
-"""Faults, moments and what became of them: shared by the tests and benchmarks/fault_table.py."""
+"""Faults, moments and results, shared by the tests and benchmarks/rig/fault_table.py."""
 
 from __future__ import annotations
 

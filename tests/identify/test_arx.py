@@ -42,9 +42,9 @@ def test_intervals_of_the_numbers_and_of_what_follows_from_them_cover_the_truth(
     for run in range(runs):
         fit = fit_arx(Record.sampled(*record(run), 10.0), ArxOrders(2, 2, NK), remove_means=False)
         (mode,) = fit.modes
-        told = [*fit.a, *fit.b, fit.static_gain, mode["natural_frequency_rad_s"],
+        estimates = [*fit.a, *fit.b, fit.static_gain, mode["natural_frequency_rad_s"],
                 mode["damping_ratio"]]  # fmt: skip
-        inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(told, truth, strict=True)]
+        inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, truth, strict=True)]
     # Binomial: 3.5 spreads about 95 %.
     assert np.abs(inside / runs - 0.95).max() <= 3.5 * np.sqrt(0.95 * 0.05 / runs)
 
@@ -63,7 +63,7 @@ def test_the_orders_are_found_on_request(criterion):
 def test_the_triangle_gives_the_same_choice_as_the_whole_record():
     u, y = record(1, 300)
     chosen = fit_arx(Record.sampled(u, y, 10.0))
-    rivals = [ArxOrders(na, nb, nk) for na in (1, 2, 3) for nb in range(1, na + 1)
+    candidates = [ArxOrders(na, nb, nk) for na in (1, 2, 3) for nb in range(1, na + 1)
               for nk in (2, 3, 4)]  # fmt: skip
     first = 4 + 12 + 4 - 1 - 1  # samples that the largest of the search leaves out
 
@@ -74,7 +74,7 @@ def test_the_triangle_gives_the_same_choice_as_the_whole_record():
         error = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
         return target.size * np.log(error @ error) + np.log(target.size) * columns.shape[1]
 
-    assert min(rivals, key=bic) == chosen.orders
+    assert min(candidates, key=bic) == chosen.orders
 
 
 def test_noise_of_the_sensor_is_told_as_bias():
@@ -107,15 +107,15 @@ def test_an_input_that_excites_too_little_gives_no_result():
     u = np.sin(0.3 * k)
     fit = fit_arx(Record.sampled(u, np.sin(0.3 * k - 0.4), 10.0), ArxOrders(3, 3, 1))
     assert fit.status.startswith("no result") and fit.answer()["a"] is None
-    with pytest.raises(ResultError, match="does not tell"):
+    with pytest.raises(ResultError, match="do not support"):
         _ = fit.static_gain
 
 
 def test_bad_records_are_refused():
     u, y = record(4, 60)
-    with pytest.raises(InputError, match="allowed are equal lengths"):
+    with pytest.raises(InputError, match="must be equally long"):
         fit_arx(Record.sampled(u[:50], y, 10.0))
-    with pytest.raises(InputError, match="finite numbers"):
+    with pytest.raises(InputError, match="must be finite"):
         fit_arx(Record.sampled(u, np.where(np.arange(60) == 7, np.nan, y), 10.0))
     with pytest.raises(InputError, match="excites nothing"):
         fit_arx(Record.sampled(np.zeros(60), y, 10.0))
@@ -123,7 +123,7 @@ def test_bad_records_are_refused():
         fit_arx(Record.sampled(u[:20], y[:20], 10.0), ArxOrders(4, 4, 3))
     with pytest.raises(InputError, match="criterion = hqic"):
         fit_arx(Record.sampled(u, y, 10.0), criterion="hqic")
-    with pytest.raises(InputError, match="na = 13; allowed is 0 to 12"):
+    with pytest.raises(InputError, match="na = 13; must be 0 to 12"):
         ArxOrders(13, 1, 1)
     with pytest.raises(InputError, match="rate"):
         fit_arx(Record.sampled(u, y, 0.0))

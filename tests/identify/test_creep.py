@@ -1,4 +1,4 @@
-"""Creep fits: truth recovered with honest intervals, the right verdict, forecasts that hold."""
+"""Creep fits: truth recovered with correct intervals, the right verdict, forecasts that hold."""
 
 from collections import Counter
 
@@ -134,17 +134,17 @@ def test_a_fit_without_a_result_has_no_model():
 @pytest.mark.parametrize(
     ("u", "y", "options", "match"),
     [
-        (np.ones(9), np.arange(9.0), {}, "24 are needed"),
-        (HELD, HELD[:-1], {}, "equal lengths"),
+        (np.ones(9), np.arange(9.0), {}, "24 are required"),
+        (HELD, HELD[:-1], {}, "must be equally long"),
         (HELD, 0.0 * HELD, {}, "output is 0 throughout"),
         (0.0 * HELD, HELD, {}, "nothing creeps"),
-        (HELD, np.where(HELD > 0, np.nan, 0), {}, "holds nan"),
+        (HELD, np.where(HELD > 0, np.nan, 0), {}, "is nan"),
         (HELD, HELD, {"model": "burgers"}, "model = burgers"),
         (HELD, HELD, {"model": "prony", "leave_out_s": 1e6}, "leaves 0 samples"),
         (HELD, HELD, {"leave_out_s": -1.0}, "must be 0 s or more"),
     ],
 )
-def test_bad_input_is_told_in_one_line(u, y, options, match):
+def test_bad_input_is_refused_in_one_line(u, y, options, match):
     with pytest.raises(InputError, match=match):
         fit_creep(Record.sampled(u, y, 1.0), **options)
 
@@ -168,7 +168,7 @@ def test_a_drift_that_began_before_the_step_is_no_creep():
     u = np.r_[np.zeros(500), np.ones(2500)]
     y = u + 0.02 * t + 0.003 * rng.normal(size=t.size)
     fit = fit_creep(Record.sampled(u, y, 100.0))
-    assert "a second before the input changes" in fit.status
+    assert "per second before the input changes" in fit.status
 
 
 def test_swapped_columns_have_no_result():

@@ -1,4 +1,4 @@
-"""Planned experiments: inside the limits, optimal where theory says so, right about the rivals."""
+"""Planned experiments: inside the limits, optimal, right about the hypotheses."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def test_alternating_polarity_separates_the_kinds_of_creep_best():
 
 @pytest.mark.long
 @pytest.mark.parametrize("omega_rad_s", [5.11, 32.1])
-def test_a_drive_that_shows_the_resonance_tells_the_reading(omega_rad_s):
+def test_a_drive_that_shows_the_resonance_identifies_the_unit_of_the_frequency(omega_rad_s):
     plant = replace(PLANT, natural_frequency_rad_s=omega_rad_s)
     plan = plan_experiment(plant, "reading", UNIPOLAR, duration_s=20.0)
     assert plan.chosen.probability > 0.95
@@ -148,9 +148,11 @@ def test_limits_that_leave_no_drive_give_no_result():
 
 
 def test_bad_plans_are_refused():
-    with pytest.raises(InputError, match="goal = colour; allowed are creep, reading, modes, all"):
+    with pytest.raises(
+        InputError, match="goal = colour; must be one of creep, reading, modes, all"
+    ):
         plan_experiment(PLANT, "colour", UNIPOLAR)
-    with pytest.raises(InputError, match=r"baseline_v = 3 V; allowed is above 0 V and within"):
+    with pytest.raises(InputError, match=r"baseline_v = 3 V; must be above 0 V and within"):
         plan_experiment(PLANT, "all", UNIPOLAR, baseline_v=3.0)
     with pytest.raises(InputError, match=r"duration_s = 0\.01 s"):
         plan_experiment(PLANT, "all", UNIPOLAR, duration_s=0.01)

@@ -1,4 +1,4 @@
-"""Equations 6 and 7: the bound of the estimator, hulls, trials, and what cannot be told."""
+"""Equations 6 and 7: the bound of the estimator, envelopes, trials, identifiability."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def bound(omega, decay):
 
 @pytest.mark.long
 @pytest.mark.parametrize("omega", [5.1, 2 * np.pi * 5.1], ids=["rad", "hz"])
-def test_both_readings_reach_the_bound_with_honest_intervals(omega):
+def test_both_readings_reach_the_bound_with_correct_intervals(omega):
     decay, runs = 3.6, 50
     truth = {"damped_frequency_rad_s": omega, "decay_rate_per_s": decay}
     errors, inside = [], np.zeros(2)
@@ -65,20 +65,20 @@ def test_natural_frequency_and_damping_follow_equation_7():
     assert abs(e["phase_rad"].value - 0.4) <= 4 * e["phase_rad"].std
 
 
-def test_hulls_through_the_peaks_agree_with_the_decay():
+def test_envelopes_through_the_peaks_agree_with_the_decay():
     fit = fit_free_response([noisy(motion(32.0, 4.2), 2), noisy(motion(32.0, 4.2, 1.1), 3)])
-    for hull in (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s):
-        assert hull is not None
-        assert abs(hull.value - 4.2) <= 4 * hull.std
-        assert hull.std < 0.1
+    for envelope in (fit.envelope_positive_decay_per_s, fit.envelope_negative_decay_per_s):
+        assert envelope is not None
+        assert abs(envelope.value - 4.2) <= 4 * envelope.std
+        assert envelope.std < 0.1
 
 
-def test_at_the_printed_reading_there_is_no_second_peak_and_no_hull():
+def test_at_the_printed_reading_there_is_no_second_peak_and_no_envelope():
     # D3: at 5.1 rad/s each cycle decays to about 1 %, below five deviations of the noise.
     fit = fit_free_response([noisy(motion(5.1, 4.2), 4)])
-    assert fit.hull_positive_decay_per_s is None
+    assert fit.envelope_positive_decay_per_s is None
     assert any("positive peaks" in note for note in fit.notes)
-    assert fit.answer()["hull_positive_decay_per_s"] is None
+    assert fit.answer()["envelope_positive_decay_per_s"] is None
 
 
 @pytest.mark.parametrize("creep", [0.0, 0.001, 0.01])
@@ -135,8 +135,8 @@ def coloured(rng, size, pole):
 
 @pytest.mark.long
 @pytest.mark.parametrize("creep", [0.0, 0.003], ids=["level", "creeping"])
-def test_intervals_and_hulls_hold_in_coloured_noise(creep):
-    runs, inside, hulls = 40, [], []
+def test_intervals_and_envelopes_are_valid_in_coloured_noise(creep):
+    runs, inside, envelopes = 40, [], []
     for run in range(runs):
         noise = NOISE * coloured(np.random.default_rng([10, run]), TIME_S.size, 0.9)
         fit = fit_free_response([FreeTrial(motion(32.0, 4.0, creep=creep) + noise, TIME_S)])
@@ -144,25 +144,27 @@ def test_intervals_and_hulls_hold_in_coloured_noise(creep):
         inside += [
             fit.parameters[n].ci95[0] <= t <= fit.parameters[n].ci95[1] for n, t in truth.items()
         ]
-        for hull in (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s):
-            assert hull is not None
-            hulls.append(((hull.value - 4.0) / hull.std, hull.ci95[0] <= 4.0 <= hull.ci95[1]))
+        for envelope in (fit.envelope_positive_decay_per_s, fit.envelope_negative_decay_per_s):
+            assert envelope is not None
+            envelopes.append(
+                ((envelope.value - 4.0) / envelope.std, envelope.ci95[0] <= 4.0 <= envelope.ci95[1])
+            )
     # Binomial: 3 spreads below 95 % of 80 intervals, of which a pair shares its noise.
     least = 0.95 - 3 * np.sqrt(0.95 * 0.05 / (2 * runs))
     assert np.mean(inside) >= least
-    assert np.mean([held for _, held in hulls]) >= least
+    assert np.mean([held for _, held in envelopes]) >= least
     # The mean of 80 normalised errors spreads by 0.11.
-    assert abs(np.mean([error for error, _ in hulls])) < 0.4
+    assert abs(np.mean([error for error, _ in envelopes])) < 0.4
 
 
 @pytest.mark.long
-def test_coloured_noise_makes_no_hull_where_no_second_peak_stands_out():
+def test_coloured_noise_makes_no_envelope_where_no_second_peak_stands_out():
     # At 5.1 rad/s a second peak has 1 % of the first, which is one deviation of this noise.
     for run in range(15):
         noise = NOISE * coloured(np.random.default_rng([11, run]), TIME_S.size, 0.9)
         fit = fit_free_response([FreeTrial(motion(5.1, 3.6) + noise, TIME_S)], creep=False)
-        assert fit.hull_positive_decay_per_s is None
-        assert fit.hull_negative_decay_per_s is None
+        assert fit.envelope_positive_decay_per_s is None
+        assert fit.envelope_negative_decay_per_s is None
 
 
 def test_frequencies_are_rad_per_s_by_name_and_unit():
@@ -180,4 +182,4 @@ def test_a_swing_that_does_not_decay_has_no_damping_ratio(growth):
     noise = 0.01 * np.random.default_rng(4).normal(size=600)
     swing = np.exp(growth * time_s) * np.cos(12.0 * time_s + 1.0)
     fit = fit_free_response([FreeTrial(swing + noise, time_s)])
-    assert fit.status.startswith("no result: no decay shows")
+    assert fit.status.startswith("no result: no decay is visible")

@@ -1,4 +1,4 @@
-"""Hysteresis fits: truth recovered with honest intervals, the right verdict, loops of the twin."""
+"""Hysteresis fits: truth recovered with correct intervals, the right verdict, loops of the twin."""
 
 from collections import Counter
 
@@ -24,7 +24,7 @@ BOUC_WEN_TRUTH = {"gain": 1.0, "offset": 0.0, "weight": -0.1, "sharpness": 3.0, 
 
 
 def drive(frequency_hz=0.25):
-    """Three cycles of different height: the smaller loops tell the thresholds."""
+    """Three cycles of different height: the smaller loops identify the thresholds."""
     cycle = triangle(0.0, 2.0, frequency_hz, 1, 100.0)
     return np.concatenate([cycle, 0.6 * cycle, 0.8 * cycle])
 
@@ -75,7 +75,7 @@ def test_a_curve_within_the_noise_shows_no_hysteresis():
 
 
 @pytest.mark.long
-def test_records_at_several_rates_tell_the_rate_dependence():
+def test_records_at_several_rates_identify_the_rate_dependence():
     truth = PrandtlIshlinskii(1.0, (0.15, 0.5), (0.4, 0.3), 0.2, 0.1, 0.04)
     fit = fit_hysteresis([record(truth, f, seed=k) for k, f in enumerate((0.1, 0.5, 2.0))])
     assert fit.verdict == "prandtl-ishlinskii"
@@ -107,7 +107,7 @@ def test_saturating_and_falling_loops_are_fitted_with_their_dead_zones():
         y = y + 0.002 * np.random.default_rng(4).normal(size=y.size)
         fit = fit_hysteresis([LoopRecord(u, y, 100.0)], "prandtl-ishlinskii")
         assert fit.model.obstacle() == ""
-        # Straight pieces of a quarter unit miss a bend of 0.77 by at most 0.77 / 8 / 16.
+        # Straight segments of a quarter unit miss a bend of 0.77 by at most 0.77 / 8 / 16.
         assert np.abs(fit.residuals[0][fit.residuals[0].size // 3 :]).max() < 0.012 + 5 * 0.002
         assert fit.width.value > 0.0  # the output lags, whatever the sign of the gain
 
@@ -195,10 +195,10 @@ GOOD = drive()
     ("make", "match"),
     [
         (lambda: LoopRecord(GOOD[:10], GOOD[:10], 1.0), "at least 24 values"),
-        (lambda: LoopRecord(GOOD, GOOD[:-1], 1.0), "equal lengths"),
+        (lambda: LoopRecord(GOOD, GOOD[:-1], 1.0), "must be equally long"),
         (lambda: LoopRecord(GOOD, 0.0 * GOOD, 1.0), "y is 0 throughout"),
         (lambda: LoopRecord(np.full(30, 2.0), GOOD[:30], 1.0), "u is 2 throughout"),
-        (lambda: LoopRecord(np.where(GOOD > 1, np.nan, GOOD), GOOD, 1.0), "holds nan"),
+        (lambda: LoopRecord(np.where(GOOD > 1, np.nan, GOOD), GOOD, 1.0), "is nan"),
         (lambda: LoopRecord(GOOD, GOOD, 0.0), "rate_hz = 0 Hz"),
         (lambda: LoopRecord(GOOD, GOOD, 1.0, 1e9), "counted_from_s"),
         (lambda: fit_hysteresis([]), "records is empty"),
@@ -206,7 +206,7 @@ GOOD = drive()
         (lambda: fit_hysteresis([LoopRecord(GOOD, GOOD, 1.0)], operators=0), "operators = 0"),
     ],
 )
-def test_bad_input_is_told_in_one_line(make, match):
+def test_bad_input_is_refused_in_one_line(make, match):
     with pytest.raises(InputError, match=match):
         make()
 

@@ -1,4 +1,4 @@
-"""Subspace models: SLICOT's published run on the hair dryer, exact records, honest intervals."""
+"""Subspace models: SLICOT's published run on the hair dryer, exact records, correct intervals."""
 
 import re
 
@@ -116,8 +116,8 @@ def test_intervals_of_poles_and_gain_cover_the_truth():
             Record.sampled(u, y, RATE_HZ), 3, remove_means=False, block_rows=8, seed=run
         )
         (mode,) = [m for m in fit.modes if "damping_ratio" in m]
-        told = [fit.static_gain, mode["natural_frequency_rad_s"], mode["damping_ratio"]]
-        inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(told, truth, strict=True)]
+        estimates = [fit.static_gain, mode["natural_frequency_rad_s"], mode["damping_ratio"]]
+        inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, truth, strict=True)]
     # Binomial: 3 spreads below 95 %, and the width from 50 repeats is known to a tenth, which
     # takes 1 % of the coverage.
     assert (inside / runs >= 0.94 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
@@ -134,16 +134,16 @@ def test_too_many_states_give_no_result_and_bad_records_are_refused():
     u = np.random.default_rng(4).normal(size=300)
     y = lfilter(TOP, BOTTOM, u)
     fit = fit_subspace(Record.sampled(u, y, RATE_HZ), 8, remove_means=False)
-    assert fit.status.startswith("no result: the record tells no 8 states")
+    assert fit.status.startswith("no result: the data do not support 8 states")
     with pytest.raises(ResultError, match="tells no 8 states"):
         _ = fit.plant
-    with pytest.raises(InputError, match="order = 15; allowed is 1 to 10"):
+    with pytest.raises(InputError, match="order = 15; must be 1 to 10"):
         fit_subspace(Record.sampled(u, y, RATE_HZ), 15)
     with pytest.raises(InputError, match="120 samples or more"):
         fit_subspace(Record.sampled(u[:100], y[:100], RATE_HZ))
     with pytest.raises(InputError, match="excites nothing"):
         fit_subspace(Record.sampled(np.zeros(300), y, RATE_HZ))
-    with pytest.raises(InputError, match="equal lengths"):
+    with pytest.raises(InputError, match="must be equally long"):
         fit_subspace(Record.sampled(u[:200], y, RATE_HZ))
     with pytest.raises(InputError, match="finite"):
         fit_subspace(Record.sampled(u, np.where(np.arange(300) == 5, np.nan, y), RATE_HZ))

@@ -46,9 +46,9 @@ def test_the_response_is_scipys_and_the_step_ends_at_the_static_gain():
 def test_what_has_no_continuous_counterpart_says_so():
     with pytest.raises(ResultError, match="z <= 0 has no continuous counterpart"):
         ArxModel([0.5], [1.0], 1, 1.0).continuous()
-    with pytest.raises(ResultError, match="remembers more inputs than outputs"):
+    with pytest.raises(ResultError, match="uses more inputs than outputs"):
         ArxModel([-0.5], [1.0, 1.0, 1.0], 1, 1.0).continuous()
-    with pytest.raises(InputError, match="allowed are finite numbers"):
+    with pytest.raises(InputError, match="all must be finite"):
         ArxModel([np.nan], [1.0], 1, 1.0)
     with pytest.raises(InputError, match="nk = -1"):
         ArxModel([-0.5], [1.0], -1, 1.0)

@@ -55,9 +55,9 @@ def test_python_control_answers_alike_and_gives_the_model_back(form, model, orde
         assert plant.slow_modes[0].time_constant_s == pytest.approx(4.7, rel=1e-9)
 
 
-def test_a_delay_is_left_out_only_when_told():
+def test_a_delay_is_left_out_only_when_requested():
     for convert in (to_scipy, to_control):
-        with pytest.raises(InputError, match=r"delay of 0\.012 s, which .* cannot hold"):
+        with pytest.raises(InputError, match=r"delay of 0\.012 s, which .* cannot represent"):
             convert(DELAYED)
     system = to_scipy(DELAYED.without_delay(0))
     same(system.freqresp(OMEGA_RAD_S)[1], MODEL.frequency_response(OMEGA_RAD_S))
@@ -83,11 +83,11 @@ def test_what_cannot_be_taken_is_refused_with_a_reason(monkeypatch):
     with pytest.raises(InputError, match="2 inputs and 1 outputs"):
         from_scipy(signal.StateSpace(-np.eye(2), np.eye(2), np.ones((1, 2)), np.zeros((1, 2))))
     for read in (from_scipy, from_control):
-        with pytest.raises(InputError, match="The model is a str; allowed are TransferFunction"):
+        with pytest.raises(InputError, match="The model is a str; must be TransferFunction"):
             read("1/s")
-    with pytest.raises(InputError, match="form = x; allowed are tf, ss, zpk"):
+    with pytest.raises(InputError, match="form = x; must be one of tf, ss, zpk"):
         to_scipy(MODEL, "x")
-    with pytest.raises(InputError, match="form = zpk; allowed are tf, ss"):
+    with pytest.raises(InputError, match="form = zpk; must be one of tf, ss"):
         to_control(MODEL, "zpk")
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(InputError, match=r"not installed; .* pip install haselab\[control\]"):

@@ -113,8 +113,8 @@ def test_bouc_wen_follows_its_differential_equation(exponent, sigma):
         sign = np.sign(path[k] - path[k - 1])
 
         def slope(_, w, sign=sign):
-            bent = np.abs(w) ** exponent
-            return 3.0 * sign * (1 - sigma * sign * np.sign(w) * bent + (sigma - 1) * bent)
+            power = np.abs(w) ** exponent
+            return 3.0 * sign * (1 - sigma * sign * np.sign(w) * power + (sigma - 1) * power)
 
         length = abs(path[k] - path[k - 1])
         w = solve_ivp(slope, (0, length), [w], rtol=1e-11, atol=1e-12, max_step=2e-3).y[0, -1]
@@ -168,12 +168,12 @@ def test_dead_zones_are_those_of_the_formula_and_have_an_inverse():
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: PrandtlIshlinskii(1.0, (0.3, 0.2), (1.0, 1.0)), "ascending ones above 0"),
+        (lambda: PrandtlIshlinskii(1.0, (0.3, 0.2), (1.0, 1.0)), "ascend from above 0"),
         (lambda: PrandtlIshlinskii(1.0, (0.3,), ()), "1 thresholds and 0 weights"),
         (lambda: PrandtlIshlinskii(1.0, (0.3,), (1.0,), 0.0, -1.0), "0 s or more"),
-        (lambda: BoucWen(1.0, 1.0, 0.0), "above 0, 0.5 or more, 1 or more"),
-        (lambda: BoucWen(1.0, np.nan, 1.0), "allowed are finite ones"),
-        (lambda: DeadZones((1.0, 0.0), (1.0, 1.0)), "ascending"),
+        (lambda: BoucWen(1.0, 1.0, 0.0), "above 0, 0.5 or more, and 1 or more"),
+        (lambda: BoucWen(1.0, np.nan, 1.0), "they must be finite"),
+        (lambda: DeadZones((1.0, 0.0), (1.0, 1.0)), "must ascend"),
         (lambda: DeadZones((1.0,), (-1.0,)).invert([2.0]), "slopes above 0"),
         (lambda: PLAYS.simulate([0.0, np.nan]), "finite vector"),
         (lambda: PLAYS.simulate([0.0], 0.0), "rate_hz = 0 Hz"),
@@ -182,7 +182,7 @@ def test_dead_zones_are_those_of_the_formula_and_have_an_inverse():
         (lambda: BoucWen(1.0, -0.6, 1.0).invert([1.0]), "Use play operators"),
         (
             lambda: PrandtlIshlinskii(1.0, (0.3,), (1.0,), 0.0, 0.1).invert([1.0], 100.0),
-            "runs away; allowed is below 1",
+            "diverges; it must be below 1",
         ),
     ],
 )
@@ -191,7 +191,7 @@ def test_what_cannot_be_is_refused_in_one_line(make, match):
         make()
 
 
-def test_the_feedback_of_the_inverse_tells_when_it_runs_away():
+def test_the_feedback_of_the_inverse_shows_when_it_diverges():
     """On a ramp the recursion of the inverse has the eigenvalues that `feedback` stands for."""
     rate_hz, y = 100.0, np.linspace(0.0, 1.0, 200)
     for filter_s, stable in ((0.04, False), (0.06, True)):

@@ -97,9 +97,9 @@ def test_a_plant_survives_the_model_file():
 def test_impossible_plants_and_inputs_are_refused():
     with pytest.raises(InputError, match="natural_frequency_rad_s = -1"):
         Plant(1.0, -1.0, 0.1)
-    with pytest.raises(InputError, match="lacks or misuses"):
+    with pytest.raises(InputError, match="is incomplete or has a wrong value"):
         Plant.from_dict({"gain": 1.0})
     with pytest.raises(InputError, match="initial_state has 1"):
         Plant(1.0, 1.0, 0.1).simulate(np.ones(2), 1.0, np.ones(1), [0.0])
-    with pytest.raises(InputError, match="holds NaN"):
+    with pytest.raises(InputError, match="contains NaN"):
         Plant(1.0, 1.0, 0.1).simulate(np.array([np.nan]), 1.0, np.ones(1))

@@ -71,8 +71,8 @@ TWO_MODES = tuple(np.poly([-1j - 1, 1j - 1, -2 - 3j, -2 + 3j]).real)
 @pytest.mark.parametrize(
     ("model", "match"),
     [
-        (RationalModel((1.0, 3.0), (1.0, 1.0, 9.0)), "zero at -3 rad/s; a plant takes one without"),
-        (RationalModel((1.0,), (1.0, 1.0)), "two fast ones"),
+        (RationalModel((1.0, 3.0), (1.0, 1.0, 9.0)), "zero at -3 rad/s; a Plant must not have one"),
+        (RationalModel((1.0,), (1.0, 1.0)), "two fast, stable ones"),
         (RationalModel((1.0,), (1.0, -0.1, 9.0)), "stable"),
         (RationalModel((1.0,), TWO_MODES), "two fast"),
         (RationalModel((1.0,), tuple(np.poly([-9.0, -8.0, -1.0, -1.0]))), "equal"),
@@ -95,7 +95,7 @@ def test_what_is_no_plant_is_refused(model, match):
         (lambda: RationalModel.from_poles([1j - 1], [], 1.0), "with their conjugates"),
         (lambda: RationalModel.from_poles([0.0], [], 1.0), "other than 0"),
         (lambda: RationalModel.from_dict({"numerator": [1.0]}), "denominator"),
-        (lambda: RationalModel.from_dict({"numerator": ["x"], "denominator": [1]}), "misuses"),
+        (lambda: RationalModel.from_dict({"numerator": ["x"], "denominator": [1]}), "wrong value"),
     ],
 )
 def test_bad_models_are_refused(make, match):

@@ -43,5 +43,5 @@ def test_what_lies_outside_is_refused_and_rounding_at_the_ends_is_not():
         SplineMap(np.array([0.0, 1.0]), np.array([1.0, -2.0]), 0.0).inverse(0.1)
     with pytest.raises(InputError, match="knots do not rise"):
         SplineMap(np.array([1.0, 1.0]), np.array([1.0, 2.0]), 0.0)
-    with pytest.raises(InputError, match="allowed are two or more"):
+    with pytest.raises(InputError, match="it must have two or more"):
         SplineMap(np.array([0.0, 1.0]), np.array([1.0, np.inf]), 0.0)

@@ -21,12 +21,12 @@ def test_a_complete_folder_is_read(run_folder):
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"no folder of a run there.*--out.*nowhere$"):
+    with pytest.raises(InputError, match=r"The folder does not exist.*--out.*nowhere$"):
         write_report(tmp_path / "nowhere")
 
 
 def test_a_folder_without_results_says_what_to_do(tmp_path):
-    with pytest.raises(InputError, match=r"no results\.json\. Make it with 'haselab analyse"):
+    with pytest.raises(InputError, match=r"no results\.json\. Create it with 'haselab analyse"):
         write_report(tmp_path)
 
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.safety.own_bench import OwnBench
 
 from haselab.base import InputError, LimitError, SafetyError, SilentProgress
 from haselab.cli.main import main
@@ -29,6 +28,7 @@ from haselab.safety.armed import armed
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.signals import OrderlyEnd
 from haselab.safety.state_machine import Safety, SafetySettings, Stage
+from tests.safety.own_bench import OwnBench
 
 BROKEN = ("no effect", "raises")
 

@@ -1,6 +1,6 @@
 """Farads, ohms and strain after two references, on a twin whose monitors lag, err and are skewed.
 
-The scene is that of benchmarks/sensing_calibration.py, which prints the numbers.
+The scene is that of benchmarks/sensing/calibration.py, which prints the numbers.
 """
 
 import importlib
@@ -12,7 +12,7 @@ import pytest
 
 @pytest.fixture(scope="module")
 def scene(benchmarks) -> ModuleType:
-    return importlib.import_module("sensing_calibration")
+    return importlib.import_module("benchmarks.sensing.calibration")
 
 
 @pytest.fixture(scope="module")

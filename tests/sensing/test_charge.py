@@ -86,7 +86,7 @@ def test_holds_at_a_high_voltage_give_numbers_too_and_leakage_is_found() -> None
     idle = np.abs(v.reshape(-1, BLOCK)).max(axis=1) == 0.0
     assert idle.any()
     assert not result.valid[idle].any()
-    assert "hardly moves" in result.reason_of(int(np.flatnonzero(idle)[0]))
+    assert "hardly changes" in result.reason_of(int(np.flatnonzero(idle)[0]))
 
 
 def test_a_stated_skew_is_taken_out() -> None:
@@ -117,12 +117,12 @@ def test_a_harmonic_of_the_drive_is_no_hum() -> None:
 
 def test_loss_that_may_be_leakage_or_hysteresis_widens_the_deviation() -> None:
     v, slope = triangle()
-    quiet = sensed(*noisy(v, KAPPA_S * slope))
+    lossless = sensed(*noisy(v, KAPPA_S * slope))
     lossy = sensed(*noisy(v, KAPPA_S * slope + 4e-4 * v))
     assert "leakage or hysteresis" in "".join(lossy.seen.values())
     # Half of G, 2e-4, is in doubt; from the foot of a ramp to its middle and back it charges at
     # most T V / 16 = 0.125 V s less than its mean would, 2 % of k V at the middle of the ramp.
-    extra_f = np.sqrt(lossy.capacitance_std_f**2 - quiet.capacitance_std_f**2)
+    extra_f = np.sqrt(lossy.capacitance_std_f**2 - lossless.capacitance_std_f**2)
     assert 0.005 < np.nanmax(extra_f) / CAPACITANCE_F < 0.04
     assert_honest(errors(lossy, CAPACITANCE_F))
 
@@ -130,10 +130,10 @@ def test_loss_that_may_be_leakage_or_hysteresis_widens_the_deviation() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda v, i: (v + 1.0, i), "does not pass 0 V"),
+        (lambda v, i: (v + 1.0, i), "does not cross 0 V"),
         (lambda v, i: (v, -i), "inverted"),
-        (lambda v, i: (v, 0.0 * i), "hardly moves"),
-        (lambda v, i: (0.0 * v, 0.0 * i), "hardly moves"),
+        (lambda v, i: (v, 0.0 * i), "hardly changes"),
+        (lambda v, i: (0.0 * v, 0.0 * i), "hardly changes"),
         (lambda v, i: (0.05 * TIME_S + 0.001, 0.05 * KAPPA_S + 0.0 * i), "not separable"),
         (lambda v, i: (np.where(v > 1.0, 2.0, 0.0), 0.0 * i), "steps faster"),
     ],
@@ -162,7 +162,7 @@ def test_a_burst_on_the_current_is_found_where_the_charge_does_not_close() -> No
     v, i = noisy(v, KAPPA_S * slope)
     i[20_000:20_050] += 0.5
     result = sensed(v, i)
-    assert "does not close" in result.reason_of(40)
+    assert "does not return to zero" in result.reason_of(40)
     assert result.valid.mean() > 0.9
     assert np.abs(errors(result, CAPACITANCE_F)).max() < 5.0
 
@@ -216,7 +216,7 @@ def test_thinning_leaves_no_sample_out(block: int) -> None:
     ],
 )
 def test_settings_outside_their_range_are_refused(settings) -> None:
-    with pytest.raises(InputError, match=r"must be|needs"):
+    with pytest.raises(InputError, match=r"must be|requires"):
         ChargeConfig(
             **{"rate_hz": RATE_HZ, "block_samples": BLOCK, "ohm_per_ratio": OHM} | settings
         )
@@ -266,7 +266,7 @@ def test_noise_that_hardly_reaches_an_edge_of_the_converter_is_no_dither(noise_v
     v, i = noisy(v, 0.51 * lsb * np.sign(slope), noise_v)
     result = sensed(np.round(v / lsb) * lsb, np.round(i / lsb) * lsb)
     assert not result.valid.any()
-    assert set(result.seen.values()) == {"step of the converter too coarse for the current"}
+    assert set(result.seen.values()) == {"converter step too coarse for the current"}
 
 
 def test_a_leakage_below_zero_is_a_skew_that_was_not_stated() -> None:
@@ -276,7 +276,7 @@ def test_a_leakage_below_zero_is_a_skew_that_was_not_stated() -> None:
     result = sensed(*noisy(v, i))
     assert result.valid.all()
     assert np.isnan(result.leakage_s).all()
-    assert set(result.seen.values()) == {"negative leakage, as of a skew of 5 ms"}
+    assert set(result.seen.values()) == {"negative leakage, as from a skew of 5 ms"}
     stated = sensed(*noisy(v, i), skew_s=skew_s)
     assert np.abs(stated.leakage_s / stated.leakage_std_s).max() < 5.0
 

@@ -51,7 +51,7 @@ def test_only_steps_that_stand_before_and_after_count():
 def test_the_median_holds_against_one_wrong_step():
     found = latency(np.array([2.0e-3, 2.0e-3, 2.0e-3, 2.0e-3, 9.0e-3]), 200e3)
     assert found.value == 2.0e-3
-    assert found.std > 1e-4  # and the spread is told
+    assert found.std > 1e-4  # and the spread is reported
 
 
 @pytest.mark.parametrize("delay_s", [0.5e-3, 2e-3, 4.5e-3])
@@ -75,5 +75,5 @@ def test_the_twin_shows_the_delay_that_it_was_given(delay_s):
 
 @pytest.mark.parametrize("shape", [(10,), (9, N), (10, N, 2)])
 def test_shapes_that_do_not_fit_are_refused(shape):
-    with pytest.raises(InputError, match=r"allowed are \(B, N\) and \(B,\)"):
+    with pytest.raises(InputError, match=r"must be \(B, N\) and \(B,\)"):
         step_latencies(np.zeros(shape), np.zeros(10), RATE_HZ)

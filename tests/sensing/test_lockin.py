@@ -180,7 +180,7 @@ def test_noise_alone_and_a_dead_channel_are_not_valid(scene, rng):
         ({"carrier_hz": 150.0}, "at least 2 periods"),
         ({"carrier_hz": 80e3}, "sample faster"),
         ({"blank": (0, 1900)}, "at least 2 periods"),
-        ({"blank": (300, 100)}, "do not lie"),
+        ({"blank": (300, 100)}, "are not inside a block"),
         ({"blank": (750, 850), "carrier_hz": 250.0}, "leaves too little"),
     ],
 )

@@ -148,7 +148,7 @@ def test_the_mains_leak_as_simulated_lines_do(carrier_hz):
 
 def test_harmonics_that_fold_back_are_named():
     choice = judge_carrier(REQUEST, 12.5e3)  # 200 kHz / 16
-    assert "Harmonics 15, 17, 31, 33 of the carrier fold back onto it" in " ".join(choice.remarks)
+    assert "Harmonics 15, 17, 31, 33 of the carrier alias onto it" in " ".join(choice.remarks)
     assert choice.alias > 0.0
     assert judge_carrier(REQUEST, 5575.0).alias == 0.0
 
@@ -172,7 +172,7 @@ def test_the_choice_is_off_the_staircase_and_better_than_the_papers():
     assert (plan.chosen.carrier_hz / 100) % 1 > 0.1
     assert min(c.total for c in plan.candidates) <= plan.chosen.total
     assert "harmonic 20 of the 100 Hz staircase" in paper.remarks[0]
-    assert "the same phase, which no average removes" in paper.remarks[0]
+    assert "the same phase, which averaging does not remove" in paper.remarks[0]
     assert any("blank" in reason for reason in plan.reasons)
 
 
@@ -198,11 +198,11 @@ def test_current_limit_and_range_bound_the_choice():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"rate_hz": 0.0}, "rate_hz = 0; allowed is above 0"),
+        ({"rate_hz": 0.0}, "rate_hz = 0; it must be above 0"),
         ({"noise_v": float("nan")}, "noise_v = nan"),
         ({"capacitance_f": -1e-9}, "capacitance_f = -1e-09"),
-        ({"step_v": -1.0}, "step_v = -1; allowed is 0 or more"),
-        ({"update_s": 0.01}, r"update_s = 0\.01 s is outside \[0, 0\.01\)"),
+        ({"step_v": -1.0}, "step_v = -1; it must be 0 or more"),
+        ({"update_s": 0.01}, r"update_s = 0\.01 s is outside the block, \[0, 0\.01\)"),
         ({"blank_s": 0.008}, "three quarters of a block"),
         ({"damping_ratio": 1.2}, "damping_ratio"),
     ],
@@ -212,9 +212,11 @@ def test_what_cannot_be_is_refused(changes, words):
         replace(REQUEST, **changes)
 
 
-def test_no_room_for_a_carrier_is_told():
+def test_no_possible_carrier_is_reported():
     with pytest.raises(InputError, match="No carrier has 4 periods"):
         plan_carrier(replace(REQUEST, block_s=0.002, update_hz=500.0, bandwidth_hz=200.0))
     for carrier_hz in (100.0, 80e3):
-        with pytest.raises(InputError, match="at least 2, and 3 samples a period, are needed"):
+        with pytest.raises(
+            InputError, match="at least 2 periods and 3 samples per period are required"
+        ):
             judge_carrier(REQUEST, carrier_hz)

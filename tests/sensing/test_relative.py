@@ -12,7 +12,7 @@ QUARTER_TURN_RAD = np.array([np.pi / 2])
 
 @pytest.mark.parametrize(("strain", "ratio"), [(-0.05, 6.9e-5), (0.1, 4.2e-5)])
 @pytest.mark.parametrize("factor", [1.0, 1e3])
-def test_the_printed_scale_asks_for_microvolts_and_a_thousandth_for_millivolts(
+def test_the_printed_scale_requires_microvolts_and_a_thousandth_for_millivolts(
     strain, ratio, factor
 ):
     """Row D11b: eq. 5 over the saturation range, and the amplitude ratio it takes."""

@@ -171,7 +171,7 @@ def test_there_is_no_interval_beyond_the_record(kind):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda c, e: (c[:20], e[:20]), "32 or more"),
+        (lambda c, e: (c[:20], e[:20]), "32 samples or more"),
         (lambda c, e: (c, e[:-1]), "same length"),
         (lambda c, e: (np.where(c > 1.3e-9, np.nan, c), e), "NaN or infinity"),
         (lambda c, e: (np.full_like(c, 1e-9), e), "1e-09 F throughout"),

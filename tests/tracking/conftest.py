@@ -15,7 +15,7 @@ NOISE_AT_GROUND = 2.0  # grey; the variance is proportional to the grey level
 class Sheet:
     """Dots that move and deform with an affine map `x = middle + F (X - middle) + shift`.
 
-    `rest_px` are the dots at rest; the frame is 240 x 260 px unless told.
+    `rest_px` are the dots at rest; the frame is 240 x 260 px by default.
     """
 
     rest_px: np.ndarray

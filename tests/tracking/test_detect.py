@@ -85,11 +85,11 @@ def test_straight_edges_are_no_particles(sheet):
 
 def test_a_blank_image_and_wrong_requests_are_refused():
     noise = np.random.default_rng(1).normal(100, 2, (64, 64))
-    with pytest.raises(ResultError, match=r"no .* dot stands out of the noise"):
+    with pytest.raises(ResultError, match=r"No .* dot exceeds the noise"):
         detect_particles(noise)
-    with pytest.raises(ResultError, match="not 6 of like size"):
+    with pytest.raises(ResultError, match="not 6 of similar size"):
         detect_fiducials(noise)
-    with pytest.raises(InputError, match="7 dots cannot stand in 2 equal rows"):
+    with pytest.raises(InputError, match="7 dots do not form 2 equal rows"):
         detect_fiducials(noise, 7)
     with pytest.raises(InputError, match="polarity = 'grey' is unknown"):
         detect_particles(noise, polarity="grey")

@@ -46,7 +46,7 @@ def test_a_sudden_turn_or_change_of_size_is_found(sheet, gradient):
         assert np.nanmax(np.abs(error)) < CLOSE_PX
 
 
-def test_the_edge_of_a_grid_tells_a_jump_from_the_same_less_a_pitch(sheet):
+def test_the_edge_of_a_grid_distinguishes_a_jump_from_the_same_less_a_pitch(sheet):
     made = sheet()
     x, y = np.meshgrid(np.arange(8) * 16.0 + 70.3, np.arange(8) * 16.0 + 60.3)
     grid = type(made)(np.stack([x.ravel(), y.ravel()], axis=1), rng=made.rng)
@@ -93,7 +93,7 @@ def test_uneven_light_is_taken_out_at_a_cost_that_is_stated(sheet):
         state, found = tracker.step(state, made.noisy(light * made.ideal()))
         errors.append(np.stack([found.x_px, found.y_px], axis=1) - made.rest_px)
         stated.append(np.stack([found.std_x_px, found.std_y_px], axis=1))
-    # 784 errors tell their rms to 3 %; slopes of 0.4 / 40 px would move dots by 0.2 px
+    # 784 errors determine their rms to 3 %; slopes of 0.4 / 40 px would move dots by 0.2 px
     true = np.sqrt(np.mean(np.square(errors)))
     assert true < 0.03
     assert 0.8 < np.sqrt(np.mean(np.square(stated))) / true < 1.25
@@ -126,7 +126,7 @@ def test_the_expected_share_of_wrong_positions_is_that_of_normal_errors():
     assert expected_wrong(np.zeros((2, 3)), 0.5).tolist() == [0.0, 0.0, 0.0]
 
 
-def test_dots_around_a_few_points_tell_which_is_which(sheet):
+def test_dots_around_a_few_points_identify_them(sheet):
     made = sheet(9, 9)
     points = made.rest_px[[21, 40, 59]]
     guides = find_guides(made.frame(), points, TrackOptions())
@@ -167,7 +167,7 @@ def test_particles_that_move_each_for_itself_keep_their_names_or_say_that_they_d
         error = np.stack([found.x_px, found.y_px], axis=1) - place
         assert np.nanmax(np.abs(error)) < 0.5
     assert found.valid.mean() > 0.7
-    for _ in range(12):  # steps of half a distance between dots: nobody can tell them apart
+    for _ in range(12):  # steps of half a distance between dots: they cannot be distinguished
         place = place + rng.normal(0.0, 12.0, place.shape)
         state, found = tracker.step(state, type(made)(place, rng=rng).frame())
     assert not found.valid.any()

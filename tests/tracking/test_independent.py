@@ -15,9 +15,12 @@ NAMES = [
 @pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_dots_that_move_independently_are_neither_lost_nor_wrong(benchmarks, name):
-    clips, board = import_module("tracking_board_clips"), import_module("tracking_board")
+    clips, difficult = (
+        import_module("benchmarks.tracking.difficult_clips"),
+        import_module("benchmarks.tracking.difficult"),
+    )
     case = next(case for case in clips.cases() if case.name.startswith(name))
-    score = board.compare(case, peers=False)["haselab"]
+    score = difficult.compare(case, libraries=False)["haselab"]
     assert score.wrong == 0.0
     assert score.lost <= 0.02
     assert score.rms < 0.03
@@ -25,8 +28,11 @@ def test_dots_that_move_independently_are_neither_lost_nor_wrong(benchmarks, nam
 
 @pytest.mark.long
 def test_dots_that_pass_each_other_keep_their_names(benchmarks):
-    clips, board = import_module("tracking_board_clips"), import_module("tracking_board")
+    clips, difficult = (
+        import_module("benchmarks.tracking.difficult_clips"),
+        import_module("benchmarks.tracking.difficult"),
+    )
     case = next(case for case in clips.cases() if case.name.startswith("layers"))
-    score = board.compare(case, peers=False)["haselab"]
+    score = difficult.compare(case, libraries=False)["haselab"]
     assert score.wrong == 0.0
     assert 0.8 < score.ratio < 1.25

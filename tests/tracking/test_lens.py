@@ -92,9 +92,9 @@ def test_the_scale_of_a_drawn_board_is_within_its_deviation(side, angle):
 
 def test_a_picture_without_a_board_and_too_few_pictures_are_refused():
     pytest.importorskip("cv2")
-    with pytest.raises(ResultError, match="no checkerboard with 9 x 6"):
+    with pytest.raises(ResultError, match="No checkerboard with 9 x 6"):
         find_checkerboard(np.zeros((100, 100), np.uint8), 9, 6)
-    with pytest.raises(InputError, match="at least 3 pictures"):
+    with pytest.raises(InputError, match="at least 3 images"):
         calibrate_lens([np.zeros((6, 9, 2))], (640, 480))
 
 
@@ -106,5 +106,5 @@ def test_without_opencv_the_error_says_what_to_install(monkeypatch):
 
 def test_a_distortion_that_folds_the_picture_is_refused():
     folded = Lens(FOCAL, CENTRE, np.array([-3.0, 0.0, 0.0, 0.0, 0.0]), (640, 480), 0.0)
-    with pytest.raises(ResultError, match="cannot be undone"):
+    with pytest.raises(ResultError, match="cannot be inverted"):
         folded.undistort(np.array([639.0]), np.array([479.0]))

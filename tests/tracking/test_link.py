@@ -71,5 +71,5 @@ def test_no_detection_at_all_gives_no_trajectory():
 
 @pytest.mark.parametrize("choice", [{"reach_px": 0.0}, {"memory": -1}, {"persistence": 1.5}])
 def test_wrong_choices_are_refused(choice):
-    with pytest.raises(InputError, match="allowed are a positive reach"):
+    with pytest.raises(InputError, match="reach_px must be above 0"):
         link_particles([], **{"reach_px": 1.0, **choice})

@@ -1,4 +1,4 @@
-"""A fixed pattern of the sensor: found at rest, taken out, and told from texture of the scene."""
+"""A fixed pattern of the sensor: found at rest, removed, and distinguished from texture."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_a_good_camera_has_no_pattern(sheet):
     assert find_pattern([scene.frame() for _ in range(10)]) is None
 
 
-def test_one_frame_tells_no_pattern(sheet, pattern):
+def test_one_frame_shows_no_pattern(sheet, pattern):
     scene = sheet()
     assert find_pattern([seen(scene.ideal(), pattern, scene.rng)]) is None
 

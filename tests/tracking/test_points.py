@@ -236,7 +236,7 @@ def test_a_contrast_that_the_noise_explains_is_not_believed():
 
 
 def test_a_place_known_to_a_pixel_only_is_no_place():
-    # an edge that hardly bends tells little of where it is along itself
+    # an edge that hardly bends gives little information on its position along itself
     y, x = np.mgrid[0:120, 0:120]
     scene = 100.0 * (100.0 + 60.0 * np.tanh((x - 60.0 - 0.002 * (y - 60.0) ** 2) / 3.0))
     cut = np.s_[53:68, 53:68]
@@ -311,13 +311,13 @@ def test_the_reference_is_renewed_under_large_deformation_and_the_deviation_says
     assert state.reference is not first
     error = np.stack([found.x_px, found.y_px], axis=1) - made.place(gradient)
     stated = np.stack([found.std_x_px, found.std_y_px])
-    # 98 errors tell their rms to 7 %; three times that, and the 5 % by which a deviation is wide
+    # 98 errors determine their rms to 7 %; three times that, and the 5 % of a wide deviation
     assert rms(stated) == pytest.approx(rms(error), rel=0.26)
     # the noise of the frame of renewal cancels; dots that shrink keep their bound
     assert rms(error) < 1.3 * cramer_rao_px(made, 10)
 
 
-def test_one_rest_frame_tells_enough_to_believe_the_next(sheet):
+def test_one_rest_frame_is_enough_to_accept_the_next(sheet):
     made = sheet()
     tracker = PointTracker(made.rest_px, TrackOptions(model="neighbours"))
     first = made.frame()
@@ -410,11 +410,11 @@ def test_an_affine_subset_turns_with_its_texture():
 @pytest.mark.parametrize(
     ("points", "options", "match"),
     [
-        ([[4.0, 45.0]], {}, r"point 0 at \(4.0, 45.0\) px is too close to the edge.*Move"),
+        ([[4.0, 45.0]], {}, r"Point 0 at \(4.0, 45.0\) px is too close to the edge.*Move"),
         ([[np.nan, 45.0]], {}, "not finite"),
         ([45.0, 45.0], {}, r"shape \(2,\), expected \(P, 2\)"),
-        ([[45.0, 45.0]], {"model": "neighbours"}, "needs at least 6 points, got 1"),
-        ([[45.0, 10.0 * k] for k in range(3, 9)], {"model": "neighbours"}, "on a line"),
+        ([[45.0, 45.0]], {"model": "neighbours"}, "needs at least 6 points, not 1"),
+        ([[45.0, 10.0 * k] for k in range(3, 9)], {"model": "neighbours"}, "are collinear"),
     ],
 )
 def test_points_that_cannot_be_tracked_are_refused(points, options, match):
@@ -446,9 +446,9 @@ def test_options_out_of_range_are_refused(choice, match):
 def test_frames_that_do_not_fit_are_refused():
     tracker = PointTracker(np.array([[45.0, 45.0]]))
     state = tracker.init([TEXTURE])
-    with pytest.raises(InputError, match=r"shape \(90, 80\), the reference \(90, 90\)"):
+    with pytest.raises(InputError, match=r"shape \(90, 80\), but but the reference \(90, 90\)"):
         tracker.step(state, TEXTURE[:, :80])
     with pytest.raises(InputError, match=r"float64 of shape.*expected uint8 or uint16"):
         tracker.step(state, TEXTURE.astype(float))
-    with pytest.raises(InputError, match="2 frames, 5 rest frames"):
+    with pytest.raises(InputError, match="2 frames, but 5 rest frames"):
         track_frames([TEXTURE, TEXTURE], np.array([[45.0, 45.0]]), rest_frames=5)

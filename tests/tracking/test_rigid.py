@@ -1,4 +1,4 @@
-"""Rigid motion told by fixed points."""
+"""Rigid motion measured by fixed points."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_an_exact_rigid_motion_is_undone_to_rounding():
     np.testing.assert_allclose(np.stack(back[:2], axis=-1)[0], sheet, atol=1e-10)
 
 
-def test_a_fixed_point_that_is_lost_leaves_the_others_to_tell_the_motion():
+def test_a_fixed_point_that_is_lost_leaves_the_others_to_measure_the_motion():
     now = moved(REST, -0.01, [1.0, 2.0], REST.mean(axis=0))
     now[2] = np.nan
     x, y = flat(now)

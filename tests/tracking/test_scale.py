@@ -46,7 +46,7 @@ def test_the_ticks_of_a_ruler_give_the_scale_within_its_deviation(period, angle)
 
 def test_a_picture_without_ticks_gives_no_scale():
     noise = np.random.default_rng(1).integers(0, 255, (100, 300), dtype=np.uint8)
-    with pytest.raises(ResultError, match="no regular ticks"):
+    with pytest.raises(ResultError, match="No regular ticks"):
         scale_from_ruler(noise, np.array([10.0, 50.0]), np.array([290.0, 50.0]), 1e-3)
 
 
@@ -79,5 +79,5 @@ def test_lengths_that_are_not_positive_are_refused(length):
 def test_points_that_coincide_and_rulers_off_the_picture_are_refused():
     with pytest.raises(InputError, match="0 px apart"):
         scale_from_points(np.ones(2), np.ones(2), 0.1)
-    with pytest.raises(InputError, match="leaves the 300 x 100 px"):
+    with pytest.raises(InputError, match="is not inside the 300 x 100 px"):
         scale_from_ruler(np.zeros((100, 300)), np.zeros(2), np.array([300.0, 5.0]), 1e-3)

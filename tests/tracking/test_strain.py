@@ -47,7 +47,7 @@ def test_a_lost_point_leaves_the_gauge_strain_unchanged():
     np.testing.assert_allclose(gauge.strain, [0.0, 0.08], atol=1e-12)
     assert gauge.std[1] == pytest.approx(0.02 * np.sqrt(1 / 3 + 1 / 2) / 200.0)
     valid[1, 3:] = False
-    with pytest.raises(ResultError, match="no point of a gauge group is valid in frame 1"):
+    with pytest.raises(ResultError, match="No point of a gauge group is valid in frame 1"):
         gauge_strain(tracks_of(stretched([0.0, 0.08]), valid=valid), ROWS, UPPER, LOWER)
 
 
@@ -131,7 +131,7 @@ def test_field_deviation_matches_scatter_and_lost_points_are_left_out(cloud):
 def test_too_few_points_are_refused(cloud):
     with pytest.raises(InputError, match="needs 3 valid points"):
         strain_field(cloud[:2], cloud[:2], cloud[:2])
-    with pytest.raises(InputError, match="6 bands need at least 24 valid points, got 20"):
+    with pytest.raises(InputError, match="6 bands need at least 24 valid points, not 20"):
         homogeneity(cloud[:20], cloud[:20], np.ones((20, 2)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 __all__ = ["Chart", "Curve", "Panel"]
 
 Array = NDArray[np.float64]
+# By name, because it imports this module; so matplotlib is loaded when one draws.
+_DRAWS = "haselab.report.chart_file"
 Style = Literal["line", "points", "steps", "bars"]
 
 
@@ -78,6 +81,5 @@ class Chart:
         Returns:
             A matplotlib figure: a notebook shows it, and `savefig` writes it.
         """
-        from haselab.report.chart_file import ChartFigure  # matplotlib is loaded when one draws
-
-        return ChartFigure.of(self)
+        figure: Figure = importlib.import_module(_DRAWS).ChartFigure.of(self)
+        return figure

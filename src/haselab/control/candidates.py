@@ -1,4 +1,4 @@
-"""Many candidate controllers at once: how far each is from its specification."""
+"""Scores of many candidate controllers: distance of each from its specification."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from haselab.models.plant import Plant
 
 __all__ = ["CandidateScores", "Task", "plant_crossover", "score"]
 
-_RISE_WEIGHT = 10.0  # a missed target of rise time counts before missed margins
+_RISE_WEIGHT = 10.0  # a missed rise time has priority over missed margins
 _MOST_SAMPLES = 250_000  # of one simulated step: 25 s at 10 kHz
 _UNSTABLE = 1e3
 _MET = 1e-9
 _LARGEST_EXCESS = 1e12
-_UNASKED = 2.0  # more than any miss of a share
-_LONGEST_WINDOW = 250  # samples of half a period of ringing
+_UNASKED = 2.0  # larger than any miss of a share
+_LONGEST_WINDOW = 250  # largest number of samples of half a period of ringing
 
 
 @dataclass(frozen=True)
 class Task:
-    """A plant, what surrounds it, and what is demanded.
+    """A plant with its loop setting and its specification.
 
     Args:
         plant: nominal plant.
         setting: rate, measurement delay and saturation.
-        spec: demands.
-        chance: plausible plants, of which a share has to keep the margins; None for no demand.
+        spec: specification.
+        chance: plausible plants, a share of which has to keep the margins; None: not required.
     """
 
     plant: AnyPlant
@@ -55,18 +55,18 @@ class Task:
         if not 10.0 <= samples <= _MOST_SAMPLES:
             raise InputError(
                 f"rate_hz = {self.setting.rate_hz:g} Hz: the simulated step of "
-                f"{self.horizon_s():.3g} s has {samples:.3g} samples, but the search needs 10 and "
-                f"holds {_MOST_SAMPLES}. Change the rate."
+                f"{self.horizon_s():.3g} s has {samples:.3g} samples, but the search needs at "
+                f"least 10 and at most {_MOST_SAMPLES}. Change the rate."
             )
 
     def plants(self) -> tuple[AnyPlant, ...]:
-        """The nominal plant, and it with the natural frequency off to either side."""
+        """The nominal plant, and with its natural frequency varied to both sides."""
         spread = self.spec.frequency_spread
         factors = (1.0 - spread, 1.0 + spread) if spread else ()
         return (self.plant, *(slowed(self.plant, factor) for factor in factors))
 
     def horizon_s(self) -> float:
-        """Length of the simulated step, in s: several rises, and the slow modes."""
+        """Length of the simulated step, in s: several rise times, and the slow modes."""
         rise = self.spec.rise_time_s or 0.0
         if isinstance(self.plant, Plant):
             slow = [mode.time_constant_s for mode in self.plant.slow_modes]
@@ -79,10 +79,10 @@ class Task:
 
 @dataclass(frozen=True)
 class CandidateScores:
-    """What candidates reach, and by how much they miss.
+    """Performance of candidates, and their shortfalls.
 
     Args:
-        miss: weighted sum of the demands' relative misses, 0 where all are met. Shape `(C,)`.
+        miss: weighted sum of the relative shortfalls, 0 if all demands are met. Shape `(C,)`.
         peak_sensitivity: worst over the plants. Shape `(C,)`.
         low_frequency_gain: integral gain, in 1/s. Shape `(C,)`.
     """
@@ -97,7 +97,7 @@ def score(candidates: Sequence[PidGains], task: Task) -> CandidateScores:
 
     Args:
         candidates: controllers. Length `C`.
-        task: plant, setting, demands.
+        task: plant, setting, specification.
     Returns:
         Scores, in the order of the candidates.
     """
@@ -119,7 +119,7 @@ def score(candidates: Sequence[PidGains], task: Task) -> CandidateScores:
     calm = np.flatnonzero(miss < 0.5 * _UNSTABLE)
     if calm.size:
         miss[calm] += _step_miss([candidates[index] for index in calm.tolist()], plants, task)
-    if task.chance is not None:  # asked last, and only of loops that meet everything else
+    if task.chance is not None:  # evaluated last, and only for loops that meet everything else
         good = miss <= _MET
         kept = [gains for gains, met in zip(candidates, good.tolist(), strict=True) if met]
         miss[~good] += _UNASKED
@@ -133,7 +133,7 @@ def _short(value: NDArray[np.float64], least: float) -> NDArray[np.float64]:
 
 
 def _over(value: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """Relative excess over `most`; beyond 10 slowly, so that what is out of reach still counts."""
+    """Relative excess over `most`; compressed beyond 10, so that large misses still count."""
     over = np.clip(value / max(most, 1e-9) - 1.0, 0.0, _LARGEST_EXCESS)
     return np.where(over > 10.0, 10.0 + 0.1 * np.log(np.maximum(over, 10.0) / 10.0), over)
 
@@ -147,7 +147,7 @@ def plant_crossover(plant: AnyPlant, setting: LoopSetting) -> float:
 def _step_miss(
     candidates: Sequence[PidGains], plants: Sequence[AnyPlant], task: Task
 ) -> NDArray[np.float64]:
-    """Misses of rise time, overshoot and error in the simulated step."""
+    """Relative misses of rise time, overshoot and error in the simulated step."""
     spec, setting = task.spec, task.setting
     reference = np.full(round(task.horizon_s() * setting.rate_hz), spec.step)
     measured, poles = _traces(candidates, plants, reference, setting)
@@ -157,7 +157,7 @@ def _step_miss(
     rise, overshoot, error = np.array(numbers).T.reshape(shape)
     miss = _over(error.max(axis=0), spec.steady_state_error)
     if spec.rise_time_s is not None and spec.rise_time_tolerance is not None:
-        off = np.abs(rise[0] / spec.rise_time_s - 1.0)  # of the nominal plant
+        off = np.abs(rise[0] / spec.rise_time_s - 1.0)  # for the nominal plant
         miss += _RISE_WEIGHT * np.minimum(10.0, np.maximum(0.0, off - spec.rise_time_tolerance))
     elif spec.rise_time_s is not None:
         miss += _over(rise.max(axis=0), spec.rise_time_s)
@@ -194,7 +194,7 @@ def _traces(
 def _step_numbers(
     measured: NDArray[np.float64], ring: Ringing | None, task: Task
 ) -> tuple[float, float, float]:
-    """Rise time, overshoot over the reference, and size of the error at the end."""
+    """Rise time, overshoot over the reference, and magnitude of the error at the end."""
     if measured[-measured.size // 10 :].mean() <= 0.0:
         return 1e3, 1e3, 1e3
     step, rate_hz = task.spec.step, task.setting.rate_hz
@@ -207,7 +207,7 @@ def _step_numbers(
 
 
 def _lasting(poles: NDArray[np.complex128], rate_hz: float) -> Ringing | None:
-    """The least damped pair of a sampled loop, where it rings for more than a period."""
+    """The least damped pair of a sampled loop, if it rings for more than a period."""
     upper = poles[(poles.imag > 1e-9) & (np.abs(poles) < 1.0)]
     s = np.log(upper) * rate_hz
     if s.size == 0:

@@ -1,4 +1,4 @@
-"""Many closed loops at once, each with the microcontroller's controller in its own bits."""
+"""Simulation of many closed loops, each with the microcontroller's controller bit for bit."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ __all__ = ["LoopSummaries", "LoopTraces", "simulate_ensemble", "trace_ensemble"]
 
 _SETTLED = 0.02
 _TENTHS = 10
-_LONGEST_STRETCH = 1000  # samples: sums in single precision lose at most 1000 roundings
+_LONGEST_STRETCH = 1000  # samples: sums in single precision have at most 1000 rounding errors
 
 
 @dataclass(frozen=True)
 class LoopSummaries:
-    """What each of many loops did with the reference's last change, and after it.
+    """Summaries of many loops' responses to the last change of the reference.
 
-    The output meant is the one that arrives at the controller, before the noise. Errors and
-    times count from the last change of the reference on (from the first sample where it is
-    constant; the step is then counted from 0, the operating point).
+    The output is the one that arrives at the controller, before the noise. Errors and
+    times are relative to the last change of the reference on (from the first sample where it is
+    constant; the step is then relative to 0, the operating point).
 
     Args:
-        absolute_error_s: integral of the error's size, in s. Shape `(B,)`, as all that follow.
+        absolute_error_s: integral of the absolute error, in s. Shape `(B,)`, as all that follow.
         highest: largest output.
         lowest: smallest output.
-        overshoot: largest excess over the last reference, part of the step; NaN without a step.
+        overshoot: largest excess over the last reference, relative to the step; NaN without a step.
         settling_time_s: time after which the error stays within 2 % of the step, in s; NaN where
             it still leaves that band in the last tenth, or without a step.
         limited_time_s: time with the controller's output at a limit, in s.
         swing: peak to peak over the last tenth.
-        unstable: the loop does not calm down: over the last tenth it swings by more than the
-            band, about where it swung in the tenth before, and by no less than 0.9 of that.
+        unstable: whether the loop does not settle: over the last tenth it swings by more than the
+            band, about the same level as in the previous tenth, and by at least 0.9 of that.
     """
 
     absolute_error_s: NDArray[np.float64]
@@ -78,21 +78,21 @@ def simulate_ensemble(
     measurement_noise: ArrayLike | WhiteNoise | None = None,
     threads: int = 0,
 ) -> LoopSummaries:
-    """Many closed loops under one reference, each told in a few numbers.
+    """Simulate many closed loops with one reference, and summarise each.
 
-    Plants in double, exact between the samples, any delay; controllers in the bits of
-    `core/hs_pid.c`. What a loop gives does not depend on the loops beside it, the threads, or
-    the machine's vectors.
+    Plants in double, exact between the samples, any delay; controllers bit-identical to
+    `core/hs_pid.c`. The result of a loop does not depend on the other loops, the threads, or
+    the machine's vector instructions.
 
     Args:
         plants: plants. Length `B`.
         gains: controllers. Length `B`.
-        reference: desired strain, one value a sample. Shape `(N,)`.
+        reference: desired strain, one value per sample. Shape `(N,)`.
         setting: rate, delay, limits, initial drive.
         measurement_noise: added to the measurements, in strain: generated, or values of shape
-            `(N,)` or `(B, N)`. NaN loses a measurement: the output is then 0, the controller
-            stands still.
-        threads: threads at most that share the loops; 0 for those of the machine.
+            `(N,)` or `(B, N)`. NaN means a lost measurement: the output is then 0, and the
+            controller keeps its state.
+        threads: largest number of threads; 0: all of the machine.
     Returns:
         The summaries, in the order of the loops.
     Raises:
@@ -120,19 +120,19 @@ def trace_ensemble(
     measurement_noise: ArrayLike | WhiteNoise | None = None,
     threads: int = 0,
 ) -> LoopTraces:
-    """The loops of `simulate_ensemble`, every sample kept: 8 bytes a loop and sample.
+    """Simulate loops as for `simulate_ensemble`, with every sample: 8 bytes per loop and sample.
 
     Args:
         plants: plants. Length `B`.
         gains: controllers. Length `B`.
-        reference: desired strain, one value a sample. Shape `(N,)`.
+        reference: desired strain, one value per sample. Shape `(N,)`.
         setting: rate, delay, limits, initial drive.
         measurement_noise: as in `simulate_ensemble`.
-        threads: threads at most that share the loops; 0 for those of the machine.
+        threads: largest number of threads; 0: all of the machine.
     Returns:
         The traces, in the order of the loops.
     Raises:
-        InputError: as `simulate_ensemble`.
+        InputError: as for `simulate_ensemble`.
     Example:
         >>> plants = [Plant(1.0, omega, 0.5) for omega in (25.0, 32.0, 40.0)]
         >>> found = trace_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, LoopSetting())
@@ -153,7 +153,7 @@ def _prepared(
     setting: LoopSetting,
     noise: ArrayLike | WhiteNoise | None,
 ) -> tuple[_loops.Loops, NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.uint32]]]:
-    """Loops, reference and noise, checked."""
+    """Check and prepare loops, reference and noise."""
     std = noise.std if isinstance(noise, WhiteNoise) else 0.0
     table = LoopTable.of(plants, gains, setting, std)
     desired = _reference(reference)
@@ -163,12 +163,12 @@ def _prepared(
 
 @dataclass(frozen=True)
 class _Window:
-    """The samples from the last change of the reference on, in tenths and pieces of these."""
+    """The samples from the last change of the reference on, in tenths, and segments of these."""
 
     start: int
     before: float
     after: float
-    pieces: int  # of a tenth
+    pieces: int  # segments per tenth
     edges: NDArray[np.int64]
 
     @classmethod
@@ -191,7 +191,7 @@ class _Window:
 
     @property
     def ends(self) -> NDArray[np.uint64]:
-        """Of the stretches that are run: one more before the window where there is something."""
+        """Ends of the simulated segments, with one more before the window if it is not empty."""
         return self.edges[0 if self.start else 1 :].astype(np.uint64)
 
     def summaries(self, kept: NDArray[np.void], period_s: float) -> LoopSummaries:
@@ -228,15 +228,13 @@ def _reference(values: ArrayLike) -> NDArray[np.float32]:
         vector = np.array(values, dtype=np.float32)
     if vector.ndim != 1 or vector.size == 0 or not np.isfinite(vector).all():
         raise InputError(
-            f"reference has shape {vector.shape} or holds NaN; allowed: a finite vector, one value "
-            f"a sample. Correct it."
+            f"reference has shape {vector.shape} or contains NaN; it must be a finite vector with "
+            "one value per sample."
         )
     return vector
 
 
 def _threads(threads: int) -> int:
     if threads < 0:
-        raise InputError(
-            f"threads = {threads}; allowed: 1 or more, or 0 for those of the machine. Correct it."
-        )
+        raise InputError(f"threads = {threads}; must be 1 or more, or 0 for all of the machine.")
     return threads

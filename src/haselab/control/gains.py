@@ -1,4 +1,4 @@
-"""The controller: gains, saturation, and its frequency response, continuous and sampled."""
+"""The PID controller: gains, saturation, and continuous and sampled frequency response."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["PidGains", "Saturation", "sampled_responses"]
 
 @dataclass(frozen=True)
 class Saturation:
-    """Allowed range of the controller's output, in strain.
+    """Range of the controller's output, in strain.
 
     Args:
         low: smallest output strain.
         high: largest output strain.
     Raises:
         InputError: the range is empty or not finite.
-    Source: reference study, section V: -0.05 <= u <= 0.1, against dielectric breakdown.
+    Source: reference study, section V: -0.05 <= u <= 0.1, to prevent dielectric breakdown.
     Example:
         >>> Saturation().high
         0.1
@@ -36,8 +36,8 @@ class Saturation:
     def __post_init__(self) -> None:
         if not -math.inf < self.low < self.high < math.inf:
             raise InputError(
-                f"saturation = [{self.low:g}, {self.high:g}] is not a range; allowed: finite, "
-                f"low < high. Correct the limits."
+                f"saturation = [{self.low:g}, {self.high:g}] is not a range; it must be finite, "
+                "with low < high."
             )
 
 
@@ -70,16 +70,14 @@ class PidGains:
         for name in ("kp", "ki", "kd", "derivative_filter_s"):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
-                raise InputError(
-                    f"{name} = {value!r}; allowed: finite, 0 or more. Correct the controller."
-                )
+                raise InputError(f"{name} = {value!r}; must be finite, 0 or more.")
 
     def controller(self) -> ChosenController:
-        """The same PID as the runner takes it."""
+        """The same PID as a registered controller for the runner."""
         return pid_controller(self.kp, self.ki, self.kd, self.derivative_filter_s)
 
     def jump_gain(self, rate_hz: float) -> float:
-        """Change of the output when one measurement changes by 1: what noise is multiplied by.
+        """Change of the output when one measurement changes by 1: the noise gain.
 
         Example:
             >>> round(PidGains(1.0, 0.0, 0.5, 0.04).jump_gain(100.0), 6)
@@ -102,7 +100,7 @@ class PidGains:
         return np.asarray(self.kp + self.ki / s + derivative)
 
     def sampled_response(self, omega_rad_s: ArrayLike, rate_hz: float) -> NDArray[np.complex128]:
-        """Response of the controller as the C core computes it, sample by sample.
+        """Response of the controller as the C core computes it, in discrete time.
 
         Args:
             omega_rad_s: angular frequencies in (0, pi * rate_hz], in rad/s. Shape `(...)`.
@@ -119,7 +117,7 @@ class PidGains:
 def sampled_responses(
     gains: Sequence[PidGains], omega_rad_s: ArrayLike, rate_hz: float
 ) -> NDArray[np.complex128]:
-    """Responses of many controllers as the C core computes them, sample by sample.
+    """Responses of many controllers as the C core computes them, in discrete time.
 
     Args:
         gains: controllers. Length `C`.

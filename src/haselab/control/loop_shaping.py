@@ -1,4 +1,4 @@
-"""Gains by optimisation: the most gain at low frequency that margins and step allow."""
+"""Controller design by optimisation: largest low-frequency gain within margins and step."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from haselab.models.plant import Plant
 __all__ = ["Design", "Prediction", "design_pi", "design_pid", "design_task", "predict"]
 
 _NAME_WIDTH = 28
-_MEMBERS = 12  # candidates a generation and unknown
+_MEMBERS = 12  # candidates per generation and unknown
 _GENERATIONS = 45
-_MOST_DELAY = 50  # updates; beyond, a search takes minutes
-_LARGEST_GAIN = 1e30  # of a plant; far beyond it a product of gains is no number any more
+_MOST_DELAY = 50  # updates; above, a search takes minutes
+_LARGEST_GAIN = 1e30  # of a plant; far above, products of gains overflow
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a controller does with one plant.
+    """Predicted performance of a controller with one plant.
 
     Args:
         natural_frequency_rad_s: of the plant, in rad/s.
         margins: of the sampled loop with its delay.
-        step: metrics of the simulated step, saturation included.
+        step: metrics of the simulated step, including saturation.
         u_peak: largest magnitude of the output in that step, in strain.
     """
 
@@ -51,15 +51,15 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Design:
-    """A controller with the proof of what it reaches.
+    """A controller with its predicted performance.
 
     Args:
         gains: controller.
-        spec: what was demanded.
+        spec: the specification.
         setting: rate, measurement delay and saturation that it was designed for.
-        nominal: prediction for the plant as given.
+        nominal: prediction for the given plant.
         spread: predictions over the spread of natural frequency, the nominal one first.
-        shortfalls: demands that are not met, in words; empty when all are.
+        shortfalls: unmet demands, as text; empty if all are met.
         plausible: margins on plants drawn from the posterior; None without one.
     """
 
@@ -106,15 +106,15 @@ def design_pi(
     *,
     rng: np.random.Generator,
 ) -> Design:
-    """PI controller for a sampled loop.
+    """Design a PI controller for a sampled loop.
 
     Args:
         plant: plant, its static gain above zero.
         spec: demands.
-        setting: rate, measurement delay (the hold is counted by itself) and saturation.
+        setting: rate, measurement delay (without the hold, which is added) and saturation.
         rng: random generator of the search.
     Returns:
-        The design; `shortfalls` says which demands no PI was found for.
+        The design; `shortfalls` lists the demands that no PI controller could meet.
     Raises:
         InputError: the plant's gain is not positive.
         ResultError: no stable loop was found.
@@ -132,20 +132,20 @@ def design_pid(
     *,
     rng: np.random.Generator,
 ) -> Design:
-    """PID controller (derivative of the filtered measurement) for a sampled loop.
+    """Design a PID controller (derivative of the filtered measurement) for a sampled loop.
 
     Args:
         plant: plant, its static gain above zero.
         spec: demands.
-        setting: rate, measurement delay (the hold is counted by itself) and saturation.
+        setting: rate, measurement delay (without the hold, which is added) and saturation.
         rng: random generator of the search.
     Returns:
-        The design; `shortfalls` says which demands no PID was found for. Gains of zero are
-        allowed: a resonance may be better left alone than damped.
+        The design; `shortfalls` lists the demands that no PID controller could meet. Gains of zero
+        are allowed, since a resonance may be better left undamped.
     Raises:
         InputError: the plant's gain is not positive.
         ResultError: no stable loop was found.
-    Source: as `design_pi`.
+    Source: as for `design_pi`.
     """
     return design_task(Task(plant, setting, spec), rng, derivative=True)
 
@@ -153,7 +153,7 @@ def design_pid(
 def predict(
     plant: AnyPlant, gains: PidGains, setting: LoopSetting, *, step: float, record_s: float = 25.0
 ) -> Prediction:
-    """Margins of the sampled loop and metrics of its simulated step.
+    """Predict the margins of a sampled loop and the metrics of its simulated step.
 
     Args:
         plant: plant.
@@ -172,8 +172,8 @@ def predict(
     if not found.stable:
         nothing = StepNumbers(*[math.nan] * len(dataclasses.fields(StepNumbers)))
         return Prediction(_frequency(plant), found, nothing, math.nan)
-    quiet = round(setting.rate_hz)
-    reference = np.r_[np.zeros(quiet), np.full(round(record_s * setting.rate_hz), step)]
+    before = round(setting.rate_hz)
+    reference = np.r_[np.zeros(before), np.full(round(record_s * setting.rate_hz), step)]
     if not isinstance(plant, Plant):
         measured, u = trace_general(plant, [gains], reference, setting)
         time_s = np.arange(reference.size) / setting.rate_hz
@@ -186,63 +186,64 @@ def predict(
 
 
 def _frequency(plant: AnyPlant) -> float:
-    """Natural frequency; of a general plant that of its fastest pole, in rad/s."""
+    """Natural frequency, in rad/s; for a general plant that of its fastest pole."""
     if isinstance(plant, Plant):
         return plant.natural_frequency_rad_s
     return PlantScale.of(plant).fast_rad_s
 
 
 def _reachable(task: Task, gain: float) -> None:
-    """Refuse a step that the limits cannot hold."""
+    """Refuse a step that the limits do not allow."""
     limits, step = task.setting.saturation, task.spec.step
     integrates = not isinstance(task.plant, Plant) and task.plant.denominator[-1] == 0.0
     if integrates or gain * limits.low <= step <= gain * limits.high:
         return
     raise ResultError(
         f"the output saturates: a step of {step:g} needs a controller output of {step / gain:.3g}, "
-        f"but --limits allows {limits.low:g} to {limits.high:g}. Reachable is a step of "
+        f"but --limits allows {limits.low:g} to {limits.high:g}. The step can be "
         f"{gain * limits.low:.3g} to {gain * limits.high:.3g}. Lower the step, or widen the limits"
     )
 
 
 def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
-    """Controller for a task, a share of plausible plants among its demands or not.
+    """Design a controller for a task, optionally with a share of plausible plants as a demand.
 
     Args:
-        task: plant, setting, demands.
+        task: plant, setting, specification.
         rng: random generator of the search.
-        derivative: whether a derivative is allowed.
+        derivative: whether a derivative term is allowed.
     Returns:
-        The design; `shortfalls` leaves out the share, which its caller judges on other plants.
+        The design; `shortfalls` does not include the share, which the caller evaluates on other
+        plants.
     Raises:
         InputError: the plant's gain is not positive, or its delay is too long.
-        ResultError: no stable loop was found, or the limits cannot hold the step.
+        ResultError: no stable loop was found, or the limits do not allow the step.
     """
     scale = PlantScale.of(task.plant)
     resonance = task.plant.gain if isinstance(task.plant, Plant) else scale.gain
     for what, gain in (("gain", resonance), ("static gain", scale.gain)):
         if not gain > 0.0:
             raise InputError(
-                f"plant {what} = {gain:g}; allowed: above 0, as the gains are. "
+                f"plant {what} = {gain:g}; it must be above 0, as the controller gains are. "
                 "Negate the input column and identify again (the model then has a gain above 0), "
                 "give --limits as -HIGH -LOW, and negate the controller's output on the bench."
             )
         if not 1.0 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
             raise InputError(
-                f"plant {what} = {gain:g}; allowed: {1.0 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}. "
-                "Choose other units for the input and output."
+                f"plant {what} = {gain:g}; it must be {1.0 / _LARGEST_GAIN:g} to "
+                f"{_LARGEST_GAIN:g}. Choose other units for the input and output."
             )
     _reachable(task, scale.gain)
     delay_s = task.plant.delay_s + task.setting.measurement_delay_s
     if delay_s * task.setting.rate_hz > _MOST_DELAY:
         raise InputError(
             f"The loop's delay of {delay_s:g} s is {delay_s * task.setting.rate_hz:.0f} updates at "
-            f"{task.setting.rate_hz:g} Hz, but a design takes at most {_MOST_DELAY}. Lower the "
+            f"{task.setting.rate_hz:g} Hz, but the limit of a design is {_MOST_DELAY}. Lower the "
             "rate, or shorten the delay."
         )
     wide = not isinstance(task.plant, Plant)
     found = _searched(task, rng, _Space(task, derivative, wide))
-    if found.shortfalls and not wide:  # gains beyond the usual ones, for other scales
+    if found.shortfalls and not wide:  # retry with a wider range of gains
         other = _searched(task, rng, _Space(task, derivative, wide=True))
         worse = len(other.shortfalls) >= len(found.shortfalls)
         found = found if worse and found.nominal.margins.stable else other
@@ -256,7 +257,7 @@ def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> De
 
 
 def _searched(task: Task, rng: np.random.Generator, space: _Space) -> Design:
-    """The best controller of a space, with its predictions."""
+    """The best controller of a search space, with its predictions."""
 
     def cost(points: NDArray[np.float64]) -> NDArray[np.float64]:
         found = score([space.gains(point) for point in points.T], task)
@@ -289,9 +290,9 @@ def _searched(task: Task, rng: np.random.Generator, space: _Space) -> Design:
 
 @dataclass(frozen=True)
 class _Space:
-    """Unit cube to gains: kp and kd reach zero, ki and the filter are logarithmic.
+    """Map from the unit cube to gains: kp and kd reach zero, ki and the filter are logarithmic.
 
-    The wide space takes its scales from the plant's response: for a static gain far from that at
+    The wide space is scaled by the plant's response, for a static gain far from that at
     the resonance, light damping, or a general plant.
     """
 
@@ -304,7 +305,7 @@ class _Space:
         return 4 if self.derivative else 2
 
     def gains(self, point: NDArray[np.float64]) -> PidGains:
-        """Controller at a point; four digits, so that what is printed is what was proven."""
+        """Controller at a point; rounded to four digits, as it is printed."""
         plant, period_s = self.task.plant, 1.0 / self.task.setting.rate_hz
         if self.wide or not isinstance(plant, Plant):
             return self._wide_gains(point, period_s)
@@ -349,7 +350,7 @@ def _digits(value: float) -> float:
 
 
 def _shortfalls(task: Task, gains: PidGains, spread: tuple[Prediction, ...]) -> tuple[str, ...]:
-    """Demands that the exact predictions miss by more than the search's resolution, in words."""
+    """Demands that the exact predictions miss by more than the search's resolution, as text."""
     spec, rate_hz = task.spec, task.setting.rate_hz
     at_least = (
         ("phase margin", min(p.margins.phase_margin_deg for p in spread), spec.phase_margin_deg),

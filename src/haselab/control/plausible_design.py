@@ -1,4 +1,4 @@
-"""Gains that a demanded share of the plausible plants stands, not the best plant alone."""
+"""Robust controller design: margins for a required share of plausible plants."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Structure", "design_plausible"]
 
 Structure = Literal["pi", "pid"]
 _FEWEST, _MOST = 50, 20_000  # draws
-_SEARCHED = 200  # plants that a search looks at
+_SEARCHED = 200  # plants used by a search
 _ROUNDS = 3
 
 
@@ -37,28 +37,28 @@ def design_plausible(
     draws: int = 400,
     nominal: AnyPlant | None = None,
 ) -> Design:
-    """PI or PID controller whose margins are judged on plants drawn from a posterior.
+    """Design a PI or PID controller with margins evaluated on plants drawn from a posterior.
 
-    The design on the best plant comes first. Where the demanded share of plausible plants keeps its
-    margins, it is the answer: no loop with more integral gain meets the demands on the best plant
-    alone. Otherwise the search is repeated with the share as one more demand, on other draws than
-    those that judge its result, so that the reported share is not flattered by the choice.
+    The design for the best plant comes first. If the required share of plausible plants keeps its
+    margins, it is the result: no loop with more integral gain meets the demands for the best plant
+    alone. Otherwise the search is repeated with the share as a further demand, on other draws than
+    those that evaluate its result, so that the reported share is unbiased.
 
     Args:
-        posterior: the model's numbers with their covariance.
-        spec: demands; phase and gain margin are those of the share.
+        posterior: the model's parameters with their covariance.
+        spec: specification; phase and gain margin are those of the share.
         setting: rate, measurement delay and saturation.
         rng: random generator of the draws and of the search.
         structure: "pi" or "pid".
-        probability: demanded share of plausible plants that keep both margins; None: report only.
-        draws: plausible plants that the result is judged on.
-        nominal: best plant, where it is not the posterior's own.
+        probability: required share of plausible plants that keep both margins; None: report only.
+        draws: number of plausible plants for the evaluation.
+        nominal: best plant, if it is not the posterior's nominal one.
     Returns:
         The design with `plausible`; a share that was not reached is a shortfall, and the gains are
         then those with the largest share found among loops that meet all other demands.
     Raises:
-        InputError: as `design_pi`; a probability or a number of draws outside its range.
-        ResultError: as `design_pi`.
+        InputError: as for `design_pi`; a probability or a number of draws outside its range.
+        ResultError: as for `design_pi`.
     Source: chance constraint by sampled scenarios, G. C. Calafiore and M. C. Campi, IEEE
         Transactions on Automatic Control 51 (2006), with an independent test of the result.
     Example:
@@ -72,12 +72,12 @@ def design_plausible(
         1.0
     """
     if not _FEWEST <= draws <= _MOST:
-        raise InputError(f"draws = {draws}; allowed: {_FEWEST} to {_MOST}. Choose one between.")
+        raise InputError(f"draws = {draws}; must be {_FEWEST} to {_MOST}.")
     most = 1.0 - 1.0 / min(draws, _SEARCHED)
     if probability is not None and not 0.0 < probability <= most:
         raise InputError(
             f"probability = {probability:g}; {draws} draws can show a share above 0 and up to "
-            f"{most:g}. Choose one between."
+            f"{most:g}."
         )
     streams = rng.spawn(2)
     plants = posterior.draw(draws, streams[0])
@@ -86,7 +86,7 @@ def design_plausible(
     found = _judged(search(best_plant, spec, setting, rng=rng), plants)
     if probability is None or _share(found) >= probability:
         return found
-    if found.shortfalls:  # more demands do not help
+    if found.shortfalls:  # further demands do not help
         return _short(found, probability, reachable=False)
     others = posterior.draw(min(draws, _SEARCHED), streams[1])
     chance = Chance.of(others, setting, probability)
@@ -104,11 +104,11 @@ def design_plausible(
 
 
 def _short(design: Design, probability: float, *, reachable: bool) -> Design:
-    """The design with one more shortfall: the share."""
+    """The design with the share as a further shortfall."""
     assert design.plausible is not None
     share, spec = design.plausible.share, design.spec
     where = " with gains that meet the other demands" if reachable else ""
-    how = "reachable is " if reachable else ""
+    how = "at most " if reachable else ""
     text = (
         f"share of plausible plants that keep {spec.phase_margin_deg:g} deg and "
         f"{spec.gain_margin_db:g} dB: {how}{100.0 * share.value:.4g} % (+- "

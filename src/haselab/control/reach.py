@@ -1,4 +1,4 @@
-"""The range of a controller's output that the drive can put out."""
+"""Range of a controller's output that the drive can produce."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _POINTS = 1501
 def reachable(
     wanted: Saturation, to_volt: VoltageMap, low_v: float | None, high_v: float | None
 ) -> Saturation:
-    """The wanted range of strain, narrowed to what the drive puts out through the voltage map.
+    """Limit a range of strain to what the drive can produce through the voltage map.
 
     Args:
         wanted: range of the corrected strain.
@@ -26,9 +26,9 @@ def reachable(
         low_v: lowest drive, in V; None: no limit.
         high_v: highest drive, in V; None: no limit.
     Returns:
-        The range that is left.
+        The limited range.
     Raises:
-        ResultError: zero strain is not inside.
+        ResultError: zero strain is outside the range.
     Example:
         >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
         >>> round(reachable(Saturation(), eq4, 0.0, 1.6).high, 4)
@@ -41,7 +41,7 @@ def reachable(
     inside = grid[(volt >= low_v) & (volt <= high_v)]
     if not inside.size or not inside[0] < 0.0 < inside[-1]:
         raise ResultError(
-            f"The voltage map puts zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
+            f"The voltage map has zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
             f"drive is limited to [{low_v:g}, {high_v:g}] V. Change the limits of the drive, or "
             "measure the voltage map again."
         )

@@ -1,4 +1,4 @@
-"""Ringing of a step response: found, and averaged out over one of its periods."""
+"""Ringing of a step response: detection, and averaging over one period."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 
 __all__ = ["Ringing", "average_out", "find_ringing", "smooth_lightly"]
 
-_MOST_SAMPLES = 1500  # a longer trace is thinned out for the search (block means)
-_SMALLEST_AMPLITUDE = 0.02  # of the trace's range; less does not move a rise time
+_MOST_SAMPLES = 1500  # a longer trace is reduced to block means for the search
+_SMALLEST_AMPLITUDE = 0.02  # of the trace's range; less does not affect a rise time
 _LIKELIHOOD_GAIN = 30.0  # white noise of 1,500 samples reaches 2 ln(1500) = 15
-_SLOWEST_DECAY_RATIO = 0.22  # decay / omega; beyond it a period leaves less than a quarter
+_SLOWEST_DECAY_RATIO = 0.22  # decay / omega; above, less than a quarter remains after one period
 
 
 @dataclass(frozen=True)
@@ -31,23 +31,23 @@ class Ringing:
 
     @property
     def lasts(self) -> bool:
-        """Whether a quarter or more is left after one period: a motion to be averaged out."""
+        """Whether a quarter or more remains after one period, so that averaging is needed."""
         return self.decay_per_s < _SLOWEST_DECAY_RATIO * self.omega_rad_s
 
 
 def find_ringing(time_s: NDArray[np.float64], trace: NDArray[np.float64]) -> Ringing | None:
-    """The ringing of a step response, if it rings.
+    """Find the ringing of a step response, if any.
 
     A smooth response (a constant and exponentials over a fixed set of time constants) and one
-    decaying oscillation are fitted together; the oscillation starts at the spectral peak of what
-    the smooth response leaves.
+    decaying oscillation are fitted together; the oscillation starts at the spectral peak of the
+    residual of the smooth response.
 
     Args:
         time_s: uniform time since the step, in s. Shape `(N,)`.
         trace: response, mean of the trials. Shape `(N,)`.
     Returns:
-        The ringing, or None where it is below 2 % of the trace's range, not above the noise, or
-        gone within a period.
+        The ringing, or None if it is below 2 % of the trace's range, not above the noise, or
+        decayed within a period.
     """
     count = max(1, -(-trace.size // _MOST_SAMPLES))
     size = trace.size // count * count
@@ -84,7 +84,7 @@ def find_ringing(time_s: NDArray[np.float64], trace: NDArray[np.float64]) -> Rin
 
 
 def _spectral_peak(t: NDArray[np.float64], left: NDArray[np.float64]) -> float | None:
-    """Angular frequency of the largest peak with three periods or more in the record."""
+    """Angular frequency of the largest peak with at least three periods in the record."""
     padded = 8 * t.size
     power = np.abs(np.fft.rfft(left, padded)) ** 2
     lowest = 3 * 8
@@ -99,15 +99,15 @@ def _spectral_peak(t: NDArray[np.float64], left: NDArray[np.float64]) -> float |
 def average_out(
     trace: NDArray[np.float64], ringing: Ringing, rate_hz: float
 ) -> NDArray[np.float64]:
-    """The response averaged over one period of the ringing.
+    """Average a response over one period of its ringing.
 
     At each time a straight line and the decaying oscillation are fitted to the period around
     it, and the line is kept. Away from the ends that is the average over one period; at the ends
-    the window stays inside the record, so that nothing of before the step is mixed in.
+    the window stays inside the record, so that data before the step are not included.
 
     Args:
         trace: response from the step on. Shape `(N,)`.
-        ringing: what is to be averaged out.
+        ringing: ringing to average out.
         rate_hz: sampling rate of the trace, in Hz.
     Returns:
         The averaged response. Shape `(N,)`.
@@ -125,11 +125,11 @@ def average_out(
 def smooth_lightly(
     trace: NDArray[np.float64], window_s: float, rate_hz: float
 ) -> NDArray[np.float64]:
-    """The response with noise averaged by a parabola over `window_s` around each time.
+    """Smooth a response by a parabola over `window_s` around each time.
 
     Args:
         trace: response from the step on. Shape `(N,)`.
-        window_s: width of the window, in s; below four samples nothing is changed.
+        window_s: width of the window, in s; below four samples the trace is unchanged.
         rate_hz: sampling rate of the trace, in Hz.
     Returns:
         The smoothed response. Shape `(N,)`.
@@ -142,7 +142,7 @@ def smooth_lightly(
 
 
 def _apply(trace: NDArray[np.float64], fit: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Middle row of a window's fit at every sample; its outer rows at the two ends."""
+    """Apply the middle row of a window's fit at every sample, and its outer rows at the ends."""
     size, half = fit.shape[0], fit.shape[0] // 2
     return np.concatenate(
         [

@@ -1,4 +1,4 @@
-"""One sampled loop on the exact plant, in double: saturation, anti-windup, any delay."""
+"""Exact simulation of one sampled loop in double precision: saturation, anti-windup, delay."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ _LONGEST_DELAY = 1e4
 
 @dataclass(frozen=True)
 class LoopSetting:
-    """What surrounds plant and controller.
+    """Settings of a loop besides plant and controller.
 
     Args:
         rate_hz: sampling rate, in Hz.
         measurement_delay_s: age of a measurement when the controller uses it, in s (half the
-            averaged block, and input/output). The hold is not part of it.
+            averaged block, and input/output), without the hold.
         saturation: limits of the controller's output.
-        initial_u: drive strain held since ever before the first sample; the plant rests on it.
-        points_per_sample: points of the fine trace a sample.
+        initial_u: constant drive strain before the first sample, at which the plant is in steady
+            state.
+        points_per_sample: points of the fine trace per sample.
     Raises:
-        InputError: a rate, delay or count that cannot be, or `initial_u` outside the limits.
+        InputError: a rate, delay or count out of range, or `initial_u` outside the limits.
     """
 
     rate_hz: float = 100.0
@@ -53,7 +54,7 @@ class LoopSetting:
         )  # fmt: skip
         for name, value, good, allowed in checks:
             if not good:
-                raise InputError(f"{name} = {value:g}; allowed: {allowed}. Correct the loop.")
+                raise InputError(f"{name} = {value:g}; must be {allowed}.")
 
 
 @dataclass(frozen=True)
@@ -83,16 +84,16 @@ def simulate_loop(
     *,
     measurement_noise: ArrayLike | None = None,
 ) -> LoopTrace:
-    """Closed loop, exact between the samples.
+    """Simulate a closed loop, exact between the samples.
 
-    At each sample the controller reads the plant's output of `measurement_delay_s` ago, and its
-    output is held until the next. Its integrator is frozen where the free output is beyond a
-    limit and the error would push it further. The PID is that of the C core, in double.
+    At each sample the controller reads the plant's output delayed by `measurement_delay_s`, and its
+    output is held until the next. Its integrator is frozen while the unlimited output is beyond a
+    limit and the error would increase that. The PID is that of the C core, in double precision.
 
     Args:
-        plant: plant; its own delay lies between drive and output.
+        plant: plant; its own delay is between drive and output.
         gains: controller.
-        reference: desired strain, one value a sample. Shape `(N,)`.
+        reference: desired strain, one value per sample. Shape `(N,)`.
         setting: rate, delay, limits, initial drive.
         measurement_noise: added to the measurements, in strain. Shape `(N,)`.
     Returns:
@@ -114,11 +115,11 @@ def simulate_loop(
 
 
 def simulate_drive(plant: Plant, drive: ArrayLike, setting: LoopSetting) -> LoopTrace:
-    """Open loop: the drive strain is put out sample by sample, without a controller.
+    """Simulate an open loop: the plant driven by a given drive strain, without a controller.
 
     Args:
         plant: plant.
-        drive: drive strain, one value a sample. Shape `(N,)`.
+        drive: drive strain, one value per sample. Shape `(N,)`.
         setting: rate and initial drive; a drive outside its limits is refused.
     Returns:
         The trace.
@@ -133,8 +134,8 @@ def simulate_drive(plant: Plant, drive: ArrayLike, setting: LoopSetting) -> Loop
     low, high = setting.saturation.low, setting.saturation.high
     if drive.min() < low or drive.max() > high:
         raise InputError(
-            f"drive spans [{drive.min():g}, {drive.max():g}]; allowed: [{low:g}, {high:g}]. "
-            f"Lower it, or widen the saturation."
+            f"drive spans [{drive.min():g}, {drive.max():g}]; it must be within [{low:g}, "
+            f"{high:g}]. Lower it, or widen the saturation."
         )
     return _trace(plant, drive, np.full(drive.size, np.nan), setting)
 
@@ -146,7 +147,7 @@ def _run(
     noise: NDArray[np.float64],
     setting: LoopSetting,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Controller outputs, and the measurements that they answered."""
+    """Controller outputs, and the measurements that they respond to."""
     period_s, u = 1.0 / setting.rate_hz, setting.initial_u
     held = HeldPlants.of(
         [plant], period_s=period_s, measurement_delay_s=setting.measurement_delay_s
@@ -184,7 +185,7 @@ def _run(
 def _trace(
     plant: Plant, u: NDArray[np.float64], measured: NDArray[np.float64], setting: LoopSetting
 ) -> LoopTrace:
-    """Fine trace of a plant that rested on the initial drive: only the change of drive moves it."""
+    """Fine trace of a plant in steady state at the initial drive; only changes of drive act."""
     fine_s = np.arange(u.size * setting.points_per_sample) / (
         setting.rate_hz * setting.points_per_sample
     )
@@ -197,9 +198,9 @@ def _vector(name: str, values: ArrayLike, size: int | None = None) -> NDArray[np
     vector = np.asarray(values, dtype=float)
     if vector.ndim != 1 or vector.size == 0 or not np.isfinite(vector).all():
         raise InputError(
-            f"{name} has shape {vector.shape} or holds NaN; allowed: a finite vector, one value "
-            f"a sample. Correct it."
+            f"{name} has shape {vector.shape} or contains NaN; it must be a finite vector with "
+            "one value per sample."
         )
     if size is not None and vector.size != size:
-        raise InputError(f"{name} has {vector.size} values; allowed: {size}. Correct it.")
+        raise InputError(f"{name} has {vector.size} values; must be {size}.")
     return vector

@@ -1,4 +1,4 @@
-"""What a controller has to reach."""
+"""Specification of a controller's performance."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from haselab.base import InputError
 
 __all__ = ["DesignSpec"]
 
-_LARGEST = 1e30  # NaN and infinity are no demands either
+_LARGEST = 1e30  # NaN and infinity are not valid either
 
 
 @dataclass(frozen=True)
 class DesignSpec:
-    """Demands on a loop. All but a rise time to be hit hold over the spread of frequency.
+    """Demands on a loop. All except a target rise time apply over the frequency spread.
 
     Args:
-        rise_time_s: 10 to 90 % rise time, ringing averaged out, in s; None for no demand.
+        rise_time_s: 10 to 90 % rise time, with ringing averaged out, in s; None: not specified.
         rise_time_tolerance: None: `rise_time_s` is an upper limit, and the largest integral gain
-            within all demands is sought. A number: the rise time is to be hit within this part
-            of it, and the most robust loop that does is sought.
-        overshoot: largest allowed overshoot, ringing included, part of the step; None: no demand.
-        steady_state_error: largest allowed error at the end of the simulated step (a few of the
-            plant's slowest time constants), part of the step.
-        phase_margin_deg: smallest allowed phase margin over all crossovers, in degrees.
-        gain_margin_db: smallest allowed gain margin, in dB.
-        peak_sensitivity: largest allowed peak sensitivity.
-        noise_gain: largest allowed answer of the output to a jump of one measurement by 1.
-        frequency_spread: the natural frequency may be off by this part, up and down.
-        keep_crossover: whether the highest crossover must not fall below the plant's own.
+            within all demands is sought. A number: the rise time has to be within this relative
+            tolerance, and the most robust such loop is sought.
+        overshoot: largest overshoot, including ringing, relative to the step; None: not specified.
+        steady_state_error: largest error at the end of the simulated step (a few of the
+            plant's slowest time constants), relative to the step.
+        phase_margin_deg: smallest phase margin over all crossovers, in degrees.
+        gain_margin_db: smallest gain margin, in dB.
+        peak_sensitivity: largest peak sensitivity.
+        noise_gain: largest change of the output when one measurement changes by 1.
+        frequency_spread: relative uncertainty of the natural frequency, up and down.
+        keep_crossover: whether the highest crossover must be at least the plant's own.
         step: reference step of the simulated experiments, in the unit of the plant's output.
     Raises:
-        InputError: a demand that cannot be meant.
+        InputError: a demand out of range.
     Example:
         >>> DesignSpec.from_mapping({"rise_time_s": 0.8}).phase_margin_deg
         50.0
@@ -67,17 +67,13 @@ class DesignSpec:
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise InputError(
-                    f"{name} = {value:g}; allowed: [{low:g}, {high:g}]. Correct the specification."
-                )
+                raise InputError(f"{name} = {value:g}; must be within [{low:g}, {high:g}].")
         if self.rise_time_tolerance is not None and self.rise_time_s is None:
-            raise InputError(
-                "rise_time_tolerance is given without rise_time_s; allowed: both. Add the latter."
-            )
+            raise InputError("rise_time_tolerance is given without rise_time_s. Add rise_time_s.")
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any]) -> DesignSpec:
-        """Specification from names and numbers, as a TOML file gives them.
+        """Create a specification from names and values, for example of a TOML file.
 
         Raises:
             InputError: an unknown name, or a value of the wrong type.
@@ -86,14 +82,14 @@ class DesignSpec:
         for name, value in data.items():
             if name not in known:
                 raise InputError(
-                    f"specification has {name!r}; allowed: {', '.join(sorted(known))}. Rename it."
+                    f"The specification has the unknown key {name!r}; must be one of "
+                    f"{', '.join(sorted(known))}."
                 )
             flag = name == "keep_crossover"
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
             if not (isinstance(value, bool) if flag else number and abs(value) <= _LARGEST):
                 raise InputError(
-                    f"{name} = {value!r}; allowed: {'true or false' if flag else 'a number'}. "
-                    f"Correct the specification."
+                    f"{name} = {value!r}; must be {'true or false' if flag else 'a number'}."
                 )
         values: dict[str, Any] = {
             name: value if isinstance(value, bool) else float(value) for name, value in data.items()

@@ -14,8 +14,8 @@ from haselab.control.ringing import Ringing, average_out, find_ringing, smooth_l
 
 __all__ = ["StepMetrics", "StepNumbers", "over_trials", "step_metrics", "step_numbers"]
 
-_BASELINE_S = 1.0  # the mean of the last second before the step is the level that it starts from
-_FINAL_PART = 0.1  # the mean of the record's last tenth is the final value
+_BASELINE_S = 1.0  # the initial level is the mean of the last second before the step
+_FINAL_PART = 0.1  # the final value is the mean of the record's last tenth
 _SETTLED = 0.02
 
 
@@ -24,13 +24,13 @@ class StepNumbers:
     """Metrics of one step response.
 
     Args:
-        rise_time_s: 10 to 90 % of the way to the final value, ringing averaged out, in s.
-        raw_rise_time_s: the same of the response as it is, ringing included, in s.
-        overshoot: largest excess over the final value, part of the step, ringing included.
+        rise_time_s: 10 to 90 % of the way to the final value, with ringing averaged out, in s.
+        raw_rise_time_s: the same for the unprocessed response, including ringing, in s.
+        overshoot: largest excess over the final value, relative to the step, including ringing.
         ring_averaged_overshoot: the same with the ringing averaged out.
         settling_time_s: time from the step after which the response stays within 2 % of the step
-            around its final value, in s; NaN where it still leaves that band in the last tenth.
-        steady_state_error: reference less final value, part of the reference's step.
+            around its final value, in s; NaN if it still leaves that band in the last tenth.
+        steady_state_error: reference minus final value, relative to the reference's step.
     """
 
     rise_time_s: float
@@ -45,17 +45,17 @@ class StepNumbers:
 class StepMetrics:
     """Metrics over the trials: mean, standard deviation of that mean, 95 % interval (Student).
 
-    A single trial has no scatter: its standard deviation and interval are NaN. Meaning of the
-    fields: see `StepNumbers`.
+    For a single trial standard deviation and interval are NaN. For the meaning of the
+    fields see `StepNumbers`.
 
     Args:
         rise_time_s: in s.
         raw_rise_time_s: in s.
-        overshoot: part of the step.
-        ring_averaged_overshoot: part of the step.
+        overshoot: relative to the step.
+        ring_averaged_overshoot: relative to the step.
         settling_time_s: in s.
-        steady_state_error: part of the step.
-        ringing: what was averaged out, None where the response does not ring.
+        steady_state_error: relative to the step.
+        ringing: ringing that was averaged out, None without ringing.
         trials: metrics of each trial.
     """
 
@@ -72,21 +72,21 @@ class StepMetrics:
 def step_metrics(
     time_s: ArrayLike, y: ArrayLike, reference: ArrayLike, *, ringing: Ringing | None = None
 ) -> StepMetrics:
-    """Metrics of repeated step experiments.
+    """Compute the metrics of repeated step experiments.
 
     The ringing is found in the mean of the trials (or given) and averaged out over one period
-    by `average_out`; a trace that does not ring is only smoothed over a tenth of its rise.
+    by `average_out`; a trace without ringing is only smoothed over a tenth of its rise.
 
     Args:
         time_s: uniform time, in s. Shape `(N,)`.
-        y: responses in strain, one row a trial. Shape `(trials, N)` or `(N,)`.
+        y: responses in strain, one row per trial. Shape `(trials, N)` or `(N,)`.
         reference: desired strain; it changes once. Shape `(N,)`.
-        ringing: ringing to average out, found in the data when not given.
+        ringing: ringing to average out, found in the data if not given.
     Returns:
         Estimates over the trials.
     Raises:
-        InputError: shapes that do not match, a time that is not uniform, no step or more
-            than one, or a response that does not move with it.
+        InputError: inconsistent shapes, a time that is not uniform, no step or more
+            than one, or a response that does not follow it.
     Source: reference study, fig. 6 (rise times read from the averaged trace).
     Example:
         >>> t = np.arange(-100, 900) / 100.0
@@ -132,24 +132,24 @@ def step_numbers(
     rate_hz: float,
     ringing: Ringing | None,
 ) -> StepNumbers:
-    """Metrics of one response, given from the step on.
+    """Compute the metrics of one response, given from the step on.
 
     Args:
-        moved: response less its level before the step, rising. Shape `(N,)`.
+        moved: response minus its level before the step, rising. Shape `(N,)`.
         size: step of the reference, above 0.
-        wanted: reference less the level before the step.
+        wanted: reference minus the level before the step.
         rate_hz: sampling rate, in Hz.
-        ringing: what to average out; None to smooth only.
+        ringing: ringing to average out; None to smooth only.
     Returns:
         The metrics.
     Raises:
-        InputError: the response does not end above where it began.
+        InputError: the response does not end above its start.
     """
     last = moved[-max(1, round(_FINAL_PART * moved.size)) :]
     final = float(last.mean())
     if not final > 0.0:
         raise InputError(
-            f"response moves by {final:g} under a step of {size:g}; allowed: a move in the step's "
+            f"response moves by {final:g} under a step of {size:g}; it must move in the step's "
             f"direction. Check the columns and the record's end."
         )
     rough_s = _rise_time(moved, final, rate_hz)
@@ -175,7 +175,7 @@ def _rise_time(moved: NDArray[np.float64], final: float, rate_hz: float) -> floa
 
 
 def _first(moved: NDArray[np.float64], level: float, rate_hz: float) -> float:
-    """Time of the first crossing of `level`, between samples by a straight line."""
+    """Time of the first crossing of `level`, by linear interpolation."""
     index = int(np.argmax(moved >= level))
     if index == 0:
         return 0.0
@@ -186,12 +186,12 @@ def _first(moved: NDArray[np.float64], level: float, rate_hz: float) -> float:
 def over_trials(
     values: NDArray[np.float64], unit: str, like: NDArray[np.float64] | None = None
 ) -> Estimate:
-    """Mean of repeated trials with Student's interval; NaN for the spread of a single one.
+    """Mean of repeated trials with Student's interval; NaN spread for a single trial.
 
     Args:
-        values: one a trial. Shape `(trials,)`.
-        unit: SI.
-        like: other trials of the same scatter, which it is taken from; None: these.
+        values: one value per trial. Shape `(trials,)`.
+        unit: SI unit.
+        like: other trials with the same scatter, used to estimate it; None: these.
     Returns:
         The mean.
     """
@@ -213,20 +213,21 @@ def _checked(
     if time.ndim != 1 or desired.shape != time.shape or trials.shape[1:] != time.shape:
         raise InputError(
             f"time, y and reference have shapes {time.shape}, {trials.shape}, {desired.shape}; "
-            f"allowed: (N,), (trials, N), (N,). Give one sample for each time."
+            "they must be (N,), (trials, N) and (N,). Give one sample for each time."
         )
     if not all(np.isfinite(values).all() for values in (time, trials, desired)):
-        raise InputError("time, y or reference holds NaN; allowed: finite. Cut the record.")
+        raise InputError("time, y or reference contains NaN. Cut the record.")
     steps = np.diff(time)
     if time.size < 20 or not np.allclose(steps, steps.mean(), rtol=1e-3, atol=0.0):
         raise InputError(
             f"time has {time.size} samples, {steps.min() if steps.size else 0:g} to "
-            f"{steps.max() if steps.size else 0:g} s apart; allowed: 20 or more, uniform. Resample."
+            f"{steps.max() if steps.size else 0:g} s apart; at least 20 uniform samples are "
+            "required. Resample."
         )
     changes = np.flatnonzero(np.diff(desired)).size
     if changes != 1:
         raise InputError(
-            f"reference changes {changes} times; allowed: once, after the first sample. "
+            f"reference changes {changes} times; it must change once, after the first sample. "
             f"Cut the record around one step."
         )
     return time, trials, desired

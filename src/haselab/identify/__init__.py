@@ -14,7 +14,7 @@ from haselab.identify.frequency.response import (
 )
 from haselab.identify.hysteresis.fit import HysteresisFit, LoopRecord, fit_hysteresis
 from haselab.identify.model_comparison.agreement import Agreement, agree
-from haselab.identify.model_comparison.comparison import Verdict, compare
+from haselab.identify.model_comparison.comparison import ModelComparison, compare
 from haselab.identify.model_comparison.hypotheses import (
     creep_hypotheses,
     linear_mode_hypotheses,
@@ -69,6 +69,7 @@ __all__ = [
     "HysteresisFit",
     "LoopRecord",
     "MapFit",
+    "ModelComparison",
     "NicholsChart",
     "NonlinearFit",
     "NyquistChart",
@@ -84,7 +85,6 @@ __all__ = [
     "TransferChoice",
     "TransferFit",
     "TransferStructure",
-    "Verdict",
     "VoltageMapFit",
     "VoltagePlantFit",
     "VoltageStructure",

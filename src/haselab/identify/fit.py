@@ -85,12 +85,12 @@ class Fit(ABC):
 
     Args:
         status: "ok", or why there is no result.
-        parameters: every number by name. One that is not identifiable is NaN with an infinite
+        parameters: every parameter by name. One that is not identifiable is NaN with an infinite
             interval.
         covariance: of `parameters`, in their order; infinite where one is not identifiable.
             Shape `(P, P)`.
         residuals: measured minus modelled, of each record. Shape `(M_r,)` each.
-        notes: what the reader of the numbers should know, a sentence each.
+        notes: remarks for the user, one sentence each.
     """
 
     status: str
@@ -101,7 +101,7 @@ class Fit(ABC):
 
     @property
     def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
+        """Whether the fit has a usable result."""
         return self.status == "ok"
 
     @abstractmethod
@@ -196,7 +196,7 @@ class RecordFit(Fit, Generic[Recorded]):
 
         Args:
             u: input, held between its samples. Shape `(N,)`.
-            rate_hz: samples a second, in Hz. None: as in the record of the fit.
+            rate_hz: sampling rate, in Hz. None: as in the record of the fit.
         Returns:
             Output at the same moments, from rest. Shape `(N,)`.
         Raises:

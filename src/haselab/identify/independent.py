@@ -1,4 +1,4 @@
-"""How many independent samples coloured residuals are worth, and intervals that know it."""
+"""Effective number of independent samples of coloured residuals, and intervals based on it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from haselab.identify.noise import autoregression, coloured_covariance
 __all__ = ["independent_share", "spread_of", "student_estimate"]
 
 Floats = NDArray[np.float64]
-_LEAST = 8.0  # samples that are left of any record
+_LEAST = 8.0  # smallest effective number of samples
 
 
 def independent_share(residuals: Sequence[Floats]) -> float:
-    r"""Share of the samples that would spread a mean as much if they were independent.
+    r"""Effective share of independent samples: the same variance of the mean as the residuals.
 
     $\sigma^2 / S(0)$, variance over spectral density at zero frequency of the autoregressive model
 
     Args:
-        residuals: one array a record, in order of time or of the abscissa. Shape `(M_r,)`.
+        residuals: one array per record, in order of time or of the abscissa. Shape `(M_r,)`.
     Returns:
         Share in (0, 1]; 1 for white residuals.
     Source: Bayley and Hammersley, J. R. Stat. Soc. Suppl. 8 (1946), 184.
@@ -43,12 +43,12 @@ def independent_share(residuals: Sequence[Floats]) -> float:
 def spread_of(
     columns: Sequence[Floats], residuals: Sequence[Floats], parameters: int
 ) -> tuple[Floats, float]:
-    """Covariance for coloured noise whose own spread is known from few independent samples only.
+    """Covariance for coloured noise whose variance is estimated from few independent samples.
 
     Args:
-        columns: sensitivities of the output to the estimates, one array a record. `(M_r, P)`.
-        residuals: one array a record. Shape `(M_r,)`.
-        parameters: all fitted numbers, nuisances included.
+        columns: sensitivities of the output to the estimates, one array per record. `(M_r, P)`.
+        residuals: one array per record. Shape `(M_r,)`.
+        parameters: all fitted parameters, nuisances included.
     Returns:
         Covariance `(P, P)`, and Student's quantile for 95 %.
     Source: `coloured_covariance`; degrees of freedom after Bayley and Hammersley (1946).
@@ -56,13 +56,13 @@ def spread_of(
     count = sum(e.size for e in residuals)
     worth = independent_share(residuals) * count
     freedom = max(worth - parameters, 1.0)
-    # The covariance divides by what the samples leave; the independent ones leave less.
+    # The covariance uses the degrees of freedom of all samples; the independent ones have fewer.
     factor = worth / freedom * max(count - parameters, 1) / count
     covariance = coloured_covariance(columns, residuals, parameters) * factor
     return np.asarray(covariance), float(stdtrit(freedom, 0.975))
 
 
 def student_estimate(value: float, std: float, quantile: float, unit: str) -> Estimate:
-    """Estimate whose interval is a quantile of Student's distribution wide."""
+    """Estimate whose interval uses a quantile of Student's distribution."""
     half = quantile * float(std)
     return Estimate(float(value), float(std), (float(value) - half, float(value) + half), unit)

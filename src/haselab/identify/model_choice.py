@@ -1,4 +1,4 @@
-"""Rival models of one record: BIC with the number of samples that coloured residuals are worth."""
+"""Choice between models of one record: BIC with the effective number of samples."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["APART", "bic", "effective_count", "told_apart"]
+__all__ = ["APART", "bic", "effective_count", "is_decisive"]
 
 Floats = NDArray[np.float64]
 APART = 6.0  # of BIC: odds of 20 to 1
 
 
 def effective_count(residuals: Sequence[Floats]) -> float:
-    r"""How many independent samples residuals this coloured are worth.
+    r"""Effective number of independent samples of coloured residuals.
 
-    $N / (1 + 2 \sum_k \hat\rho_k)$, the sum over the lags before the first one whose correlation
-    is not positive: what is left unexplained, be it noise or misfit, counts once a swing.
+    $N / (1 + 2 \sum_k \hat\rho_k)$, summed over the lags before the first one whose correlation
+    is not positive: each swing of an unexplained part, noise or misfit, counts once.
 
     Args:
-        residuals: one array a record. Shape `(M_r,)`.
+        residuals: one array per record. Shape `(M_r,)`.
     Returns:
         At most N, which is that of white residuals; at least 8.
     Source: Bayley and Hammersley, J. R. Stat. Soc. Suppl. 8 (1946), 184; truncation by Geyer,
@@ -47,18 +47,18 @@ def bic(cost: float, count: int, effective: float, parameters: int, floor: float
     Args:
         cost: sum of the squared residuals.
         count: number of residuals.
-        effective: from `effective_count`, the same for all rivals.
-        parameters: fitted numbers.
-        floor: mean square below which residuals are rounding.
+        effective: from `effective_count`, the same for all candidate models.
+        parameters: fitted parameters.
+        floor: mean square below which residuals are rounding errors.
     Returns:
-        The criterion; differences of it matter.
+        The criterion; only differences of it are meaningful.
     Source: Schwarz, Ann. Stat. 6 (1978), 461.
     """
     mean = max(cost / count, floor) or 1e-300
     return effective * math.log(mean) + parameters * math.log(effective)
 
 
-def told_apart(scores: Mapping[str, float]) -> bool:
-    """Whether the best score leads the second by 6 or more; one model alone is always told."""
+def is_decisive(scores: Mapping[str, float]) -> bool:
+    """Whether the best score leads the second by 6 or more; True for a single model."""
     ordered = sorted(scores.values())
     return len(ordered) < 2 or ordered[1] - ordered[0] >= APART

@@ -1,4 +1,4 @@
-"""What residuals tell: goodness of fit, whiteness, and intervals that stay honest when coloured."""
+"""Residual analysis: fit percentage, whiteness, and intervals valid for coloured noise."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _CORRECTIONS = 3
 
 
 def fit_percent(measured: Sequence[Floats], modelled: Sequence[Floats]) -> float:
-    r"""Normalised root-mean-square fit over all records, as `compare` of the field defines it.
+    r"""Normalised root-mean-square fit over all records, as defined by MATLAB's `compare`.
 
     $100\,(1 - \lVert y - \hat y\rVert / \lVert y - \bar y\rVert)$, each record with its own mean
 
     Args:
-        measured: outputs, one array a record. Shape `(M_r,)`.
+        measured: outputs, one array per record. Shape `(M_r,)`.
         modelled: outputs of the model. Same shapes.
     Returns:
         100 for a perfect model, 0 for one no better than the mean, negative for worse.
@@ -60,15 +60,15 @@ def _autocovariance(residuals: Sequence[Floats], lags: int) -> Floats:
 
 
 def whiteness_p(residuals: Sequence[Floats], lags: int = _MAX_ORDER) -> float:
-    r"""Ljung-Box probability that residuals this coloured come from white noise.
+    r"""Ljung-Box probability of such residuals under white noise.
 
-    $Q = N(N + 2) \sum_k \hat\rho_k^2/(N - k)$, chi-square with as many degrees as lags
+    $Q = N(N + 2) \sum_k \hat\rho_k^2/(N - k)$, chi-square with as many degrees of freedom as lags
 
     Args:
-        residuals: one array a record, in order of time. Shape `(M_r,)`.
+        residuals: one array per record, in order of time. Shape `(M_r,)`.
         lags: number of lags; at most a fifth of the samples are used.
     Returns:
-        Probability; below 0.05 the model leaves something unexplained.
+        Probability; below 0.05 the model does not explain everything.
     Source: Ljung and Box, Biometrika 65 (1978), 297.
     """
     count = sum(e.size for e in residuals)
@@ -85,7 +85,7 @@ def autoregression(residuals: Sequence[Floats]) -> tuple[Floats, float]:
     """Autoregressive noise model of the order that BIC chooses; order 0 is white noise.
 
     Args:
-        residuals: one array a record. Shape `(M_r,)`.
+        residuals: one array per record. Shape `(M_r,)`.
     Returns:
         Polynomial `(1, a1, ..., ap)` and variance of its innovation.
     Source: Levinson's recursion on the pooled autocovariance; Schwarz, Ann. Stat. 6 (1978), 461.
@@ -98,15 +98,15 @@ def autoregression(residuals: Sequence[Floats]) -> tuple[Floats, float]:
 def noise_behind(
     residuals: Sequence[Floats], columns: Sequence[Floats], own: Sequence[Floats] | None = None
 ) -> tuple[Floats, float]:
-    r"""Autoregressive model of the noise, given residuals of a fit that took some of it away.
+    r"""Autoregressive model of the noise, corrected for the part that the fit removed.
 
     $\mathrm{E}\,ee' = (I - H)\,\Sigma\,(I - H)$, with $H$ the projection on the fitted functions;
-    the autocovariance of $\Sigma$ is moved until that of $ee'$ is the one that was observed.
+    the autocovariance of $\Sigma$ is adjusted until that of $ee'$ matches the observed one.
 
     Args:
-        residuals: one array a record. Shape `(M_r,)`.
+        residuals: one array per record. Shape `(M_r,)`.
         columns: fitted functions common to all records. Shape `(M_r, P)`.
-        own: orthonormal functions of one record, of which its columns are freed. `(M_r, Q)`.
+        own: orthonormal functions of one record, to which its columns are orthogonal. `(M_r, Q)`.
     Returns:
         Polynomial `(1, a1, ..., ap)` and variance of the innovation.
     Source: method of moments; the trace formulas follow from the line above.
@@ -137,16 +137,16 @@ def coloured_covariance(
 
     $(Z'Z)^{-1} Z' \Sigma Z (Z'Z)^{-1}$, with the noise covariance $\Sigma$ of an autoregressive
     model of the residuals; white residuals give the classical formula. Coloured residuals are
-    first corrected for what the fit took out of the noise.
+    first corrected for the noise that the fit removed.
 
     Args:
-        columns: sensitivities of the output to the estimates, one array a record. `(M_r, P)`.
-        residuals: one array a record. Shape `(M_r,)`.
-        parameters: all fitted numbers, nuisances included.
-        own: orthonormal functions that only one record has, of which its columns are freed.
+        columns: sensitivities of the output to the estimates, one array per record. `(M_r, P)`.
+        residuals: one array per record. Shape `(M_r,)`.
+        parameters: all fitted parameters, nuisances included.
+        own: orthonormal functions of one record only, to which its columns are orthogonal.
             Shape `(M_r, Q)`. None: none.
     Returns:
-        Covariance. Shape `(P, P)`; a variance is infinite where the data do not tell.
+        Covariance. Shape `(P, P)`; a variance is infinite where a parameter is not identifiable.
     Source: White, Econometrica 48 (1980), 817, with a parametric noise covariance.
     """
     count = sum(e.size for e in residuals)
@@ -181,7 +181,7 @@ class _Basis:
 
     Args:
         values: Shape `(M, own + P)`.
-        own: how many belong to this record alone.
+        own: number that belong to this record alone.
     """
 
     values: Floats
@@ -202,7 +202,7 @@ def _orthonormal(columns: Sequence[Floats], own: Sequence[Floats] | None) -> lis
 def _taken(
     bases: Sequence[_Basis], polynomial: Floats, variance: float, lags: int
 ) -> tuple[Floats, Floats]:
-    """Autocovariance of a noise model, and what a fit takes from its sums at each lag."""
+    """Autocovariance of a noise model, and what a fit removes from its sums at each lag."""
     covered = [_times_covariance(polynomial, variance, basis.values) for basis in bases]
     spread = covered[0][0][: lags + 1]
     inner = [b.values.T @ covering for b, (_, covering) in zip(bases, covered, strict=True)]
@@ -235,8 +235,8 @@ def _times_covariance(
 
 
 def _inverse(gram: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Inverse on the directions that the data tell; marks the estimates that have others."""
+    """Inverse on the identifiable directions; marks estimates with other directions."""
     values, vectors = np.linalg.eigh(gram)
-    told = values > _SINGULAR * values[-1]
-    inverse = (vectors[:, told] / values[told]) @ vectors[:, told].T
-    return inverse, (np.abs(vectors[:, ~told]) > 1e-3).any(axis=1)
+    regular = values > _SINGULAR * values[-1]
+    inverse = (vectors[:, regular] / values[regular]) @ vectors[:, regular].T
+    return inverse, (np.abs(vectors[:, ~regular]) > 1e-3).any(axis=1)

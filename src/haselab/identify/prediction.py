@@ -1,4 +1,4 @@
-"""How well a model predicts a record that it has not seen."""
+"""Prediction of a record that was not used for the fit, with error and band."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["fitted_output", "predict"]
 Floats = NDArray[np.float64]
 _DRAWS = 100
 _HALF_WIDTH = 1.959963984540054  # standard deviations of a 95 % interval
-_SLOWEST = 10.0  # lengths of a record beyond which a free response is a straight line
+_SLOWEST = 10.0  # lengths of a record beyond which a free response counts as a straight line
 
 
 def predict(
@@ -31,20 +31,20 @@ def predict(
     free_start: bool = True,
     rng: np.random.Generator,
 ) -> Prediction:
-    r"""Simulate records from their inputs and compare them with their outputs.
+    r"""Simulate records from their inputs and compare the result with their outputs.
 
-    What a record was doing before it began is not the model's fault: with `free_start` the initial
+    The state before a record is not an error of the model: with `free_start` the initial
     state and a constant are fitted to each record by least squares, as the System Identification
     Toolbox's `compare` does. The band is $1.96\sqrt{\sigma_p^2 + \sigma_n^2}$ with $\sigma_p$ from
-    plants drawn from the posterior and $\sigma_n$ the noise.
+    plants drawn from the posterior and $\sigma_n$ from the noise.
 
     Args:
-        model: that predicts.
-        records: that it has not seen.
-        posterior: of the model's numbers; None: there is no band.
+        model: model under test.
+        records: records that were not used for the fit.
+        posterior: of the model's parameters; None: no band.
         noise_std: root mean square of the residuals of the fit, in the unit of the output.
-        free_start: fit initial state and constant; False: the record starts at rest at 0.
-        rng: source of the plants.
+        free_start: fit initial state and constant; False: the record starts at 0 in steady state.
+        rng: random generator of the plants.
     Returns:
         The prediction.
     Raises:
@@ -57,7 +57,7 @@ def predict(
         100.0
     """
     if not records:
-        raise InputError("There is no record to predict. Name a file with one.")
+        raise InputError("There is no record to predict. Give at least one.")
     modelled = [fitted_output(model, record, free_start) for record in records]
     half = None
     if posterior is not None:
@@ -75,7 +75,7 @@ def _spread(
 
 
 def fitted_output(model: Plant | RationalModel, record: Record, free_start: bool = True) -> Floats:
-    """The model's output, with the initial state and constant that suit the record best.
+    """The model's output, with the initial state and constant that fit the record best.
 
     Args:
         model: that predicts.
@@ -84,7 +84,7 @@ def fitted_output(model: Plant | RationalModel, record: Record, free_start: bool
     Returns:
         Output. Shape `(M,)`.
     """
-    # with a free start the constant takes up what the level before the record does
+    # with a free start the constant includes the response to the level before the record
     level = float(record.u[0]) if free_start else 0.0
     output = model.simulate(record.u - level, record.input_rate_hz, record.output_time_s)
     if not free_start:
@@ -95,14 +95,14 @@ def fitted_output(model: Plant | RationalModel, record: Record, free_start: bool
 
 
 def _free_columns(poles: NDArray[np.complex128], record: Record) -> Floats:
-    """A constant, and what the model does on its own from any initial state. Shape `(M, P + 1)`."""
+    """A constant and the model's free responses. Shape `(M, P + 1)`."""
     time_s = record.output_time_s - record.output_time_s[0]
     columns = [np.ones_like(time_s)]
     slowest = 1.0 / (_SLOWEST * max(record.duration_s, 1e-9))
     for pole in poles:
         if pole.imag < 0.0 or abs(pole) < slowest:
             continue
-        # a pole that grows is written backwards, so that no column overflows
+        # a growing response is computed backwards in time, so that no column overflows
         shift = time_s if pole.real <= 0.0 else time_s - time_s[-1]
         wave = np.exp(pole.real * shift + 1j * pole.imag * time_s)
         columns.append(wave.real)

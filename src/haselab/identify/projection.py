@@ -1,4 +1,4 @@
-"""Separable least squares: linear numbers are solved for, only the nonlinear ones are searched."""
+"""Separable least squares: linear parameters are solved, nonlinear ones searched."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Basis:
-    """Functions of one record and their derivatives by the searched numbers.
+    """Functions of one record and their derivatives with respect to the searched parameters.
 
     Args:
-        target: what the functions have to explain. Shape `(M,)`.
+        target: output that the functions have to explain. Shape `(M,)`.
         shared: functions whose factors are common to all records. Shape `(M, S)`.
         own: functions with a factor of this record alone. Shape `(M, Q)`.
         by_search: derivatives of `shared` and `own`, side by side. Shape `(L, M, S + Q)`.
@@ -38,14 +38,14 @@ class Basis:
 
 @dataclass(frozen=True)
 class Solution:
-    """Best factors at given searched numbers.
+    """Best factors for given searched parameters.
 
     Args:
-        search: searched numbers. Shape `(L,)`.
+        search: searched parameters. Shape `(L,)`.
         shared: common factors. Shape `(S,)`.
         own: factors of each record. Shape `(Q,)` each.
-        residuals: target minus model, one array a record. Shape `(M_r,)`.
-        columns: sensitivities to `search` and `shared`, freed of `own`. Shape `(M_r, L + S)`.
+        residuals: target minus model, one array per record. Shape `(M_r,)`.
+        columns: sensitivities to `search` and `shared`, orthogonal to `own`. Shape `(M_r, L + S)`.
         cost: sum of the squared residuals.
     """
 
@@ -58,7 +58,7 @@ class Solution:
 
 
 def _freed(own: Floats) -> tuple[Floats, Floats]:
-    """Orthonormal basis of the columns and its triangle, regular by a ridge of 1e-10."""
+    """Orthonormal basis of the columns and its triangle, regularised by a ridge of 1e-10."""
     scale = np.sqrt((own**2).sum(axis=0)).max(initial=0.0) or 1.0
     q, r = np.linalg.qr(np.vstack([own, _RIDGE * scale * np.eye(own.shape[1])]))
     return q[: own.shape[0]], r
@@ -99,7 +99,7 @@ def _solve(matrix: Floats, target: Floats) -> Floats:
 
 
 def _step(solution: Solution, damping: float) -> Floats:
-    """Damped Gauss-Newton step of the searched numbers."""
+    """Damped Gauss-Newton step of the searched parameters."""
     size = solution.search.size
     columns = np.vstack(solution.columns)
     slope, shared = columns[:, :size], columns[:, size:]
@@ -124,13 +124,13 @@ def minimise(
     """Levenberg-Marquardt search inside bounds, with the factors projected out.
 
     Args:
-        evaluate: bases of all records at given searched numbers.
+        evaluate: bases of all records at given searched parameters.
         start: first numbers. Shape `(L,)`.
         bounds: lowest and highest numbers. Shape `(L,)` each.
         iterations: most steps.
-        gain: relative gain of a step below which the search rests.
+        gain: relative gain of a step below which the search stops.
     Returns:
-        Best solution, and whether the search came to rest.
+        Best solution, and whether the search converged.
     Source: Kaufman, BIT 15 (1975), 49, for the projected Jacobian.
     """
     best = project(start, evaluate(start))

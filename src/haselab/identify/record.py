@@ -1,4 +1,4 @@
-"""One recorded experiment: an input with its way between the samples, an output with its clock."""
+"""One recorded experiment: input with its hold, output with its sample times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["HOLDS", "Record", "finite_vector"]
 
 Floats = NDArray[np.float64]
 HOLDS = ("zero", "first", "band-limited")
-_LARGEST_GAP = 50.0  # usual distances of two outputs
+_LARGEST_GAP = 50.0  # typical sampling intervals of the output
 _LARGEST_SHARE = 0.05  # of the record
 
 
@@ -23,14 +23,14 @@ def finite_vector(name: str, values: object, least: int) -> Floats:
     vector = np.asarray(values, dtype=np.float64)
     if vector.ndim != 1 or vector.size < least:
         raise InputError(
-            f"{name} has shape {vector.shape}; allowed is a vector of at least {least} values. "
+            f"{name} has shape {vector.shape}; it must be a vector of at least {least} values. "
             "Record longer, or name the right column."
         )
     if not np.isfinite(vector).all():
         row = int(np.flatnonzero(~np.isfinite(vector))[0])
         raise InputError(
-            f"{name} holds {vector[row]} at index {row}; allowed are finite numbers. "
-            "Remove the rows without a value."
+            f"{name} is {vector[row]} at index {row}; it must be finite. "
+            "Remove rows without a value."
         )
     return vector
 
@@ -41,16 +41,17 @@ class Record:
 
     Args:
         u: input, updated at `input_rate_hz` from `t = 0`. Shape `(N,)`.
-        input_rate_hz: updates of the input a second, in Hz.
+        input_rate_hz: update rate of the input, in Hz.
         y: output. Shape `(M,)`.
         output_time_s: rising times of the output on the clock of the input, in s. Shape `(M,)`.
-        input_before: input before `t = 0`, at which the plant had settled. None: not known; the
+        input_before: input before `t = 0`, at which the plant was settled. None: not known; the
             fit takes 0 or `u[0]`, whichever explains the record better.
-        hold: the input between its updates: "zero" (held, as a converter does), "first" (straight
-            lines), or "band-limited" (a measured signal without content above half its rate).
+        hold: interpolation of the input between its updates: "zero" (held, as a converter does),
+            "first" (straight lines), or "band-limited" (a measured signal without content above
+            half its rate).
     Raises:
-        InputError: wrong shapes, NaN, times that do not rise or have a gap, an input or output
-            without change.
+        InputError: wrong shapes, NaN, times that do not rise or that have a gap, a constant input
+            or output.
     """
 
     u: Floats
@@ -65,37 +66,37 @@ class Record:
             object.__setattr__(self, name, finite_vector(name, getattr(self, name), least))
         if self.y.size != self.output_time_s.size:
             raise InputError(
-                f"y has {self.y.size} values and output_time_s {self.output_time_s.size}; allowed "
-                "are equal lengths. Give one time for each output."
+                f"y has {self.y.size} values and output_time_s {self.output_time_s.size}; they "
+                "must be equally long. Give one time for each output."
             )
         _check_times(self.output_time_s)
         if not self.input_rate_hz > 0.0:
             raise InputError(
-                f"input_rate_hz = {self.input_rate_hz:g} Hz; allowed is above 0 Hz. "
+                f"input_rate_hz = {self.input_rate_hz:g} Hz; must be above 0 Hz. "
                 "Give the rate at which the input was updated."
             )
         if self.hold not in HOLDS:
-            raise InputError(f"hold = {self.hold}; allowed are {', '.join(HOLDS)}. Choose one.")
+            raise InputError(f"hold = {self.hold}; must be one of {', '.join(HOLDS)}.")
         before = self.u[0] if self.input_before is None else self.input_before
         if np.ptp(self.u) == 0.0 and self.u[0] == before and self.input_before is not None:
             raise InputError(
-                f"The input is {self.u[0]:g} throughout, so it excites nothing; allowed is an "
-                "input that changes. Name the right column, or record a chirp or a step."
+                f"The input is {self.u[0]:g} throughout, so it excites nothing. It "
+                "must change. Name the right column, or record a chirp or a step."
             )
         if np.ptp(self.y) == 0.0:
             raise InputError(
-                f"The output is {self.y[0]:g} throughout; allowed is an output that changes. "
+                f"The output is {self.y[0]:g} throughout; it must change. "
                 "Name the right column, or check the sensor."
             )
 
     @property
     def duration_s(self) -> float:
-        """Time of the last output since the first input, in s."""
+        """Time from the first input to the last output, in s."""
         return float(self.output_time_s[-1])
 
     @cached_property
     def output_step_s(self) -> float:
-        """Usual time between two outputs, in s."""
+        """Median time between two outputs, in s."""
         return float(np.median(np.diff(self.output_time_s)))
 
     @classmethod
@@ -109,26 +110,26 @@ class Record:
         hold: str = "zero",
         held_at_hz: float | None = None,
     ) -> Record:
-        """Record whose input and output were stored at the same moments.
+        """Create a record whose input and output were sampled at the same times.
 
         Args:
             u: input. Shape `(N,)`.
             y: output. Shape `(N,)`.
-            rate_hz: samples a second, in Hz.
+            rate_hz: sampling rate, in Hz.
             input_before: as in the class.
             hold: as in the class.
-            held_at_hz: rate at which the input was really updated, a whole fraction of `rate_hz`,
-                where the recorded command is finer than the converter. None: `rate_hz`.
+            held_at_hz: actual update rate of the input, a whole fraction of `rate_hz`,
+                if the command was recorded faster than the converter updates. None: `rate_hz`.
         """
         if not rate_hz > 0.0:
             raise InputError(
-                f"rate_hz = {rate_hz:g} Hz; allowed is above 0 Hz. Give the sampling rate."
+                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz. Give the sampling rate."
             )
         source, output = finite_vector("u", u, 8), finite_vector("y", y, 8)
         if source.size != output.size:
             raise InputError(
-                f"u has {source.size} values and y {output.size}; allowed are equal lengths. "
-                "Give both at the same moments, or name the right columns."
+                f"u has {source.size} values and y {output.size}, but they must be equally long. "
+                "Give both at the same times, or name the right columns."
             )
         times = np.arange(output.size) / rate_hz
         every = 1
@@ -136,19 +137,18 @@ class Record:
             every = round(rate_hz / held_at_hz) if held_at_hz > 0.0 else 0
             if every < 1 or abs(every * held_at_hz - rate_hz) > 1e-6 * rate_hz:
                 raise InputError(
-                    f"held_at_hz = {held_at_hz:g} Hz; allowed is {rate_hz:g} Hz over a whole "
+                    f"held_at_hz = {held_at_hz:g} Hz; it must be {rate_hz:g} Hz divided by a whole "
                     "number. Give the update rate of the converter."
                 )
         return cls(source[::every], rate_hz / every, output, times, input_before, hold)
 
 
 def _check_times(time_s: Floats) -> None:
-    """Rising times without a hole; missing single samples are no hole."""
+    """Require rising times without a gap; single missing samples are allowed."""
     steps = np.diff(time_s)
     if not (steps > 0.0).all():
         raise InputError(
-            "output_time_s does not rise everywhere; allowed are rising times. "
-            "Sort the record, or remove repeated frames."
+            "output_time_s does not rise everywhere. Sort the record, or remove repeated frames."
         )
     widest = int(np.argmax(steps))
     usual_s = float(np.median(steps))

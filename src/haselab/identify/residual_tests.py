@@ -1,4 +1,4 @@
-"""Whether residuals still hold something of the input."""
+"""Test whether residuals are still correlated with the input."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ __all__ = ["input_correlation_p", "lags_of", "means_before"]
 
 Floats = NDArray[np.float64]
 _LAGS = 32
-_REACH = 0.1  # of the record: the longest lag
+_REACH = 0.1  # of the record: longest lag
 _DEPENDENT = 1e-8
 
 
 def input_correlation_p(records: Sequence[Record], residuals: Sequence[Floats]) -> float:
-    r"""Probability that residuals which have nothing to do with the input are this like it.
+    r"""Probability of such a correlation if the residuals are independent of the input.
 
-    The residuals are regressed on the mean input of 31 stretches of the past, which grow from one
-    output to a tenth of the record, both whitened by an autoregressive model of what the input
-    does not explain.
-    $\lVert Q'e\rVert^2/\sigma^2$, chi-square with as many degrees as independent stretches
+    The residuals are regressed on the mean input over 31 past intervals, which grow from one
+    output to a tenth of the record, both whitened by an autoregressive model of the part that the
+    input does not explain.
+    $\lVert Q'e\rVert^2/\sigma^2$, chi-square with as many degrees of freedom as independent
+    intervals
 
     Args:
         records: experiments.
         residuals: measured minus modelled. Shape `(M_r,)` each.
     Returns:
-        Probability; below 0.05 the model leaves some of the dynamics unexplained.
+        Probability; below 0.05 part of the dynamics is missing from the model.
     Source: Ljung, System Identification (1999), section 16.6, whitened.
     """
     lags_s = lags_of(records)
@@ -47,14 +48,14 @@ def input_correlation_p(records: Sequence[Record], residuals: Sequence[Floats]) 
 
 
 def lags_of(records: Sequence[Record]) -> Floats:
-    """Edges of stretches of the past that grow from one output to a tenth of the record, in s."""
+    """Edges of past intervals that grow from one output to a tenth of the record, in s."""
     step_s = min(record.output_step_s for record in records)
     most = max(2.0, _REACH * max(record.duration_s for record in records) / step_s)
     return np.asarray(step_s * np.unique(np.rint(np.geomspace(1.0, most + 1.0, _LAGS)) - 1.0))
 
 
 def _explained(columns: Sequence[Floats], targets: Sequence[Floats]) -> tuple[Floats, list[Floats]]:
-    """Coordinates of the targets along the columns' span, and what lies outside it."""
+    """Coordinates of the targets in the span of the columns, and the remainder."""
     vectors, sizes, _ = np.linalg.svd(np.vstack(columns), full_matrices=False)
     inside = vectors[:, sizes > _DEPENDENT * sizes[0]]
     target = np.concatenate(targets)
@@ -64,7 +65,7 @@ def _explained(columns: Sequence[Floats], targets: Sequence[Floats]) -> tuple[Fl
 
 
 def means_before(record: Record, lags_s: Floats) -> Floats:
-    """Mean input between each two lags before each output, less its mean. Shape `(M, K - 1)`."""
+    """Mean input between successive lags before each output, centred. `(M, K - 1)`."""
     before = record.input_before or 0.0
     edges_s = np.arange(record.u.size + 1) / record.input_rate_hz
     summed = np.concatenate([[0.0], np.cumsum(record.u - before)]) / record.input_rate_hz

@@ -1,4 +1,4 @@
-"""A linear difference equation: what a sampled record tells without a continuous model."""
+"""A linear difference equation: a discrete-time model of a sampled record (ARX)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class ArxModel:
-    r"""Difference equation of an input and an output, both about their operating point.
+    r"""Difference equation of an input and an output, both relative to their operating point.
 
     $y_k + a_1 y_{k-1} + \dots + a_{n_a} y_{k-n_a} = b_1 u_{k-n_k} + \dots
     + b_{n_b} u_{k-n_k-n_b+1}$
@@ -27,11 +27,11 @@ class ArxModel:
     Args:
         a: `a_1` to `a_na`. Shape `(na,)`.
         b: `b_1` to `b_nb`. Shape `(nb,)`.
-        nk: samples from an input to the first output that knows of it; 1 for a plant that is
-            held and read at the same moments.
-        rate_hz: samples a second, in Hz.
+        nk: delay in samples from an input to the first output that depends on it; 1 for a plant
+            with a held input, sampled at the update times.
+        rate_hz: sampling rate, in Hz.
     Raises:
-        InputError: numbers that are not finite, a negative `nk`, a rate not above zero.
+        InputError: coefficients that are not finite, a negative `nk`, a rate not above zero.
     Source: Ljung, System Identification (1999), eq. 4.7, with its count of `nk`.
     Example:
         >>> model = ArxModel(np.array([-0.5]), np.array([1.0]), 1, 10.0)
@@ -50,47 +50,47 @@ class ArxModel:
         if not (np.isfinite(self.a).all() and np.isfinite(self.b).all() and self.b.size):
             raise InputError(
                 f"The difference equation has a = {self.a.tolist()}, b = {self.b.tolist()}; "
-                "allowed are finite numbers and one of b at least. Fit the model again."
+                "all must be finite, with at least one b. Fit the model again."
             )
         if self.nk < 0 or not 0.0 < self.rate_hz < float("inf"):
             raise InputError(
-                f"nk = {self.nk}, rate_hz = {self.rate_hz:g} Hz; allowed are 0 or above and above "
-                "0 Hz. Correct the model."
+                f"nk = {self.nk}, rate_hz = {self.rate_hz:g} Hz; nk must be 0 or above and "
+                "rate_hz above 0 Hz."
             )
 
     @property
     def denominator(self) -> Floats:
-        """`1, a_1, ..., a_na`, in rising powers of the delay by a sample."""
+        """`1, a_1, ..., a_na`, in rising powers of the one-sample delay."""
         return np.concatenate([[1.0], self.a])
 
     @property
     def numerator(self) -> Floats:
-        """`nk` zeros, then `b`, in rising powers of the delay by a sample."""
+        """`nk` zeros, then `b`, in rising powers of the one-sample delay."""
         return np.concatenate([np.zeros(self.nk), self.b])
 
     @property
     def static_gain(self) -> float:
-        """Output per input at rest."""
+        """Static gain: output per input in steady state."""
         return float(self.b.sum() / self.denominator.sum())
 
     @property
     def poles(self) -> Complexes:
-        """Roots of the denominator in the plane of z. Shape `(na,)`."""
+        """Roots of the denominator in the z-plane. Shape `(na,)`."""
         return np.asarray(np.roots(self.denominator), dtype=np.complex128)
 
     @property
     def is_stable(self) -> bool:
-        """Whether all poles lie inside the unit circle."""
+        """Whether all poles are inside the unit circle."""
         return bool((np.abs(self.poles) < 1.0).all())
 
     @property
     def has_continuous(self) -> bool:
-        """Whether a continuous model of the same order gives these samples: no pole at z <= 0."""
+        """Whether a continuous model of the same order exists: no pole at z <= 0."""
         z = self.poles
         return not bool(((np.abs(z.imag) < 1e-12) & (z.real <= 0.0)).any())
 
     def simulate(self, u: ArrayLike) -> Floats:
-        """Output from rest for an input; the input before the first sample is zero.
+        """Simulate the output from rest; the input before the first sample is zero.
 
         Args:
             u: input. Shape `(N,)`.
@@ -100,17 +100,17 @@ class ArxModel:
         return np.asarray(lfilter(self.numerator, self.denominator, np.asarray(u, np.float64)))
 
     def frequency_response(self, omega_rad_s: ArrayLike) -> Complexes:
-        """Complex response. Shape of `omega_rad_s`, in rad/s."""
+        """Complex gain. Shape of `omega_rad_s`, in rad/s."""
         back = np.exp(-1j * np.asarray(omega_rad_s, dtype=np.float64) / self.rate_hz)
         top = np.polynomial.polynomial.polyval(back, self.numerator)
         return np.asarray(top / np.polynomial.polynomial.polyval(back, self.denominator))
 
     def continuous(self) -> tuple[Floats, Floats, float]:
-        """Continuous transfer function that gives the same samples when its input is held.
+        """Continuous transfer function with the same samples for a held input.
 
         Returns:
             Numerator and denominator in falling powers of s, and the delay in s: `nk - 1` samples,
-            or none when the output knows of the input at once.
+            or none when the output responds to the input at once.
         Raises:
             ResultError: a pole at z <= 0 has no continuous counterpart.
         Source: matrix logarithm of the held state equations; Franklin, Powell and Workman,
@@ -132,7 +132,7 @@ class ArxModel:
         extra = size - self.a.size
         if extra:
             raise ResultError(
-                f"na = {self.a.size} and nb = {self.b.size}: the equation remembers more inputs "
+                f"na = {self.a.size} and nb = {self.b.size}: the equation uses more inputs "
                 f"than outputs, so {extra} of its poles are at z = 0 and have no continuous "
                 "counterpart. Raise na, raise nk, or keep the difference equation."
             )
@@ -142,7 +142,7 @@ class ArxModel:
 def _continuous(
     top: Floats, bottom: Floats, rate_hz: float, shift: int
 ) -> tuple[Floats, Floats, float]:
-    """Controller form, its logarithm, and the transfer function of that."""
+    """Continuous transfer function by the matrix logarithm of the controller form."""
     size = bottom.size - 1
     padded = np.concatenate([top, np.zeros(size + 1 - top.size)])
     through = float(padded[0])

@@ -1,4 +1,4 @@
-"""Creep: the slow answer to a held input, by exponentials or by a fractional power."""
+"""Creep: the slow response to a held input, as exponentials, power law or logarithm."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _NODES = 32
-_FEW = 32  # changes of the input up to which they are summed one by one
+_FEW = 32  # number of input changes up to which their responses are summed directly
 
 
 def mittag_leffler(order: float, x: ArrayLike) -> Floats:
@@ -52,13 +52,13 @@ def mittag_leffler(order: float, x: ArrayLike) -> Floats:
     values = np.asarray(x, dtype=np.float64)
     if not 0.0 < order <= 1.0 or not (values >= 0.0).all():
         raise InputError(
-            f"Mittag-Leffler of order {order:g} down to {values.min(initial=0.0):g}; allowed are "
-            "orders above 0 up to 1 and arguments of 0 or more. Correct them."
+            f"Mittag-Leffler of order {order:g} down to {values.min(initial=0.0):g}; the order "
+            "must be above 0 and at most 1, and the argument 0 or more."
         )
     theta = (2.0 * np.arange(_NODES // 2) + 1.0) * math.pi / _NODES
     z = _NODES * (0.1309 - 0.1194 * theta**2 + 0.2500j * theta)
     slope = _NODES * (-0.2388 * theta + 0.2500j)
-    # Conjugate nodes give the conjugate, so half of them do.
+    # Conjugate nodes give the conjugate, so half of them suffice.
     factor = np.exp(z) * z ** (order - 1.0) * slope
     power = z**order
     total = np.zeros(values.shape)
@@ -68,11 +68,11 @@ def mittag_leffler(order: float, x: ArrayLike) -> Floats:
 
 
 class Creep(ABC):
-    """Linear creep: `compliance` is the answer to a unit step, superposition gives the rest."""
+    """Linear creep: `compliance` is the response to a unit step; superposition does the rest."""
 
     @abstractmethod
     def compliance(self, time_s: ArrayLike) -> Floats:
-        """Answer to a unit step held since 0, per unit of input.
+        """Response to a unit step at time 0, per unit of input.
 
         Args:
             time_s: times since the step, 0 or more, in s. Shape `(...)`.
@@ -81,11 +81,11 @@ class Creep(ABC):
         """
 
     def simulate(self, u: ArrayLike, rate_hz: float) -> Floats:
-        """Output right after each update of an input that is held in between, exactly.
+        """Simulate the exact output right after each update of a held input.
 
         Args:
             u: inputs; before the first one the input was 0. Shape `(N,)`.
-            rate_hz: updates a second, in Hz.
+            rate_hz: update rate, in Hz.
         Returns:
             Outputs. Shape `(N,)`.
         Raises:
@@ -97,7 +97,7 @@ class Creep(ABC):
 
 
 def superpose(inputs: Floats, answer: Floats) -> Floats:
-    """Sum of the answers to all changes of the input. Shape `(N,)` each."""
+    """Sum of the responses to all changes of the input. Shape `(N,)` each."""
     changes = np.diff(inputs, prepend=0.0)
     at = np.flatnonzero(changes)
     if at.size > _FEW:
@@ -112,8 +112,8 @@ def _held(u: ArrayLike, rate_hz: float) -> Floats:
     inputs = np.asarray(u, dtype=np.float64)
     if inputs.ndim != 1 or not np.isfinite(inputs).all() or not 0.0 < rate_hz < math.inf:
         raise InputError(
-            f"The held input has shape {inputs.shape} at {rate_hz:g} Hz, or holds NaN; allowed is "
-            "a finite vector at a rate above 0 Hz. Remove the rows without a value."
+            f"The held input has shape {inputs.shape} at {rate_hz:g} Hz, or contains NaN; it must "
+            "be a finite vector at a rate above 0 Hz. Remove rows without a value."
         )
     return inputs
 
@@ -121,14 +121,14 @@ def _held(u: ArrayLike, rate_hz: float) -> Floats:
 def _checked(names: str, numbers: tuple[float, ...], positive: tuple[float, ...]) -> None:
     if not np.isfinite(numbers).all() or not all(value > 0.0 for value in positive):
         raise InputError(
-            f"The creep has {names} = {numbers}; allowed are finite numbers, time constants and "
-            "orders above 0. Correct them."
+            f"The creep has {names} = {numbers}; they must be finite, and time constants and "
+            "orders above 0."
         )
 
 
 @dataclass(frozen=True)
 class PronyCreep(Creep):
-    r"""A spring and retarded branches: $J(t) = J_0 + \sum_i J_i\,(1 - e^{-t/\tau_i})$.
+    r"""A spring and Kelvin-Voigt branches: $J(t) = J_0 + \sum_i J_i\,(1 - e^{-t/\tau_i})$.
 
     Args:
         instant: $J_0$, output per unit of input.
@@ -151,20 +151,20 @@ class PronyCreep(Creep):
         if len(self.gains) != len(self.time_constants_s):
             raise InputError(
                 f"The creep has {len(self.gains)} gains and {len(self.time_constants_s)} time "
-                "constants; allowed are as many of each. Give a time constant for each gain."
+                "constants. Give one time constant for each gain."
             )
         numbers = (self.instant, *self.gains, *self.time_constants_s)
         _checked("instant, gains, time_constants_s", numbers, self.time_constants_s)
 
     def compliance(self, time_s: ArrayLike) -> Floats:
-        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        """Response to a unit step at time 0, per unit of input. Shape of `time_s`, in s."""
         t = np.asarray(time_s, dtype=np.float64)
         branches = zip(self.gains, self.time_constants_s, strict=True)
         grown = sum((-gain * np.expm1(-t / tau_s) for gain, tau_s in branches), np.zeros(t.shape))
         return np.asarray(self.instant + grown)
 
     def simulate(self, u: ArrayLike, rate_hz: float) -> Floats:
-        """As `Creep.simulate`, by one recursion a branch."""
+        """Simulate the output as `Creep.simulate`, by one recursion per branch."""
         inputs = _held(u, rate_hz)
         total = self.instant * inputs
         for gain, tau_s in zip(self.gains, self.time_constants_s, strict=True):
@@ -172,19 +172,19 @@ class PronyCreep(Creep):
         return total
 
     def invert(self, y: ArrayLike, rate_hz: float) -> Floats:
-        """Input, held between its updates, after each of which the output is `y`: the feed-forward.
+        """Compute the held input whose output is `y` after each update: the feed-forward.
 
         Args:
-            y: wanted outputs. Shape `(N,)`.
-            rate_hz: updates a second, in Hz.
+            y: desired outputs. Shape `(N,)`.
+            rate_hz: update rate, in Hz.
         Returns:
             Inputs. Shape `(N,)`.
         Raises:
-            InputError: no instantaneous answer, or branches that outweigh it with the other
-                sign: no input, or only a growing one, gives the output at once.
+            InputError: no instantaneous response, or branches of opposite sign that exceed it:
+                no input, or only a growing one, gives the output at once.
         """
         outputs = _held(y, rate_hz)
-        # Each branch is a filter b/(1 - a z^-1) of the input one sample back.
+        # Each branch is a filter b/(1 - a z^-1) of the previous input.
         numerator, denominator = np.array([self.instant]), np.array([1.0])
         for gain, tau_s in zip(self.gains, self.time_constants_s, strict=True):
             stay = math.exp(-1.0 / (rate_hz * tau_s))
@@ -195,14 +195,14 @@ class PronyCreep(Creep):
             denominator = np.convolve(denominator, [1.0, -stay])
         if self.instant == 0.0 or (np.abs(np.roots(numerator)) >= 1.0).any():
             raise InputError(
-                f"The instantaneous answer is {self.instant:g}, which no stable inverse goes with; "
-                "allowed is one above the creep against it. Leave the creep to the controller."
+                f"The instantaneous response is {self.instant:g}, so there is no stable inverse; "
+                "it must exceed the opposing creep. Let the controller compensate the creep."
             )
         return np.asarray(lfilter(denominator, numerator, outputs))
 
 
 def retarded(inputs: Floats, rate_hz: float, tau_s: float) -> Floats:
-    """Answer of `1 - exp(-t/tau)` to a held input, from rest. Shape `(N,)`."""
+    """Response of `1 - exp(-t/tau)` to a held input, from rest. Shape `(N,)`."""
     step = math.exp(-1.0 / (rate_hz * tau_s))
     push = -math.expm1(-1.0 / (rate_hz * tau_s))
     return np.asarray(lfilter([0.0, push], [1.0, -step], inputs))
@@ -212,14 +212,14 @@ def retarded(inputs: Floats, rate_hz: float, tau_s: float) -> Floats:
 class PowerCreep(Creep):
     r"""A spring and a spring-pot in series: $J(t) = J_0 + J_1\,t^\alpha/\Gamma(1 + \alpha)$.
 
-    It grows for ever: no time constant, no final value.
+    It grows without limit: there is no time constant and no final value.
 
     Args:
         instant: $J_0$, output per unit of input.
         gain: $J_1$, output per unit of input and $\mathrm{s}^{\alpha}$.
         order: $\alpha$, above 0, at most 1.
     Raises:
-        InputError: a number outside its range.
+        InputError: a parameter outside its range.
     Source: Mainardi, Fractional Calculus and Waves in Linear Viscoelasticity (2010), section 3.
     Example:
         >>> float(PowerCreep(1.0, 0.5, 1.0).compliance(3.0))
@@ -235,7 +235,7 @@ class PowerCreep(Creep):
         _checked("instant, gain, order", numbers, (self.order, 1.0 + 1e-12 - self.order))
 
     def compliance(self, time_s: ArrayLike) -> Floats:
-        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        """Response to a unit step at time 0, per unit of input. Shape of `time_s`, in s."""
         t = np.asarray(time_s, dtype=np.float64)
         return np.asarray(self.instant + self.gain * t**self.order / math.gamma(1.0 + self.order))
 
@@ -244,14 +244,14 @@ class PowerCreep(Creep):
 class LogarithmicCreep(Creep):
     r"""Logarithmic creep: $J(t) = J_0 + J_1\,\ln(1 + t/\tau)$.
 
-    It grows for ever, by the same amount in each decade of time after $\tau$.
+    It grows without limit, by the same amount in each decade of time after $\tau$.
 
     Args:
         instant: $J_0$, output per unit of input.
         gain: $J_1$, the same unit, per factor e of time.
         time_constant_s: $\tau$, in s.
     Raises:
-        InputError: a number outside its range.
+        InputError: a parameter outside its range.
     Source: Phillips, Phil. Mag. 9 (1905), 513; usual for piezoelectric and polymer actuators.
     Example:
         >>> round(float(LogarithmicCreep(1.0, 0.5, 2.0).compliance(2.0)), 6)
@@ -267,7 +267,7 @@ class LogarithmicCreep(Creep):
         _checked("instant, gain, time_constant_s", numbers, (self.time_constant_s,))
 
     def compliance(self, time_s: ArrayLike) -> Floats:
-        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        """Response to a unit step at time 0, per unit of input. Shape of `time_s`, in s."""
         t = np.asarray(time_s, dtype=np.float64)
         return np.asarray(self.instant + self.gain * np.log1p(t / self.time_constant_s))
 
@@ -277,7 +277,7 @@ class FractionalCreep(Creep):
     r"""A spring and a fractional Kelvin-Voigt branch (Cole-Cole):
     $J(t) = J_0 + J_1\,(1 - E_\alpha(-(t/\tau)^\alpha))$.
 
-    A whole band of time constants about $\tau$; order 1 is one Prony branch.
+    It covers a band of time constants about $\tau$; order 1 is one Prony branch.
 
     Args:
         instant: $J_0$, output per unit of input.
@@ -285,7 +285,7 @@ class FractionalCreep(Creep):
         order: $\alpha$, above 0, at most 1.
         time_constant_s: $\tau$, in s.
     Raises:
-        InputError: a number outside its range.
+        InputError: a parameter outside its range.
     Source: Mainardi, Fractional Calculus and Waves in Linear Viscoelasticity (2010), section 3.
     Example:
         >>> whole = FractionalCreep(1.0, 0.5, 1.0, 2.0).compliance(4.0)
@@ -304,7 +304,7 @@ class FractionalCreep(Creep):
         _checked("instant, gain, order, time_constant_s", numbers, positive)
 
     def compliance(self, time_s: ArrayLike) -> Floats:
-        """Answer to a unit step held since 0, per unit of input. Shape of `time_s`, in s."""
+        """Response to a unit step at time 0, per unit of input. Shape of `time_s`, in s."""
         t = np.asarray(time_s, dtype=np.float64)
         left = mittag_leffler(self.order, (t / self.time_constant_s) ** self.order)
         return np.asarray(self.instant + self.gain * (1.0 - left))

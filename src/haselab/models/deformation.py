@@ -1,4 +1,4 @@
-"""How a test deforms a sheet of constant volume: from the recorded stretch to two of its three."""
+"""Deformation of a sheet of constant volume in a test: length and width from the stretch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEFORMATIONS = ("uniaxial", "pure_shear", "equibiaxial", "fixed_lateral", "prest
 
 @dataclass(frozen=True)
 class Deformation:
-    r"""Kind of a test.
+    r"""Kind of deformation in a test.
 
     | kind | length | width |
     |---|---|---|
@@ -28,8 +28,8 @@ class Deformation:
     | `prestretched` | $\lambda_p \lambda$ | clamped at $\lambda_p$, the `prestretch` of both |
 
     Args:
-        kind: one of the table.
-        lateral_stretch: of a width that is clamped.
+        kind: one of the kinds in the table.
+        lateral_stretch: stretch of a clamped width.
         prestretch: stretch of length and width at which the recorded stretch is 1.
     Raises:
         InputError: an unknown kind, or a stretch not above zero.
@@ -45,13 +45,13 @@ class Deformation:
     def __post_init__(self) -> None:
         if self.kind not in DEFORMATIONS:
             raise InputError(
-                f"deformation = {self.kind}; allowed are {', '.join(DEFORMATIONS)}. Choose one."
+                f"deformation = {self.kind}; must be one of {', '.join(DEFORMATIONS)}."
             )
         for name in ("lateral_stretch", "prestretch"):
             value = getattr(self, name)
             if not 0.0 < value < float("inf"):
                 raise InputError(
-                    f"{name} = {value:g}; allowed is above 0 (1 is the natural length). "
+                    f"{name} = {value:g}; must be above 0 (1 is the natural length). "
                     "Give a stretch, not a strain."
                 )
 
@@ -68,7 +68,7 @@ class Deformation:
         x = np.asarray(stretch, dtype=np.float64)
         if not (x > 0.0).all():
             raise LimitError(
-                f"stretch = {float(x.min()):g}; allowed is above 0 (1 is the natural length). "
+                f"stretch = {float(x.min()):g}; must be above 0 (1 is the natural length). "
                 "Give stretch, not strain."
             )
         if self.kind == "uniaxial":
@@ -81,6 +81,6 @@ class Deformation:
         return x, np.full(x.shape, side)
 
     def to_dict(self) -> JsonObject:
-        """Kind and the numbers that it needs."""
+        """The kind and its parameters."""
         needed = {"fixed_lateral": "lateral_stretch", "prestretched": "prestretch"}.get(self.kind)
         return {"kind": self.kind, **({needed: getattr(self, needed)} if needed else {})}

@@ -1,4 +1,4 @@
-"""Models of other tools: python-control and scipy.signal, to and from the rational form."""
+"""Conversion of models to and from python-control and scipy.signal."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _FORMS = ("tf", "ss", "zpk")
 
 
 def to_scipy(model: RationalModel, form: str = "tf", *, delay_order: int = 0) -> Any:
-    """The model as an object of scipy.signal, which knows no delay.
+    """Convert a model to scipy.signal, which does not support delays.
 
     Args:
         model: the model.
         form: "tf" TransferFunction, "ss" StateSpace or "zpk" ZerosPolesGain.
-        delay_order: order of the all-pass that stands for the delay; needed when there is one.
+        delay_order: order of the all-pass that replaces a delay; required if there is a delay.
     Returns:
         A system in continuous time.
     Raises:
-        InputError: an unknown form, or a delay and no order for it.
+        InputError: an unknown form, or a delay without an order for it.
     Example:
         >>> system = to_scipy(RationalModel((2.0,), (1.0, 3.0)), "zpk")
         >>> system.poles.real.tolist(), float(system.gain)
@@ -37,8 +37,8 @@ def to_scipy(model: RationalModel, form: str = "tf", *, delay_order: int = 0) ->
     """
     rational = _delay_free(model, delay_order, "scipy.signal")
     if form not in _FORMS:
-        raise InputError(f"form = {form}; allowed are {', '.join(_FORMS)}. Choose one.")
-    from scipy import signal  # half a second, for this form alone
+        raise InputError(f"form = {form}; must be one of {', '.join(_FORMS)}.")
+    from scipy import signal  # the import takes half a second
 
     if form == "ss":
         return signal.StateSpace(*_state_space(rational))
@@ -48,12 +48,12 @@ def to_scipy(model: RationalModel, form: str = "tf", *, delay_order: int = 0) ->
 
 
 def from_scipy(system: Any) -> RationalModel:
-    """A model from scipy.signal.
+    """Convert a model from scipy.signal.
 
     Args:
         system: TransferFunction, StateSpace or ZerosPolesGain in continuous time.
     Returns:
-        The model; its zeros and relative degree are those of the system, not of rounding.
+        The model; its zeros and relative degree are those of the system, not artefacts of rounding.
     Raises:
         InputError: another object, discrete time, several inputs or outputs.
     """
@@ -63,7 +63,7 @@ def from_scipy(system: Any) -> RationalModel:
         return _from_state_space(system.A, system.B, system.C, system.D, system.dt)
     if not isinstance(system, (signal.TransferFunction, signal.ZerosPolesGain)):
         raise InputError(
-            f"The model is a {type(system).__name__}; allowed are TransferFunction, StateSpace and "
+            f"The model is a {type(system).__name__}; must be TransferFunction, StateSpace or "
             "ZerosPolesGain of scipy.signal. Convert it."
         )
     _check_continuous(system.dt)
@@ -72,24 +72,24 @@ def from_scipy(system: Any) -> RationalModel:
 
 
 def to_control(model: RationalModel, form: str = "tf", *, delay_order: int = 0) -> Any:
-    """The model as an object of python-control, which knows no delay.
+    """Convert a model to python-control, which does not support delays.
 
     Args:
         model: the model.
         form: "tf" TransferFunction or "ss" StateSpace.
-        delay_order: order of the all-pass that stands for the delay; needed when there is one.
+        delay_order: order of the all-pass that replaces a delay; required if there is a delay.
     Returns:
         A system in continuous time with the names of input and output.
     Raises:
         InputError: python-control is not installed, an unknown form, or a delay and no order.
     """
     if form not in _FORMS[:2]:
-        raise InputError(f"form = {form}; allowed are {', '.join(_FORMS[:2])}. Choose one.")
+        raise InputError(f"form = {form}; must be one of {', '.join(_FORMS[:2])}.")
     try:
         control = importlib.import_module("control")
     except ImportError as error:
         raise InputError(
-            "python-control is not installed; allowed is version 0.10 or later. Install it with "
+            "python-control is not installed; version 0.10 or later is required. Install it with "
             "pip install haselab[control]."
         ) from error
     rational = _delay_free(model, delay_order, "python-control")
@@ -100,7 +100,7 @@ def to_control(model: RationalModel, form: str = "tf", *, delay_order: int = 0) 
 
 
 def from_control(system: Any) -> RationalModel:
-    """A model from python-control.
+    """Convert a model from python-control.
 
     Args:
         system: TransferFunction or StateSpace in continuous time.
@@ -114,7 +114,7 @@ def from_control(system: Any) -> RationalModel:
         return _from_state_space(system.A, system.B, system.C, system.D, system.dt, labels)
     if not all(hasattr(system, name) for name in ("num", "den", "dt")):
         raise InputError(
-            f"The model is a {type(system).__name__}; allowed are TransferFunction and StateSpace "
+            f"The model is a {type(system).__name__}; must be TransferFunction or StateSpace "
             "of python-control. Convert it."
         )
     _check_continuous(system.dt)
@@ -126,8 +126,8 @@ def from_control(system: Any) -> RationalModel:
 def _delay_free(model: RationalModel, delay_order: int, tool: str) -> RationalModel:
     if model.delay_s > 0.0 and delay_order == 0:
         raise InputError(
-            f"The model has a delay of {model.delay_s:g} s, which {tool} cannot hold; allowed is "
-            "one with delay_order = 1 to 10. Give the order of an all-pass, or take the delay out "
+            f"The model has a delay of {model.delay_s:g} s, which {tool} cannot represent. Give "
+            "delay_order = 1 to 10, the order of an all-pass, or remove the delay "
             "with without_delay(0)."
         )
     return model.without_delay(delay_order)
@@ -165,7 +165,7 @@ def _numerator(a: Floats, b: Floats, c: Floats, through: float) -> Floats:
     """Leading factor times the polynomial of the zeros.
 
     The leading factor is the first Markov parameter that is not zero; the zeros are the poles of
-    what still moves while the output is held at zero.
+    the zero dynamics.
     """
     if through != 0.0:
         return np.asarray(through * np.real(np.poly(a - b @ c / through)))
@@ -197,16 +197,16 @@ def _label(system: Any, attribute: str, otherwise: str) -> str:
 
 
 def _check_continuous(step_s: Any) -> None:
-    """python-control writes 0 for continuous time, scipy None."""
+    """python-control uses 0 for continuous time, scipy None."""
     if step_s is not None and (step_s is True or float(step_s) != 0.0):
         raise InputError(
-            f"The model is in discrete time (dt = {step_s}); allowed is continuous time. Convert "
-            "it, for example with d2c, or fit the records here."
+            f"The model is in discrete time (dt = {step_s}); it must be in continuous time. "
+            "Convert it, for example with d2c, or fit the records here."
         )
 
 
 def _many(inputs: int, outputs: int) -> InputError:
     return InputError(
-        f"The model has {inputs} inputs and {outputs} outputs; allowed is one of each. Take one "
-        "channel of it."
+        f"The model has {inputs} inputs and {outputs} outputs; it must have one of each. Select "
+        "one channel of it."
     )

@@ -1,4 +1,4 @@
-"""Filters of scipy, imported at their first use: half a second that most commands do not need."""
+"""Filters of scipy, imported at first use, since the import takes half a second."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exact response of one pole to an input that a converter holds between its updates."""
+"""Exact response of one pole to the held input of a converter."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class PoleResponse:
-    """State of `x' = pole x + u` and its sensitivities, at the asked times.
+    """State of `x' = pole x + u` and its sensitivities, at the requested times.
 
     Args:
         state: `x`. Shape `(M,)`.
-        by_pole: derivative of `x` by the pole. Shape `(M,)`.
-        by_time: derivative of `x` by time, which is minus that by the delay. Shape `(M,)`.
+        by_pole: derivative of `x` with respect to the pole. Shape `(M,)`.
+        by_time: derivative of `x` with respect to time: minus that with respect to the delay.
+            Shape `(M,)`.
     """
 
     state: Complexes
@@ -34,13 +35,13 @@ class PoleResponse:
 
 @dataclass(frozen=True)
 class HeldInput:
-    r"""Input of a zero-order hold: `u[k]` from `k/rate` to `(k+1)/rate`, the last one for ever.
+    r"""Input of a zero-order hold: `u[k]` from `k/rate` to `(k+1)/rate`, the last one without end.
 
     Before `t = 0` the input is zero.
 
     Args:
         u: values. Shape `(N,)`.
-        rate_hz: updates a second, in Hz.
+        rate_hz: update rate, in Hz.
     Example:
         >>> response = HeldInput(np.ones(3), 100.0).response(-2.0 + 0j, np.array([0.7]))
         >>> round(float(response.state[0].real), 9), round(float(1 - np.exp(-1.4)) / 2, 9)
@@ -53,12 +54,12 @@ class HeldInput:
     def __post_init__(self) -> None:
         if self.u.ndim != 1 or self.u.size == 0 or not np.isfinite(self.u).all():
             raise InputError(
-                f"The held input has shape {self.u.shape} or holds NaN; allowed is a finite "
-                "vector of one value or more. Remove the rows without a value."
+                f"The held input has shape {self.u.shape} or contains NaN; it must be a finite "
+                "vector of at least one value. Remove rows without a value."
             )
         if not self.rate_hz > 0.0:
             raise InputError(
-                f"input_rate_hz = {self.rate_hz:g} Hz; allowed is above 0 Hz. "
+                f"input_rate_hz = {self.rate_hz:g} Hz; must be above 0 Hz. "
                 "Give the rate at which the input was updated."
             )
 

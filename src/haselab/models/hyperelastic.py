@@ -54,8 +54,9 @@ def inverse_langevin(y: ArrayLike) -> Floats:
     y = np.asarray(y, dtype=np.float64)
     if not (np.abs(y) < 1.0).all():
         raise LimitError(
-            f"The inverse Langevin function was asked at {np.abs(y).max():g}; allowed is below 1. "
-            "The chains are at their full length: lower the stretch or raise lambda_m."
+            f"The inverse Langevin function was evaluated at {np.abs(y).max():g}; the argument "
+            "must be below 1. The chains are at their full length. Lower the stretch or raise "
+            "lambda_m."
         )
     x = y * (3.0 - y * y) / (1.0 - y * y)
     for _ in range(6):
@@ -65,7 +66,7 @@ def inverse_langevin(y: ArrayLike) -> Floats:
 
 
 def _langevin(x: Floats) -> tuple[Floats, Floats]:
-    """Langevin function and its slope."""
+    """Langevin function and its derivative."""
     small = np.abs(x) < 0.05
     z = np.where(small, 1.0, x)
     x2 = x * x
@@ -81,7 +82,7 @@ def _stretches(
     length = np.asarray(stretch, dtype=np.float64)
     if not (length > 0.0).all():
         raise LimitError(
-            f"stretch = {float(length.min()):g}; allowed is above 0 (1 is the natural length). "
+            f"stretch = {float(length.min()):g}; must be above 0 (1 is the natural length). "
             "Give stretch, not strain."
         )
     if lateral_stretch is None:
@@ -90,7 +91,7 @@ def _stretches(
     side = np.broadcast_to(np.asarray(lateral_stretch, dtype=np.float64), length.shape)
     if not (side > 0.0).all():
         raise LimitError(
-            f"lateral_stretch = {float(side.min()):g}; allowed is above 0. "
+            f"lateral_stretch = {float(side.min()):g}; must be above 0. "
             "Give None for a free width, 1 for pure shear."
         )
     return length, side, 1.0 / (length * side)
@@ -98,9 +99,9 @@ def _stretches(
 
 @dataclass(frozen=True)
 class HyperelasticLaw:
-    """A law of incompressible rubber; the subclasses are final and differ in `name` and numbers.
+    """A law of incompressible rubber; the subclasses are final and differ in `name` and parameters.
 
-    Args: those of the subclass.
+    Args: parameters of the subclass.
     """
 
     name: ClassVar[str]
@@ -126,19 +127,19 @@ class HyperelasticLaw:
         return self._twice_w1_pa(first_invariant) * (length - thickness**2 / length)
 
     def _twice_w1_pa(self, first_invariant: Floats) -> Floats:
-        """Twice the derivative of the energy density by the first invariant."""
-        raise NotImplementedError(f"{type(self).__name__} is no law of the first invariant")
+        """Twice the derivative of the energy density with respect to the first invariant."""
+        raise NotImplementedError(f"{type(self).__name__} is not a law of the first invariant")
 
     def parameters(self) -> Mapping[str, float]:
-        """Numbers of the law by name."""
+        """Parameters of the law by name."""
         return {field.name: float(getattr(self, field.name)) for field in fields(self)}
 
 
 def _check_extension(name: str, got: float, allowed: float) -> None:
     if not got < allowed:
         raise LimitError(
-            f"The stretch needs {name} = {got:g}; allowed is below {allowed:g}, where the chains "
-            "are at their full length. Lower the stretch."
+            f"The stretch requires {name} = {got:g}; it must be below {allowed:g}, where the "
+            "chains are at their full length. Lower the stretch."
         )
 
 
@@ -163,7 +164,7 @@ class NeoHooke(HyperelasticLaw):
 
 @dataclass(frozen=True)
 class ArrudaBoyce(HyperelasticLaw):
-    r"""Eight chains, exact inverse Langevin function.
+    r"""Arruda-Boyce eight-chain model with the exact inverse Langevin function.
 
     $2 W_1 = \frac{\mu}{3} \frac{\lambda_m}{\lambda_c} L^{-1}(\lambda_c/\lambda_m),\quad
     \lambda_c = \sqrt{I_1/3}$
@@ -190,7 +191,7 @@ class ArrudaBoyce(HyperelasticLaw):
 
 @dataclass(frozen=True)
 class ArrudaBoyceSeries(HyperelasticLaw):
-    r"""Eight chains, the series of five terms that finite-element codes use.
+    r"""Arruda-Boyce eight-chain model as the five-term series of finite-element codes.
 
     $2 W_1 = 2\mu \sum_{i=1}^{5} i\,C_i (I_1/\lambda_m^2)^{i-1}$
 
@@ -243,7 +244,7 @@ class Ogden(HyperelasticLaw):
     Args:
         mu_pa: shear modulus, in Pa.
         alpha: exponent; 2 is neo-Hooke.
-    Source: Ogden, Proc. R. Soc. A 326 (1972), 565, with the shear modulus as first number.
+    Source: Ogden, Proc. R. Soc. A 326 (1972), 565, with the shear modulus as first parameter.
     Example:
         >>> round(float(Ogden(1000.0, 2.0).nominal_stress_pa(2.0)), 9)
         1750.0
@@ -256,7 +257,7 @@ class Ogden(HyperelasticLaw):
     def nominal_stress_pa(
         self, stretch: ArrayLike, lateral_stretch: ArrayLike | None = None
     ) -> Floats:
-        """As in the other laws; `2 mu/alpha (l1^alpha - l3^alpha) / l1`."""
+        """Nominal stress, in Pa: `2 mu/alpha (l1^alpha - l3^alpha) / l1`."""
         length, _, thickness = _stretches(stretch, lateral_stretch)
         return self.mu_pa * ogden_term(length, thickness, self.alpha)
 
@@ -285,7 +286,7 @@ class OgdenTwoTerms(HyperelasticLaw):
     def nominal_stress_pa(
         self, stretch: ArrayLike, lateral_stretch: ArrayLike | None = None
     ) -> Floats:
-        """Sum of the terms."""
+        """Nominal stress, in Pa: the sum of the terms."""
         length, _, thickness = _stretches(stretch, lateral_stretch)
         first = self.mu1_pa * ogden_term(length, thickness, self.alpha1)
         return np.asarray(first + self.mu2_pa * ogden_term(length, thickness, self.alpha2))
@@ -323,7 +324,7 @@ class OgdenThreeTerms(HyperelasticLaw):
     def nominal_stress_pa(
         self, stretch: ArrayLike, lateral_stretch: ArrayLike | None = None
     ) -> Floats:
-        """Sum of the terms."""
+        """Nominal stress, in Pa: the sum of the terms."""
         length, _, thickness = _stretches(stretch, lateral_stretch)
         pairs = ((self.mu1_pa, self.alpha1), (self.mu2_pa, self.alpha2), (self.mu3_pa, self.alpha3))
         terms = [mu_pa * ogden_term(length, thickness, alpha) for mu_pa, alpha in pairs]
@@ -415,22 +416,22 @@ LAWS: Mapping[str, type[HyperelasticLaw]] = {
 
 
 def law_from_parameters(name: str, parameters: Mapping[str, float]) -> HyperelasticLaw:
-    """The law called `name` with its numbers.
+    """Create the law called `name` with given parameters.
 
     Args:
         name: key of `LAWS`.
-        parameters: numbers of the law by name.
+        parameters: parameters of the law by name.
     Returns:
         The law.
     Raises:
-        InputError: an unknown name, or a number that the law does not take.
+        InputError: an unknown name, or a parameter that the law does not have.
     """
     if name not in LAWS:
-        raise InputError(f"model = {name}; allowed are {', '.join(LAWS)}. Choose one of them.")
+        raise InputError(f"model = {name}; must be one of {', '.join(LAWS)}.")
     try:
         return LAWS[name](**parameters)
     except TypeError as error:
         wanted = ", ".join(field.name for field in fields(LAWS[name]))
         raise InputError(
-            f"The law {name} got {', '.join(parameters)}; it takes {wanted}. Correct the model."
+            f"The law {name} got {', '.join(parameters)}; it needs {wanted}."
         ) from error

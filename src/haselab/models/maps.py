@@ -46,7 +46,7 @@ class VoltageMap:
         numbers = (self.a1_v, self.b1, self.a2_v, self.b2, self.strain_low, self.strain_high)
         if not np.isfinite(numbers).all() or not self.strain_low < self.strain_high:
             raise InputError(
-                f"The voltage map has the numbers {numbers}; allowed are finite ones with "
+                f"The voltage map has the parameters {numbers}; they must be finite, with "
                 "strain_low below strain_high. Fit the map again."
             )
 
@@ -56,7 +56,7 @@ class VoltageMap:
         return np.asarray(self.a1_v * np.exp(self.b1 * e) + self.a2_v * np.exp(self.b2 * e))
 
     def slope_v(self, strain: ArrayLike) -> Floats:
-        """Derivative of the voltage by the strain, in V. Shape of `strain`."""
+        """Derivative of the voltage with respect to the strain, in V. Shape of `strain`."""
         e = np.asarray(strain, dtype=np.float64)
         first = self.a1_v * self.b1 * np.exp(self.b1 * e)
         return np.asarray(first + self.a2_v * self.b2 * np.exp(self.b2 * e))
@@ -64,8 +64,8 @@ class VoltageMap:
     def is_monotone(self, strain_low: float, strain_high: float) -> bool:
         """Whether the voltage rises, or falls, everywhere between the two strains.
 
-        The slope has at most one zero, where `a1 b1 e^{b1 e} = -a2 b2 e^{b2 e}`; so the two ends
-        decide.
+        The slope has at most one zero, where `a1 b1 e^{b1 e} = -a2 b2 e^{b2 e}`; so it is
+        sufficient to check both ends.
         """
         ends = self.slope_v([strain_low, strain_high])
         return bool(ends[0] * ends[1] > 0.0)
@@ -79,7 +79,7 @@ class VoltageMap:
             Strain. Shape `(...)`.
         Raises:
             InputError: the map is not monotone in its range.
-            LimitError: a voltage that no strain of the range gives.
+            LimitError: a voltage that the map does not reach in its range.
         Source: Newton's method kept inside a bracket by bisection.
         """
         if not self.is_monotone(self.strain_low, self.strain_high):
@@ -141,7 +141,7 @@ class LinearMap:
         """Inverse of `strain`; a map of slope zero is an `InputError`."""
         if self.slope == 0.0:
             raise InputError(
-                "The capacitance map has slope 0, so strain does not tell the capacitance; "
-                "allowed is any other slope. Fit the map again."
+                "The capacitance map has slope 0, so strain does not determine the capacitance. "
+                "Fit the map again."
             )
         return np.asarray((np.asarray(strain, np.float64) - self.offset) / self.slope)

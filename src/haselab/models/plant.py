@@ -1,4 +1,4 @@
-"""The linear plant: one resonance, slow branches beside it, a delay."""
+"""The linear plant: one resonance, parallel slow branches and a delay."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ from haselab.models.held_input import HeldInput
 
 __all__ = ["Plant", "SlowMode"]
 
-# Two equal poles are a limit of the modal form; below this distance of the damping ratio from 1
-# the pair is moved apart to it, which changes a response by about 1e-9 of its size.
+# The modal form is singular for two equal poles; if the damping ratio is closer to 1 than this,
+# the pair is moved apart, which changes a response by about 1e-9 of its magnitude.
 _CRITICAL_BAND = 1e-9
 
 
 def _require(name: str, value: float, unit: str, *, positive: bool) -> None:
     allowed = "above 0" if positive else "0 or above"
     if not (value > 0.0 if positive else value >= 0.0) or value == float("inf"):
-        raise InputError(
-            f"{name} = {value:g} {unit}; allowed is {allowed} and finite. Correct the model."
-        )
+        raise InputError(f"{name} = {value:g} {unit}; must be {allowed} and finite.")
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class SlowMode:
 
 @dataclass(frozen=True)
 class Plant:
-    r"""A resonance with slow branches beside it and a delay.
+    r"""A resonance with parallel slow branches and a delay.
 
     $y = \left[\frac{g\,\omega_n^2}{s^2 + 2\zeta\omega_n s + \omega_n^2}
     + \sum_i \frac{c_i}{\tau_i s + 1}\right] e^{-s T_d} u$
@@ -59,7 +57,7 @@ class Plant:
         slow_modes: slow branches.
     Raises:
         InputError: a frequency or time constant not above zero, a negative damping or delay.
-    Source: reference study, eqs. 8 to 10; the slow branch is this project's.
+    Source: reference study, eqs. 8 to 10; the slow branches are an extension of this project.
     Example:
         >>> plant = Plant(0.5, 5.11, 0.09, slow_modes=(SlowMode(0.4, 4.7),))
         >>> plant.static_gain, round(float(abs(plant.frequency_response(5.11))), 2)
@@ -79,12 +77,12 @@ class Plant:
 
     @property
     def static_gain(self) -> float:
-        """Gain at standstill, the slow branches included."""
+        """Static gain, including the slow branches."""
         return self.gain + sum(mode.gain for mode in self.slow_modes)
 
     @property
     def poles(self) -> tuple[complex, ...]:
-        """Poles, in rad/s: the pair of the resonance, then one a slow branch."""
+        """Poles, in rad/s: the pair of the resonance, then one per slow branch."""
         slow = (complex(-1.0 / mode.time_constant_s) for mode in self.slow_modes)
         return (*self._pair(), *slow)
 
@@ -119,16 +117,16 @@ class Plant:
         time_s: ArrayLike,
         initial_state: Sequence[float] | None = None,
     ) -> NDArray[np.float64]:
-        """Output for an input that is held between its updates, exact at any time.
+        """Simulate the exact output for a held input.
 
         The input is zero before `t = 0` and keeps its last value after its end.
 
         Args:
             u: input. Shape `(N,)`.
-            input_rate_hz: updates of the input a second, in Hz.
-            time_s: times of the output since `u[0]` was put out, in s. Shape `(M,)`.
+            input_rate_hz: update rate of the input, in Hz.
+            time_s: times of the output after the update of `u[0]`, in s. Shape `(M,)`.
             initial_state: at `t = 0`: output of the resonance, its rate per second, output of each
-                slow branch. OutputState when not given. Shape `(2 + slow branches,)`.
+                slow branch. Zero when not given. Shape `(2 + slow branches,)`.
         Returns:
             Output. Shape `(M,)`.
         Raises:
@@ -139,8 +137,8 @@ class Plant:
         time_s = np.asarray(time_s, dtype=np.float64)
         if time_s.ndim != 1 or not np.isfinite(time_s).all():
             raise InputError(
-                f"time_s has shape {time_s.shape} or holds NaN; allowed is a finite vector. "
-                "Give one time for each wanted output."
+                f"time_s has shape {time_s.shape} or contains NaN; it must be a finite vector. "
+                "Give one time for each output."
             )
         after_s = time_s - self.delay_s
         slow_pole, fast_pole = self._pair()
@@ -169,7 +167,7 @@ class Plant:
         return np.ascontiguousarray(total.real)
 
     def to_dict(self) -> JsonObject:
-        """The form that `model.json` keeps under the key `plant`."""
+        """The plant as stored in `model.json` under the key `plant`."""
         return {
             "gain": self.gain,
             "natural_frequency_rad_s": self.natural_frequency_rad_s,
@@ -183,7 +181,7 @@ class Plant:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Plant:
-        """Inverse of `to_dict`; a missing or unusable key is an `InputError`."""
+        """Create a plant from `to_dict`; a missing or unusable key is an `InputError`."""
         try:
             return cls(
                 float(data["gain"]),
@@ -199,6 +197,7 @@ class Plant:
             if isinstance(error, InputError):
                 raise
             raise InputError(
-                f"The plant lacks or misuses {error}; needed are gain, natural_frequency_rad_s, "
-                "damping_ratio. Write the model again with `haselab identify transfer`."
+                f"The plant is incomplete or has a wrong value: {error}. It needs gain, "
+                "natural_frequency_rad_s, damping_ratio. Write the model again with `haselab "
+                "identify transfer`."
             ) from error

@@ -1,4 +1,4 @@
-"""An identified model's numbers with their covariance, and plausible plants drawn from them."""
+"""Parameters of an identified model with their covariance, and plants drawn from them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from haselab.models.rational import RationalModel
 __all__ = ["PlantPosterior"]
 
 Floats = NDArray[np.float64]
-_INDEFINITE = -1e-6  # smallest eigenvalue of a correlation matrix that rounding explains
+_INDEFINITE = -1e-6  # smallest eigenvalue of a correlation matrix that rounding can cause
 _ADVICE = "Fit the model again, or remove the key covariance."
 _ASYMMETRY = 1e-6  # of the product of the standard deviations
-_SMALLEST_STEP, _LARGEST_STEP = 1e-6, 0.2  # of a number, where quantities are differentiated
-_WIDEST = 5.0  # standard deviation of a logarithm; a factor of 150 to either side
+_SMALLEST_STEP, _LARGEST_STEP = 1e-6, 0.2  # steps of a parameter for numerical derivatives
+_WIDEST = 5.0  # standard deviation of a logarithm; a factor of 150 on either side
 _PAIR = re.compile(r"natural_frequency(_\d+)?_rad_s")
 _SLOW = re.compile(r"slow_time_constant(_\d+)?_s")
 _NUMERATOR = re.compile(r"numerator_(\d+)")
@@ -32,29 +32,29 @@ _POSITIVE = re.compile(r"natural_frequency.*|.*time_constant.*")
 
 @dataclass(frozen=True)
 class PlantPosterior:
-    r"""A model's numbers and the covariance of their errors: a normal distribution.
+    r"""A model's parameters and the covariance of their errors: a normal distribution.
 
-    The distribution is that of the fit's own numbers: logarithms of frequencies, damping ratios and
-    time constants, and gains, numerator factors and the delay as they are. So every draw has
-    positive frequencies and time constants. Two sets of names are known:
+    The distribution is that of the parameters used by the fit: logarithms of frequencies, damping
+    ratios and time constants, and gains, numerator coefficients and the delay directly. Every draw
+    therefore has positive frequencies and time constants. There are two sets of names:
 
     - a fit of `identify transfer`: `natural_frequency_rad_s`, `damping_ratio` (further resonances
       `natural_frequency_2_rad_s`, `damping_ratio_2`, ...), `time_constant_s` of a real pole, `gain`
-      at standstill, `numerator_1`, ..., `slow_gain`, `slow_time_constant_s`, `delay_s`. With
-      $\Omega$ the geometric mean of the fast poles' sizes,
+      (static), `numerator_1`, ..., `slow_gain`, `slow_time_constant_s`, `delay_s`. With
+      $\Omega$ the geometric mean of the fast poles' magnitudes,
       $B(s)/A(s) = \left[g + \sum_k n_k (s/\Omega)^k\right] / \prod_i (1 - s/p_i)$;
     - any rational model: `b_m`, ..., `b_0` and `a_{n-1}`, ..., `a_0` of $b_m s^m + \dots$ over
       $s^n + a_{n-1} s^{n-1} + \dots$, and `delay_s`. It may integrate or be unstable.
 
     Args:
-        names: names of the numbers.
-        logarithmic: whether the covariance is that of a number's natural logarithm.
-        values: best values of the numbers themselves, in SI units. Shape `(P,)`.
-        covariance: covariance of the numbers, or of the logarithms of the logarithmic ones.
-            Zero rows and columns for known numbers. Shape `(P, P)`.
+        names: names of the parameters.
+        logarithmic: whether the covariance is that of a parameter's natural logarithm.
+        values: best values of the parameters themselves, in SI units. Shape `(P,)`.
+        covariance: covariance of the parameters, or of the logarithms of the logarithmic ones.
+            Zero rows and columns for known parameters. Shape `(P, P)`.
     Raises:
-        InputError: an unknown or missing name, a number that is not identifiable (NaN, or an
-            infinite deviation), a matrix that is no covariance.
+        InputError: an unknown or missing name, a parameter that is not identifiable (NaN, or an
+            infinite deviation), a matrix that is not a covariance.
     Source: large-sample distribution of a least-squares estimate, Ljung, System Identification
         (1999), chapter 9; with a flat prior it is the posterior.
     Example:
@@ -78,29 +78,30 @@ class PlantPosterior:
         if shapes != (count,) * 4 or count == 0 or len(set(self.names)) != count:
             raise InputError(
                 f"The covariance has {count} names, and values and a matrix of {shapes[1:]}; it "
-                f"needs one value, one row and one column a name, all names different. {_ADVICE}"
+                "needs one value, one row and one column per name, and all names must differ. "
+                f"{_ADVICE}"
             )
         self._check_names()
         self._check_identifiable()
         self._check_matrix()
 
     def _check_names(self) -> None:
-        """Complete sets of known names; frequencies and time constants in logarithms."""
+        """Check for a complete set of names, with logarithms of frequencies and time constants."""
         wanted = _wanted(self.names)
         unknown, missing = set(self.names) - wanted, wanted - {"delay_s"} - set(self.names)
         if unknown or missing:
             found = ", ".join(sorted(unknown)) or "no unknown name"
             lacks = ", ".join(sorted(missing)) or "nothing"
             raise InputError(
-                f"The covariance names {found} and lacks {lacks}. Name the numbers as `identify "
-                "transfer` does, or a_k and b_k of a rational model."
+                f"The covariance names {found} and lacks {lacks}. Use the names of `identify "
+                "transfer`, or a_k and b_k of a rational model."
             )
         for name, flag, var in zip(
             self.names, self.logarithmic, np.diag(self.covariance), strict=True
         ):
             if _POSITIVE.fullmatch(name) and not flag and var != 0.0:
                 raise InputError(
-                    f"The covariance holds {name} itself, so that draws may be negative. Give the "
+                    f"The covariance is that of {name} itself, so draws may be negative. Give the "
                     "covariance of its logarithm."
                 )
 
@@ -111,16 +112,16 @@ class PlantPosterior:
         ):
             widest = _WIDEST**2 if flag else math.inf
             if not (math.isfinite(value) and math.isfinite(var) and var <= widest):
-                size = "nothing" if math.isnan(var) else f"{math.sqrt(max(var, 0.0)):.3g}"
+                size = "not given" if math.isnan(var) else f"{math.sqrt(max(var, 0.0)):.3g}"
                 raise InputError(
                     f"{name} is not identifiable: its value is {value:g} and the standard deviation"
                     f"{' of its logarithm' if flag else ''} is {size}. Add a record that "
-                    "determines it, fit a simpler structure, or give it as a known number (--fix)."
+                    "determines it, fit a simpler structure, or fix it to a known value (--fix)."
                 )
             if flag and not value > 0.0:
                 raise InputError(
                     f"{name} = {value:g} has no logarithm, but the covariance is that of its "
-                    "logarithm. Correct the model."
+                    "logarithm."
                 )
 
     def _check_matrix(self) -> None:
@@ -128,7 +129,7 @@ class PlantPosterior:
         size = np.outer(std, std)
         lopsided = np.abs(self.covariance - self.covariance.T) > _ASYMMETRY * size + 1e-300
         if (np.diag(self.covariance) < 0.0).any() or not np.isfinite(self.covariance).all():
-            raise InputError(f"The covariance has a negative variance or a gap. {_ADVICE}")
+            raise InputError(f"The covariance has a negative or missing variance. {_ADVICE}")
         if lopsided.any() or (np.abs(self.covariance) > (1.0 - _INDEFINITE) * size + 1e-300).any():
             raise InputError(
                 f"The covariance is not symmetric, or has a correlation above 1. {_ADVICE}"
@@ -141,7 +142,7 @@ class PlantPosterior:
             )
 
     def _correlation(self, std: Floats) -> Floats:
-        """Correlations, 0 for a known number."""
+        """Correlations, 0 for a known parameter."""
         scale = np.where(std > 0.0, std, 1.0)
         return np.asarray(self.covariance / np.outer(scale, scale))
 
@@ -155,10 +156,10 @@ class PlantPosterior:
     ) -> tuple[Floats, Floats]:
         """Quantities of the model and their covariance, to first order.
 
-        Each number is moved by its standard deviation, up and down.
+        Each parameter is varied by its standard deviation, up and down.
 
         Args:
-            quantities: of a model. Shape `(Q,)`.
+            quantities: function from a model to quantities. Shape `(Q,)`.
         Returns:
             The quantities at the best values, shape `(Q,)`, and their covariance, shape `(Q, Q)`.
         """
@@ -181,27 +182,27 @@ class PlantPosterior:
         return centre, jacobian.T @ self.covariance[np.ix_(known, known)] @ jacobian
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[Plant | RationalModel, ...]:
-        """Plants that are as plausible as the posterior says.
+        """Draw plants from the distribution.
 
         One resonance with slow branches is a `Plant`, anything else a `RationalModel`. A delay
         drawn below zero becomes zero; a gain may change its sign.
 
         Args:
             count: number of plants, 1 or more.
-            rng: source of the draws.
+            rng: random generator of the draws.
         Returns:
             The plants. Length `count`.
         Raises:
             InputError: `count` is below 1.
         """
         if count < 1:
-            raise InputError(f"count = {count}; needed is 1 or more. Raise it.")
+            raise InputError(f"count = {count}; must be 1 or more.")
         std = np.sqrt(np.diag(self.covariance))
         sizes, axes = np.linalg.eigh(self._correlation(std))
         root = std[:, None] * axes * np.sqrt(np.maximum(sizes, 0.0))
         errors = rng.standard_normal((count, std.size)) @ root.T
         flags = np.array(self.logarithmic)
-        # A known number stays itself to the last bit.
+        # A known parameter keeps its exact value.
         drawn = np.where(flags, self.values * np.exp(np.where(flags, errors, 0.0)), self.values)
         drawn = np.where(flags, drawn, drawn + errors)
         return tuple(self._built(row) for row in drawn)
@@ -234,7 +235,7 @@ class PlantPosterior:
         return model.beside(slow)
 
     def to_dict(self) -> JsonObject:
-        """The form that a model file keeps under the key `covariance`."""
+        """The distribution as stored in a model file under the key `covariance`."""
         return {
             "names": list(self.names),
             "logarithmic": list(self.logarithmic),
@@ -244,10 +245,10 @@ class PlantPosterior:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PlantPosterior:
-        """Inverse of `to_dict`; a null is a number that is not identifiable.
+        """Create from `to_dict`; null means a parameter that is not identifiable.
 
         Raises:
-            InputError: a missing key, or as the class.
+            InputError: a missing key, or as for the class.
         """
         try:
             # fmt: off
@@ -263,19 +264,19 @@ class PlantPosterior:
             if isinstance(error, InputError):
                 raise
             raise InputError(
-                f"The covariance of the model lacks or misuses {error}; it needs names, "
-                "logarithmic, values and matrix. Write the model again with `haselab identify "
-                "transfer`."
+                f"The covariance of the model is incomplete or has a wrong value: {error}. It "
+                "needs names, logarithmic, values and matrix. Write the model again with `haselab "
+                "identify transfer`."
             ) from error
 
 
 def _numbers(pattern: re.Pattern[str], names: tuple[str, ...]) -> list[str]:
-    """Suffixes of a kind of number: "", "_2", ..."""
+    """Suffixes of the parameters of one kind: "", "_2", ..."""
     return [found.group(1) or "" for found in map(pattern.fullmatch, names) if found]
 
 
 def _wanted(names: tuple[str, ...]) -> set[str]:
-    """The names that a set must hold, given some of them."""
+    """The complete set of names that some names belong to."""
     factors = [found.groups() for found in map(_FACTOR.fullmatch, names) if found]
     if factors:
         top = max((int(power) for kind, power in factors if kind == "b"), default=0)

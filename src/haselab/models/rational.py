@@ -1,4 +1,4 @@
-"""A rational transfer function with a delay: the form that other tools exchange."""
+"""A rational transfer function with a delay: the form for exchange with other tools."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class RationalModel:
     r"""$y = \frac{b_m s^m + \dots + b_0}{s^n + \dots + a_0}\, e^{-s T_d}\, u$.
 
     Args:
-        numerator: factors of falling powers of `s`, in rad/s; leading zeros are dropped.
-        denominator: the same; the leading one becomes 1.
+        numerator: coefficients of falling powers of `s`, in rad/s; leading zeros are dropped.
+        denominator: coefficients of falling powers, normalised to a leading 1.
         delay_s: delay, in s.
         input_name: name of the input.
         output_name: name of the output.
     Raises:
-        InputError: factors that are not finite, no denominator, more zeros than poles, a negative
-            delay.
+        InputError: coefficients that are not finite, no denominator, more zeros than poles, a
+            negative delay.
     Example:
         >>> model = RationalModel.from_plant(Plant(0.5, 5.0, 0.1))
         >>> [round(factor, 9) for factor in model.denominator]
@@ -54,18 +54,14 @@ class RationalModel:
             "denominator", self.denominator
         )  # fmt: skip
         if not bottom.any():
-            raise InputError(
-                "The denominator is 0; allowed is a polynomial of order 0 or more. Correct it."
-            )
+            raise InputError("The denominator is 0. Give a nonzero polynomial.")
         if top.size > bottom.size:
             raise InputError(
-                f"The model has {top.size - 1} zeros and {bottom.size - 1} poles; allowed are at "
-                "most as many zeros as poles. Correct the numerator."
+                f"The model has {top.size - 1} zeros and {bottom.size - 1} poles; it must have at "
+                "most as many zeros as poles."
             )
         if not 0.0 <= self.delay_s < math.inf:
-            raise InputError(
-                f"delay_s = {self.delay_s:g} s; allowed is 0 s or above. Correct the model."
-            )
+            raise InputError(f"delay_s = {self.delay_s:g} s; must be 0 s or above.")
         object.__setattr__(self, "numerator", tuple((top / bottom[0]).tolist()))
         object.__setattr__(self, "denominator", tuple((bottom / bottom[0]).tolist()))
 
@@ -92,15 +88,15 @@ class RationalModel:
         return np.asarray(ratio * np.exp(-s * self.delay_s), dtype=np.complex128)
 
     def simulate(self, u: ArrayLike, input_rate_hz: float, time_s: ArrayLike) -> Floats:
-        """Output from rest for an input that is held between its updates, exact at any time.
+        """Simulate the exact output from rest for a held input.
 
         The input is zero before `t = 0` and keeps its last value after its end. Equal poles, and
         one at 0, are moved apart by a millionth of the fastest pole.
 
         Args:
             u: input. Shape `(N,)`.
-            input_rate_hz: updates of the input a second, in Hz.
-            time_s: times of the output since `u[0]` was put out, in s. Shape `(M,)`.
+            input_rate_hz: update rate of the input, in Hz.
+            time_s: times of the output after the update of `u[0]`, in s. Shape `(M,)`.
         Returns:
             Output. Shape `(M,)`.
         Source: partial fractions, and variation of constants for each pole.
@@ -120,20 +116,20 @@ class RationalModel:
         return np.ascontiguousarray(total.real)
 
     def without_delay(self, order: int) -> RationalModel:
-        r"""The same model with the delay as an all-pass of equal orders, or left out.
+        r"""Replace the delay by an all-pass, or remove it.
 
         $e^{-sT} \approx \sum_k c_k (-sT)^k / \sum_k c_k (sT)^k,\quad
         c_k = \frac{(2n - k)!\, n!}{(2n)!\, k!\, (n - k)!}$
 
         Args:
-            order: of the all-pass, 0 to 10; 0 leaves the delay out. The magnitude is exact; the
+            order: of the all-pass, 0 to 10; 0 removes the delay. The magnitude is exact; the
                 phase is right to 0.1 degrees up to `omega T` of 0.27, 1.0, 3.4 at orders 1, 2, 4.
         Raises:
-            InputError: an order outside.
+            InputError: an order out of range.
         Source: Padé's approximant of the exponential function.
         """
         if not 0 <= order <= 10:
-            raise InputError(f"order = {order}; allowed is 0 to 10. Choose one between.")
+            raise InputError(f"order = {order}; must be 0 to 10.")
         if self.delay_s == 0.0 or order == 0:
             return replace(self, delay_s=0.0)
         powers = np.arange(order, -1, -1)
@@ -149,13 +145,13 @@ class RationalModel:
 
     @classmethod
     def from_plant(cls, plant: Plant) -> RationalModel:
-        """The plant over a common denominator."""
+        """Convert a plant to a rational model."""
         wn, zeta = plant.natural_frequency_rad_s, plant.damping_ratio
         resonance = cls((plant.gain * wn**2,), (1.0, 2.0 * zeta * wn, wn**2), plant.delay_s)
         return resonance.beside(plant.slow_modes)
 
     def beside(self, slow_modes: Sequence[SlowMode]) -> RationalModel:
-        """The same model with slow branches beside it, before the same delay."""
+        """Add parallel slow branches, with the same delay."""
         top, bottom = np.array(self.numerator), np.array(self.denominator)
         for mode in slow_modes:
             branch = np.array([1.0, 1.0 / mode.time_constant_s])
@@ -167,7 +163,7 @@ class RationalModel:
     def from_poles(
         cls, poles: ArrayLike, zeros: ArrayLike, gain: float, delay_s: float = 0.0
     ) -> RationalModel:
-        """A model from its poles and zeros, in rad/s, and its gain at standstill.
+        """Create a model from its poles and zeros, in rad/s, and its static gain.
 
         Raises:
             InputError: a pole or zero at 0, or without its conjugate.
@@ -180,8 +176,8 @@ class RationalModel:
             conjugate = bool((np.abs(np.imag(polynomial)) <= _REAL * size).all())
             if not conjugate or not np.isfinite(polynomial).all() or (values == 0.0).any():
                 raise InputError(
-                    f"{name} = {values.tolist()}; allowed are finite numbers other than 0, complex "
-                    "ones with their conjugates. Complete them."
+                    f"{name} = {values.tolist()}; they must be finite and other than 0, complex "
+                    "ones with their conjugates."
                 )
             polynomials.append(np.real(polynomial))
         top, bottom = polynomials
@@ -189,10 +185,10 @@ class RationalModel:
         return cls(tuple(top.tolist()), tuple(bottom.tolist()), delay_s)
 
     def to_plant(self) -> Plant:
-        """One resonance with slow branches, by partial fractions.
+        """Convert to one resonance with slow branches, by partial fractions.
 
         Raises:
-            InputError: not two fast poles with real slow ones beside them, an unstable pole, equal
+            InputError: not two fast poles with real slow ones, an unstable pole, equal
                 slow poles, or a zero in the resonance.
         """
         fast, slow = self._fast_and_slow()
@@ -208,8 +204,8 @@ class RationalModel:
         wn = math.sqrt(float(fast[-1]))
         if max(abs(rest[0]) * wn**2, abs(rest[1]) * wn) > _NO_ZERO * abs(rest[2]):
             raise InputError(
-                f"The resonance at {wn:g} rad/s has a zero at {_zero(rest):g} rad/s; a plant takes "
-                "one without. Keep the rational form, or fit without zeros."
+                f"The resonance at {wn:g} rad/s has a zero at {_zero(rest):g} rad/s; a Plant must "
+                "not have one. Keep the rational form, or fit without zeros."
             )
         branches = [
             SlowMode(float(-r / p), float(-1.0 / p)) for p, r in zip(slow, residues, strict=True)
@@ -224,7 +220,7 @@ class RationalModel:
         real = np.sort(poles.real[np.abs(poles.imag) <= _REAL * np.abs(poles)])
         if poles.size < 2 or upper.size > 1 or (poles.real >= 0.0).any():
             raise InputError(
-                f"The poles are {_listed(poles)} rad/s; a plant takes two fast ones, stable, and "
+                f"The poles are {_listed(poles)} rad/s; a Plant needs two fast, stable ones and "
                 "real slow ones. Keep the rational form."
             )
         if upper.size:
@@ -233,13 +229,13 @@ class RationalModel:
             fast, real = np.poly(real[:2]), real[2:]
         if (np.diff(real) <= _EQUAL * np.abs(real[1:])).any():
             raise InputError(
-                f"The slow poles are {_listed(real)} rad/s, two of them equal; a plant takes "
+                f"The slow poles are {_listed(real)} rad/s, two of them equal; a Plant needs "
                 "different ones. Keep the rational form."
             )
         return np.asarray(fast, dtype=np.float64), real
 
     def to_dict(self) -> JsonObject:
-        """The general form in JSON."""
+        """The model as stored in JSON."""
         return {
             "numerator": list(self.numerator),
             "denominator": list(self.denominator),
@@ -250,7 +246,7 @@ class RationalModel:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RationalModel:
-        """Inverse of `to_dict`; a missing or unusable key is an `InputError`."""
+        """Create a model from `to_dict`; a missing or unusable key is an `InputError`."""
         try:
             return cls(
                 tuple(float(factor) for factor in data["numerator"]),
@@ -263,25 +259,24 @@ class RationalModel:
             if isinstance(error, InputError):
                 raise
             raise InputError(
-                f"The model lacks or misuses {error}; needed are numerator and denominator, lists "
-                "of numbers. Write the model again with `haselab export`."
+                f"The model is incomplete or has a wrong value: {error}. It needs numerator and "
+                "denominator, lists of numbers. Write the model again with `haselab export`."
             ) from error
 
 
 def _trimmed(name: str, factors: tuple[float, ...]) -> Floats:
-    """The factors without leading zeros."""
+    """The coefficients without leading zeros."""
     values = np.asarray(factors, dtype=np.float64)
     if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
         raise InputError(
-            f"{name} = {factors}; allowed are one or more finite numbers, falling powers of s. "
-            "Correct the model."
+            f"{name} = {factors}; it must be a list of finite numbers, for falling powers of s."
         )
     leading = np.flatnonzero(values)
     return values[leading[0] :] if leading.size else values[-1:]
 
 
 def _apart(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Poles that partial fractions can bear: none at 0, no two of them equal."""
+    """Poles for partial fractions: none at 0, no two of them equal."""
     least = _EQUAL * float(np.abs(poles).max(initial=1.0))
     moved = poles.copy()
     for k in range(moved.size):

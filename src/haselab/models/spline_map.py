@@ -1,4 +1,4 @@
-"""A static map as a smooth curve of straight slopes, whose inverse is exact."""
+"""A static map as a quadratic spline with an exact inverse."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from haselab.base import InputError, LimitError
 __all__ = ["SplineMap"]
 
 Floats = NDArray[np.float64]
-_SLACK = 1e-12  # of the range: rounding of a value that was asked at its end
+_SLACK = 1e-12  # of the range: rounding error of a value at the end of the range
 
 
 @dataclass(frozen=True)
 class SplineMap:
-    r"""Quadratic spline, told by its slopes at the knots.
+    r"""Quadratic spline, defined by its slopes at the knots.
 
-    Between two knots the slope is a straight line; so the curve rises everywhere exactly when it
-    rises at all knots, and each piece is inverted in closed form.
+    Between two knots the slope is linear, so the curve rises everywhere exactly when it
+    rises at all knots, and each segment is inverted in closed form.
 
     Args:
-        knots: rising abscissas; the ends are those of the map. Shape `(K,)`, two at least.
+        knots: rising abscissas; the first and last are the ends of the map. Shape `(K,)`, two at
+            least.
         slopes: derivative at the knots. Shape `(K,)`.
         start: value at the first knot.
     Raises:
-        InputError: unequal lengths, numbers that are not finite, knots that do not rise.
+        InputError: unequal lengths, values that are not finite, knots that do not rise.
     Source: Ramsay, Statistical Science 3 (1988), 425, integrated splines of order 2.
     Example:
         >>> curve = SplineMap(np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 3.0]), 0.5)
@@ -45,11 +46,11 @@ class SplineMap:
         fine = knots.ndim == 1 and knots.size >= 2 and knots.shape == slopes.shape
         if not fine or not np.isfinite([*knots, *slopes, self.start]).all():
             raise InputError(
-                f"The map has {knots.size} knots and {slopes.size} slopes; allowed are two or more "
-                "of each, finite. Fit the map again."
+                f"The map has {knots.size} knots and {slopes.size} slopes; it must have two or "
+                "more of each, finite. Fit the map again."
             )
         if not (np.diff(knots) > 0.0).all():
-            raise InputError("The knots do not rise; allowed are rising ones. Fit the map again.")
+            raise InputError("The knots do not rise. Fit the map again.")
         object.__setattr__(self, "knots", knots)
         object.__setattr__(self, "slopes", slopes)
 
@@ -61,7 +62,7 @@ class SplineMap:
 
     @property
     def is_monotone(self) -> bool:
-        """Whether the map rises, or falls, everywhere; then it has an inverse."""
+        """Whether the map rises, or falls, everywhere, so that it has an inverse."""
         return bool((self.slopes > 0.0).all() or (self.slopes < 0.0).all())
 
     def value(self, x: ArrayLike) -> Floats:
@@ -84,7 +85,7 @@ class SplineMap:
         return np.asarray(np.interp(x, self.knots, self.slopes))
 
     def _placed(self, x: ArrayLike) -> tuple[Floats, NDArray[np.intp], Floats]:
-        """Abscissas, their pieces, and how far they are past the knots."""
+        """Abscissas, the indices of their segments, and their distances from the knots."""
         x = np.asarray(x, dtype=np.float64)
         x = _inside(x, float(self.knots[0]), float(self.knots[-1]), "x")
         piece = np.clip(np.searchsorted(self.knots, x, side="right") - 1, 0, self.knots.size - 2)
@@ -104,8 +105,8 @@ class SplineMap:
         if not self.is_monotone:
             turns = self.knots[1:][np.diff(np.sign(self.slopes)) != 0]
             raise InputError(
-                f"The map turns near x = {float(turns[0]):g}, so it has no inverse; allowed is a "
-                "monotone map. Fit it as monotone."
+                f"The map turns near x = {float(turns[0]):g}, so it has no inverse. "
+                "Fit it as monotone."
             )
         sign, values = np.sign(self.slopes[0]), self.values
         low, high = sorted((float(values[0]), float(values[-1])))
@@ -114,14 +115,14 @@ class SplineMap:
         piece = np.clip(np.searchsorted(rising, sign * y, side="right") - 1, 0, self.knots.size - 2)
         gap, slope = y - values[piece], self.slopes[piece]
         bend = (self.slopes[piece + 1] - slope) / np.diff(self.knots)[piece]
-        # The root of the quadratic in the form that stays exact for a straight piece.
+        # The root of the quadratic in the form that is exact also for a straight segment.
         root = np.sqrt(np.maximum(slope * slope + 2.0 * bend * gap, 0.0))
         past = 2.0 * gap / (slope + sign * root)
         return np.asarray(np.minimum(self.knots[piece] + past, self.knots[piece + 1]))
 
 
 def _inside(values: Floats, low: float, high: float, name: str) -> Floats:
-    """The values, rounding at the ends taken away; a `LimitError` for others."""
+    """Clamp rounding errors at the ends; other outside values are a `LimitError`."""
     slack = _SLACK * max(high - low, abs(low), abs(high))
     outside = ~((values >= low - slack) & (values <= high + slack))
     if outside.any():

@@ -1,4 +1,4 @@
-"""A sampled linear plant by its state."""
+"""A linear state-space model in discrete time."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Complexes = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class StateSpaceModel:
-    r"""Sampled plant of one input and one output, about its operating point.
+    r"""Discrete-time model of one input and one output, about its operating point.
 
     $x_{k+1} = A x_k + b\,u_k,\quad y_k = c\,x_k + d\,u_k$
 
     Args:
-        a: from state to state. Shape `(n, n)`.
-        b: from input to state. Shape `(n,)`.
-        c: from state to output. Shape `(n,)`.
-        d: from input to output.
-        rate_hz: samples a second, in Hz.
+        a: state matrix. Shape `(n, n)`.
+        b: input vector. Shape `(n,)`.
+        c: output vector. Shape `(n,)`.
+        d: feed-through.
+        rate_hz: sampling rate, in Hz.
     Raises:
-        InputError: shapes that do not fit, or numbers that are not finite.
+        InputError: inconsistent shapes, or values that are not finite.
     Example:
         >>> plant = StateSpaceModel([[0.5]], [1.0], [2.0], 0.0, 10.0)
         >>> plant.static_gain, plant.simulate([1.0, 1.0, 1.0]).tolist()
@@ -50,28 +50,28 @@ class StateSpaceModel:
         numbers = np.concatenate([self.a.ravel(), self.b, self.c, [self.d, self.rate_hz]])
         if shapes != ((size, size), (size,), (size,)) or not np.isfinite(numbers).all():
             raise InputError(
-                f"The state model has shapes {shapes}; allowed are (n, n), (n,), (n,) and finite "
-                "numbers. Fit the model again."
+                f"The state model has shapes {shapes}; they must be (n, n), (n,), (n,), with "
+                "finite values. Fit the model again."
             )
 
     @property
     def poles(self) -> Complexes:
-        """Eigenvalues of `a`, in the plane of z. Shape `(n,)`."""
+        """Eigenvalues of `a`, in the z-plane. Shape `(n,)`."""
         return np.asarray(np.linalg.eigvals(self.a), dtype=np.complex128)
 
     @property
     def is_stable(self) -> bool:
-        """Whether all poles lie inside the unit circle."""
+        """Whether all poles are inside the unit circle."""
         return bool((np.abs(self.poles) < 1.0).all())
 
     @property
     def static_gain(self) -> float:
-        """Output per input at rest."""
+        """Static gain: output per input in steady state."""
         still = np.eye(self.b.size) - self.a
         return float(self.c @ np.linalg.solve(still, self.b) + self.d)
 
     def simulate(self, u: ArrayLike, state: ArrayLike | None = None) -> Floats:
-        """Output for an input.
+        """Simulate the output.
 
         Args:
             u: input. Shape `(N,)`.
@@ -90,7 +90,7 @@ class StateSpaceModel:
         Args:
             u: input. Shape `(N,)`.
         Returns:
-            Both. Shape `(N, n)` each.
+            Both responses. Shape `(N, n)` each.
         """
         below = np.poly(self.a)
         impulse = np.zeros(u.size)

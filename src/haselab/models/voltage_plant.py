@@ -1,4 +1,4 @@
-"""From drive voltage to strain: a pull by the square, mechanical or electrical creep."""
+"""From drive voltage to strain: force with the voltage squared, and one kind of creep."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ def pulling_square(
     time_constant_s: float,
     slew_v_s: float = math.inf,
 ) -> Floats:
-    r"""Mean square of the voltage that pulls, one value an update.
+    r"""Mean square of the effective voltage, one value per update.
 
     $p = \overline{\bigl((1 - s)\,V + s\,r\bigr)^2},\quad \tau \dot r = V - r$
 
-    A part `s` of the voltage follows with the charge of oil and silicone, with its sign: where the
-    polarity alternates faster than the time constant it is gone.
+    A part `s` of the voltage relaxes with the charge of oil and silicone, with its sign; if the
+    polarity alternates faster than the time constant, it vanishes.
 
     Args:
-        drive_v: drive, in V, held between updates; the first value has stood for ever. `(N,)`.
-        rate_hz: updates a second, in Hz.
+        drive_v: drive, in V, held between updates; the first value has been applied long before.
+            `(N,)`.
+        rate_hz: update rate, in Hz.
         share: part `s` that relaxes, 0 to below 1.
         time_constant_s: time constant, in s.
         slew_v_s: fastest change of the drive, in V/s: current limit over capacitance and gain.
@@ -60,15 +61,15 @@ def pulling_square(
     start, _ = lfilter([0.0, 1.0 - decay], [1.0, -decay], mean_v - drive_v[0], zi=[0.0])
     relaxed_v = mean_v + math.sqrt(decay) * (start + drive_v[0] - mean_v)
     pulls_v = (1.0 - share) * mean_v + share * relaxed_v
-    # What the voltage moves within the update pulls by its part that follows at once.
+    # A change of the voltage within the update acts by its instantaneous part.
     within = drive_v**2 - lost - mean_v**2
     return np.asarray(pulls_v**2 + (1.0 - share) ** 2 * within)
 
 
 class _Held:
-    """A held input and the output's times in it, for the states of many poles.
+    """A held input and the output's times, for the states of many poles.
 
-    As `HeldInput`, without the sensitivities: searches over rival models evaluate it most.
+    As `HeldInput`, without sensitivities: model comparison evaluates it most often.
     """
 
     def __init__(self, u: Floats, rate_hz: float, time_s: Floats) -> None:
@@ -103,12 +104,12 @@ def _follows(plant: Plant, held: _Held) -> Floats:
 
 @dataclass(frozen=True)
 class VoltagePlant:
-    r"""Drive voltage to output: a pull, one resonance (or two), creep of one kind.
+    r"""Model from drive voltage to output: squared voltage, one or two resonances, creep.
 
     $y = \sum_k g_k\, (x^k - x_0^k),\ x = G(s)\, p$; mechanical creep: $p = V^2$ and
     $G = (1 - c)\,G_0 + c/(\tau s + 1)$; electrical creep: $G = G_0$ and $p$ of
-    `pulling_square`; $G_0$ is the resonance with the delay. The output counts from the first
-    value of the drive, at which all has settled; gains beyond the first bend the static curve.
+    `pulling_square`; $G_0$ is the resonance with the delay. The output is relative to that at the
+    first value of the drive, at steady state; further gains make the static curve nonlinear.
 
     Args:
         creep: "mechanical" or "electrical".
@@ -116,13 +117,13 @@ class VoltagePlant:
         natural_frequency_rad_s: undamped natural frequency, in rad/s.
         damping_ratio: damping ratio.
         delay_s: delay, in s.
-        creep_share: part of a small step's response that creeps in, 0 to below 1.
+        creep_share: part of a small step's response that creeps, 0 to below 1.
         creep_time_constant_s: its time constant, in s.
         second_mode: natural frequency in rad/s, damping ratio and static share of another
-            resonance beside the first one.
+            resonance in addition to the first one.
     Raises:
-        InputError: a number out of range, an unknown kind of creep.
-    Source: the square of the voltage: Maxwell's stress; electrical creep: Maxwell-Wagner charging.
+        InputError: a value out of range, an unknown kind of creep.
+    Source: square of the voltage: Maxwell stress; electrical creep: Maxwell-Wagner charging.
     Example:
         >>> plant = VoltagePlant("mechanical", (0.05,), 5.11, 0.09, 0.0, 0.3, 4.7)
         >>> drive_v = np.concatenate([np.ones(100), np.full(9900, 2.0)])
@@ -141,19 +142,15 @@ class VoltagePlant:
 
     def __post_init__(self) -> None:
         if self.creep not in CREEPS:
-            raise InputError(
-                f"creep = {self.creep}; allowed are {', '.join(CREEPS)}. Correct the model."
-            )
+            raise InputError(f"creep = {self.creep}; must be one of {', '.join(CREEPS)}.")
         if not 0.0 <= self.creep_share < 1.0:
-            raise InputError(
-                f"creep_share = {self.creep_share:g}; allowed is 0 to below 1. Correct the model."
-            )
+            raise InputError(f"creep_share = {self.creep_share:g}; must be 0 to below 1.")
         if not self.gains:
-            raise InputError("gains is empty; allowed is one gain or more. Correct the model.")
+            raise InputError("gains is empty. Give at least one gain.")
         self._linear()
 
     def _linear(self) -> Plant:
-        """What the pull goes through."""
+        """Linear part that the squared voltage passes through."""
         share = self.creep_share if self.creep == "mechanical" else 0.0
         slow = (SlowMode(share, self.creep_time_constant_s),) if share else ()
         other = self.second_mode[2] if self.second_mode else 0.0
@@ -165,11 +162,11 @@ class VoltagePlant:
     def shapes(
         self, drive_v: Floats, rate_hz: float, time_s: Floats, slew_v_s: float = math.inf
     ) -> Floats:
-        """Powers of the pull after resonance and creep: what the gains multiply.
+        """Responses that the gains multiply: powers of the filtered squared voltage.
 
         Args:
             drive_v: drive, in V. Shape `(N,)`.
-            rate_hz: updates of it a second, in Hz.
+            rate_hz: update rate, in Hz.
             time_s: times of the output since the first update, in s. Shape `(M,)`.
             slew_v_s: as for `pulling_square`.
         Returns:
@@ -190,7 +187,7 @@ class VoltagePlant:
 
         Args:
             omega_rad_s: angular frequency, in rad/s. Shape `(...)`.
-            baseline_v: drive about which it changes, in V.
+            baseline_v: drive at the operating point, in V.
         Returns:
             Output per volt. Shape `(...)`.
         """
@@ -210,15 +207,15 @@ class VoltagePlant:
     def simulate(
         self, drive_v: ArrayLike, rate_hz: float, time_s: ArrayLike, slew_v_s: float = math.inf
     ) -> Floats:
-        """Output for a drive that is held between its updates.
+        """Simulate the output for a held drive.
 
         Args:
-            drive_v: drive, in V; the first value has stood for ever. Shape `(N,)`.
-            rate_hz: updates of it a second, in Hz.
+            drive_v: drive, in V; the first value has been applied long before. Shape `(N,)`.
+            rate_hz: update rate, in Hz.
             time_s: times of the output since the first update, in s. Shape `(M,)`.
             slew_v_s: fastest change of the drive, in V/s.
         Returns:
-            Output against that at the start. Shape `(M,)`.
+            Output relative to that at the start. Shape `(M,)`.
         """
         drive_v = np.asarray(drive_v, dtype=np.float64)
         time_s = np.asarray(time_s, dtype=np.float64)
@@ -226,7 +223,7 @@ class VoltagePlant:
         return np.asarray(shapes @ np.array(self.gains))
 
     def to_dict(self) -> JsonObject:
-        """The form that a file keeps under the key `voltage_plant`."""
+        """The model as stored in a file under the key `voltage_plant`."""
         return {
             "creep": self.creep,
             "gains": list(self.gains),
@@ -240,7 +237,7 @@ class VoltagePlant:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> VoltagePlant:
-        """Inverse of `to_dict`; a missing or unusable key is an `InputError`."""
+        """Create a model from `to_dict`; a missing or unusable key is an `InputError`."""
         try:
             second = data.get("second_mode")
             return cls(
@@ -257,6 +254,6 @@ class VoltagePlant:
             if isinstance(error, InputError):
                 raise
             raise InputError(
-                f"The voltage plant lacks or misuses {error}; needed are the keys of to_dict. "
-                "Write the model again with `haselab identify verdict`."
+                f"The voltage plant is incomplete or has a wrong value: {error}. It needs the "
+                "keys of to_dict. Write the model again with `haselab identify verdict`."
             ) from error

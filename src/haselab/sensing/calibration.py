@@ -1,4 +1,4 @@
-"""Absolute calibration against reference capacitors: the monitors' errors become two numbers."""
+"""Absolute calibration against reference capacitors: complex scale and stray admittance."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ Complexes = NDArray[np.complex128]
 Floats = NDArray[np.float64]
 
 _FEWEST_BLOCKS = 8  # their scatter gives the noise of the mean to 25 %
-_LEAST_SHARE = 0.75  # of the blocks must hold: a disturbance now and then may be
-_CLEAR = 5.0  # standard deviations: apart from each other, or beyond what noise explains
+_LEAST_SHARE = 0.75  # of the blocks must be valid; occasional disturbances are allowed
+_CLEAR = 5.0  # standard deviations of a significant difference
 _SAME_CARRIER = 1e-6  # relative; a generator's own error is a few parts in a million
-_LOOP_ROUNDS = 3  # of weights that need the scale they help to find; it settles in two
+_LOOP_ROUNDS = 3  # iterations of the weights, which depend on the scale; two suffice
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Reference:
     Args:
         capacitance_f: its value at the carrier.
         series_ohm: its loss.
-        tolerance: relative half-width of what the value may be off; 0 takes it as exact.
+        tolerance: relative half-width of the value's tolerance; 0: exact.
     Raises:
         InputError: a capacitance that is not positive, a negative loss, a tolerance outside [0, 1).
     Example:
@@ -58,7 +58,7 @@ class Reference:
         ):
             raise InputError(
                 f"Reference of {self.capacitance_f:g} F, {self.series_ohm:g} ohm, tolerance "
-                f"{self.tolerance:g}; allowed are (0, 1) F, 0 ohm or more, [0, 1). Correct it."
+                f"{self.tolerance:g}; must be in (0, 1) F, 0 ohm or more, and in [0, 1)."
             )
 
     def admittance_s(self, carrier_hz: float) -> complex:
@@ -67,10 +67,10 @@ class Reference:
         return 1.0 / (self.series_ohm + 1.0 / (1j * omega * self.capacitance_f))
 
     def tolerance_s(self, carrier_hz: float) -> complex:
-        r"""What one standard deviation of the value moves the admittance, in S.
+        r"""Change of the admittance by one standard deviation of the value, in S.
 
-        $dY/dC = j\omega (Y/j\omega C)^2$; a half-width is $\sqrt3$ standard deviations of what is
-        equally likely anywhere within it.
+        $dY/dC = j\omega (Y/j\omega C)^2$; a half-width is $\sqrt3$ standard deviations of a
+        uniform distribution.
         """
         omega = 2.0 * math.pi * carrier_hz
         per_farad = self.admittance_s(carrier_hz) ** 2 / (1j * omega * self.capacitance_f**2)
@@ -79,11 +79,11 @@ class Reference:
 
 @dataclass(frozen=True)
 class ReferenceReading:
-    """What both monitors show of one reference.
+    """Reading of both monitors with one reference connected.
 
     Args:
         ratio: current over voltage reading at the carrier, complex.
-        ratio_std: standard deviation of one quadrature of it.
+        ratio_std: standard deviation of one quadrature of `ratio`.
         offsets_v: mean of both channels, drive at 0 V.
     """
 
@@ -94,24 +94,24 @@ class ReferenceReading:
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""What turns readings into admittance: $Y = a\,I/V - Y_s$.
+    r"""Conversion of readings to admittance: $Y = a\,I/V - Y_s$.
 
-    $a$ holds the monitors' gains, the phase between them and the channels' skew; $Y_s$ is what lies
-    in parallel with the actuator. What is common to both monitors, as the amplifier's own phase
-    and gain, is not in it: it cancels in $I/V$.
+    $a$ includes the monitors' gains, the phase between them and the channels' skew; $Y_s$ is the
+    admittance parallel to the actuator. Factors common to both monitors, such as the amplifier's
+    phase and gain, are not included, because they cancel in $I/V$.
 
     Args:
         scale_s: $a$, in S for equal readings.
         stray_s: $Y_s$.
         offsets_v: readings of both monitors at 0 V and 0 A.
-        carrier_hz: for which it holds.
-        rate_hz: of the converter: a multiplexer's skew goes with it.
-        amplifier: for which it holds.
+        carrier_hz: carrier for which it is valid.
+        rate_hz: sampling rate of the converter; a multiplexer's skew depends on it.
+        amplifier: amplifier for which it is valid.
         date: when the references were measured, ISO 8601.
-        references: that were used.
-        readings: of them, in the same order.
-        residual: rms over the references of what the two numbers leave, relative; 0 with two.
-        scale_std_s: standard deviation of `scale_s` from noise and tolerances, along its size.
+        references: references that were used.
+        readings: readings of the references, in the same order.
+        residual: relative rms residual over the references; 0 with two references.
+        scale_std_s: standard deviation of `scale_s` from noise and tolerances, along its magnitude.
     """
 
     scale_s: complex
@@ -137,8 +137,8 @@ class Calibration:
         """The configuration with scale, stray and offsets of this calibration.
 
         Args:
-            config: of the method that will read the monitors.
-            amplifier: whose monitors they are.
+            config: configuration of the sensing method.
+            amplifier: amplifier whose monitors are read.
             volt_per_reading: 1 for readings in volts, else volts of one ADC code.
         Returns:
             The completed configuration.
@@ -151,13 +151,13 @@ class Calibration:
         ):
             if abs(here - there) > _SAME_CARRIER * there:
                 raise InputError(
-                    f"The calibration of {self.date} is for a {name} of {there:g} Hz, got "
-                    f"{here:g} Hz. Sense at {there:g} Hz, or calibrate anew."
+                    f"The calibration of {self.date} is for a {name} of {there:g} Hz, not "
+                    f"{here:g} Hz. Sense at {there:g} Hz, or calibrate again."
                 )
         if amplifier != self.amplifier:
             raise InputError(
-                f"The calibration of {self.date} is for the amplifier {self.amplifier!r}, got "
-                f"{amplifier!r}. Calibrate this one."
+                f"The calibration of {self.date} is for the amplifier {self.amplifier!r}, not "
+                f"{amplifier!r}. Calibrate this amplifier."
             )
         volt_v, ampere_v = self.offsets_v
         return replace(
@@ -168,18 +168,18 @@ class Calibration:
         )
 
     def capacitance_f(self, ratio: complex) -> float:
-        """Series capacitance of what gives this ratio of current over voltage reading."""
+        """Series capacitance for a ratio of the current reading to the voltage reading."""
         impedance = 1.0 / (self.scale_s * ratio - self.stray_s)
         return -1.0 / (2.0 * math.pi * self.carrier_hz * impedance.imag)
 
     def capacitance_std_f(self, capacitance_f: float, series_ohm: float = 0.0) -> float:
-        """How far this calibration may be off there: references' noise and tolerances.
+        """Standard deviation due to the calibration: noise and tolerances of the references.
 
-        The noise of the measurement itself comes on top.
+        The noise of the measurement itself is not included.
 
         Args:
-            capacitance_f: that was measured.
-            series_ohm: that was measured with it.
+            capacitance_f: measured capacitance.
+            series_ohm: measured series resistance.
         Returns:
             Standard deviation in F, the same for all measurements with this calibration.
         """
@@ -191,7 +191,7 @@ class Calibration:
         return capacitance_f * math.sqrt(variance) / abs((1.0 / y).imag)
 
     def _errors(self, ratio: complex) -> tuple[Complexes, Complexes]:
-        """One standard deviation of Y at a ratio, by reference: noise (any phase), tolerance."""
+        """Error of Y at a ratio from each reference: noise (any phase), tolerance."""
         noise_s, known_s = _spreads(self.references, self.readings, self.carrier_hz, self.scale_s)
         inverse = _inverse(self.readings, noise_s, known_s)
         weight = ratio * inverse[0] - inverse[1]
@@ -205,7 +205,7 @@ def read_reference(
     carrier_hz: float,
     volt_per_reading: float = 1.0,
 ) -> ReferenceReading:
-    """What both monitors show of a reference: mean over valid blocks, noise from their scatter.
+    """Read a reference: mean over valid blocks, with noise from their scatter.
 
     Args:
         readings: at 0 V drive, carrier on, settled. Shape `(blocks, block_samples, 2)`.
@@ -215,8 +215,8 @@ def read_reference(
     Returns:
         The reading.
     Raises:
-        InputError: fewer than 8 blocks, or of a shape that does not fit.
-        ResultError: more than a quarter of the blocks do not hold.
+        InputError: fewer than 8 blocks, or a wrong shape.
+        ResultError: more than a quarter of the blocks are not valid.
     Example:
         >>> angle = 2 * np.pi * 2000.0 * np.arange(16000) / 200e3
         >>> noise = 1e-3 * np.random.default_rng(1).standard_normal((16000, 2))
@@ -227,7 +227,7 @@ def read_reference(
     """
     if readings.ndim != 3 or len(readings) < _FEWEST_BLOCKS:
         raise InputError(
-            f"Readings of shape {readings.shape}; allowed are at least {_FEWEST_BLOCKS} blocks, "
+            f"Readings of shape {readings.shape}; they must be at least {_FEWEST_BLOCKS} blocks, "
             "(blocks, block_samples, 2). Record the reference for longer."
         )
     config = LockinConfig(
@@ -270,17 +270,18 @@ def fit_calibration(
     least squares, each weighted by its noise and tolerance.
 
     Args:
-        references: what was connected, two or more that differ.
-        readings: what the monitors showed of each.
+        references: the connected capacitors, two or more that differ.
+        readings: the readings of each.
         carrier_hz: sensing frequency.
         rate_hz: samples per second and channel.
-        amplifier: whose monitors were read.
-        date: when, ISO 8601.
+        amplifier: amplifier whose monitors were read.
+        date: date of the measurement, ISO 8601.
     Returns:
         The calibration.
     Raises:
-        InputError: fewer than two references, or they are equal within noise and tolerances.
-        ResultError: the residual is far above what noise and tolerances explain.
+        InputError: fewer than two references, or references that are equal within noise and
+            tolerances.
+        ResultError: the residual is much larger than noise and tolerances explain.
     Example:
         >>> known = [Reference(0.5e-9), Reference(2e-9)]
         >>> truth = [(r.admittance_s(2e3) + 1e-6j) / 4e-7 for r in known]
@@ -326,7 +327,7 @@ def _spreads(
     carrier_hz: float,
     scale_s: complex,
 ) -> tuple[Floats, Complexes]:
-    """Of each reference in S: noise of one quadrature, and what its tolerance moves."""
+    """Standard deviations of each reference, in S: noise of one quadrature, and tolerance."""
     noise_s = abs(scale_s) * np.array([r.ratio_std for r in readings])
     return noise_s, np.array([r.tolerance_s(carrier_hz) for r in references])
 
@@ -334,7 +335,7 @@ def _spreads(
 def _inverse(
     readings: Sequence[ReferenceReading], noise_s: Floats, known_s: Complexes
 ) -> Complexes:
-    """What takes the known admittances to scale and stray, rows, by weighted least squares."""
+    """Matrix from the known admittances to scale and stray (rows), by weighted least squares."""
     spread = np.hypot(noise_s, np.abs(known_s))
     weight = 1.0 / np.maximum(spread, 1e-12 * max(float(spread.max()), 1e-30))
     weight /= weight.max()
@@ -346,12 +347,12 @@ def _inverse(
 def _check_pairs(references: Sequence[Reference], readings: Sequence[ReferenceReading]) -> None:
     if len(references) != len(readings):
         raise InputError(
-            f"{len(references)} references and {len(readings)} readings; allowed is one reading "
+            f"{len(references)} references and {len(readings)} readings; there must be one reading "
             "for each. Measure every reference once."
         )
     if len(references) < 2:
         raise InputError(
-            f"{len(references)} reference capacitor(s); scale and stray need at least 2 that "
+            f"{len(references)} reference capacitor(s); scale and stray require at least 2 that "
             "differ. Add another one."
         )
 
@@ -359,31 +360,31 @@ def _check_pairs(references: Sequence[Reference], readings: Sequence[ReferenceRe
 def _check_read_apart(
     references: Sequence[Reference], readings: Sequence[ReferenceReading]
 ) -> None:
-    """Refuse references that the monitors cannot tell from each other."""
+    """Refuse references whose readings are equal within noise."""
     ratios = np.array([r.ratio for r in readings])
     noise = np.array([r.ratio_std for r in readings])
     if not _some_apart(ratios, noise):
         listed = ", ".join(f"{r.capacitance_f:g}" for r in references)
         raise InputError(
-            f"The references ({listed} F) read alike, equal within noise; scale and stray need two "
-            "that differ. Check that each was connected in turn."
+            f"The references ({listed} F) have equal readings within noise; scale and stray "
+            "require two that differ. Check that each was connected in turn."
         )
 
 
 def _some_apart(values: Complexes, std: Floats) -> bool:
-    """Whether two of the values differ by more than their standard deviations and roundings."""
+    """Whether two of the values differ by more than their standard deviations and rounding."""
     apart = np.abs(values[:, np.newaxis] - values)
     unsure = np.hypot(std[:, np.newaxis], std)
     return bool(np.any(apart > np.maximum(_CLEAR * unsure, 1e-9 * np.abs(values).max())))
 
 
 def _check_apart(references: Sequence[Reference], known: Complexes, spread: Floats) -> None:
-    """Refuse references whose distance is lost in what is not known of them."""
+    """Refuse references that are equal within their uncertainty."""
     if not _some_apart(known, spread):
         listed = ", ".join(f"{r.capacitance_f:g}" for r in references)
         raise InputError(
             f"The references ({listed} F) are equal within noise and tolerance; scale and stray "
-            "need two that differ. Add one of another value."
+            "require two that differ. Add one with a different value."
         )
 
 
@@ -398,6 +399,6 @@ def _check_residual(references: Sequence[Reference], left: Complexes, spread: Fl
         worst = references[int(np.argmax(weighted))]
         raise ResultError(
             f"The references contradict each other {factor:.3g} times more than noise and "
-            f"tolerance explain, allowed is {_CLEAR:g}; the worst is {worst.capacitance_f:g} F. "
-            "Check its value and leads, or state its tolerance."
+            f"tolerance explain (the limit is {_CLEAR:g}); the worst is {worst.capacitance_f:g} F. "
+            "Check its value and leads, or specify its tolerance."
         )

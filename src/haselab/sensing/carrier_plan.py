@@ -1,4 +1,4 @@
-"""Which carrier: what each one costs in noise, and what leaks into it."""
+"""Choice of the carrier from the noise and leakage of each candidate."""
 
 from __future__ import annotations
 
@@ -19,46 +19,46 @@ Complexes = NDArray[np.complex128]
 
 _FEWEST_PERIODS = 4.0
 _MOST_CANDIDATES = 500
-_SMALLEST, _LARGEST = 1e-15, 1e15  # of any number of a request
-_MOST_JUDGED, _SEARCHED = 1e7, 8e7  # samples for one carrier, and for all of a search
+_SMALLEST, _LARGEST = 1e-15, 1e15  # range of any number of a request
+_MOST_JUDGED, _SEARCHED = 1e7, 8e7  # samples for one carrier, and for a whole search
 _MOST_TURNS = 1e6
-_OFFSETS = 16  # places of an output step whose time is not known
-_AVERAGED_S = 1.0  # over which a step's leak may average out
+_OFFSETS = 16  # simulated times of an output step whose time is not known
+_AVERAGED_S = 1.0  # averaging time for a step's leakage
 _DISTORTION_ORDERS = range(2, 41)
-_HEADROOM = 0.5  # of current limit and range: the rest is for the drive
-_SETTLED = 2.0  # time constants 1 / (2 pi damping bandwidth) times 2 pi: e^-12 is left of a step
-_EQUAL = 1.03  # of the least error: then a carrier off the harmonics is the better one
-_TINY = 0.1  # of the noise: a leak below adds half a percent to it
+_HEADROOM = 0.5  # of current limit and range: the rest is reserved for the drive
+_SETTLED = 2.0  # time constants 1 / (2 pi damping bandwidth) times 2 pi: e^-12 of a step remains
+_EQUAL = 1.03  # of the smallest error: within it a carrier off the harmonics is preferred
+_TINY = 0.1  # of the noise: a smaller leakage adds half a percent at most
 
 
 @dataclass(frozen=True)
 class CarrierRequest:
-    """What is known before a carrier is chosen.
+    """Known properties of bench and drive, for the choice of a carrier.
 
     Args:
         rate_hz: samples per second and channel.
-        update_hz: new outputs per second; each is a step.
-        block_s: length of a block, one capacitance each.
-        blank_s: time after each update that does not count.
-        update_s: time of the update in its block; None where it is not known (no blanking then).
+        update_hz: output updates per second; each is a step.
+        block_s: length of a block, one capacitance value per block.
+        blank_s: time after each update that is blanked.
+        update_s: time of the update within its block; None if not known (then nothing is blanked).
         step_v: typical step of the voltage monitor at an update.
-        mains_hz: of the place.
+        mains_hz: mains frequency.
         mains_v: peak of the mains' fundamental on each monitor; harmonics fall as 1/n.
         distortion: second harmonic of the carrier, relative; the n-th falls as (2/n)^2.
         bandwidth_hz: of the amplifier, second order.
         damping_ratio: of the amplifier.
         capacitance_f: of the actuator.
         series_ohm: of its electrodes.
-        noise_v: rms of one reading on each monitor, quantisation included.
+        noise_v: rms of one reading on each monitor, including quantisation.
         carrier_v: peak of the carrier ahead of the amplifier.
         gain: of the amplifier.
         volt_per_monitor_volt: scale of the voltage monitor.
         ampere_per_monitor_volt: scale of the current monitor.
         current_limit_a: of the amplifier.
-        range_v: of the converter, either sign.
+        range_v: of the converter, for either sign.
         strain_per_relative: d strain / d ln C; the study's line has strain + 0.276.
     Raises:
-        InputError: a number that cannot be.
+        InputError: a value out of range.
     """
 
     rate_hz: float = 200e3
@@ -99,60 +99,61 @@ class CarrierRequest:
             if not (_SMALLEST <= value <= _LARGEST or (value == 0.0 and name in at_least_zero)):
                 allowed = "0 or more" if name in at_least_zero else "above 0"
                 raise InputError(
-                    f"{name} = {value:g}; allowed is {allowed}, of a size between {_SMALLEST:g} "
-                    f"and {_LARGEST:g}. Correct it."
+                    f"{name} = {value:g}; it must be {allowed}, with a magnitude between "
+                    f"{_SMALLEST:g} and {_LARGEST:g}."
                 )
         samples = self.block_s * self.rate_hz
         if not (samples >= 8.0 and self.judged_samples <= _MOST_JUDGED):
             raise InputError(
                 f"block_s = {self.block_s:g} s has {samples:.3g} samples and "
-                f"{self.block_s * self.update_hz:.3g} updates of the output; allowed are 8 samples "
-                f"and more, and samples times updates up to {_MOST_JUDGED:g} ({_OFFSETS} times as "
-                "many count where the update's time is not known). Change block_s."
+                f"{self.block_s * self.update_hz:.3g} updates of the output; it must have at "
+                f"least 8 samples, and samples times updates must be at most {_MOST_JUDGED:g} "
+                f"({_OFFSETS} times as many count if the update's time is not known). Change "
+                "block_s."
             )
         if max(self.update_hz, self.rate_hz / self.mains_hz) > _MOST_TURNS:
             raise InputError(
                 f"update_hz = {self.update_hz:g} Hz, and {self.rate_hz / self.mains_hz:g} samples "
-                f"in a period of the mains; allowed are up to {_MOST_TURNS:g} of both. Correct it."
+                f"in a period of the mains; both must be at most {_MOST_TURNS:g}."
             )
         if not (self.update_s is None or 0.0 <= self.update_s < self.block_s):
             raise InputError(
-                f"update_s = {self.update_s:g} s is outside [0, {self.block_s:g}) s, a block. "
-                "Give its time in the block, or say that it is not known."
+                f"update_s = {self.update_s:g} s is outside the block, [0, {self.block_s:g}) s. "
+                "Give its time in the block, or None if it is not known."
             )
         if self.blank_s > 0.75 * min(self.block_s, 1.0 / self.update_hz):
             raise InputError(
-                f"blank_s = {self.blank_s:g} s takes more than three quarters of a block of "
+                f"blank_s = {self.blank_s:g} s is more than three quarters of a block of "
                 f"{self.block_s:g} s or of an update's period. Blank less, or lengthen the block."
             )
         if self.damping_ratio >= 1.0:
             raise InputError(
-                f"damping_ratio = {self.damping_ratio:g} is outside (0, 1). Take 0.99 for more."
+                f"damping_ratio = {self.damping_ratio:g} is outside (0, 1). Use 0.99 for more."
             )
 
     @property
     def judged_samples(self) -> float:
-        """Samples that one carrier costs: those of a block, for each update that it may see."""
+        """Number of samples to evaluate per carrier: those of a block for each possible update."""
         places = _OFFSETS if self.update_s is None else 1
         return self.block_s * self.rate_hz * places * (1.0 + self.block_s * self.update_hz)
 
 
 @dataclass(frozen=True)
 class CarrierChoice:
-    """One carrier and what it gives. Errors are relative to C, rms, of one block.
+    """One carrier with its errors: relative to C, rms, for one block.
 
     Args:
         carrier_hz: its frequency.
         v_peak_v: amplitude on the voltage monitor.
         i_peak_v: amplitude on the current monitor.
         noise: Cramer-Rao bound of the monitors' noise.
-        step: what an output's step leaves.
-        step_average: the part of `step` that is left after an average over one second.
-        mains: what the mains' harmonics leave.
-        alias: what harmonics of the carrier leave that fold back onto it.
-        total: all of them.
+        step: residual error of an output step.
+        step_average: the part of `step` that remains after averaging over one second.
+        mains: residual error of the mains' harmonics.
+        alias: residual error of carrier harmonics that alias onto the carrier.
+        total: all errors together.
         strain_std: `total` in strain.
-        remarks: what leaks and why, a sentence each.
+        remarks: sources of leakage, one sentence each.
         usable: within current limit and range.
     """
 
@@ -172,12 +173,12 @@ class CarrierChoice:
 
 @dataclass(frozen=True)
 class CarrierPlan:
-    """The choice, and what it was chosen from.
+    """The chosen carrier and all candidates.
 
     Args:
-        chosen: the carrier with the smallest error among those to which nothing sticks.
-        reasons: why, a sentence each.
-        candidates: all that were judged, by frequency.
+        chosen: the carrier with the smallest error among those without remarks.
+        reasons: reasons for the choice, one sentence each.
+        candidates: all evaluated carriers, by frequency.
     """
 
     chosen: CarrierChoice
@@ -186,10 +187,10 @@ class CarrierPlan:
 
 
 def plan_carrier(request: CarrierRequest) -> CarrierPlan:
-    """The best carrier between four periods a window and twice the amplifier's bandwidth.
+    """Choose the best carrier between four periods per window and twice the amplifier's bandwidth.
 
     Args:
-        request: what is known of bench, drive and place.
+        request: known properties of bench and drive.
     Returns:
         The choice with its reasons, and all candidates.
     Raises:
@@ -205,7 +206,7 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     high_hz = min(request.rate_hz / 3.0, 2.0 * request.bandwidth_hz)
     if not low_hz < high_hz:
         raise InputError(
-            f"No carrier has {_FEWEST_PERIODS:g} periods in {window_s:g} s that count and stays "
+            f"No carrier has {_FEWEST_PERIODS:g} periods in {window_s:g} s that count and is "
             f"below {high_hz:g} Hz. Lengthen the block, blank less, or sample faster."
         )
     grid_hz = 0.25 / request.block_s
@@ -218,7 +219,8 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     if not usable:
         raise InputError(
             f"At {request.carrier_v:g} V no carrier stays within half of the current limit "
-            f"{request.current_limit_a:g} A and of the range {request.range_v:g} V. Lower it."
+            f"{request.current_limit_a:g} A and of the range {request.range_v:g} V. Lower "
+            "carrier_v."
         )
     free = [c for c in usable if c.step_average < max(_TINY * c.noise, 0.2 * c.step)]
     least = min(c.total for c in free or usable)
@@ -231,10 +233,10 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
 
 
 def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
-    """What one carrier gives.
+    """Errors and remarks for one carrier.
 
     Args:
-        request: what is known of bench, drive and place.
+        request: known properties of bench and drive.
         carrier_hz: the carrier.
     Returns:
         Amplitudes, errors and remarks.
@@ -246,8 +248,8 @@ def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
     if not (periods >= 2.0 and carrier_hz <= r.rate_hz / 3.0):
         raise InputError(
             f"Carrier = {carrier_hz:g} Hz has {periods:.3g} periods in the samples that count, at "
-            f"{r.rate_hz:g} samples a second; at least 2, and 3 samples a period, are needed. "
-            "Choose another one."
+            f"{r.rate_hz:g} samples per second; at least 2 periods and 3 samples per period are "
+            "required. Choose another carrier."
         )
     omega = 2.0 * math.pi * carrier_hz
     impedance = r.series_ohm + 1.0 / (1j * omega * r.capacitance_f)
@@ -292,13 +294,13 @@ def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
 
 @dataclass(frozen=True)
 class _Window:
-    """The lock-in's weights for one carrier.
+    """Weights of the lock-in for one carrier.
 
     Args:
         time_s: of the samples of a block. Shape `(N,)`.
-        weights: complex; their sum with the readings is the phasor. Shape `(N,)`.
+        weights: complex; their product with the readings is the phasor. Shape `(N,)`.
         noise_gain: standard deviation of a quadrature over that of a reading.
-        steps_s: when the output steps; several lists where that is not known.
+        steps_s: times of the output's steps; several lists if these are not known.
     """
 
     time_s: Floats
@@ -308,7 +310,7 @@ class _Window:
 
 
 def _steps_s(r: CarrierRequest, update_s: float) -> Floats:
-    """Updates that a block sees, the last one before it included."""
+    """Times of the updates that affect a block, including the last one before it."""
     period_s = 1.0 / r.update_hz
     first_s = update_s - period_s * math.ceil(update_s / period_s)
     return np.arange(first_s, r.block_s, period_s)
@@ -349,7 +351,7 @@ def _mean(values: Sequence[float]) -> float:
     return math.sqrt(sum(value**2 for value in values) / len(values))
 
 
-# ---- what leaks -----------------------------------------------------------------------------
+# ---- leakage -----------------------------------------------------------------------------
 
 
 def _amplifier(r: CarrierRequest, s: complex) -> complex:
@@ -358,11 +360,11 @@ def _amplifier(r: CarrierRequest, s: complex) -> complex:
 
 
 def _mains_v(r: CarrierRequest, window: _Window, carrier_hz: float) -> float:
-    """What the mains' harmonics leave in one quadrature of a monitor's phasor, rms over phase."""
+    """Error of one quadrature of a monitor's phasor due to the mains' harmonics, rms over phase."""
     count = int(0.5 * r.rate_hz / r.mains_hz)
     if count == 0 or r.mains_v == 0.0:
         return 0.0
-    from scipy.signal import CZT  # half a second
+    from scipy.signal import CZT  # the import takes half a second
 
     turn = cmath.exp(2j * math.pi * r.mains_hz / r.rate_hz)
     chirp = CZT(window.weights.size, count, w=turn, a=1.0 / turn)
@@ -375,10 +377,10 @@ def _mains_v(r: CarrierRequest, window: _Window, carrier_hz: float) -> float:
 def _step(
     r: CarrierRequest, window: _Window, steps_s: Floats, output_v: float, impedance: complex
 ) -> float:
-    """What the output's steps leave in one quadrature of I/V, relative, rms over their phase.
+    """Relative error of one quadrature of I/V due to the output's steps, rms over their phase.
 
-    Voltage and current of a step through amplifier and load are sums of exponentials. Where the
-    load answers the step within the window as it answers the carrier, nothing is left.
+    Voltage and current of a step through amplifier and load are sums of exponentials. If the
+    load responds to the step within the window as it does to the carrier, there is no error.
     """
     w, z = 2.0 * math.pi * r.bandwidth_hz, r.damping_ratio
     fast = complex(-z * w, w * math.sqrt(1.0 - z * z))
@@ -407,7 +409,7 @@ def _step(
 
 
 def _folded(r: CarrierRequest, carrier_hz: float) -> list[int]:
-    """Orders of the carrier's harmonics that the converter folds into its main lobe."""
+    """Orders of the carrier's harmonics that alias into its main lobe."""
     found = []
     for n in _DISTORTION_ORDERS:
         away = n * carrier_hz % r.rate_hz
@@ -418,7 +420,7 @@ def _folded(r: CarrierRequest, carrier_hz: float) -> list[int]:
 
 
 def _left_after_average(r: CarrierRequest, carrier_hz: float) -> float:
-    """Share of a step's leak after an average: its phase goes on by carrier / update each time."""
+    """Share of a step's error that remains after averaging, since its phase advances each time."""
     count = max(2, round(_AVERAGED_S * r.update_hz))
     turns = np.exp(2j * np.pi * carrier_hz / r.update_hz * np.arange(count))
     return float(abs(turns.mean()))
@@ -429,7 +431,7 @@ def _on_harmonic(carrier_hz: float, base_hz: float) -> bool:
     return abs(order - round(order)) < 1e-6 * order
 
 
-# ---- words ----------------------------------------------------------------------------------
+# ---- texts ----------------------------------------------------------------------------------
 
 
 def _with_remarks(
@@ -440,9 +442,9 @@ def _with_remarks(
     if _on_harmonic(f, r.update_hz):
         effect = (
             f"each step adds an error of {100 * choice.step:.2g} % of C with the same phase, "
-            "which no average removes"
+            "which averaging does not remove"
             if choice.step > _TINY * choice.noise
-            else "its steps are nothing beside the noise here"
+            else "its steps are negligible compared with the noise"
         )
         remarks.append(
             f"{f:g} Hz is harmonic {round(f / r.update_hz)} of the {r.update_hz:g} Hz staircase of "
@@ -451,20 +453,20 @@ def _with_remarks(
     nearest = round(f / r.mains_hz)
     if nearest >= 1 and abs(nearest * r.mains_hz - f) < 1.0 / _window_s(r):
         remarks.append(
-            f"Mains harmonic {nearest} ({nearest * r.mains_hz:g} Hz) lies in the main lobe of "
+            f"Mains harmonic {nearest} ({nearest * r.mains_hz:g} Hz) is in the main lobe of "
             f"{1.0 / _window_s(r):.3g} Hz to each side: {100 * choice.mains:.2g} % of C."
         )
     if folded:
         orders = ", ".join(str(n) for n in folded)
         remarks.append(
-            f"Harmonics {orders} of the carrier fold back onto it: {100 * choice.alias:.2g} % of C."
+            f"Harmonics {orders} of the carrier alias onto it: {100 * choice.alias:.2g} % of C."
         )
     if not _on_harmonic(r.rate_hz, f):
-        remarks.append("A period is no whole number of samples: the paper's chain cannot fold it.")
+        remarks.append("A period is not a whole number of samples, as the paper requires.")
     if not choice.usable:
         remarks.append(
-            f"It takes {1e3 * current_a:.3g} mA and {choice.i_peak_v:.3g} V of the current "
-            "monitor: more than half of limit or range."
+            f"It requires {1e3 * current_a:.3g} mA and {choice.i_peak_v:.3g} V of the current "
+            "monitor, more than half of the limit or the range."
         )
     return replace(choice, remarks=tuple(remarks))
 
@@ -482,14 +484,14 @@ def _reasons(r: CarrierRequest, chosen: CarrierChoice, free: bool) -> tuple[str,
         f"{chosen.strain_std:.2g}; most of it from {largest}."
     ]
     if chosen.step <= _TINY * chosen.noise:
-        reasons.append("The output's steps are nothing beside the noise.")
+        reasons.append("The output's steps are negligible compared with the noise.")
     elif free:
         reasons.append("The output's steps change their phase from block to block and average out.")
     else:
-        reasons.append("No carrier is free of the output's steps: blank after each update.")
+        reasons.append("Every carrier is affected by the output's steps. Blank after each update.")
     if chosen.step > chosen.noise:
         reasons.append(
-            f"The steps leave {100 * chosen.step:.2g} % of C: "
+            f"The steps cause an error of {100 * chosen.step:.2g} % of C: "
             + (
                 "find the time of the updates, or let the lock-in search for them."
                 if r.update_s is None

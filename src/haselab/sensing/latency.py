@@ -1,4 +1,4 @@
-"""When an output took effect, as the voltage monitor saw it: the delay that a loop really has."""
+"""Latency of the output, measured by the voltage monitor: the real delay of a loop."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from haselab.base import Estimate, InputError
 
 __all__ = ["latency", "step_latencies"]
 
-_BLOCKS = 12  # after the one that a step was asked for, in which it is looked for
-_REST_BLOCKS = 2  # of one output before a step
-_CLEAR = 5.0  # times the spread at rest that a step has to have
+_BLOCKS = 12  # blocks after a requested step in which it is searched for
+_REST_BLOCKS = 2  # blocks of constant output before a step
+_CLEAR = 5.0  # smallest step relative to the spread of a constant output
 
 
 def step_latencies(
     monitor: NDArray[np.float64] | NDArray[np.int16], drive_v: NDArray[np.float64], rate_hz: float
 ) -> NDArray[np.float64]:
-    """Time of each step of the output from the start of the block that it was asked for.
+    """Measure the time of each output step from the start of the block that requested it.
 
     That start is the last sample of the block before, from which a loop computes the output. A step
-    counts when the output stood for two blocks before it and for as long after it as it is looked
-    for, and when it is clear of carrier and noise; its time is that of the middle between both.
+    counts when the output was constant for two blocks before it and during the whole search
+    after it, and when it is above carrier and noise; its time is that of the midpoint.
 
     Args:
         monitor: voltage monitor in any unit, codes as well, shape `(B, N)`, in order and without a
             gap.
-        drive_v: asked for in each block, shape `(B,)`, in V.
+        drive_v: requested output in each block, shape `(B,)`, in V.
         rate_hz: samples per second.
     Returns:
-        In s, one for each step that can be told; perhaps none.
+        Times in s, one for each detectable step; possibly none.
     Raises:
-        InputError: shapes that do not fit.
+        InputError: wrong shapes.
     Example:
         >>> monitor_v = np.zeros((20, 100))
         >>> monitor_v.reshape(-1)[1023:] = 1.0
@@ -41,8 +41,8 @@ def step_latencies(
     """
     if monitor.ndim != 2 or drive_v.shape != monitor.shape[:1]:
         raise InputError(
-            f"Monitor of shape {monitor.shape} and drive of shape {drive_v.shape}, allowed are "
-            "(B, N) and (B,). Correct the call."
+            f"Monitor of shape {monitor.shape} and drive of shape {drive_v.shape}; they must be "
+            "(B, N) and (B,)."
         )
     samples = monitor.shape[1]
     found: list[float] = []
@@ -67,13 +67,13 @@ def step_latencies(
 
 
 def latency(times_s: NDArray[np.float64], rate_hz: float) -> Estimate | None:
-    """One latency from that of every step; None without one.
+    """Combine the latencies of all steps; None without one.
 
     Args:
-        times_s: of `step_latencies`, all steps of a rig, shape `(n,)`, in s.
+        times_s: from `step_latencies`, all steps of a rig, shape `(n,)`, in s.
         rate_hz: samples per second.
     Returns:
-        Median; its standard deviation from the steps' spread, and no less than a sample's.
+        Median; its standard deviation is from the spread, but at least that of one sample.
     Example:
         >>> latency(np.array([0.00225, 0.00225]), 10e3).value
         0.00225

@@ -28,32 +28,32 @@ from haselab.sensing.sensed import (
 __all__ = ["Lockin", "as_readings"]
 
 _RESULT = _sense.RESULT  # of a block, by name: native/sensing/sense.h
-_GLANCE, _VALUES = 256, 64  # readings; so few different values show a coarse converter
-_BLOCKS = 16  # in which its step is looked for
+_GLANCE, _VALUES = 256, 64  # readings, and distinct values below which a converter is coarse
+_BLOCKS = 16  # blocks in which its step is searched for
 _LOST = 4 | 8 | 32  # clipped, current limit, not finite: no model helps
-_TOO_SHORT = "not the plain model, and too few carrier periods in a block to tell what"
+_TOO_SHORT = "not the plain model; too few carrier periods in a block to find the cause"
 _Taken = Callable[[NDArray[np.intp] | slice], NDArray[Any]]
 _READ = (np.int16, np.float32, np.float64)
 
 
 def as_readings(values: NDArray[Any]) -> NDArray[Any]:
-    """Readings as the C code takes them: int16, float32 or float64, in one piece."""
+    """Convert readings to the form of the C code: contiguous int16, float32 or float64."""
     kept = values.dtype in _READ
     return np.ascontiguousarray(values, dtype=values.dtype if kept else np.float64)
 
 
 class Lockin:
-    r"""Lock-in whose basis is sine, cosine, level and slope, so that a ramp leaves no error.
+    r"""Lock-in whose basis is sine, cosine, level and slope, so that a ramp causes no error.
 
-    A block is cut into pieces of a carrier period. One pass over the samples leaves a few sums of
-    each piece; least squares over the pieces that count gives the phasors, and what each piece
-    leaves on its own the noise. A known update of the output is blanked (`LockinConfig.blank`), one
-    at an unknown time is looked for (`search_updates`); a level of its own stands on either side.
+    A block is cut into segments of a carrier period. One pass over the samples gives a few sums for
+    each segment; least squares over the counted segments gives the phasors, and the residuals of
+    each segment give the noise. A known update of the output is blanked (`LockinConfig.blank`), one
+    at an unknown time is searched for (`search_updates`); each side has its own level.
 
     Args:
         config: see `LockinConfig`.
-        models: look for a model of blocks that the plain one does not explain, and refuse those
-            that none explains. Without noise there is nothing to judge by.
+        models: find a model for blocks that the plain one does not explain, and refuse those
+            that none explains. This requires noise in the readings.
     Raises:
         InputError: fewer than two carrier periods count, or the carrier is above a third of the
             sampling rate.
@@ -87,16 +87,16 @@ class Lockin:
 
     @property
     def middle_s(self) -> float:
-        """Mean time of the samples that count, from a block's first sample, in s."""
+        """Mean time of the counted samples, from a block's first sample, in s."""
         return float(self._weights.middle_s[0])
 
     def step(self, block: NDArray[Any]) -> tuple[float, float, bool]:
-        """One block in the loop, by the C core.
+        """Process one block in a loop, by the C core.
 
         Args:
             block: shape `(block_samples, 2)`, voltage then current; int16, float32 or float64.
         Returns:
-            Capacitance in F, series resistance in ohm, and whether they hold.
+            Capacitance in F, series resistance in ohm, and whether they are valid.
         Raises:
             ValueError: the block has another length or type.
         """
@@ -104,7 +104,7 @@ class Lockin:
         return capacitance_f, resistance_ohm, reason == 0
 
     def sense(self, readings: NDArray[Any]) -> Sensed:
-        """Many blocks at once, with standard deviations; the phasors are those of `step`.
+        """Process many blocks, with standard deviations; the phasors are those of `step`.
 
         Args:
             readings: shape `(blocks, block_samples, 2)`, voltage then current.
@@ -119,7 +119,7 @@ class Lockin:
         return self._sensed(rows, lambda blocks: readings[blocks])
 
     def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
-        """The same from two columns.
+        """Process many blocks from two columns.
 
         Args:
             v: voltage monitor, shape `(blocks * block_samples,)`.
@@ -127,7 +127,7 @@ class Lockin:
         Returns:
             Results, arrays of shape `(blocks,)`; amplitudes in the unit of the readings.
         Raises:
-            InputError: unequal lengths, or no whole number of blocks.
+            InputError: unequal lengths, or not a whole number of blocks.
         """
         check_channels(v, i, self.config)
         rows = np.empty(v.size // self.config.block_samples, _RESULT)
@@ -156,14 +156,14 @@ class Lockin:
         return audited(sensed_from_phasors(_without_coarse(phasors, rows, taken), self.config))
 
     def _suspects(self, rows: NDArray[np.void]) -> NDArray[np.intp]:
-        """Blocks that the plain model does not explain and that are not lost for another reason."""
+        """Blocks that the plain model does not explain and that have no other fault."""
         reason = rows["reason"].astype(np.uint8)
         suspect = (rows["suspicion"] > 0) | (reason & ~np.uint8(_LOST) > 0)
         return np.flatnonzero(suspect & (reason & _LOST == 0))
 
     def _phasors(self, rows: NDArray[np.void]) -> Phasors:
         choice, weights = rows["choice"].astype(np.intp), self._weights
-        # The carrier's band may scatter more than the noise beside it: then it is believed.
+        # If the carrier's band scatters more than the noise beside it, its scatter is used.
         quadrature = weights.quadrature[choice] * rows["excess"]
         level, slope = weights.level[choice], weights.slope[choice]
         v_noise, i_noise = rows["v_noise"], rows["i_noise"]
@@ -187,7 +187,7 @@ class Lockin:
 
 
 def _without_coarse(phasors: Phasors, rows: NDArray[np.void], taken: _Taken) -> Phasors:
-    """Plain blocks with what the converter's rounding may err, refused where that is most of it."""
+    """Add the converter's rounding error to plain blocks; refuse them where it dominates."""
     count = len(rows)
     few = taken(np.unique([0, count // 2, max(count - 1, 0)]))[:, :_GLANCE] if count else rows
     if count == 0 or all(np.unique(few[..., c]).size > _VALUES for c in (0, 1)):
@@ -212,7 +212,7 @@ def _without_coarse(phasors: Phasors, rows: NDArray[np.void], taken: _Taken) -> 
 
 
 def _unexplained(phasors: Phasors, blocks: NDArray[np.intp]) -> Phasors:
-    """Blocks too short for any other model than the plain one, which they contradict."""
+    """Refuse blocks that contradict the plain model and are too short for any other."""
     reason = phasors.reason.copy()
     plain = reason[blocks] == 0
     reason[blocks[plain]] |= DISTURBED
@@ -226,12 +226,14 @@ def _unexplained(phasors: Phasors, blocks: NDArray[np.intp]) -> Phasors:
 def _with_explained(
     phasors: Phasors, blocks: NDArray[np.intp], found: Explained, config: LockinConfig
 ) -> Phasors:
-    """Blocks that a slower model explains take its numbers; refused ones keep their own."""
-    told = np.array([text != "" for text in found.texts]) | (found.reason != 0)
-    seen = {int(b): text for b, text, tell in zip(blocks, found.texts, told, strict=True) if tell}
+    """Use the results of a slower model where it explains a block; keep those of refused blocks."""
+    described = np.array([text != "" for text in found.texts]) | (found.reason != 0)
+    seen = {
+        int(b): text for b, text, shown in zip(blocks, found.texts, described, strict=True) if shown
+    }
     reason = phasors.reason.copy()
     reason[blocks] = found.reason
-    kept = told & (found.reason == 0)
+    kept = described & (found.reason == 0)
     blocks = blocks[kept]
     changed: dict[str, Any] = {}
     for name in ("voltage", "current", "voltage_std", "current_std", "omega_rad_s"):
@@ -241,7 +243,7 @@ def _with_explained(
     changed["omega_rad_s"][blocks] += config.omega_rad_s
     time_s = phasors.time_s.copy()
     time_s[blocks] = config.block_s * blocks + found.middle_s[kept]
-    if phasors.levels is not None:  # a straight line says nothing of the leakage here
+    if phasors.levels is not None:  # a straight line does not give the leakage here
         levels = {f.name: getattr(phasors.levels, f.name).copy() for f in fields(Levels)}
         for values in levels.values():
             values[blocks] = np.nan

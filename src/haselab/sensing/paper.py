@@ -1,4 +1,4 @@
-"""The reference study's own chain: Butterworth, mean of the periods, peak to peak, phase."""
+"""The reference study's own method: Butterworth, mean of the periods, peak to peak, phase."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ _RESULT = _sense.PAPER_RESULT  # of a channel, by name: native/sensing/paper.h
 
 
 class PaperChain:
-    r"""Rows S6 to S9 as printed, to compare with; the lock-in is better in every respect.
+    r"""Rows S6 to S9 as printed, for comparison; the lock-in is better in every respect.
 
-    Both monitors pass a low-pass whose state goes on from block to block. The periods of a block
+    Both monitors pass a low-pass whose state is kept from block to block. The periods of a block
     are averaged into one; its peak-to-peak values are the amplitudes, the angle between the
     fundamentals of its two channels is the phase: $Z = k\,(V_{pp}/I_{pp})\,e^{-j\varphi}$.
 
-    The low-pass takes 3 dB from both amplitudes where its cut-off is the carrier; capacitance and
-    phase are not touched by it. A drive that ramps stays in the average of the periods and
-    biases the result, which the standard deviation, from the scatter of the periods, cannot tell.
+    The low-pass reduces both amplitudes by 3 dB if its cut-off is the carrier; capacitance and
+    phase are not affected. A drive that ramps remains in the average of the periods and
+    biases the result; the standard deviation, from the scatter of the periods, does not include
+    this.
 
     Args:
-        config: see `LockinConfig`; the chain knows neither blanking nor a search for updates.
+        config: see `LockinConfig`; blanking and the search for updates are not supported.
         cutoff_hz: of the low-pass.
     Raises:
-        InputError: a period is not a whole number of samples, a block not one of at least two
-            periods, or samples are blanked.
+        InputError: a period is not a whole number of samples, a block is not at least two
+            whole periods, or samples are blanked.
     Source: reference study, rows S6 to S9.
     Example:
         >>> angle = 2 * np.pi * 2000.0 * np.arange(20 * 2000) / 200e3
@@ -62,19 +63,20 @@ class PaperChain:
         periods = config.block_samples / period
         if not whole or config.block_samples % self._period_samples or periods < 2:
             raise InputError(
-                f"The paper's chain folds whole periods, got {period:g} samples a period and "
-                f"{periods:g} periods a block. Take a block of whole periods, or the lock-in."
+                f"The paper's method averages whole periods, but there are {period:g} samples per "
+                f"period and {periods:g} periods per block. Use a block of whole periods, or the "
+                "lock-in."
             )
         if config.blank[1] > config.blank[0]:
             raise InputError(
-                f"The paper's chain cannot blank {config.blank[1] - config.blank[0]} samples of a "
-                "block, only 0. Take the lock-in."
+                f"The paper's method cannot blank {config.blank[1] - config.blank[0]} samples of a "
+                "block. Use the lock-in."
             )
         if not 0.0 < cutoff_hz < 0.5 * config.rate_hz:
             raise InputError(
                 f"Cut-off = {cutoff_hz:g} Hz is outside (0, {0.5 * config.rate_hz:g}) Hz. Lower it."
             )
-        from scipy import signal  # half a second, for this method alone
+        from scipy import signal  # the import takes half a second
 
         sections = signal.butter(_ORDER, cutoff_hz, fs=config.rate_hz, output="sos")
         turn = 2.0 * np.pi * np.arange(self._period_samples) / self._period_samples
@@ -82,7 +84,7 @@ class PaperChain:
         self._native = _sense.Paper(sections, signal.sosfilt_zi(sections), wave)
 
     def sense(self, readings: NDArray[Any]) -> Sensed:
-        """The next blocks; the filter goes on where the last call left it.
+        """Process the next blocks; the filter keeps its state between calls.
 
         Args:
             readings: shape `(blocks, block_samples, 2)`, voltage then current.
@@ -115,5 +117,5 @@ class PaperChain:
         )
 
     def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
-        """The same from two columns, each of shape `(blocks * block_samples,)`."""
+        """Process the next blocks from two columns, each of shape `(blocks * block_samples,)`."""
         return self.sense(blocks_of_channels(v, i, self.config))

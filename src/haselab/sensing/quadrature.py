@@ -1,4 +1,4 @@
-"""Capacitance from the chip's readings, by the chip's own arithmetic."""
+"""Capacitance from the microcontroller's readings, with its own arithmetic."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from haselab.firmware import ChipSettings
 
 __all__ = ["sense_quadrature"]
 
-_HALF = 4  # readings of a channel in an update: half of the window that it looks at
+_HALF = 4  # readings of a channel in an update: half of its window
 
 
 def sense_quadrature(codes: NDArray[np.int16], settings: ChipSettings) -> NDArray[np.float64]:
-    """What the chip made of what it latched, bit for bit.
+    """Capacitance that the microcontroller computed from its readings, bit for bit.
 
-    An update looks at its own readings and at those before it; the first of a recording has none
-    before it, so it has no capacitance.
+    An update uses its own readings and the previous ones; the first of a recording has none
+    before it and therefore no capacitance.
 
     Args:
-        codes: of the converter, voltage then current, four rows an update, without a gap. Shape
+        codes: of the converter, voltage then current, four rows per update, without a gap. Shape
             `(4 N, 2)`.
-        settings: that were compiled in.
+        settings: settings that were compiled in.
     Returns:
-        In F, NaN where the carrier was lost or the capacitance is beyond what the chip believes.
+        Capacitance in F; NaN where the carrier was lost or the capacitance is out of range.
         Shape `(N,)`.
     Raises:
         InputError: another shape.
@@ -38,9 +38,7 @@ def sense_quadrature(codes: NDArray[np.int16], settings: ChipSettings) -> NDArra
         array([nan, nan])
     """
     if codes.ndim != 2 or codes.shape[1] != 2 or len(codes) % _HALF or not len(codes):
-        raise InputError(
-            f"Codes of shape {codes.shape}, allowed is (4 N, 2). Give whole updates of the chip."
-        )
+        raise InputError(f"Codes of shape {codes.shape}; it must be (4 N, 2). Give whole updates.")
     updates = len(codes) // _HALF
     farad, reason = np.zeros(updates, np.float32), np.ones(updates, np.uint8)
     rows = np.ascontiguousarray(codes, dtype=np.int16)

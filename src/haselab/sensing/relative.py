@@ -28,7 +28,7 @@ def relative_capacitance(
         i_pp: the same of the current monitor, in V. Broadcasts with `v_pp`.
         phase_rad: phase of current against voltage, in rad.
         frequency_hz: sensing frequency, in Hz.
-        reactance_scale: $k_X$, printed as 2.5e6; 2.5e3 is what eq. 5 needs (row D11b).
+        reactance_scale: $k_X$, printed as 2.5e6; eq. 5 requires 2.5e3 (row D11b).
         capacitance_scale: $k_C$, printed as 10.
     Returns:
         Relative capacitance, arbitrary units. The broadcast shape.

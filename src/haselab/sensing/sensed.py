@@ -1,4 +1,4 @@
-"""What every sensing method takes and gives: configuration, phasors, results block by block."""
+"""Data common to all sensing methods: configuration, phasors and results per block."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8,
 # Amplitude over the standard deviation of a quadrature. Noise alone exceeds it once in 270,000
 # blocks: exp(-5^2 / 2), the tail of its Rayleigh distribution.
 _CLEAR_OF_NOISE = 5.0
-_MOST_LEAKAGE = 0.8  # of the admittance of C, doubled: beyond it the two are hardly told apart
-_ROUNDS = 6  # each leaves some 2 R G of the error before
+_MOST_LEAKAGE = 0.8  # of the admittance of C, doubled: above it the two are hardly separable
+_ROUNDS = 6  # each reduces the error by about 2 R G
 _LARGEST_LEAD = 0.25  # tangent of the lead beyond 90 degrees that a monitor's phase error explains
 
 
@@ -54,7 +54,7 @@ _SMALLEST, _LARGEST = 1e-9, 1e15
 
 @dataclass(frozen=True)
 class LockinConfig:
-    """What a sensing method must know.
+    """Configuration of a sensing method.
 
     Args:
         rate_hz: samples per second and channel.
@@ -63,17 +63,18 @@ class LockinConfig:
         skew_s: time from a voltage sample to its current sample.
         ohm_per_ratio: impedance for equal readings on both channels, in ohm:
             (V per V of the amplifier output) / (A per V) of the two monitors.
-        blank: samples of each block, from the first to before the second, that do not count: from
+        blank: samples of each block, from the first to before the second, that are not used: from
             an output's update until amplifier and monitors have settled.
-        search_updates: the time of an update is not known; each block is searched for one, and
-            what it hit is blanked.
-        min_amplitude_codes: below it the carrier counts as lost, in ADC codes; in the unit of the
-            readings where they are no codes.
-        full_scale: a reading of this size has left the converter's range, unit of the readings.
-        current_limit: the same for the current monitor where the amplifier limits its current.
-        scale_s: admittance for equal readings, in S, with the phase between the channels taken
-            back; None: from `ohm_per_ratio` and `skew_s`.
-        stray_s: admittance beside the actuator at the carrier, in S.
+        search_updates: whether to search each block for an update at an unknown time and
+            blank the affected part.
+        min_amplitude_codes: amplitude below which the carrier counts as lost, in ADC codes, or in
+            the unit of the readings if these are not codes.
+        full_scale: a reading of this magnitude is out of the converter's range, unit of the
+            readings.
+        current_limit: the same for the current monitor at the amplifier's current limit.
+        scale_s: admittance for equal readings, in S, with the phase between the channels corrected;
+            None: from `ohm_per_ratio` and `skew_s`.
+        stray_s: admittance parallel to the actuator at the carrier, in S.
         offsets: readings of both monitors at 0 V and 0 A.
     """
 
@@ -96,16 +97,16 @@ class LockinConfig:
             value = getattr(self, name)
             if not _SMALLEST <= value <= _LARGEST:
                 raise InputError(
-                    f"{name} = {value:g}; allowed is a number above 0, from {_SMALLEST:g} to "
-                    f"{_LARGEST:g}. Correct it."
+                    f"{name} = {value:g}; must be a number above 0, from {_SMALLEST:g} to "
+                    f"{_LARGEST:g}."
                 )
         for name in ("full_scale", "current_limit", "min_amplitude_codes", "skew_s"):
             if np.isnan(getattr(self, name)):
-                raise InputError(f"{name} is not a number. Correct it, or leave it out.")
+                raise InputError(f"{name} is not a number.")
         low, high = self.blank
         if not 0 <= low <= high <= self.block_samples:
             raise InputError(
-                f"Blanked samples [{low}, {high}) do not lie in a block of {self.block_samples}. "
+                f"Blanked samples [{low}, {high}) are not inside a block of {self.block_samples}. "
                 "Shorten the blanking."
             )
 
@@ -145,16 +146,16 @@ class Sensed:
         capacitance_std_f: its standard deviation, from the residual of the same block.
         resistance_ohm: series resistance.
         resistance_std_ohm: its standard deviation.
-        leakage_s: conductance in parallel, in S, from the levels of both monitors; NaN where the
-            method has none.
-        leakage_std_s: its standard deviation; large where there is hardly a voltage.
+        leakage_s: conductance in parallel, in S, from the levels of both monitors; NaN if the
+            method does not give it.
+        leakage_std_s: its standard deviation; large at low voltage.
         phase_rad: phase of current against voltage.
         v_pp: peak-to-peak carrier on the voltage monitor, in the unit of the readings.
         i_pp: the same on the current monitor.
-        valid: the numbers hold.
-        reason: why they do not, a sum of keys of `REASONS`; 0 where they do.
-        seen: of blocks beyond the plain model, by their index: the model that explains a valid
-            one, or what was seen in one that is not.
+        valid: whether the results are valid.
+        reason: why they are not, a sum of keys of `REASONS`; 0 where they are.
+        seen: for blocks beyond the plain model, by index: the model that explains a valid
+            block, or the disturbance of an invalid one.
     """
 
     time_s: Floats
@@ -172,11 +173,11 @@ class Sensed:
     seen: Mapping[int, str] = field(default_factory=dict)
 
     def model(self, block: int) -> str:
-        """Name of the model behind the numbers of a block: "plain", or what it adds to that."""
+        """Name of the model of a block: "plain", or its additions to that."""
         return self.seen.get(block, "plain") if self.valid[block] else ""
 
     def reason_of(self, block: int) -> str:
-        """Why a block is not valid, in words; nothing where it is."""
+        """Why a block is not valid, as text; empty if it is valid."""
         if self.valid[block]:
             return ""
         known, seen = reason_text(int(self.reason[block])), self.seen.get(block, "")
@@ -185,7 +186,7 @@ class Sensed:
 
 @dataclass(frozen=True)
 class Levels:
-    """What stays of both monitors without the carrier; arrays of shape `(blocks,)`.
+    """Levels of both monitors without the carrier; arrays of shape `(blocks,)`.
 
     Args:
         voltage: mean of the voltage monitor, in the unit of the readings.
@@ -206,7 +207,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class Phasors:
-    """The carrier on both monitors, block by block; arrays of shape `(blocks,)`.
+    """The carrier on both monitors, per block; arrays of shape `(blocks,)`.
 
     Args:
         voltage: complex peak amplitude, in the unit of the readings.
@@ -214,9 +215,9 @@ class Phasors:
         voltage_std: standard deviation of one quadrature of `voltage`.
         current_std: the same of `current`.
         omega_rad_s: frequency of the carrier.
-        time_s: middle of the samples that counted.
-        reason: what is wrong with the readings, a sum of keys of `REASONS`.
-        levels: of both monitors, for the leakage; None where the method has none.
+        time_s: middle of the counted samples.
+        reason: faults of the readings, a sum of keys of `REASONS`.
+        levels: of both monitors, for the leakage; None if the method does not give them.
         seen: as in `Sensed`.
     """
 
@@ -232,12 +233,12 @@ class Phasors:
 
 
 def reason_text(mask: int) -> str:
-    """Words for the reasons of a block that is not valid.
+    """Text for the reasons why a block is not valid.
 
     Args:
         mask: of `Sensed.reason`.
     Returns:
-        The reasons, joined; nothing for 0.
+        The reasons, joined; empty for 0.
     Example:
         >>> reason_text(6)
         'phase out of band; clipped'
@@ -262,14 +263,14 @@ def check_blocks(readings: NDArray[np.generic], config: _Blocks) -> None:
 
 
 def check_channels(v: NDArray[np.generic], i: NDArray[np.generic], config: _Blocks) -> None:
-    """Refuse columns that are no whole number of blocks.
+    """Refuse columns that are not a whole number of blocks.
 
     Args:
         v: voltage monitor, expected shape `(blocks * block_samples,)`.
         i: current monitor, the same shape.
         config: states `block_samples`.
     Raises:
-        InputError: unequal lengths, or no whole number of blocks.
+        InputError: unequal lengths, or not a whole number of blocks.
     """
     if v.ndim != 1 or v.shape != i.shape or v.size % config.block_samples:
         raise InputError(
@@ -281,17 +282,17 @@ def check_channels(v: NDArray[np.generic], i: NDArray[np.generic], config: _Bloc
 def blocks_of_channels(
     v: NDArray[np.generic], i: NDArray[np.generic], config: LockinConfig
 ) -> Floats:
-    """Two columns of readings as blocks, shape `(blocks, block_samples, 2)`: `check_channels`."""
+    """Two checked columns of readings as blocks, shape `(blocks, block_samples, 2)`."""
     check_channels(v, i, config)
     pairs = np.stack([v, i], axis=1).astype(np.float64, copy=False)
     return pairs.reshape(-1, config.block_samples, 2)
 
 
 def range_reasons(most: Floats, config: LockinConfig) -> NDArray[np.uint8]:
-    """What the size of the readings tells: clipped, current limit.
+    """Faults visible from the magnitude of the readings: clipped, current limit.
 
     Args:
-        most: largest reading of either channel without its sign, shape `(blocks, 2)`.
+        most: largest reading of either channel by magnitude, shape `(blocks, 2)`.
         config: states the limits.
     Returns:
         Sums of keys of `REASONS`, shape `(blocks,)`.
@@ -302,7 +303,7 @@ def range_reasons(most: Floats, config: LockinConfig) -> NDArray[np.uint8]:
 
 
 def middles_s(config: LockinConfig, middle_s: Floats) -> Floats:
-    """Times of the blocks' middles, from those inside their own blocks, shape `(blocks,)`."""
+    """Times of the blocks' middles, from those relative to each block, shape `(blocks,)`."""
     return middle_s + config.block_s * np.arange(middle_s.size, dtype=np.float64)
 
 
@@ -314,14 +315,14 @@ def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
     With equal, independent noise in both quadratures, $\sigma_V$ and $\sigma_I$, the standard
     deviation of either part of $Z = 1/Y$ is
     $|Y + Y_s|\,|Z|^2 \sqrt{\sigma_V^2/|V|^2 + \sigma_I^2/|I|^2}$.
-    G is the mean current, less the charging current $C\,dV/dt$, over the mean voltage; it takes
-    part in C and R where it is clear of its noise and the drive is above the carrier.
+    G is the mean current minus the charging current $C\,dV/dt$, over the mean voltage; it is
+    included in C and R if it is significant and the drive is above the carrier.
 
     Args:
         phasors: of each block.
         config: scale, stray and the amplitude below which the carrier is lost.
     Returns:
-        Results; the numbers of a block that is not valid are NaN, but for its amplitudes.
+        Results; those of an invalid block are NaN, except for its amplitudes.
     Example:
         >>> config = LockinConfig(200e3, 2000, 2000.0, 0.0, ohm_per_ratio=1e6)
         >>> one = np.ones(1)
@@ -350,7 +351,7 @@ def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
         leakage_s, leakage_std_s = _leakage(
             phasors.levels, config, capacitance_f, capacitance_std_f
         )
-        # Without a drive an offset of the monitors would pass for a leakage.
+        # Without a drive, an offset of the monitors would look like leakage.
         driven = np.abs(phasors.levels.voltage - config.offsets[0]) > np.abs(voltage)
         clear = driven & (leakage_s > _CLEAR_OF_NOISE * leakage_std_s)
         resistive = clear & ~(2.0 * leakage_s * np.abs(z.imag) < _MOST_LEAKAGE)
@@ -380,7 +381,7 @@ def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
 def _judged(
     phasors: Phasors, config: LockinConfig
 ) -> tuple[NDArray[np.uint8], NDArray[np.complex128]]:
-    """Reasons of each block, and the admittance with the stray one where there is a carrier."""
+    """Reasons of each block, and the admittance including the stray one."""
     voltage, current = phasors.voltage, phasors.current
     floor = config.min_amplitude_codes
     there = np.abs(voltage) > np.maximum(floor, _CLEAR_OF_NOISE * phasors.voltage_std)
@@ -391,7 +392,7 @@ def _judged(
     reason |= np.where(lost, _AMPLITUDE_LOST, 0).astype(np.uint8)
     ratio = np.divide(current, voltage, out=np.full_like(voltage, np.nan), where=there & finite)
     whole_s = config.admittance_scale_s * ratio
-    if config.scale_s is None:  # the skew turns by the true frequency of the block
+    if config.scale_s is None:  # the phase of the skew depends on the true frequency of the block
         whole_s *= np.exp(-1j * (phasors.omega_rad_s - config.omega_rad_s) * config.skew_s)
     y = whole_s - config.stray_s
     with np.errstate(invalid="ignore"):
@@ -418,9 +419,9 @@ def _leakage(
 def _without(
     leakage_s: Floats, z: NDArray[np.complex128], omega_rad_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Capacitance and series resistance beside a known parallel conductance.
+    """Capacitance and series resistance for a known parallel conductance.
 
-    The level sees R + 1/G: G follows from it once R is known, which needs G.
+    The level sees R + 1/G: this gives G once R is known, and R requires G.
     """
     x, g = -z.imag, leakage_s
     resistance_ohm = z.real

@@ -1,4 +1,4 @@
-"""Sine fit with the frequency as an unknown: for a carrier whose frequency is not known exactly."""
+"""Sine fit with unknown frequency, for a carrier whose frequency is not known exactly."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from haselab.sensing.sensed import (
 __all__ = ["SineFit"]
 
 _MAX_ITERATIONS = 12
-_TOLERANCE_RAD = 1e-9  # change of the phase at a block's end: far below any converter's noise
+_TOLERANCE_RAD = 1e-9  # change of the phase at a block's end, far below the noise of any converter
 _CARRIER_OFF = 64
 _FIT = np.dtype([
     ("voltage", complex), ("current", complex), ("voltage_std", float), ("current_std", float),
@@ -35,7 +35,7 @@ _NOT_SETTLED = np.array([(np.nan,) * len(_FIT.names or ())], _FIT)
 
 @dataclass(frozen=True)
 class _Channel:
-    """One channel at one trial frequency, and what it says of the frequency."""
+    """One channel at one trial frequency, with its frequency correction."""
 
     phasor: complex
     level: float
@@ -46,18 +46,18 @@ class _Channel:
 
 
 class SineFit:
-    r"""Sine fit of both monitors with one common frequency, block by block.
+    r"""Sine fit of both monitors with one common frequency, for each block.
 
     $x = a\cos\omega t + b\sin\omega t + c + d\,t$, with $\omega$ refined by Gauss-Newton from
     the nominal carrier. Each channel gives a correction of $\omega$; the two are averaged with
-    the weights of their variances. The slope $d$ takes the drive's ramp out; where samples are
-    blanked a level of its own stands on either side. A block whose frequency leaves the main lobe
-    ($\pm 1$ period a block), or does not settle, is not valid.
+    the weights of their variances. The slope $d$ removes the drive's ramp; where samples are
+    blanked, each side has its own level. A block whose frequency leaves the main lobe
+    ($\pm 1$ period per block) or does not converge is not valid.
 
     Args:
         config: see `LockinConfig`; `carrier_hz` is where the search starts. Updates at an unknown
-            time are not looked for.
-        parameters: 4 refines the frequency, 3 takes it as it is.
+            time are not searched for.
+        parameters: 4 refines the frequency, 3 keeps it.
     Raises:
         InputError: fewer than two carrier periods count, or the carrier is above a third of the
             sampling rate.
@@ -81,7 +81,7 @@ class SineFit:
             raise InputError(
                 f"Sine fit at {config.carrier_hz:g} Hz has {periods:g} periods in {kept.size} "
                 f"samples of {config.rate_hz:g} Hz; at least 2 periods and a carrier up to "
-                f"{config.rate_hz / 3:g} Hz are needed. Lengthen the block, or sample faster."
+                f"{config.rate_hz / 3:g} Hz are required. Lengthen the block, or sample faster."
             )
         self._refine = parameters == 4
         self._kept = kept
@@ -107,7 +107,7 @@ class SineFit:
         return sensed_from_phasors(self._fit(readings), self.config)
 
     def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
-        """The same from two columns, each of shape `(blocks * block_samples,)`."""
+        """Capacitance and resistance from two columns of shape `(blocks * block_samples,)`."""
         return self.sense(blocks_of_channels(v, i, self.config))
 
     def frequencies_hz(self, readings: NDArray[Any]) -> NDArray[np.float64]:
@@ -116,7 +116,7 @@ class SineFit:
         Args:
             readings: shape `(blocks, block_samples, 2)`, voltage then current.
         Returns:
-            Frequencies in Hz, shape `(blocks,)`; NaN where the fit did not settle.
+            Frequencies in Hz, shape `(blocks,)`; NaN where the fit did not converge.
         Raises:
             InputError: the shape does not fit the configuration.
         """
@@ -133,7 +133,7 @@ class SineFit:
         reason = range_reasons(most, self.config)
         unsettled = np.isnan(rows["voltage"].real) & np.isfinite(most).all(axis=1)
         return Phasors(
-            # Not settled is not the same as no number: the reason tells it, the phasor is 0.
+            # A search without convergence sets the reason, not NaN; the phasor is 0.
             voltage=np.where(unsettled, 0.0, rows["voltage"]),
             current=np.where(unsettled, 0.0, rows["current"]),
             voltage_std=rows["voltage_std"],
@@ -182,7 +182,7 @@ class SineFit:
         parameters = inverse @ (basis.T @ block)
         residual = block - basis @ parameters
         variance = (residual**2).sum(axis=0) / (len(block) - basis.shape[1] - 1)
-        # d x / d omega, without what the basis takes: then omega is one more column.
+        # d x / d omega, orthogonal to the basis, so omega becomes one more column.
         ramp = self._drift[:, 1:2]
         slopes = ramp * (cosine[:, np.newaxis] * parameters[1])
         slopes -= ramp * (sine[:, np.newaxis] * parameters[0])
@@ -205,9 +205,9 @@ class SineFit:
 
 
 def _combine(voltage: _Channel, current: _Channel) -> float:
-    """Correction of the common frequency; NaN where a channel carries nothing at all."""
+    """Correction of the common frequency; NaN where a channel has no signal."""
     total = voltage.step_variance + current.step_variance
-    if total == 0.0:  # both channels without noise: equally good
+    if total == 0.0:  # both channels without noise have equal weight
         return 0.5 * (voltage.step_rad_s + current.step_rad_s)
     return (
         voltage.step_rad_s * current.step_variance + current.step_rad_s * voltage.step_variance

@@ -1,7 +1,7 @@
-"""Strain from capacitance in farads, with the band that hysteresis opens, and a watch on drift.
+"""Strain from capacitance in farads, with its band due to hysteresis, and a drift check.
 
 `identify.fit_capacitance_map` fits eq. 5 of the study, in relative units, with intervals of its two
-numbers. Here a capacitance becomes a strain: the question is how far off that strain may be.
+parameters. Here a capacitance is converted to a strain, with the uncertainty of that strain.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ Floats = NDArray[np.float64]
 MapKind = Literal["auto", "line", "quadratic", "cubic"]
 
 _FEWEST = 32
-_CELLS = 24  # of equal capacitance: each counts once a branch, however long was spent there
-_TURN = 0.15  # of the range: smaller reversals are noise, not a new branch
-_FOLDS = 10  # groups that the cycles are dealt to, each left out once
-_SEGMENTS = 16  # of a record whose drift is judged
+_CELLS = 24  # of equal capacitance; each counts once per branch, however long it took
+_TURN = 0.15  # of the range: smaller reversals do not start a new branch
+_FOLDS = 10  # groups of cycles, each left out once
+_SEGMENTS = 16  # of a record that is checked for drift
 _HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
 class DriftCheck:
-    """Whether the map still holds.
+    """Whether the map is still valid.
 
     Args:
-        slope_per_hour: change of (camera's strain minus the map's) in an hour.
-        offset: their mean distance over the record.
+        slope_per_hour: change of (camera's strain minus the map's) per hour.
+        offset: mean of that difference over the record.
         verdict: "no drift seen", "drifts", or "too short to tell".
     """
 
@@ -48,23 +48,23 @@ class DriftCheck:
 def fit_strain_map(
     capacitance_f: ArrayLike, strain: ArrayLike, kind: MapKind = "auto", *, coverage: float = 0.95
 ) -> StrainMap:
-    r"""Strain as a polynomial of the capacitance, rising and falling branches alike.
+    r"""Fit strain as a polynomial of the capacitance, with equal weight for both branches.
 
     Cells of equal capacitance count once for each branch, so that neither the time spent at a
     strain nor the hysteresis shifts the map. The band is taken from deviations of cycles that were
-    left out of the fit, one after the other, so that it is valid for a cycle to come. The
-    covariance is the jackknife's: it contains what differs from cycle to cycle.
+    left out of the fit one at a time, so that it is valid for future cycles. The
+    covariance is from the jackknife, so it includes differences between cycles.
 
     Args:
         capacitance_f: in order of time, in F. Shape `(N,)`.
         strain: of the camera at the same times. Shape `(N,)`.
-        kind: "line", the study's form; "quadratic"; "cubic"; "auto" is the highest of them that
-            rises over the whole record.
-        coverage: share of the strains that the band is to contain.
+        kind: "line", the study's form; "quadratic"; "cubic"; "auto" is the highest degree for
+            which the map rises over the whole record.
+        coverage: share of the strains that the band should contain.
     Returns:
         The map with its band and the range of the record. With one cycle it has no covariance.
     Raises:
-        InputError: fewer than 32 samples, unequal lengths, NaN, a capacitance that does not change,
+        InputError: fewer than 32 samples, unequal lengths, NaN, a constant capacitance,
             an unknown kind, a coverage outside (0, 1).
         ResultError: the strain does not rise with the capacitance.
     Source: reference study, row S15, for the line; Efron, The Jackknife (1982), for the covariance.
@@ -78,9 +78,7 @@ def fit_strain_map(
     """
     c, e = _checked(capacitance_f, strain, coverage)
     if kind not in get_args(MapKind):
-        raise InputError(
-            f"kind = {kind!r}, but must be one of {', '.join(get_args(MapKind))}. Name one of them."
-        )
+        raise InputError(f"kind = {kind!r}; must be one of {', '.join(get_args(MapKind))}.")
     ends_f = (float(c.min()), float(c.max()))
     turns = _turns(c)
     record = _Record(c, e, _branches(c.size, turns), ends_f)
@@ -90,7 +88,7 @@ def fit_strain_map(
     left_out = [_left_out(record, fold == k, degree) for k in range(int(fold.max()) + 1)]
     parts = [(part, other) for part, other in left_out if part.size]
     band, held = _band([part for part, _ in parts], coverage)
-    if math.isnan(held):  # one cycle: there is none to leave out
+    if math.isnan(held):  # with one cycle there is none to leave out
         band = _tails(deviation, coverage)
     return StrainMap(
         *_in_farads(factors, ends_f),
@@ -107,19 +105,19 @@ def fit_strain_map(
 def drift_check(
     fitted: StrainMap, capacitance_f: ArrayLike, strain: ArrayLike, time_s: ArrayLike
 ) -> DriftCheck:
-    """Whether the camera's strain moves away from the map's as time goes on.
+    """Check whether the camera's strain drifts away from the map's.
 
-    The record is cut into 16 segments, whose means are taken as independent: let each hold whole
-    cycles of the drive.
+    The record is cut into 16 segments, whose means are assumed to be independent; each should
+    contain whole cycles of the drive.
 
     Args:
         fitted: the map.
         capacitance_f: in order of time. Shape `(N,)`.
         strain: of the camera at the same times. Shape `(N,)`.
-        time_s: rising. Shape `(N,)`.
+        time_s: rising times, in s. Shape `(N,)`.
     Returns:
-        Slope and offset with intervals, and a verdict: it drifts where the interval of the slope
-        leaves zero out; the record is too short where that interval would let the map leave its
+        Slope and offset with intervals, and a verdict: "drifts" if the interval of the slope
+        excludes zero; "too short to tell" if that interval would allow the map to leave its
         own band within the record.
     Raises:
         InputError: fewer than 32 samples, unequal lengths, NaN, times that do not rise, a map
@@ -138,8 +136,8 @@ def drift_check(
     c, e = _columns(capacitance_f, strain)
     if time.shape != c.shape or not np.all(np.diff(time) > 0.0):
         raise InputError(
-            f"time_s of shape {time.shape} for {c.size} samples; allowed are as many, rising. "
-            "Give the time of each sample."
+            f"time_s of shape {time.shape} for {c.size} samples; there must be as many rising "
+            "times. Give the time of each sample."
         )
     segments = np.array_split(np.arange(c.size), _SEGMENTS)
     fitted.interval(c)  # refuses a capacitance outside the map
@@ -154,7 +152,7 @@ def drift_check(
     change = _interval(slope, slope_std, "1/h")
     over_hours = float(time[-1] - time[0]) / _HOUR_S
     if fitted.band is None:
-        raise InputError("The strain map has no band to compare a drift with. Fit it to cycles.")
+        raise InputError("The strain map has no band to compare with. Fit it to several cycles.")
     reach = 0.5 * (change.ci95[1] - change.ci95[0]) * over_hours
     if not change.ci95[0] <= 0.0 <= change.ci95[1]:
         verdict = "drifts"
@@ -176,13 +174,13 @@ def _columns(capacitance_f: ArrayLike, strain: ArrayLike) -> tuple[Floats, Float
     e = np.asarray(strain, dtype=np.float64)
     if c.ndim != 1 or c.shape != e.shape or c.size < _FEWEST:
         raise InputError(
-            f"capacitance_f of shape {c.shape} and strain of shape {e.shape}; allowed are two "
-            f"columns of the same length, {_FEWEST} or more. Record for longer."
+            f"capacitance_f of shape {c.shape} and strain of shape {e.shape}; they must be two "
+            f"columns of the same length, with {_FEWEST} samples or more."
         )
     if not (np.isfinite(c).all() and np.isfinite(e).all()):
         raise InputError(
-            "capacitance_f or strain holds NaN or infinity. Leave out the samples that are not "
-            "valid, in both."
+            "capacitance_f or strain contains NaN or infinity. Remove samples that are not "
+            "valid from both."
         )
     return c, e
 
@@ -191,16 +189,16 @@ def _checked(capacitance_f: ArrayLike, strain: ArrayLike, coverage: float) -> tu
     c, e = _columns(capacitance_f, strain)
     if np.ptp(c) == 0.0:
         raise InputError(
-            f"capacitance_f is {c[0]:g} F throughout; allowed is a column that changes. Record "
+            f"capacitance_f is {c[0]:g} F throughout; it must change. Record "
             "while the actuator moves."
         )
     if not 0.0 < coverage < 1.0:
-        raise InputError(f"coverage = {coverage:g} is outside (0, 1). Take 0.95.")
+        raise InputError(f"coverage = {coverage:g} is outside (0, 1). Use for example 0.95.")
     return c, e
 
 
 def _turns(c: Floats) -> list[tuple[int, int]]:
-    """Samples where the capacitance turns, and the way it takes from there, 1 up or -1 down."""
+    """Samples where the capacitance reverses, and the direction after it: 1 up, -1 down."""
     least = _TURN * float(np.ptp(c))
     low = high = way = 0
     found: list[tuple[int, int]] = []
@@ -225,7 +223,7 @@ def _branches(size: int, turns: list[tuple[int, int]]) -> NDArray[np.intp]:
 
 
 def _folds(size: int, turns: list[tuple[int, int]]) -> NDArray[np.intp]:
-    """Cycles, from one way of turning to the next of the same, dealt to at most `_FOLDS` groups."""
+    """Cycles between equal reversals, distributed over at most `_FOLDS` groups."""
     starts = [start for start, way in turns if way == turns[0][1]]
     cycle = np.searchsorted(np.asarray(starts[1:]), np.arange(size), side="right")
     return np.asarray(cycle % _FOLDS, dtype=np.intp)
@@ -241,7 +239,7 @@ def _weights(c: Floats, branch: NDArray[np.intp]) -> Floats:
 
 @dataclass(frozen=True)
 class _Record:
-    """Samples with their branches; polynomials of them run over -1 to 1.
+    """Samples with their branches; the abscissa of polynomials is scaled to -1 to 1.
 
     Args:
         c: capacitances, in F. Shape `(N,)`.
@@ -256,7 +254,7 @@ class _Record:
     ends_f: tuple[float, float]
 
     def part(self, rows: NDArray[np.bool_]) -> _Record:
-        """Some of the samples, over the same range."""
+        """The selected samples, over the same range."""
         return _Record(self.c[rows], self.e[rows], self.branch[rows], self.ends_f)
 
     @property
@@ -265,7 +263,7 @@ class _Record:
         return np.asarray((2.0 * self.c - low_f - high_f) / (high_f - low_f))
 
     def values(self, factors: Floats) -> Floats:
-        """Strain by a polynomial of rising powers. Shape `(N,)`."""
+        """Strain from a polynomial of rising powers. Shape `(N,)`."""
         return np.asarray(np.polynomial.polynomial.polyval(self.x, factors))
 
 
@@ -273,7 +271,7 @@ def _chosen(record: _Record, kind: MapKind) -> tuple[int, Floats]:
     """Degree and factors of the map.
 
     Raises:
-        ResultError: no polynomial of the kind rises over the whole record.
+        ResultError: no polynomial of this kind rises over the whole record.
     """
     for degree in {"auto": (3, 2, 1), "cubic": (3,), "quadratic": (2,), "line": (1,)}[kind]:
         factors = _fit(record, degree)
@@ -290,7 +288,7 @@ def _chosen(record: _Record, kind: MapKind) -> tuple[int, Floats]:
 
 
 def _fit(record: _Record, degree: int) -> Floats:
-    """Factors of rising powers of `x`. Shape `(4,)`, those beyond the degree 0."""
+    """Factors of rising powers of `x`. Shape `(4,)`, zero beyond the degree."""
     root = np.sqrt(_weights(record.c, record.branch))
     columns = np.stack([record.x**power for power in range(degree + 1)], axis=1)
     factors = np.linalg.lstsq(root[:, None] * columns, root * record.e, rcond=None)[0]
@@ -300,7 +298,7 @@ def _fit(record: _Record, degree: int) -> Floats:
 def _rises(factors: Floats) -> bool:
     """Whether a polynomial of degree 3 rises from -1 to 1."""
     _, slope, curvature, cubic = factors.tolist()
-    least = slope + 3.0 * cubic - 2.0 * abs(curvature)  # of the slope at the ends
+    least = slope + 3.0 * cubic - 2.0 * abs(curvature)  # lower bound of the slope at the ends
     if cubic > 0.0 and abs(curvature) < 3.0 * cubic:  # its minimum lies between
         least = slope - curvature**2 / (3.0 * cubic)
     return bool(least > 0.0)
@@ -319,7 +317,7 @@ def _in_farads(factors: Floats, ends_f: tuple[float, float]) -> tuple[float, flo
 def _jackknife(
     others: list[tuple[float, float, float, float]],
 ) -> tuple[tuple[float, ...], ...] | None:
-    """Covariance of the map's factors from fits without a group of cycles each."""
+    """Covariance of the map's factors from fits with one group of cycles left out."""
     count = len(others)
     if count < 2:
         return None
@@ -329,7 +327,7 @@ def _jackknife(
 
 
 def _left_out(record: _Record, out: NDArray[np.bool_], degree: int) -> tuple[Floats, Floats]:
-    """Deviations of the samples left out, and the factors of the fit to the others."""
+    """Deviations of the left-out samples, and the factors of the fit to the others."""
     rest = record.part(~out)
     if not rest.c.size or np.ptp(rest.c) == 0.0:
         return np.zeros(0), np.zeros(4)
@@ -339,10 +337,10 @@ def _left_out(record: _Record, out: NDArray[np.bool_], degree: int) -> tuple[Flo
 
 
 def _band(parts: list[Floats], coverage: float) -> tuple[tuple[float, float], float]:
-    """Band of the deviations of left-out cycles, and the share inside the others' bands.
+    """Band of the deviations of left-out cycles, and the share inside the bands of the others.
 
-    A few cycles do not show all that cycles can be: the band is widened by what the bands of the
-    others would have needed to contain their share of each cycle left out.
+    A few cycles do not show the full variation, so the band is widened by the amount that the bands
+    of the others would have required to contain their share of each left-out cycle.
     """
     if len(parts) < 2:
         return (math.nan, math.nan), math.nan
@@ -363,7 +361,7 @@ def _tails(deviation: Floats, coverage: float) -> tuple[float, float]:
 
 
 def _loop_height(c: Floats, deviation: Floats, branch: NDArray[np.intp]) -> float:
-    """Largest distance of the branches' means over cells of equal capacitance."""
+    """Largest distance between the branches' means, over cells of equal capacitance."""
     cell = np.minimum((_CELLS * (c - c.min()) / np.ptp(c)).astype(np.intp), _CELLS - 1)
     means = []
     for way in (1, -1):

@@ -9,7 +9,7 @@ from haselab.base import InputError
 
 __all__ = ["constant", "linear_chirp", "multisine", "prbs", "square", "triangle"]
 
-# Feedback taps of maximal shift registers by their length: x^n + x^k + 1 and the like.
+# Feedback taps of maximal-length shift registers by their length: x^n + x^k + 1 and similar.
 _TAPS = {
     5: (5, 3), 6: (6, 5), 7: (7, 6), 8: (8, 6, 5, 4), 9: (9, 5), 10: (10, 7), 11: (11, 9),
     12: (12, 11, 10, 4), 13: (13, 12, 11, 8), 14: (14, 13, 12, 2), 15: (15, 14),
@@ -23,19 +23,19 @@ _MOST_SAMPLES = 1e8
 def _count(duration_s: float, rate_hz: float) -> int:
     if not (duration_s > 0.0 and rate_hz > 0.0):
         raise InputError(
-            f"Duration {duration_s:g} s at {rate_hz:g} Hz gives no sample; both must be positive."
+            f"Duration {duration_s:g} s at {rate_hz:g} Hz gives no sample; both must be above 0."
         )
     count = duration_s * rate_hz
     if not 0.5 < count <= _MOST_SAMPLES:
         raise InputError(
-            f"Duration {duration_s:g} s at {rate_hz:g} Hz gives {count:.3g} samples; allowed are 1 "
+            f"Duration {duration_s:g} s at {rate_hz:g} Hz gives {count:.3g} samples; it must be 1 "
             f"to {_MOST_SAMPLES:g}. Change the duration."
         )
     return round(count)
 
 
 def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:
-    """One level.
+    """Create a constant signal.
 
     Args:
         level: value of every sample, any unit.
@@ -44,7 +44,7 @@ def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.floa
     Returns:
         Samples, shape `(round(duration_s * rate_hz),)`.
     Raises:
-        InputError: no sample at all.
+        InputError: no sample.
     Example:
         >>> constant(1.0, 0.03, 100.0)
         array([1., 1., 1.])
@@ -55,18 +55,18 @@ def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.floa
 def triangle(
     low: float, high: float, frequency_hz: float, cycles: int, rate_hz: float
 ) -> NDArray[np.float64]:
-    """Triangle from `low` up to `high` and back.
+    """Create a triangle from `low` up to `high` and back.
 
     Args:
         low: start, any unit.
         high: peak, same unit.
-        frequency_hz: of one rise and fall.
-        cycles: how many.
+        frequency_hz: frequency of one rise and fall.
+        cycles: number of cycles.
         rate_hz: updates per second.
     Returns:
         Samples, shape `(round(cycles / frequency_hz * rate_hz),)`.
     Raises:
-        InputError: no sample at all.
+        InputError: no sample.
     Source: reference study, row S2.
     Example:
         >>> triangle(0.0, 2.0, 0.25, 1, 2.0)
@@ -81,7 +81,7 @@ def triangle(
 def linear_chirp(
     start_hz: float, stop_hz: float, duration_s: float, rate_hz: float
 ) -> NDArray[np.float64]:
-    r"""Sine of unit amplitude whose frequency grows linearly.
+    r"""Create a sine of unit amplitude with linearly increasing frequency.
 
     $x = \sin 2\pi\,(f_0 t + (f_1 - f_0)\,t^2 / 2T)$
 
@@ -110,10 +110,10 @@ def linear_chirp(
 
 
 def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:
-    """Plus one and minus one in turn, plus first: signs for an alternating polarity.
+    """Create a square wave of plus and minus one, plus first: signs for alternating polarity.
 
     Args:
-        frequency_hz: of one plus and one minus.
+        frequency_hz: frequency of one plus and one minus.
         duration_s: length, in s.
         rate_hz: updates per second.
     Returns:
@@ -136,17 +136,17 @@ def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np
 def prbs(
     bit_s: float, duration_s: float, rate_hz: float, register_start: int = 1
 ) -> NDArray[np.float64]:
-    """Pseudo-random binary sequence of plus and minus one, by a maximal shift register.
+    """Create a pseudo-random binary sequence of plus and minus one, by a maximal shift register.
 
     Args:
         bit_s: shortest time between two changes, in s; a whole number of updates is used.
-        duration_s: length, in s; the register is the shortest that does not repeat in it.
+        duration_s: length, in s; the shortest register that does not repeat is used.
         rate_hz: updates per second.
         register_start: content of the register at the start, above zero.
     Returns:
         Samples, shape `(round(duration_s * rate_hz),)`.
     Raises:
-        InputError: no sample, a bit shorter than an update, more bits than registers are long.
+        InputError: no sample, a bit shorter than an update, more bits than the longest register.
     Source: Ljung, System Identification, 2nd ed., sec. 13.3.
     Example:
         >>> bits = prbs(0.01, 0.31, 100.0)
@@ -159,9 +159,9 @@ def prbs(
     length = next((n for n in _TAPS if 2**n - 1 >= bits), 0)
     if bits == 0 or length == 0 or register_start % (1 << length) == 0:
         raise InputError(
-            f"Bits of {bit_s:g} s over {duration_s:g} s from start {register_start}; allowed are "
-            f"{1.0 / rate_hz:g} s or longer, up to 65535 of them, from a start that is not 0 in "
-            "the register. Change the bit's length."
+            f"Bits of {bit_s:g} s over {duration_s:g} s from start {register_start}: bits must be "
+            f"{1.0 / rate_hz:g} s or longer, at most 65535 of them, and the start must not be 0 in "
+            "the register. Change bit_s."
         )
     register = register_start % (1 << length)
     signs = np.empty(bits)
@@ -181,21 +181,21 @@ def multisine(
     power: ArrayLike = 1.0,
     trials: int = 32,
 ) -> NDArray[np.float64]:
-    r"""Sum of sines with phases for a low crest factor, peak one.
+    r"""Create a sum of sines of peak one, with phases for a low crest factor.
 
     $x = \sum_k \sqrt{2 P_k} \cos(2\pi f_k t + \varphi_k)$; Schroeder's phases are tried, then
-    random ones, and the lowest peak wins.
+    random ones, and the lowest peak is kept.
 
     Args:
         frequencies_hz: lines, in Hz. Shape `(K,)`.
         duration_s: length, in s; lines at multiples of its inverse make it periodic.
         rate_hz: updates per second.
-        power: of each line, any scale. Shape `(K,)` or one for all.
-        trials: random sets of phases.
+        power: of each line, any scale. Shape `(K,)` or one value for all.
+        trials: number of random sets of phases.
     Returns:
         Samples, shape `(round(duration_s * rate_hz),)`.
     Raises:
-        InputError: no sample, a line outside half the update rate, no power.
+        InputError: no sample, a line at or above half the update rate, no power.
     Source: Schroeder, IEEE Trans. Inf. Theory 16 (1970), 85.
     Example:
         >>> x = multisine([0.5, 1.0, 1.5, 2.0], 2.0, 100.0)

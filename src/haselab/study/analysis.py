@@ -55,7 +55,8 @@ class Analysis:
         self.study, self.rig = study, rig
         self.experiments = experiments_of(study)
         self._source, self._on_fit, self._fitted = source, on_fit, fitted
-        self._repeated, self._known = repeated or {}, known or {}
+        self._repeated = {} if repeated is None else repeated
+        self._known = known or {}
         self._seen: dict[str, Observation] = {}
         self._outcomes: dict[str, Outcome | NotPlayedError] = {}
         self._under_way: list[str] = []

@@ -253,9 +253,21 @@ def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, 
 
 
 def noise_free_results(
-    config: TwinConfig, study: Study, known: ActuatorTables | None, played: Findings
+    config: TwinConfig,
+    study: Study,
+    known: ActuatorTables | None,
+    repeated: Mapping[type, object],
 ) -> dict[str, float]:
-    """Results of the same experiments and fits on the same twin without noise, by id."""
+    """Results of the same experiments and fits on the same twin without noise.
+
+    Args:
+        config: of the twin.
+        study: what is played and fitted.
+        known: the actuator file that the study starts from; None: there is none.
+        repeated: values of the run with noise, by type, that are played again.
+    Returns:
+        Numbers by id.
+    """
     noise_free = NoiseFreeBench(config, study)
     sensing = study.sensing
     # Without noise a sensor at rest repeats the same value, which is not a fault here.
@@ -267,6 +279,6 @@ def noise_free_results(
     ) as runner:
         found = investigate(
             noise_free.observation, study, noise_free.rig.description, runner,
-            repeated=played.values, known={} if known is None else known_values(known),
+            repeated=repeated, known={} if known is None else known_values(known),
         )  # fmt: skip
     return {key: estimate.value for key, estimate in found.quantities.items()}

@@ -1,4 +1,4 @@
-"""How many positions are expected to be wrong, by their standard deviations."""
+"""Expected number of wrong positions, from their standard deviations."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ __all__ = [
     "wrong_share",
 ]
 
-LEAST_WRONG = 1e-4  # smaller shares are not believable
-LOOKALIKES = 5e-3  # wrong positions for each lost one, under covers with dots of the same kind
-_SURELY = 3.6  # deviations within which a position lies with a probability of 0.999
+LEAST_WRONG = 1e-4  # smaller shares are not credible
+LOOKALIKES = 5e-3  # wrong positions per lost one, under covers with similar dots
+_SURELY = 3.6  # standard deviations that contain a position with probability 0.999
 
 
 def may_be_uncertain(attempt: Attempt, scatter: float, options: TrackOptions) -> bool:
-    """A cheap test: is any deviation, widened by the scatter, large enough to matter?"""
-    # light that was taken out has widened them too, by less than a half
+    """Cheap test whether any standard deviation, widened by the scatter, is relevant."""
+    # the light correction has also widened them, by less than a half
     largest = 1.5 * attempt.summary.largest_std_px * sqrt(scatter)
     return attempt.believed > 0 and largest >= options.wrong_px / _SURELY
 
 
 def uncertain_points(attempt: Attempt, options: TrackOptions) -> NDArray[np.bool_]:
-    """The least certain of the points, without which no more are expected wrong than may be."""
+    """Mark the least certain points, so that the others meet the limit of wrong positions."""
     std = attempt.std_px
     valid = attempt.reason == 0
     out = np.zeros(len(valid), bool)
@@ -60,7 +60,7 @@ def expected_wrong(std_px: Floats, wrong_px: float) -> Floats:
 def wrong_share(wrong: float, valid: int, count: int) -> float:
     """Share of the valid positions that is expected to be wrong, with its lower limit.
 
-    The deviations say nothing of something alike that takes a point's place. That happens where
+    The standard deviations do not include confusion with a similar dot. That happens where
     points are covered, so the share is at least 1e-4 and at least 0.005 of the share of lost
     positions (measured: 0.001 to 0.006).
 

@@ -1,4 +1,4 @@
-"""A few points in a scene of many dots: the dots around them tell which is which."""
+"""Tracking of a few points in a scene of many dots, identified by the dots around them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["GuidedState", "GuidedTracker", "find_guides"]
 
 _MOST_GUIDES = 60
 _FEWEST_TOGETHER = 12
-_SAME_PX = 1.0  # both trackers found the same place
+_SAME_PX = 1.0  # distance within which two positions are the same
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,20 @@ class GuidedState:
 
     @property
     def noise(self) -> NoiseLaw | None:
-        """The camera's noise law, where the rest frames told it."""
+        """The camera's noise law, if the rest frames determined it."""
         return self.alone.noise
 
 
 def find_guides(frame: Frame, points_px: Floats, options: TrackOptions) -> Floats:
-    """Dots of a frame that stand beside the points, strong and far from each other.
+    """Select dots around the points, strong and well separated.
 
     Args:
-        frame: at rest. Shape `(H, W)`.
+        frame: rest frame. Shape `(H, W)`.
         points_px: the points, in px. Shape `(P, 2)`.
-        options: of the tracker.
+        options: tracker options.
 
     Returns:
-        Up to 60 dots; none where there are too few. Shape `(G, 2)`.
+        Up to 60 dots; none if there are too few. Shape `(G, 2)`.
     """
     half = options.subset_px // 2
     found = locate_particles(frame, find_profile(frame), margin_px=half + 2)
@@ -56,19 +56,19 @@ def find_guides(frame: Frame, points_px: Floats, options: TrackOptions) -> Float
 
 
 class GuidedTracker:
-    """Follows a few points each for itself, and with the dots around them as one body.
+    """Follows a few points individually, and together with the dots around them as one body.
 
-    Where the body holds a point, its place counts: the dots around a point distinguish it from
-    others that look the same. Where it does not, because the point moves and the dots around it do
-    not, the point alone counts, as long as it cannot have jumped to another dot.
+    If a point moves with the body, that position is used: the dots around it distinguish it from
+    similar ones. If it does not, because the point moves and the dots around it do
+    not, the individual position is used, as long as it cannot have jumped to another dot.
 
     Args:
         points_px: points `[x, y]` in the first frame, in px. Shape `(P, 2)`.
         guides_px: dots around them, from `find_guides`. Shape `(G, 2)`.
-        options: how to track; the model is that of the points alone.
+        options: tracker options; the model is that of the individual points.
 
     Raises:
-        InputError: all lie on one line, or as `PointTracker`.
+        InputError: all points are on one line, or as for `PointTracker`.
     """
 
     def __init__(self, points_px: Floats, guides_px: Floats, options: TrackOptions) -> None:
@@ -76,18 +76,18 @@ class GuidedTracker:
         if self._count + len(guides_px) < _FEWEST_TOGETHER:
             raise InputError(
                 f"{self._count} points and {len(guides_px)} guides; at least {_FEWEST_TOGETHER} "
-                "are needed together. Take PointTracker."
+                "are required together. Use PointTracker."
             )
         both = np.concatenate([points_px, guides_px])
         self._together = PointTracker(both, replace(options, model="neighbours"))
         self._alone = PointTracker(points_px, options)
 
     def init(self, rest_frames: Sequence[Frame]) -> GuidedState:
-        """The state at rest; see `PointTracker.init`."""
+        """Create the state at rest; see `PointTracker.init`."""
         return GuidedState(self._together.init(rest_frames), self._alone.init(rest_frames))
 
     def step(self, state: GuidedState, frame: Frame) -> tuple[GuidedState, FrameTracks]:
-        """Finds the points in the next frame; see `PointTracker.step`."""
+        """Find the points in the next frame; see `PointTracker.step`."""
         n = self._count
         body, held = self._together.step(state.together, frame)
         alone, single = self._alone.step(state.alone, frame)

@@ -1,9 +1,9 @@
-"""Which point is which: where all points went together, and whether that is the only answer.
+"""Identification of points: joint motion of all points, and whether it is unique.
 
-Dots look the same, so a match gives a position but not which point it is; the pattern of all does.
-The templates of all points, laid out as the points stand, form one pattern. Its correlation with
-the whole frame has its peak where all points went together, however far that is, and a second peak
-as high where the pattern repeats itself.
+Dots look alike, so a match gives a position but not its identity; the pattern of all points does.
+The templates of all points at their positions form one pattern. Its correlation with
+the whole frame has its peak at the joint motion, however large it is, and a second peak
+of equal height if the pattern repeats.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from haselab.tracking.subsets import Subsets
 
 __all__ = ["Hypothesis", "JointSearch", "lookalikes", "repeats"]
 
-_MOST_SIDE_PX = 512  # of the picture that is correlated; larger frames are binned
-_APART_PX = 3.0  # between two peaks
+_MOST_SIDE_PX = 512  # of the image that is correlated; larger frames are binned
+_APART_PX = 3.0  # smallest distance between two peaks
 _PEAKS = 4
-_FLOOR = 4.0  # grey levels of 8 bits: deviations below count as even grey
-_SAME = 0.6  # of the pattern's own peak: a repeat
+_FLOOR = 4.0  # grey levels of 8 bits: smaller standard deviations count as uniform grey
+_SAME = 0.6  # of the pattern's own peak: higher ones are repeats
 _MOST_REPEATS = 12
-# turns and changes of size from one frame to the next, the likelier ones first
+# rotations and scalings from one frame to the next, the most likely first
 _TURNS_DEG = tuple(s * a for a in (4, 8, 12, 16, 20, 25, 30, 36, 42) for s in (1, -1))
 _SIZES = (0.97, 1.03, 0.94, 1.06, 0.91, 1.09, 0.87, 1.13)
 
@@ -40,9 +40,9 @@ class Hypothesis:
     """One joint motion.
 
     Args:
-        matrix: of the turn or the change of size about the middle of the points. Shape `(2, 2)`.
-        shift_px: of that middle. Shape `(2,)`.
-        height: of the correlation's peak, about the number of points that it explains.
+        matrix: rotation or scaling about the centre of the points. Shape `(2, 2)`.
+        shift_px: translation of that centre. Shape `(2,)`.
+        height: of the correlation's peak, approximately the number of points that it explains.
     """
 
     matrix: Floats
@@ -67,7 +67,7 @@ def _binned(image: Singles, by: int) -> Singles:
 
 
 def _normalised(image: Singles, side: int, floor: float) -> Singles:
-    """Each pixel less the mean of the square around it, over the square's norm."""
+    """Each pixel minus the mean of the square around it, over the square's norm."""
     mean = uniform_filter(image, side, mode="nearest")
     power = uniform_filter(image * image, side, mode="nearest") - mean * mean
     return np.asarray((image - mean) / (side * np.sqrt(np.maximum(power, 0.0) + floor**2)))
@@ -79,7 +79,7 @@ class JointSearch:
     Args:
         subsets: templates of the points.
         shape: `(H, W)` of the frames.
-        bits: of a pixel that are in use.
+        bits: number of bits of a pixel that are used.
     """
 
     def __init__(self, subsets: Subsets, shape: tuple[int, int], bits: int) -> None:
@@ -91,13 +91,13 @@ class JointSearch:
         self._size = tuple(next_fast_len(size // self._bin, real=True) for size in shape)
 
     def spectrum(self, frame: Frame | Floats) -> NDArray[np.complex64]:
-        """Of a frame, normalised in squares of a subset's size."""
+        """Spectrum of a frame, normalised in squares of a subset's size."""
         grey = _binned(np.asarray(frame, np.float32), self._bin)
         side = max(self._side // self._bin, 3)
         return np.asarray(rfft2(_normalised(grey, side, self._floor * self._bin**2), self._size))
 
     def _pattern(self, poses: Poses, matrix: Floats) -> Singles:
-        """All templates at their places, turned by the matrix."""
+        """All templates at their positions, transformed by the matrix."""
         half = self._side // 2
         offsets = np.mgrid[-half : half + 1, -half : half + 1][::-1].reshape(2, -1)
         source = np.rint(np.linalg.inv(matrix) @ offsets).astype(int)
@@ -113,7 +113,7 @@ class JointSearch:
     def _peaks(
         self, spectrum: NDArray[np.complex64], pattern: Singles, count: int
     ) -> list[tuple[float, Floats]]:
-        """Highest correlations, with their shifts in px."""
+        """Highest correlations, with their translations in px."""
         product = spectrum * np.conj(rfft2(pattern, self._size))
         plane = irfft2(product, self._size)
         near = 2 * max(round(_APART_PX / self._bin), 1) + 1
@@ -130,7 +130,7 @@ class JointSearch:
     def shifts(
         self, spectrum: NDArray[np.complex64], poses: Poses, count: int = _PEAKS
     ) -> list[Hypothesis]:
-        """The likeliest shifts of all points together, the likeliest first."""
+        """The most likely translations of all points together, best first."""
         pattern = self._pattern(poses, np.eye(2))
         return [
             Hypothesis(np.eye(2), shift, height)
@@ -138,7 +138,7 @@ class JointSearch:
         ]
 
     def turns(self, spectrum: NDArray[np.complex64], poses: Poses) -> list[Hypothesis]:
-        """The likeliest turns and changes of size with a shift, the likeliest first."""
+        """The most likely rotations and scalings with a translation, best first."""
         middle = poses["centre_px"].mean(axis=0)
         found = []
         for matrix in _matrices():
@@ -156,16 +156,16 @@ def _matrices() -> Iterator[Floats]:
 
 
 def lookalikes(picture: Frame | Floats, subsets: Subsets, reach_px: int, least: float) -> Floats:
-    """Distance from each point to the nearest place in the reference that would pass for it.
+    """Distance from each point to the nearest similar place in the reference.
 
     Args:
         picture: the reference. Shape `(H, W)`.
         subsets: templates of the points.
         reach_px: how far to look, in px.
-        least: correlation (ZNCC) at which a place passes.
+        least: correlation (ZNCC) from which a place is similar.
 
     Returns:
-        Distances, in px; infinite where there is no such place. Shape `(P,)`.
+        Distances, in px; infinite if there is none. Shape `(P,)`.
     """
     side, half = subsets.side, subsets.side // 2
     edge = reach_px + half
@@ -189,15 +189,15 @@ def lookalikes(picture: Frame | Floats, subsets: Subsets, reach_px: int, least: 
 
 
 def repeats(search: JointSearch, picture: Frame | Floats, poses: Poses) -> Floats:
-    """Shifts that carry the pattern of the points onto something that looks the same.
+    """Translations that move the pattern of the points onto a similar pattern.
 
     Args:
-        search: of the points.
+        search: joint search of the points.
         picture: the reference. Shape `(H, W)`.
-        poses: of the points in it. Shape `(P,)`.
+        poses: poses of the points in it. Shape `(P,)`.
 
     Returns:
-        The shifts, in px, the shortest first. Shape `(R, 2)`; none for scattered dots.
+        The translations, in px, the shortest first. Shape `(R, 2)`; none for scattered dots.
     """
     found = search.shifts(search.spectrum(picture), poses, 8 * _MOST_REPEATS)
     own = found[0].height

@@ -1,4 +1,4 @@
-"""Who a point's neighbours are, and how their displacements tell its own and its deformation."""
+"""Neighbours of each point, and weights to predict its displacement and deformation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Neighbourhood", "build_neighbourhood"]
 _NEIGHBOURS = 12
 _FEWEST_POINTS = 6
 _WORST_CONDITION = 30.0
-_LEAST_LEFT = 0.3  # of a point's own deviation that a quadratic fit must leave to be audited
+_LEAST_LEFT = 0.3  # smallest share of a point's own error left by a quadratic fit for an audit
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class Neighbourhood:
 
     Args:
         index: neighbours of each point, itself left out. Shape `(P, K)`.
-        lever_px: point less neighbour in the reference, in px. Shape `(P, K, 2)`.
+        lever_px: point minus neighbour in the reference, in px. Shape `(P, K, 2)`.
         weights: displacement gradient from the neighbours' displacements relative to the
             point's own, in 1/px. Shape `(P, 2, K)`.
         smooth: value at the point of an affine least-squares fit through its own value and those
             of the neighbours, in this order. Shape `(P, K + 1)`.
-        rough: what a quadratic, then an affine least-squares fit leaves at the point, in the same
-            order; zeros where too few neighbours stand around it. Shape `(P, 2, K + 1)`.
+        rough: residual weights of a quadratic and of an affine least-squares fit at the point, in
+            the same order; zeros where there are too few neighbours. Shape `(P, 2, K + 1)`.
     """
 
     index: NDArray[np.int32]
@@ -42,7 +42,7 @@ class Neighbourhood:
 
     @classmethod
     def none(cls, count: int) -> Neighbourhood:
-        """Each of `count` points for itself."""
+        """Neighbourhood of `count` independent points."""
         index = np.zeros((count, 0), np.int32)
         alone = np.zeros((count, 1))
         nothing = np.zeros((count, 2, 1))
@@ -50,17 +50,17 @@ class Neighbourhood:
 
 
 def build_neighbourhood(points_px: Floats, exact_px: Floats | None = None) -> Neighbourhood:
-    """The nearest neighbours of each point and the weights of a local affine fit.
+    """Find the nearest neighbours of each point and the weights of a local affine fit.
 
     Args:
         points_px: middles of the subsets `[x, y]` in the reference, in px. Shape `(P, 2)`.
-        exact_px: the points themselves, where they lie beside those, in px. Shape `(P, 2)`.
+        exact_px: the points themselves, if they differ from the centres, in px. Shape `(P, 2)`.
 
     Returns:
-        Up to 12 neighbours a point.
+        Up to 12 neighbours per point.
 
     Raises:
-        InputError: fewer than 6 points, or some lie on a line with all their neighbours.
+        InputError: fewer than 6 points, or some are collinear with all their neighbours.
 
     Example:
         >>> grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), -1).reshape(-1, 2)
@@ -72,8 +72,8 @@ def build_neighbourhood(points_px: Floats, exact_px: Floats | None = None) -> Ne
     count = len(points_px)
     if count < _FEWEST_POINTS:
         raise InputError(
-            f"the model 'neighbours' needs at least {_FEWEST_POINTS} points, got {count}. "
-            "Take 'translation' or 'affine', or more points."
+            f"The model 'neighbours' needs at least {_FEWEST_POINTS} points, not {count}. "
+            "Use 'translation' or 'affine', or more points."
         )
     kept = min(_NEIGHBOURS, count - 1)
     index = cKDTree(points_px).query(points_px, kept + 1)[1][:, 1:]
@@ -83,8 +83,8 @@ def build_neighbourhood(points_px: Floats, exact_px: Floats | None = None) -> Ne
     if thin.any():
         x, y = points_px[int(np.argmax(thin))]
         raise InputError(
-            f"{int(thin.sum())} points lie on a line with all their neighbours, the first at "
-            f"({x:.1f}, {y:.1f}) px. Add points beside the line, or take 'translation'."
+            f"{int(thin.sum())} points are collinear with all their neighbours, the first at "
+            f"({x:.1f}, {y:.1f}) px. Add points beside the line, or use 'translation'."
         )
     around = np.concatenate([np.zeros((count, 1, 2)), -lever], axis=1)
     design = np.concatenate([np.ones((count, kept + 1, 1)), around], axis=2)
@@ -96,7 +96,7 @@ def build_neighbourhood(points_px: Floats, exact_px: Floats | None = None) -> Ne
 
 
 def _roughness(around: Floats) -> Floats:
-    """Weights of what a quadratic and an affine fit leave at the first of K + 1 places."""
+    """Residual weights of a quadratic and an affine fit at the first of K + 1 points."""
     x, y = np.moveaxis(around / np.abs(around).max(), 2, 0)
     affine = np.stack([np.ones_like(x), x, y], axis=2)
     quadratic = np.concatenate([affine, np.stack([x * x, x * y, y * y], axis=2)], axis=2)

@@ -1,4 +1,4 @@
-"""How points are tracked, and the types that the whole room shares."""
+"""Tracker options, and types shared by the package."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ _SMALLEST_SUBSET_PX = 7
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Choices of the point tracker.
+    """Options of the point tracker.
 
     Args:
         subset_px: side of the square subset around each point, in px, odd.
-        model: `"translation"` solves for 2 unknowns a point; `"neighbours"` too, with the subset
-            deformed as the neighbours' displacements say, which also catches points that jumped;
+        model: `"translation"` solves for 2 unknowns per point; `"neighbours"` too, with the subset
+            deformed according to the neighbours' displacements, which also detects jumps;
             `"affine"` solves for 6 unknowns, for few points on a textured surface.
         search_px: radius of the whole-pixel search for a point that was lost, in px; 0 for none.
         minimum_quality: correlation (ZNCC) below which a point counts as lost.
-        wrong_px: error of a position that counts as wrong, in px.
-        most_wrong: share of the valid positions of a frame that may be expected to be wrong, by
-            their standard deviations; the least certain points are not valid until it is met.
+        wrong_px: error from which a position counts as wrong, in px.
+        most_wrong: largest expected share of wrong positions among the valid ones of a frame, by
+            their standard deviations; the least certain points are marked invalid to meet it.
         smoothing_px: standard deviation of the Gaussian that smooths the reference gradient, in
-            px; it keeps the reference's noise out of the solve.
+            px; it reduces the effect of the reference's noise.
         tolerance_px: a point has converged when its step falls below this, in px. A step leaves
-            about a tenth of its size to go.
-        max_iterations: most Gauss-Newton steps for a point and frame.
+            an error of about a tenth of its size.
+        max_iterations: largest number of Gauss-Newton steps per point and frame.
 
     Raises:
-        InputError: a choice lies outside its range.
+        InputError: an option is outside its range.
 
     Example:
         >>> TrackOptions(subset_px=15).model
@@ -65,7 +65,7 @@ class TrackOptions:
         ):
             raise InputError(
                 f"subset_px = {self.subset_px} is not an odd number in [{_SMALLEST_SUBSET_PX}, "
-                f"{_LARGEST_SUBSET_PX}]. Take an odd side that covers two or three dots."
+                f"{_LARGEST_SUBSET_PX}]. Use an odd side that covers two or three dots."
             )
         if self.model not in ("translation", "neighbours", "affine"):
             raise InputError(

@@ -1,4 +1,4 @@
-"""Given points followed through a video: positions, standard deviations, quality."""
+"""Tracking of given points through a video: positions, standard deviations, quality."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ from haselab.tracking.tracks import FrameTracks, LossReason, Tracks, TrackState
 
 __all__ = ["PointTracker", "track_frames"]
 
-_FIELD_POINTS = 12  # from so many on, affine subsets start from their neighbours' deformation
-_DOUBT = 0.02  # share of the points lost in one frame at which all are looked for together
-_EXPLAINED = 0.98  # share of the points at which a joint motion needs no second look
-_MOSTLY = 0.8  # share at which turns need not be tried
-_FEWEST_TOGETHER = 6  # points that tell a joint affine motion
-_SURPRISE_PX = 1.0  # from the expected places; beyond, the pattern's repeats are asked
-_EVEN_LIGHT = 0.004  # relative; a slope of that over 30 px moves a dot by 0.004 px
+_FIELD_POINTS = 12  # from this number on, affine subsets start with their neighbours' deformation
+_DOUBT = 0.02  # share of the points lost in one frame above which all are searched for jointly
+_EXPLAINED = 0.98  # share of the points above which a joint motion needs no further check
+_MOSTLY = 0.8  # share above which rotations need not be tried
+_FEWEST_TOGETHER = 6  # fewest points for a joint affine motion
+_SURPRISE_PX = 1.0  # from the expected positions; above, the pattern's repeats are checked
+_EVEN_LIGHT = 0.004  # relative; such a slope over 30 px shifts a dot by 0.004 px
 _MANY_STRAYED = 0.2  # share of the points
-_FEWEST_AUDITED = 20  # numbers that an audit takes
+_FEWEST_AUDITED = 20  # fewest values for an audit
 _SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed 1
-_LEAST_LEFT = 0.05  # of a template's power; below, the pattern could well be the texture
-_DOTS_IN_SUBSET = 6.0  # sides of a subset to the distance at which a dot's slopes are unlike
-_MOVED_PX = 1.5  # along x or y; an offset has left its pixel
-_DUE = 0.1  # share of the points due for a new template at which the reference is renewed
+_LEAST_LEFT = 0.05  # of a template's power; below, the pattern may be the texture
+_DOTS_IN_SUBSET = 6.0  # distance, in sides of a subset, at which a dot's gradients differ
+_MOVED_PX = 1.5  # along x or y, after which an offset is outside its pixel
+_DUE = 0.1  # share of strongly deformed points at which the reference is renewed
 
 
 class PointTracker:
-    """Follows given points by subset matching against one reference, the frames at rest.
+    """Tracks given points by subset matching against a reference, the mean of the rest frames.
 
     With neighbours, the reference is renewed when more than a tenth of the points are stretched by
     more than 1.4 or to less than two thirds: the templates of all points that are valid in that
-    frame are taken from it. Their displacements still count from the first reference.
+    frame are replaced. Displacements remain relative to the first reference.
 
     Args:
         points_px: points `[x, y]` in the first frame, in px (pixel centres at integers).
             Shape `(P, 2)`.
-        options: how to track.
+        options: tracker options.
 
     Raises:
         InputError: the points are not finite numbers of shape `(P, 2)`.
@@ -73,29 +73,30 @@ class PointTracker:
         points = np.array(points_px, float)
         if points.ndim != 2 or points.shape[1] != 2 or not len(points):
             raise InputError(
-                f"points_px has shape {points.shape}, expected (P, 2) with P >= 1: [x, y] a row."
+                f"points_px has shape {points.shape}, expected (P, 2) with P >= 1: one row [x, y] "
+                "per point."
             )
         if not np.isfinite(points).all():
-            raise InputError("points_px holds numbers that are not finite. Remove those points.")
+            raise InputError("points_px contains values that are not finite. Remove those points.")
         self._points = points
         self._options = options or TrackOptions()
         self._neighbourhood = _neighbourhood(points, self._options.model)
         self._together = self._neighbourhood.index.size > 0
 
     def init(self, rest_frames: Sequence[Frame]) -> TrackState:
-        """The state at rest, from the frames whose mean is the reference.
+        """Create the state at rest from the frames whose mean is the reference.
 
         Args:
-            rest_frames: one or more frames `(H, W)`, uint8 or uint16, nothing moving.
+            rest_frames: one or more frames `(H, W)`, uint8 or uint16, without motion.
 
         Returns:
-            The state before the first frame. With two frames or more it holds the noise law.
+            The state before the first frame. With two frames or more it contains the noise law.
 
         Raises:
             InputError: no frame, frames that differ in shape, or a point that cannot be tracked.
         """
         if not rest_frames:
-            raise InputError("no rest frame given. At least one is needed, ten are better.")
+            raise InputError("No rest frame was given. At least one is required; ten are better.")
         shape = rest_frames[0].shape
         for frame in rest_frames:
             _check_frame(frame, shape)
@@ -110,7 +111,7 @@ class PointTracker:
     def _without(
         self, pattern: FixedPattern, rest_frames: Sequence[Frame], plain: Reference
     ) -> Reference | None:
-        """The reference less a pattern; `None` where the points show little else."""
+        """The reference without a pattern; `None` where the points have little other texture."""
         clean = [pattern.removed(frame) for frame in rest_frames]
         try:
             reference = first_reference(clean, self._points, self._options, self._neighbourhood)
@@ -138,7 +139,7 @@ class PointTracker:
         )
 
     def placed(self, state: TrackState, points_px: Floats) -> TrackState:
-        """The same reference in a new clip: the points stand still, about where they are told.
+        """Use the same reference for a new clip, with stationary points at given positions.
 
         Args:
             state: from `init` or `step`.
@@ -148,7 +149,7 @@ class PointTracker:
             The state before the first frame of the clip.
 
         Raises:
-            InputError: another number of points.
+            InputError: a different number of points.
         """
         if np.shape(points_px) != self._points.shape:
             raise InputError(
@@ -160,7 +161,7 @@ class PointTracker:
         return self._at_rest(state.reference, centres, state.pattern, state.textured)
 
     def step(self, state: TrackState, frame: Frame) -> tuple[TrackState, FrameTracks]:
-        """Finds all points in the next frame.
+        """Find all points in the next frame.
 
         Args:
             state: from `init` or the previous `step`.
@@ -184,7 +185,7 @@ class PointTracker:
             attempt = self._identified(state, frame, attempt)
         summary = attempt.summary
         audit = summary.audit
-        # of points that move each for itself, others that come near would pass for uneven light
+        # for independently moving points, others nearby would look like uneven light
         if self._together and summary.unevenness > _EVEN_LIGHT and attempt.believed:
             self._take_light_out(state.reference, frame, attempt)
             audit = _track.audit(state.reference.native, attempt.position_px, attempt.std_px)
@@ -200,7 +201,7 @@ class PointTracker:
         return replace(after, textured=state.textured), attempt.tracks()
 
     def _decided(self, state: TrackState, frame: Frame) -> TrackState:
-        """Whether the pattern is the sensor's or the scene's, once enough points have moved."""
+        """Decide whether the pattern belongs to sensor or scene, once enough points have moved."""
         rest, now = state.reference.centres_px, state.poses["centre_px"]
         moved = (state.reason == 0) & (np.abs(now - rest).max(axis=1) > _MOVED_PX)
         if state.pattern is None or state.textured is None or 4 * moved.sum() < len(moved):
@@ -211,23 +212,23 @@ class PointTracker:
         return replace(state, reference=state.textured, pattern=None, textured=None)
 
     def _audited(self, state: TrackState, attempt: Attempt, audit: tuple[float, int]) -> float:
-        """Widens the deviations where the points scatter more about a smooth field than they state.
+        """Widen standard deviations that are smaller than the scatter about a smooth field.
 
-        The least certain points are not valid where too many would be wrong. Returns the scatter
-        of this frame, or the last one known where too many neighbours are lost to tell it.
+        The least certain points become invalid if too many would be wrong. Returns the scatter
+        of this frame, or the last known one if too many neighbours are lost.
         """
         scatter = state.scatter
         ratio, numbers = audit
         if numbers >= _FEWEST_AUDITED:
             scatter = ratio if ratio > 1.0 + _SIGNIFICANT * sqrt(2.0 / numbers) else 1.0
-            scatter = max(scatter, 0.5 * state.scatter)  # a codec errs in bursts
+            scatter = max(scatter, 0.5 * state.scatter)  # errors of a codec come in bursts
         strayed = attempt.summary.strayed / len(self._points)
         if strayed > _MANY_STRAYED and attempt.believed and (attempt.reason == 0).any():
-            # so many are no accidents: they are the tails of errors that all points have
+            # this many are not outliers but the tails of errors common to all points
             spread = JUMP_PX / float(np.nanmedian(attempt.std_px))
             scatter = max(scatter, strayed * spread**2)
         if scatter > 1.0 and attempt.believed:
-            # all points of a frame share what shakes them, whatever their own noise
+            # all points of a frame share common disturbances, whatever their own noise
             common = (scatter - 1.0) * np.nanmean(attempt.std_px**2)
             attempt.std_px = np.sqrt(attempt.std_px**2 + common)
         if state.pattern is not None or may_be_uncertain(attempt, scatter, self._options):
@@ -235,7 +236,7 @@ class PointTracker:
         return scatter
 
     def _drop(self, attempt: Attempt) -> None:
-        """Makes the least certain points invalid; all, where few are left, which is chance."""
+        """Mark the least certain points as invalid; all of them if only few would remain."""
         coarse = uncertain_points(attempt, self._options)
         if coarse.any():
             if 3 * np.count_nonzero((attempt.reason == 0) & ~coarse) < len(coarse):
@@ -244,7 +245,7 @@ class PointTracker:
             attempt.position_px[:, coarse] = attempt.std_px[:, coarse] = np.nan
 
     def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:
-        """Corrects the positions for slopes of the light, and their deviations for the cost."""
+        """Correct the positions for brightness slopes, and their standard deviations for that."""
         samples = np.empty(reference.subsets.shape.shape, np.float32)
         _track.samples(reference.native, frame, reference.bits, attempt.poses, samples)
         used = attempt.reason == 0
@@ -259,7 +260,7 @@ class PointTracker:
             attempt.std_px = np.sqrt(attempt.std_px**2 + found.variance_px2.T)
 
     def _attempt(self, state: TrackState, frame: Frame, poses: Poses | None = None) -> Attempt:
-        """One frame from where the state, or `poses`, expects the points."""
+        """Try to find the points of a frame from the expected, or given, poses."""
         reference, count = state.reference, len(self._points)
         after_poses, gain = np.empty_like(state.poses), np.empty(1)
         velocity_px, reason = np.empty((count, 2)), np.empty(count, np.uint8)
@@ -298,10 +299,10 @@ class PointTracker:
         return made
 
     def _stay_certain(self, state: TrackState, attempt: Attempt) -> None:
-        """Points without neighbours are ambiguous from where they may have jumped to another dot.
+        """Mark points without neighbours as ambiguous if they may have jumped to another dot.
 
-        A point keeps its name while it is within a quarter of the distance to its nearest
-        look-alike from where its velocity puts it.
+        A point keeps its identity while it is within a quarter of the distance to its nearest
+        similar dot from the position expected by its velocity.
         """
         if not attempt.summary.ambiguous and attempt.summary.most_surprise_px <= _SURPRISE_PX:
             return
@@ -319,7 +320,7 @@ class PointTracker:
             attempt.position_px[:, lost] = attempt.std_px[:, lost] = np.nan
 
     def _identified(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
-        """The attempt that explains most points, and whether another does so as well."""
+        """The attempt that explains most points, marked if another does so equally well."""
         summary, count = plain.summary, len(self._points)
         best = plain
         if summary.newly_lost >= max(2, _DOUBT * count) or 2 * plain.believed < count:
@@ -331,7 +332,7 @@ class PointTracker:
         return self._unambiguous(state, frame, best, around, moves_on) if len(around) else best
 
     def _best(self, state: TrackState, frame: Frame, plain: Attempt) -> Attempt:
-        """The joint motion that explains most points; of equals the least surprising."""
+        """The joint motion that explains most points; among equals the smallest surprise."""
         search, count = state.reference.search, len(self._points)
         spectrum = search.spectrum(frame)
         middle = state.poses["centre_px"].mean(axis=0)
@@ -354,11 +355,11 @@ class PointTracker:
     def _unambiguous(
         self, state: TrackState, frame: Frame, best: Attempt, around: Floats, moves_on: bool
     ) -> Attempt:
-        """The best attempt; all its points are ambiguous where a repeat explains the frame as well.
+        """The best attempt; its points are ambiguous if a repeat explains the frame equally well.
 
-        A rival that leaves three visible points more unexplained is out: each is missed with a
-        probability of a few per cent. Of rivals that are not, the motion decides, where the state
-        tells one and the best is within a quarter of the distance to the nearest repeat.
+        An alternative that misses three more visible points is excluded: each is missed with a
+        probability of a few per cent. Among the others the motion decides, if the state
+        has one and the best is within a quarter of the distance to the nearest repeat.
         """
         nearest = float(np.hypot(*around[0]))
         if moves_on and best.surprise_px <= 0.25 * nearest:
@@ -388,9 +389,9 @@ class PointTracker:
 
 
 def _left_variance(state: TrackState, attempt: Attempt) -> Floats:
-    """Variance along x and y from what the templates keep of a fixed pattern. Shape `(2, P)`.
+    """Variance along x and y due to the fixed pattern left in the templates. Shape `(2, P)`.
 
-    It is that of the pattern as noise of one frame, for points that have moved away from it.
+    The pattern counts as noise of one frame, for points that have moved away from it.
     """
     if state.pattern is None:
         return np.zeros((2, len(attempt.reason)))
@@ -402,13 +403,13 @@ def _left_variance(state: TrackState, attempt: Attempt) -> Floats:
 
 
 def _neighbourhood(points_px: Floats, model: Model) -> Neighbourhood:
-    """Neighbours where the model needs them, or where an affine field has them to offer."""
+    """Neighbours if the model needs them, or for an affine field with enough points."""
     if model == "neighbours":
         return build_neighbourhood(np.rint(points_px), points_px)
     if model == "affine" and len(points_px) >= _FIELD_POINTS:
         try:
             return build_neighbourhood(np.rint(points_px), points_px)
-        except InputError:  # a row of points: each for itself
+        except InputError:  # collinear points are tracked individually
             pass
     return Neighbourhood.none(len(points_px))
 
@@ -416,13 +417,13 @@ def _neighbourhood(points_px: Floats, model: Model) -> Neighbourhood:
 def _check_frame(frame: Frame, shape: tuple[int, ...]) -> None:
     if frame.ndim != 2 or frame.dtype not in (np.uint8, np.uint16):
         raise InputError(
-            f"a frame is {frame.dtype} of shape {frame.shape}; expected uint8 or uint16 of "
+            f"A frame is {frame.dtype} of shape {frame.shape}; expected uint8 or uint16 of "
             "shape (H, W). Convert colour frames to grey first."
         )
     if frame.shape != tuple(shape):
         raise InputError(
-            f"a frame has shape {frame.shape}, the reference {tuple(shape)}. All frames of a "
-            "clip must be alike."
+            f"A frame has shape {frame.shape}, but the reference {tuple(shape)}. All frames of a "
+            "clip must have the same shape."
         )
 
 
@@ -432,19 +433,19 @@ def track_frames(
     options: TrackOptions | None = None,
     rest_frames: int = 1,
 ) -> Tracks:
-    """Points through a whole clip.
+    """Track points through a whole clip.
 
     Args:
-        frames: frames `(H, W)` in order, uint8 or uint16; taken one by one.
+        frames: frames `(H, W)` in order, uint8 or uint16; read one by one.
         points_px: points `[x, y]` in the first frame, in px. Shape `(P, 2)`.
-        options: how to track.
-        rest_frames: how many of the first frames, at rest, are averaged as the reference.
+        options: tracker options.
+        rest_frames: number of initial frames, at rest, that are averaged as the reference.
 
     Returns:
-        The tracks of all frames, the rest frames among them.
+        The tracks of all frames, including the rest frames.
 
     Raises:
-        InputError: fewer frames than `rest_frames`, or as `PointTracker`.
+        InputError: fewer frames than `rest_frames`, or as for `PointTracker`.
 
     Example:
         >>> frame = np.random.default_rng(2).integers(0, 255, (60, 60), dtype=np.uint8)
@@ -452,12 +453,12 @@ def track_frames(
         [[30.0], [30.0]]
     """
     if rest_frames < 1:
-        raise InputError(f"rest_frames = {rest_frames} is below 1. Take the frames before motion.")
+        raise InputError(f"rest_frames = {rest_frames} is below 1. Use frames without motion.")
     stream = iter(frames)
     rest = list(islice(stream, rest_frames))
     if len(rest) < rest_frames:
         raise InputError(
-            f"the clip has {len(rest)} frames, {rest_frames} rest frames were asked for. "
+            f"The clip has {len(rest)} frames, but {rest_frames} rest frames were requested. "
             "Lower rest_frames."
         )
     tracker = PointTracker(points_px, options)

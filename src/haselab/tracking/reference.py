@@ -1,4 +1,4 @@
-"""What the frames of a clip are compared with, and how it is renewed."""
+"""The reference that frames are compared with, and its renewal."""
 
 from __future__ import annotations
 
@@ -20,31 +20,32 @@ from haselab.tracking.subsets import Subsets, build_subsets
 
 __all__ = ["JUMP_PX", "Reference", "first_reference", "poses_at", "renewed_reference"]
 
-JUMP_PX = 1.0  # farther than this from where the neighbours put it, a point has strayed
-_MOST_RESIDUAL = 8.0  # mean square residual over the noise's, against the median point
-_MOST_GAIN = 2.0  # contrast over the median point's, or the other way round
-_UNIT_LAW = NoiseLaw(1.0, 0.0)  # where one rest frame tells no law, the residual scales it
+JUMP_PX = 1.0  # largest distance of a point from the position predicted by its neighbours
+_MOST_RESIDUAL = 8.0  # largest mean square residual over the noise's, relative to the median point
+_MOST_GAIN = 2.0  # largest ratio of contrast to that of the median point, or its inverse
+_UNIT_LAW = NoiseLaw(1.0, 0.0)  # used with one rest frame; the residual scales it
 _HEADROOM = 1.5  # of a 16-bit frame's grey levels over the reference's largest
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What the frames are compared with.
+    """The reference that frames are compared with.
 
     Args:
         subsets: templates of the points.
         points_px: the points at rest. Shape `(P, 2)`.
         base: inverse of the deformation gradient that each point had when its template was
             taken; the identity at rest. Shape `(P, 2, 2)`.
-        covariance: the reference's share in that of each displacement, in px². Shape `(P, 2, 2)`.
+        covariance: the reference's contribution to that of each displacement, in px².
+            Shape `(P, 2, 2)`.
         frames: how many were averaged into each template. Shape `(P,)`.
         around: neighbours of the points.
-        noise: the camera's noise law, `None` when one rest frame could not tell it.
+        noise: the camera's noise law, `None` with a single rest frame.
         shape: `(H, W)` of all frames.
-        bits: of a pixel that are in use.
-        picture: mean of the frames at rest, rounded. Shape `(H, W)`.
-        native: all of this, for the kernel.
-        rules: the tracker's choices, for the kernel.
+        bits: number of bits of a pixel that are used.
+        picture: mean of the rest frames, rounded. Shape `(H, W)`.
+        native: the same data for the native kernel.
+        rules: the tracker's options for the native kernel.
     """
 
     subsets: Subsets
@@ -62,21 +63,21 @@ class Reference:
 
     @cached_property
     def search(self) -> JointSearch:
-        """Where all points went together in a frame."""
+        """Search for the joint motion of all points."""
         return JointSearch(self.subsets, self.shape, self.bits)
 
     @cached_property
     def slopes(self) -> LightSlopes:
-        """Reads uneven light from the subsets."""
+        """Estimator of uneven light from the subsets."""
         return build_slopes(self.subsets)
 
     @cached_property
     def repeats_px(self) -> Floats:
-        """Shifts that carry the points onto look-alikes. Shape `(R, 2)`, the shortest first."""
+        """Translations to similar patterns. Shape `(R, 2)`, the shortest first."""
         return repeats(self.search, self.picture, poses_at(self.centres_px))
 
     def lookalikes_px(self, reach_px: int, least: float) -> Floats:
-        """Distance from each point to its nearest look-alike; see `identity.lookalikes`. `(P,)`."""
+        """Distance from each point to its nearest similar dot. Shape `(P,)`."""
         known = self._lookalikes.get((reach_px, least))
         if known is None:
             known = lookalikes(self.picture, self.subsets, reach_px, least)
@@ -89,7 +90,7 @@ class Reference:
 
     @property
     def centres_px(self) -> Floats:
-        """Where the subsets' centres are at rest. Shape `(P, 2)`."""
+        """Rest positions of the subsets' centres. Shape `(P, 2)`."""
         return _centres_at_rest(self.points_px, self.base, self.subsets)
 
 
@@ -119,16 +120,16 @@ def first_reference(
     options: TrackOptions,
     around: Neighbourhood,
 ) -> Reference:
-    """The mean of frames at rest as reference.
+    """Create a reference from the mean of rest frames.
 
     Args:
         rest_frames: one or more frames `(H, W)` of one shape, uint8 or uint16.
         points_px: points `[x, y]` in them, in px. Shape `(P, 2)`.
-        options: how to track.
+        options: tracker options.
         around: neighbours of the points.
 
     Returns:
-        The reference; with two frames or more it holds the noise law.
+        The reference; with two frames or more it contains the noise law.
 
     Raises:
         InputError: a point is too close to the edge, or has no texture.
@@ -165,22 +166,22 @@ def renewed_reference(
     where: Floats,
     options: TrackOptions,
 ) -> tuple[Reference, Poses]:
-    """Templates taken anew from one frame, where its points allow it.
+    """Renew the templates from one frame, where its points allow it.
 
-    A point's error in that frame has two parts. The one from the frame's noise is in the new
-    template too, with the opposite sign, so displacements against it keep only the other, the old
-    reference's.
+    A point's error in that frame has two parts. The part from the frame's noise is also in the new
+    template, with the opposite sign, so displacements relative to it keep only the other part, the
+    old reference's.
 
     Args:
-        old: the reference so far.
+        old: the current reference.
         frame: the frame, `(H, W)`.
         poses: centre and deformation gradient of each subset in it. Shape `(P,)`.
         valid: points that were found in it. Shape `(P,)`.
-        where: the points in it, `[x, y]`, in px. Shape `(P, 2)`.
-        options: how to track.
+        where: positions of the points in it, `[x, y]`, in px. Shape `(P, 2)`.
+        options: tracker options.
 
     Returns:
-        The reference and the poses against it; the old ones when a subset shows no texture now.
+        The reference and the poses relative to it; the old ones if a subset has no texture now.
         Points that are not valid or too near to the edge keep their template.
     """
     half = options.subset_px // 2 + 1
@@ -193,7 +194,7 @@ def renewed_reference(
     except InputError:  # no texture in a subset
         return old, poses
     subsets = _merged(old.subsets, fresh, new)
-    stretch = poses["deformation"][new]  # of the old templates
+    stretch = poses["deformation"][new]  # deformation of the old templates
     base, covariance, frames = old.base.copy(), old.covariance.copy(), old.frames.copy()
     base[new] = old.base[new] @ np.linalg.inv(stretch)
     covariance[new] = stretch @ covariance[new] @ stretch.transpose(0, 2, 1)
@@ -221,7 +222,7 @@ def renewed_reference(
 
 
 def _merged(old: Subsets, fresh: Subsets, new: NDArray[np.bool_]) -> Subsets:
-    """The old subsets with the fresh ones in their places."""
+    """The old subsets with some replaced by new ones."""
     parts = {}
     for part in fields(Subsets):
         value = getattr(old, part.name)
@@ -233,7 +234,7 @@ def _merged(old: Subsets, fresh: Subsets, new: NDArray[np.bool_]) -> Subsets:
 
 
 def _squared_cardinal_weights(fractions: Floats) -> Floats:
-    """Sum of squared weights with which cubic-spline interpolation draws on the pixels."""
+    """Sum of squared pixel weights of cubic-spline interpolation."""
     pixels = np.arange(-12, 14)
     pole = np.sqrt(3.0) - 2.0
     lag = np.abs(pixels[:, None] - pixels[None, :])
@@ -251,7 +252,7 @@ _WHITE = _squared_cardinal_weights(np.linspace(0.0, 1.0, 33)).astype(np.float32)
 
 
 def _bits_in_use(frames: Sequence[Frame]) -> int:
-    """8 for bytes; else what the largest grey level and half as much again need, 8 to 16."""
+    """8 for bytes; otherwise bits for 1.5 times the largest grey level, 8 to 16."""
     if frames[0].dtype == np.uint8:
         return 8
     largest = max(int(frame.max()) for frame in frames)
@@ -266,7 +267,7 @@ def _native_points(
     frames: NDArray[np.intp],
     around: Neighbourhood,
 ) -> _track.Points:
-    """The reference in the kernel's layout."""
+    """The reference in the layout of the native kernel."""
     noise = np.empty(len(frames), _track.NOISE)
     upper = (slice(None), [0, 0, 1], [0, 1, 1])
     noise["even"], noise["shaped"] = subsets.even[upper], subsets.shaped[upper]

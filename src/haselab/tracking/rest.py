@@ -1,4 +1,4 @@
-"""How many of the first frames show the points at rest."""
+"""Number of initial frames in which the points are at rest."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from haselab.tracking.points import PointTracker
 
 __all__ = ["frames_at_rest"]
 
-_LEAST_PX = 0.05  # a smaller joint motion is not looked for
-_CERTAIN = 5.0  # standard deviations
+_LEAST_PX = 0.05  # a smaller joint motion is ignored
+_CERTAIN = 5.0  # standard deviations of a significant motion
 _FEWEST_FOR_AFFINE = 6
 _SECOND_DIFFERENCE = 0.6745 * 6.0**0.5  # its median size over the standard deviation
-_FEWEST_BEFORE = 3  # frames that show how much the picture shakes at rest
+_FEWEST_BEFORE = 3  # frames needed to estimate camera shake at rest
 
 
 def _joint_motion(frames: Sequence[Frame], points_px: Floats, options: TrackOptions) -> Floats:
-    """Joint motion of the points against the first frame and its deviation. `(F, 2 K)` each.
+    """Joint motion of the points relative to the first frame, and its std. `(F, 2 K)` each.
 
-    For six points or more an affine motion, given where the points' spread ends along x and y
-    (K = 3 places), else the mean (K = 1). NaN in frames where fewer than half are found.
+    For six points or more an affine motion, evaluated at the ends of the points' spread along x
+    and y (K = 3 places), else the mean (K = 1). NaN in frames where fewer than half are found.
     """
     tracker = PointTracker(points_px, replace(options, model="translation"))
     state = tracker.init(frames[:1])
@@ -41,7 +41,7 @@ def _joint_motion(frames: Sequence[Frame], points_px: Floats, options: TrackOpti
         used = found.valid.copy()
         if 2 * used.sum() < len(used) or used.sum() < design.shape[1]:
             continue
-        # points that went astray are left out
+        # points with wrong positions are excluded
         away = np.abs(moved - np.median(moved[used], axis=0)).max(axis=1)
         used &= away <= 5.0 * max(float(np.median(away[used])), 0.05)
         inverse = np.linalg.pinv(design[used])
@@ -56,9 +56,9 @@ def _joint_motion(frames: Sequence[Frame], points_px: Floats, options: TrackOpti
 
 
 def _shaking(motion: Floats) -> Floats:
-    """Standard deviation from frame to frame; a steady motion or a step does not count. `(2 K,)`.
+    """Standard deviation between frames, without a steady motion or a step. `(2 K,)`.
 
-    From the median second difference, of at least four frames; else 0.
+    From the median second difference, of at least four frames; otherwise 0.
     """
     known = motion[np.isfinite(motion).all(axis=1)]
     if len(known) < 4:
@@ -67,16 +67,16 @@ def _shaking(motion: Floats) -> Floats:
 
 
 def frames_at_rest(rest_frames: Sequence[Frame], points_px: Floats, options: TrackOptions) -> int:
-    """How many of the first frames show no joint motion of the points.
+    """Count the initial frames without joint motion of the points.
 
-    The points are followed from the first frame. From the frame on from which all further ones lie
-    off the mean of those before (by 5 standard deviations, by 5 times what the picture shakes,
-    and by 0.05 px) something moves. A picture that shakes about one place is at rest.
+    The points are tracked from the first frame. Motion begins at the frame from which all further
+    ones differ from the mean of the earlier ones by 5 standard deviations, by 5 times the camera
+    shake, and by 0.05 px. An image that only shakes about one position is at rest.
 
     Args:
         rest_frames: the frames that should be at rest.
         points_px: points `[x, y]` in the first frame, in px. Shape `(P, 2)`.
-        options: how to track.
+        options: tracker options.
 
     Returns:
         Number of frames before the motion, 1 or more.

@@ -1,4 +1,4 @@
-"""From displacements to strain: a gauge, a field, and how even it is."""
+"""From displacements to strain: gauge, field and homogeneity."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ __all__ = [
 ]
 
 _WORST_CONDITION = 30.0
-_MOST_WEIGHT = 2.0  # of a mark in its group's mean
-_MOST_TILT = 0.02  # of the line between the valid marks to the gauge, across over along
+_MOST_WEIGHT = 2.0  # largest weight of a mark in its group's mean
+_MOST_TILT = 0.02  # largest tilt of the line between the valid marks relative to the gauge
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class GaugeStrain:
     """Strain of the length between two groups of points.
 
     Args:
-        strain: engineering strain, positive in elongation; NaN where the valid marks do not lie
+        strain: engineering strain, positive in elongation; NaN where the valid marks are not
             along the gauge. Shape `(F,)`.
         std: its standard deviation. Shape `(F,)`.
         length_px: gauge length, in px. Shape `(F,)`.
         rest_length_px: gauge length of all marks at rest, in px.
-        upper_marks, lower_marks: how many marks of each group were valid. Shape `(F,)`.
+        upper_marks, lower_marks: number of valid marks of each group. Shape `(F,)`.
     """
 
     strain: Floats
@@ -48,10 +48,10 @@ class GaugeStrain:
 
 
 def _mark_weights(across: Floats, is_lower: NDArray[np.bool_]) -> Floats:
-    """Weights of the valid marks; each group's add up to 1.
+    """Weights of the valid marks; they add up to 1 in each group.
 
-    The smallest for which the weighted mean marks of both groups lie beside each other across the
-    gauge, so that a narrowing or a shear does not count as strain. Plain means where no such
+    These are the smallest weights that align the weighted means of both groups across the
+    gauge, so that narrowing or shear does not count as strain. Plain means are used if no such
     weights exist, or where they would extrapolate far.
     """
     plain = np.where(is_lower, 1.0 / is_lower.sum(), 1.0 / (~is_lower).sum())
@@ -66,11 +66,11 @@ def _mark_weights(across: Floats, is_lower: NDArray[np.bool_]) -> Floats:
 def gauge_strain(
     tracks: Tracks, rest_px: Floats, upper: NDArray[np.intp], lower: NDArray[np.intp]
 ) -> GaugeStrain:
-    r"""Engineering strain between the means of two groups of points.
+    r"""Compute the engineering strain between the means of two groups of points.
 
     $\varepsilon = |\bar c_l - \bar c_u| / L_0 - 1$. Where marks are not valid, both lengths are
     those of the remaining marks, weighted so that the line between the groups keeps its direction
-    at rest. Where no weights do that and the line is tilted by more than 0.02, the strain is NaN.
+    at rest. If no weights do that and the line is tilted by more than 0.02, the strain is NaN.
 
     Args:
         tracks: points through the clip.
@@ -79,7 +79,7 @@ def gauge_strain(
         upper, lower: indices of the points of each group.
 
     Returns:
-        Strain with its standard deviation in every frame. The part of the deviation that comes
+        Strain with its standard deviation in every frame. The part of the std that comes
         from the reference is common to all frames.
 
     Raises:
@@ -97,11 +97,11 @@ def gauge_strain(
     """
     upper, lower = np.atleast_1d(upper), np.atleast_1d(lower)
     if not upper.size or not lower.size:
-        raise InputError("a gauge needs at least one point in each group, one is empty.")
+        raise InputError("A gauge needs at least one point in each group, but one is empty.")
     between = rest_px[lower].mean(axis=0) - rest_px[upper].mean(axis=0)
     rest_length = float(np.hypot(*between))
     if rest_length == 0.0:
-        raise InputError("both groups of the gauge have the same mean position. Choose two rows.")
+        raise InputError("Both groups of the gauge have the same mean position. Choose two rows.")
     axis = between / rest_length
     marks = np.concatenate([upper, lower])
     is_lower = np.arange(len(marks)) >= upper.size
@@ -110,7 +110,7 @@ def gauge_strain(
     if not counts.all():
         frame = int(np.argmin(counts.all(axis=0)))
         raise ResultError(
-            f"no point of a gauge group is valid in frame {frame}. Add points, or raise search_px."
+            f"No point of a gauge group is valid in frame {frame}. Add points, or raise search_px."
         )
     across = (rest_px[marks] - rest_px[upper].mean(axis=0)) @ [-axis[1], axis[0]]
     patterns, which = np.unique(seen, axis=0, return_inverse=True)
@@ -151,7 +151,7 @@ class StrainField:
 
 
 def _local_fit(lever: Floats, moved: Floats, std: Floats) -> tuple[Floats, Floats] | None:
-    """Displacement gradient and its deviation from one neighbourhood; `None` if it is a line."""
+    """Displacement gradient and its std from one neighbourhood; `None` if it is a line."""
     design = np.column_stack([np.ones(len(lever)), lever])
     spread = np.linalg.svd(lever - lever.mean(axis=0), compute_uv=False)
     if len(lever) < 3 or spread[1] * _WORST_CONDITION < spread[0]:
@@ -163,16 +163,16 @@ def _local_fit(lever: Floats, moved: Floats, std: Floats) -> tuple[Floats, Float
 def strain_field(
     rest_px: Floats, displacement_px: Floats, std_px: Floats, *, neighbours: int = 12
 ) -> StrainField:
-    """Strain at each point from an affine fit to its nearest valid neighbours and itself.
+    """Compute the strain at each point from an affine fit to it and its nearest valid neighbours.
 
     Args:
         rest_px: positions at rest `[x, y]`, in px. Shape `(P, 2)`.
         displacement_px: displacements in one frame, NaN where lost. Shape `(P, 2)`.
         std_px: their standard deviations. Shape `(P, 2)`.
-        neighbours: how many neighbours; more smooth the field and lower its deviation.
+        neighbours: number of neighbours; more smooth the field and reduce its std.
 
     Returns:
-        The field; NaN where the neighbours lie on a line or are too few.
+        The field; NaN where the neighbours are collinear or too few.
 
     Raises:
         InputError: fewer than 3 valid points, or `neighbours` below 2.
@@ -189,7 +189,7 @@ def strain_field(
     good = np.isfinite(displacement_px).all(axis=1)
     if good.sum() < 3 or neighbours < 2:
         raise InputError(
-            f"a strain field needs 3 valid points and 2 neighbours, got {int(good.sum())} and "
+            f"A strain field needs 3 valid points and 2 neighbours, not {int(good.sum())} and "
             f"{neighbours}. Track more points."
         )
     found = np.flatnonzero(good)
@@ -214,16 +214,17 @@ def strain_field(
 
 @dataclass(frozen=True)
 class Homogeneity:
-    r"""How even the stretch is along the length, and how the sides move.
+    r"""Homogeneity of the stretch along the length, and lateral motion.
 
     Args:
         height_px: middle of each band along the length, in px. Shape `(B,)`.
         strain: longitudinal strain of each band. Shape `(B,)`.
         strain_std: standard deviation of it. Shape `(B,)`.
         mean_strain: strain of the whole length (slope of displacement against position).
-        unevenness: scatter of the bands' strain beyond their deviations, over the mean strain.
+        unevenness: scatter of the bands' strain beyond their standard deviations, over the mean
+            strain.
         offset_px: distance of each band of points from the mid-line, in px. Shape `(B,)`.
-        lateral_px: mean motion away from the mid-line, in px, of those. Shape `(B,)`.
+        lateral_px: mean motion away from the mid-line of each band, in px. Shape `(B,)`.
         lateral_slope: motion away from the mid-line for each px of distance; negative where the
             sheet narrows.
     """
@@ -249,7 +250,7 @@ def _line(x: Floats, y: Floats, std: Floats) -> tuple[float, float]:
 def homogeneity(
     rest_px: Floats, displacement_px: Floats, std_px: Floats, *, bands: int = 6
 ) -> Homogeneity:
-    """Stretch band by band along the length (y), motion band by band from the mid-line (x).
+    """Compute the stretch in bands along the length (y), and the motion from the mid-line (x).
 
     Args:
         rest_px: positions at rest `[x, y]`, in px. Shape `(P, 2)`.
@@ -275,7 +276,7 @@ def homogeneity(
     place, moved, std = rest_px[good], displacement_px[good], std_px[good]
     if bands < 1 or len(place) < 4 * bands:
         raise InputError(
-            f"{bands} bands need at least {4 * bands} valid points, got {len(place)}. Take fewer "
+            f"{bands} bands need at least {4 * bands} valid points, not {len(place)}. Use fewer "
             "bands or more points."
         )
     mean_strain, _ = _line(place[:, 1], moved[:, 1], std[:, 1])

@@ -1,4 +1,4 @@
-"""Subset templates: what the native kernel compares each frame with."""
+"""Subset templates that the native kernel compares each frame with."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ __all__ = ["Subsets", "build_subsets", "descent_rows", "project_out"]
 
 Singles = NDArray[np.float32]
 
-_LANES = 16  # floats that the kernel takes at a time
+_LANES = 16  # floats that the kernel processes at a time
 _WORST_CONDITION = 1e4
-_GAUSS_REACH = 4.0  # deviations at which the Gaussian is cut
-_LEAST_CURVATURE = 0.15  # of the mean; a round dot's rotation, seen in noise, has 0.02 to 0.13
+_GAUSS_REACH = 4.0  # standard deviations at which the Gaussian is truncated
+_LEAST_CURVATURE = 0.15  # of the mean; a round dot's rotation has 0.02 to 0.13 from noise alone
 
 
 @dataclass(frozen=True)
 class Subsets:
-    """Templates of all points, and what their uncertainty needs. N = side², S = N up to 16.
+    """Templates of all points, with data for their uncertainty. N = side², S = N padded to 16.
 
     Args:
         shape: reference grey levels, mean removed, norm 1, padded with zeros. Shape `(P, S)`.
-        gradient: their smoothed slopes along x and y, in 1/px. Shape `(P, 2, S)`.
+        gradient: their smoothed gradients along x and y, in 1/px. Shape `(P, 2, S)`.
         inverse: inverse of the Gauss-Newton matrix, in px. Shape `(P, M, M)`.
         place: distance of each sample from the centre along x and y, in px. Shape `(2, S)`.
         centres_px: integer centres of the subsets `[x, y]`, in px. Shape `(P, 2)`.
-        offsets_px: the points less their centres, in px. Shape `(P, 2)`.
+        offsets_px: the points minus their centres, in px. Shape `(P, 2)`.
         norm: root of the summed squared grey deviations. Shape `(P,)`.
         level: mean grey level. Shape `(P,)`.
         even: covariance of the displacement, times amplitude squared, from a pixel variance of 1.
             Shape `(P, 2, 2)`.
         shaped: the same from a pixel variance that follows `shape`. Shape `(P, 2, 2)`.
-        residual_share: share of white noise that the weighted residual keeps. Shape `(P,)`.
+        residual_share: share of white noise in the weighted residual. Shape `(P,)`.
     """
 
     shape: Singles
@@ -91,7 +91,7 @@ def _derivatives(
 ) -> tuple[list[Floats], list[Floats]]:
     """Smoothed and exact spline derivatives of the reference along x and y, in the subsets.
 
-    Taken in squares around the subsets, or over the whole frame where they hold more pixels.
+    Computed in squares around the subsets, or over the whole frame if that has fewer pixels.
     """
     reach = 1 + int(_GAUSS_REACH * smoothing_px + 0.5)  # of both filters, px
     spline = np.pad(spline_filter(reference, order=3, mode="mirror"), reach, mode="reflect")
@@ -123,7 +123,7 @@ def descent_rows(gx: Floats, gy: Floats, side: int, unknowns: int) -> Floats:
 
 
 def project_out(rows: Floats, shape: Floats) -> Floats:
-    """Rows made orthogonal to 1 and to the shape (itself of mean 0 and norm 1)."""
+    """Make rows orthogonal to 1 and to the shape (itself of mean 0 and norm 1)."""
     rows = rows - rows.mean(axis=2, keepdims=True)
     along = np.einsum("pmn,pn->pm", rows, shape)
     return np.asarray(rows - along[:, :, None] * shape[:, None, :])
@@ -136,9 +136,9 @@ def _check_inside(points: Floats, centres: Floats, side: int, shape: tuple[int, 
         index = int(np.argmax(outside))
         x, y = points[index]
         raise InputError(
-            f"point {index} at ({x:.1f}, {y:.1f}) px is too close to the edge of the "
-            f"{shape[1]} x {shape[0]} px frame for a subset of {side} px. Allowed is "
-            f"[{side // 2}, {last[0]}] x [{side // 2}, {last[1]}]. Move the point, or take a "
+            f"Point {index} at ({x:.1f}, {y:.1f}) px is too close to the edge of the "
+            f"{shape[1]} x {shape[0]} px frame for a subset of {side} px. It must be in "
+            f"[{side // 2}, {last[0]}] x [{side // 2}, {last[1]}]. Move the point, or use a "
             "smaller subset."
         )
 
@@ -149,10 +149,10 @@ def _refuse_blank(points: Floats, condition: Floats) -> None:
         index = int(np.argmax(blank))
         x, y = points[index]
         raise InputError(
-            f"{int(blank.sum())} of {len(points)} points cannot be tracked: the first, point "
+            f"{int(blank.sum())} of {len(points)} points cannot be tracked. The first, point "
             f"{index} at ({x:.1f}, {y:.1f}) px, has no texture in both directions (condition "
-            f"{condition[index]:.1e}, allowed {_WORST_CONDITION:.0e}). Move it onto a dot, or "
-            "take a larger subset or fewer unknowns."
+            f"{condition[index]:.1e}, at most {_WORST_CONDITION:.0e}). Move it onto a dot, or "
+            "use a larger subset or fewer unknowns."
         )
 
 
@@ -164,11 +164,11 @@ def _translation_condition(hessian: Floats, norm: Floats) -> Floats:
 
 
 def _observable_inverse(gradient: Floats, hessian: Floats, side: int) -> Floats:
-    """Inverse over the deformations that the subset shows, zero over those it does not.
+    """Inverse on the observable deformations of the subset, zero on the others.
 
     With two unknowns the plain inverse. With six, directions whose curvature (displacements in
-    px, rms over the subset) is below 0.15 of the mean stay as they are: a round dot does not
-    tell its rotation, and would turn with the noise.
+    px, rms over the subset) is below 0.15 of the mean are not estimated: a round dot does not
+    show its rotation, which would only follow the noise.
     """
     unknowns = hessian.shape[1]
     if unknowns == 2:
@@ -188,16 +188,16 @@ def _observable_inverse(gradient: Floats, hessian: Floats, side: int) -> Floats:
 
 
 def _pad(rows: Floats) -> Singles:
-    """Rows of single floats, filled with zeros for the kernel's lanes."""
+    """Rows as single floats, padded with zeros to the kernel's lanes."""
     width = [(0, 0)] * (rows.ndim - 1) + [(0, -rows.shape[-1] % _LANES)]
     return np.ascontiguousarray(np.pad(rows, width), dtype=np.float32)
 
 
 def build_subsets(reference: Floats, points_px: Floats, options: TrackOptions) -> Subsets:
-    """Templates around the points of a reference image.
+    """Build templates around the points of a reference image.
 
     Args:
-        reference: mean of the rest frames, grey levels. Shape `(H, W)`.
+        reference: mean of the rest frames, in grey levels. Shape `(H, W)`.
         points_px: points `[x, y]` in the reference, in px. Shape `(P, 2)`.
         options: subset size, model, smoothing.
 
@@ -259,7 +259,7 @@ def _sandwich(outer: Floats, inner: Floats) -> Floats:
 
 
 def _point_rows(offsets: Floats, unknowns: int) -> Floats:
-    """Displacement of the point (not of the subset's centre) from the unknowns. `(P, 2, M)`."""
+    """Matrix from the unknowns to the displacement of the point. `(P, 2, M)`."""
     count = len(offsets)
     if unknowns == 2:
         return np.broadcast_to(np.eye(2), (count, 2, 2))

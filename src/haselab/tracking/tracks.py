@@ -1,4 +1,4 @@
-"""What a tracker carries and gives: states, tracks, and why a point is not valid."""
+"""States and results of a tracker, and reasons why a point is not valid."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ __all__ = ["FrameTracks", "LossReason", "TrackState", "Tracks"]
 
 
 class LossReason(IntFlag):
-    """Why a point is not valid in a frame; several may hold.
+    """Why a point is not valid in a frame; several bits may be set.
 
-    UNLIKE: the correlation is below the least quality, the contrast is not above what noise alone
-    shows, or the place is known to a pixel at best. LEFT: the subset reaches over the edge of the
-    frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
-    STRAYED: it is not where the neighbours put it. COVERED: its residual or its contrast are not
-    like the other points', so something else is in the subset. UNTIED: it was found, but no point
-    that should stand still was, so the motion of the stand is not known. AMBIGUOUS: the pattern of
-    the points repeats itself, and another place explains the frame as well.
+    UNLIKE: the correlation is below the minimum quality, the contrast is not above that of noise
+    alone, or the position is known to a pixel at best. LEFT: the subset extends beyond the edge of
+    the frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
+    STRAYED: it is not where its neighbours predict it. COVERED: its residual or contrast differs
+    from those of other points, so something else is in the subset. UNTIED: it was found, but no
+    fixed point was, so the motion of the stand is not known. AMBIGUOUS: the pattern of
+    the points repeats itself, and another position explains the frame equally well.
     """
 
     UNLIKE = 1
@@ -41,16 +41,16 @@ class LossReason(IntFlag):
 
 @dataclass(frozen=True)
 class FrameTracks:
-    """All points in one frame.
+    """Results of all points in one frame.
 
     Args:
         x_px, y_px: positions, in px; NaN where not valid. Shape `(P,)`.
         std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
         quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
-            subset shows an even grey.
+            subset is uniformly grey.
         valid: whether the point was found.
         reason: bits of `LossReason` for points that are not valid, else 0; `None` where the
-            positions come from elsewhere.
+            positions come from another source.
     """
 
     x_px: Floats
@@ -64,16 +64,16 @@ class FrameTracks:
 
 @dataclass(frozen=True)
 class Tracks:
-    """All points in all frames.
+    """Results of all points in all frames.
 
     Args:
         x_px, y_px: positions, in px; NaN where not valid. Shape `(F, P)`.
         std_x_px, std_y_px: standard deviations of the displacement from the reference, in px.
         quality: zero-mean normalised cross-correlation with the reference, -1 to 1; 0 where the
-            subset shows an even grey.
+            subset is uniformly grey.
         valid: whether the point was found.
         reason: bits of `LossReason` for points that are not valid, else 0; `None` where the
-            positions come from elsewhere.
+            positions come from another source.
     """
 
     x_px: Floats
@@ -86,7 +86,7 @@ class Tracks:
 
     @classmethod
     def stack(cls, frames: Sequence[FrameTracks]) -> Tracks:
-        """The frames one below the other."""
+        """Stack the results of several frames."""
         reasons = [f.reason for f in frames if f.reason is not None]
         return cls(
             x_px=np.stack([f.x_px for f in frames]),
@@ -101,18 +101,18 @@ class Tracks:
 
 @dataclass(frozen=True)
 class TrackState:
-    """What a tracker carries from frame to frame.
+    """State of a tracker between frames.
 
     Args:
-        reference: what the frames are compared with.
+        reference: the reference for matching.
         poses: `centre_px` of each subset and its `deformation` gradient. Shape `(P,)`.
         velocity_px: last motion from frame to frame, in px. Shape `(P, 2)`.
         reason: `LossReason` of each point in the last frame, 0 where it was found. Shape `(P,)`.
-        gain: median over the points of the contrast over the reference's; 0 before the first
+        gain: median contrast of the points relative to the reference; 0 before the first
             frame. Shape `(1,)`.
-        scatter: mean square of the points' scatter about a smooth field over what their deviations
-            explain, at least 1, of the last frame that told it.
-        pattern: fixed pattern of the sensor that is taken from each frame, if there is one.
+        scatter: mean square of the points' scatter about a smooth field, relative to their standard
+            deviations, at least 1, of the last frame that allowed it.
+        pattern: fixed pattern of the sensor that is subtracted from each frame, if any.
         textured: the reference in which the pattern is texture of the scene, until the motion of
             the points has decided.
     """
@@ -127,12 +127,12 @@ class TrackState:
     textured: Reference | None = None
 
     def cleaned(self, frame: Frame) -> Frame:
-        """The frame as it is compared with the reference."""
+        """The frame prepared for comparison with the reference."""
         return frame if self.pattern is None else self.pattern.removed(frame)
 
     @property
     def noise(self) -> NoiseLaw | None:
-        """The camera's noise law, where the rest frames told it."""
+        """The camera's noise law, if the rest frames determined it."""
         return self.reference.noise
 
     @property

@@ -44,7 +44,7 @@ def test_a_blank_frees_the_choice_of_the_staircase(capsys):
     assert run(["--json", "--blank-s", "0.0015"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["chosen"]["step"] < 1e-9
-    assert "its steps are nothing beside the noise" in answer["warnings"][0]
+    assert "its steps are negligible compared with the noise" in answer["warnings"][0]
     assert run(["--json", "--update-unknown"]) == 0
     unknown = json.loads(capsys.readouterr().out)
     assert unknown["request"]["update_s"] is None
@@ -54,12 +54,12 @@ def test_a_blank_frees_the_choice_of_the_staircase(capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--carrier-hz", "90000"], "at least 2, and 3 samples a period, are needed"),
+        (["--carrier-hz", "90000"], "at least 2 periods and 3 samples per period are required"),
         (["--carrier-hz", "nan"], "is not a finite number"),
-        (["--rate-hz", "-1"], "rate_hz = -1; allowed is above 0"),
+        (["--rate-hz", "-1"], "rate_hz = -1; it must be above 0"),
         (["--blank-s", "0.009"], "three quarters of a block"),
-        (["--update-s", "1"], "outside [0, 0.01)"),
-        (["--carrier-v", "5"], "Lower it"),
+        (["--update-s", "1"], "outside the block, [0, 0.01)"),
+        (["--carrier-v", "5"], "Lower carrier_v"),
         (["--capacitance-f", "x"], "not a valid float"),
     ],
 )

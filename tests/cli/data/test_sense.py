@@ -298,7 +298,7 @@ def test_a_record_that_never_passes_0_v_ends_with_3_and_says_so(
     source, out = write_csv(tmp_path / "m.csv", record), tmp_path / "out.csv"
     options = ["--method", "charge", "--rate-hz", 1000, "--out", out]
     assert run("sense", source, *options) == 3
-    assert "does not pass 0 V" in capsys.readouterr().err
+    assert "does not cross 0 V" in capsys.readouterr().err
     assert not read(out)[1]["valid"].any()
 
 

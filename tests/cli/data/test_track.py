@@ -274,7 +274,7 @@ def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, ca
         (("--scale-points", "1,2,3,4,0"), "not a positive length"),
         (("--scale-points", "1,2,1,2,5"), "0 px apart"),
         (("--scale-points", "1,2,3,4,5", "--scale-mm-per-px", "1"), "exclude each other"),
-        (("--scale-ruler", "10,10,900,10,1"), "leaves the 220 x 240 px picture"),
+        (("--scale-ruler", "10,10,900,10,1"), "is not inside the 220 x 240 px image"),
         (("--scale-board", "9,5"), "not of the form COLUMNSxROWS,MM"),
         (("--fixed", "left"), "No point has the name left"),
         (("--lens", "nothing.json"), "No such file"),

@@ -89,8 +89,8 @@ def test_free_response_answers_null_for_a_missing_envelope(tmp_path):
     answer = ask("free-response", write(tmp_path / "x.csv", x=x, time_s=TIME_S[:400]))
     assert answer["damped_frequency_rad_s"]["value"] == pytest.approx(5.1, rel=0.01)
     assert answer["natural_frequency_rad_s"]["value"] == pytest.approx(6.48, rel=0.01)
-    assert answer["hull_positive_decay_per_s"] is None or is_estimate(
-        answer["hull_positive_decay_per_s"]
+    assert answer["envelope_positive_decay_per_s"] is None or is_estimate(
+        answer["envelope_positive_decay_per_s"]
     )
 
 
@@ -149,7 +149,7 @@ def test_no_result_is_a_result_error_with_the_reason_in_the_json(tmp_path):
         (["transfer", "{sweep}", "--delay", "soon", "--rate-hz", "9"], "--delay is soon"),
         (["transfer", "{sweep}", "--fix", "gain", "--rate-hz", "9"], "--fix is gain"),
         (["transfer", "{sweep}", "--rate-hz", "-1"], "--rate-hz is -1 Hz"),
-        (["transfer", "{sweep}", "--poles", "9", "--rate-hz", "9"], "poles = 9; allowed"),
+        (["transfer", "{sweep}", "--poles", "9", "--rate-hz", "9"], "poles = 9; must be"),
         (["hyperelastic", "{sweep}"], "lacks stretch, nominal_stress_pa"),
     ],
 )
@@ -220,7 +220,7 @@ def test_several_tests_of_one_rubber_are_fitted_together(tmp_path):
     mu = answer["parameters"]["mu_pa"]
     assert abs(mu["value"] - 15e3) <= 4.0 * mu["std"]
     assert is_estimate(answer["asked"][0]["nominal_stress_pa"])
-    assert any("stretch 4, outside the data" in note for note in answer["notes"])
+    assert any("Stretch 4 is outside the data" in note for note in answer["notes"])
     for options, match in (
         (["--deformation", "uniaxial"] * 3, "given 3 times for 2 files"),
         (

@@ -92,7 +92,7 @@ def test_files_of_different_rates_are_refused(record, tmp_path):
     same.write_text("# rate_hz = 100\n" + record.read_text())
     with pytest.raises(InputError, match=r"different sampling rates: 100, 50 Hz"):
         invoke(same, other)
-    with pytest.raises(InputError, match="allowed is a period with the method periodic"):
+    with pytest.raises(InputError, match="the method periodic requires a period"):
         invoke(record, "--rate-hz", 100, "--method", "periodic")
 
 

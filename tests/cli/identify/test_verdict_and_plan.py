@@ -60,8 +60,10 @@ def test_the_verdict_comes_with_its_evidence_and_a_model_for_the_plan(alternatio
     )
     assert answer["verdict"] == "supports mechanical"
     assert answer["supported"] == "mechanical"
-    assert [rival["excluded"] for rival in answer["rivals"]] == [False, True]
-    assert {"bic", "log_likelihood", "probability", "lead", "misfit"} <= set(answer["rivals"][1])
+    assert [rival["excluded"] for rival in answer["candidates"]] == [False, True]
+    assert {"bic", "log_likelihood", "probability", "lead", "misfit"} <= set(
+        answer["candidates"][1]
+    )
     assert VoltagePlant.from_dict(answer["voltage_plant"]).creep == "mechanical"
     assert json.loads(out.read_text()) == answer
     page = printed(identify, "verdict", alternation, "--question", "creep")

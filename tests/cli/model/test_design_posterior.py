@@ -75,7 +75,7 @@ def test_gains_by_probability_reach_the_share_or_say_what_is_reachable(wide, tmp
     wide.write_text(json.dumps(model_of((1.0, 0.05, 0.2, 0.001))))  # positive: 84 %
     code, text, error = run(capsys, *arguments, "--probability", 0.97, "--draws", 100)
     assert (code, text) == (3, "") and error.count("\n") == 1
-    assert "reachable is" in error and "lower --probability" in error
+    assert "at most" in error and "lower --probability" in error
 
 
 def test_a_probability_without_a_covariance_is_exit_2(tmp_path, capsys):
@@ -99,7 +99,7 @@ def changed(key, value):
         (changed("values", [1.0, 40.0, 0.12, 0.012]), "belongs to other parameters"),
         (changed("matrix", [[1.0]]), "needs one value, one row"),
         (changed("matrix", "wide"), "matrix: Input should be a valid list"),
-        (changed("names", ["gain"] * 4), "all names different"),
+        (changed("names", ["gain"] * 4), "all names must differ"),
     ],
 )
 def test_a_covariance_that_cannot_be_used_is_one_line_and_exit_2(model, message, tmp_path, capsys):

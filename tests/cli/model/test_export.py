@@ -69,7 +69,7 @@ def test_a_fit_with_zeros_keeps_its_poles_and_gain(tmp_path):
     fast = 0.7 * (1 + s / 3) / ((1 + s / 4) * (1 + 0.4 * s + 0.2 * s**2))
     expected = fast + 0.7 / (5.0 * s + 1.0)
     assert np.abs(made.frequency_response(OMEGA_RAD_S) / expected - 1).max() <= 1e-10
-    with pytest.raises(InputError, match="a plant takes"):
+    with pytest.raises(InputError, match="a Plant must not have one"):
         export(path, "--to", "plant")
     path.write_text(json.dumps(fit | {"gain": number | {"value": None}}))
     with pytest.raises(InputError, match="gain: Input should be a valid number"):

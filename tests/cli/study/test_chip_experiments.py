@@ -26,6 +26,8 @@ from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.loops import Loops
 from haselab.study.fits.maps import Maps
 
+# What has to be fitted before they begin; its content is of no concern here.
+FITTED = Outcome(values=tuple(object.__new__(kind) for kind in (Maps, Dynamics, Loops)))
 DATA = Path(__file__).resolve().parents[2] / "firmware" / "data"
 
 
@@ -50,12 +52,15 @@ def test_tools_that_are_missing_are_one_line_of_the_report(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(folder / "nothing"))
-    main(folder, "none")
-    known = json.loads((folder / "firmware" / "experiments.json").read_text())
+    parts = {}
     for name in ("chip", "miniature"):
-        assert "is not installed. Run:  sudo apt-get install" in known["left_out"][name].replace(
-            ". Run: ", ". Run:  "
-        )
+        main(folder, "none", name)
+        parts[name] = json.loads((folder / "firmware" / f"{name}.json").read_text())
+        assert "is not installed. Run:  sudo apt-get install" in parts[name]["left_out"][
+            name
+        ].replace(". Run: ", ". Run:  ")
+    known = {"left_out": {name: part["left_out"][name] for name, part in parts.items()}}
+    (folder / "firmware" / "experiments.json").write_text(json.dumps(known))
     rows = chip_rows(folder, None)  # type: ignore[arg-type]
     assert rows.quantities == {}
     (folder / "results.json").write_text('{"quantities": [], "provenance": {}}')
@@ -70,7 +75,7 @@ def test_a_study_without_such_experiments_has_no_rows_of_them_and_says_why(tmp_p
     rows = chip_rows(tmp_path, None)  # type: ignore[arg-type]
     assert (rows.quantities, rows.notes) == ({}, {})
     for name in ("chip", "miniature"):  # figures S4 and S5 say why, so that no number is missing
-        assert "'haselab reproduce' alone plays it" in rows.figures[name]["left_out"]
+        assert "only 'haselab reproduce' plays it" in rows.figures[name]["left_out"]
 
 
 def test_a_recording_that_is_damaged_is_left_out_with_its_reason(tmp_path: Path) -> None:
@@ -78,7 +83,7 @@ def test_a_recording_that_is_damaged_is_left_out_with_its_reason(tmp_path: Path)
     (tmp_path / "chip" / "session.h5").write_bytes(b"no HDF5 file")
     rows = chip_rows(tmp_path, None)  # type: ignore[arg-type]
     assert rows.quantities == {}
-    assert rows.figures["chip"]["left_out"].startswith("its recording gives no result. ")
+    assert rows.figures["chip"]["left_out"].startswith("no result from its recording. ")
 
 
 @dataclass
@@ -94,29 +99,29 @@ class Sleeper:
 
 def started(
     folder: Path, code: str, monkeypatch: pytest.MonkeyPatch
-) -> tuple[ChipExperiments, subprocess.Popen[bytes]]:
+) -> tuple[ChipExperiments, list[subprocess.Popen[bytes]]]:
     beside = ChipExperiments(folder, builtin_study(), twin_of_reading("hz"), 1, True, "none")
-    process: list[subprocess.Popen[bytes]] = []
+    processes: list[subprocess.Popen[bytes]] = []
 
     def popen(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
-        process.append(Sleeper(code).popen(command, **options))
-        return process[0]
+        processes.append(Sleeper(code).popen(command, **options))
+        return processes[-1]
 
     module = sys.modules[ChipExperiments.__module__]
     monkeypatch.setattr(module, "write_design", lambda *_: None)
     patched = type("Patched", (), {**vars(subprocess), "Popen": staticmethod(popen)})
     monkeypatch.setattr(module, "subprocess", patched)
-    beside.start(Outcome(values=tuple(object.__new__(kind) for kind in (Maps, Dynamics, Loops))))
-    return beside, process[0]
+    beside.start(FITTED)
+    return beside, processes
 
 
 @pytest.mark.long
 def test_the_end_of_the_study_ends_them(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    beside, process = started(folder, "import sys; sys.stdin.read()", monkeypatch)
+    beside, processes = started(folder, "import sys; sys.stdin.read()", monkeypatch)
     time.sleep(0.1)
-    assert process.poll() is None
+    assert [process.poll() for process in processes] == [None, None]
     beside.stop()
-    assert process.poll() == 0
+    assert [process.poll() for process in processes] == [0, 0]
 
 
 @pytest.mark.long

@@ -141,4 +141,4 @@ def test_a_calibration_of_the_file_is_used_and_one_for_another_carrier_refused(
     other = tmp_path / "other.toml"
     other.write_text(TRIANGLE + "[sensing]\ncarrier_hz = 1000.0\n")
     assert run("run", other, *arguments, "--out", tmp_path / "no") == 2
-    assert "is for a carrier of 2000 Hz, got 1000 Hz" in capsys.readouterr().err
+    assert "is for a carrier of 2000 Hz, not 1000 Hz" in capsys.readouterr().err

@@ -64,7 +64,7 @@ def test_the_report_has_its_row_and_figure_and_no_columns_about_a_paper(lab) -> 
     assert "<title>SIMULATED: creep at 1.5 V</title>" in page
     assert "creep, time constant" in page and "Creep at 1.5 V" in page
     assert (lab.folder / "out/creep/figures/creep.svg").is_file()
-    assert not re.search("<th>(Paper|Recomputed|Verdict)</th>", page)
+    assert not re.search("<th>(Paper|Recomputed|Agreement)</th>", page)
     assert "left out" not in page
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.docs.page import Page
 
 from haselab.models import PrandtlIshlinskii, PronyCreep
 from haselab.signals import triangle
+from tests.docs.page import Page
 
 PAGE = Page("identify/hysteresis-and-creep.md")
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.docs.page import Page
 
 from haselab.models import ArrudaBoyce, Plant, SlowMode, VoltageMap
+from tests.docs.page import Page
 
 PAGE = Page("identify/identification.md")
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from tests.docs.page import Page
 
 from haselab.models import Deformation, LinearMap, OgdenTwoTerms, VoltageMap
+from tests.docs.page import Page
 
 PAGE = Page("identify/static-laws.md")
 

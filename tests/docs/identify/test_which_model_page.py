@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.docs.page import Page
 
 from haselab.base import Estimate
 from haselab.models import VoltagePlant
 from haselab.signals import linear_chirp, square
+from tests.docs.page import Page
 
 PAGE = Page("identify/which-model.md")
 KEY, UNIT = "natural_frequency_rad_s", "rad/s"

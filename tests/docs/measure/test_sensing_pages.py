@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.docs.page import Page
 
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
+from tests.docs.page import Page
 
 HOW_TO, EXPLAINED = Page("measure/sensing.md"), Page("measure/how-self-sensing-works.md")
 SNIPPETS = [(page, code) for page in (HOW_TO, EXPLAINED) for code in page.python]

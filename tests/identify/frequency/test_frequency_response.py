@@ -1,4 +1,4 @@
-"""Leakage is removed and intervals hold; averaged segments are told to be wrong for a sweep."""
+"""Leakage is removed and intervals are valid; segment averages are refused for a sweep."""
 
 import numpy as np
 import pytest
@@ -117,8 +117,8 @@ def test_the_warning_comes_for_a_sweep_or_step_and_for_nothing_else(drive, segme
     response = estimate_frequency_response(
         u, PLANT.simulate(u, 400.0, TIME_S), 400.0, method="h1", segment_s=segment_s
     )
-    told = any("like a single sweep" in note for note in response.notes)
-    assert told == (drive.startswith("chirp") or drive == "step")
+    warned = any("like a single sweep" in note for note in response.notes)
+    assert warned == (drive.startswith("chirp") or drive == "step")
 
 
 def test_h1_and_its_coherence_are_those_of_scipy():
@@ -152,12 +152,12 @@ def test_each_average_is_right_for_noise_on_its_side(method, on):
     assert np.mean(gains) == pytest.approx(2.0, rel=0.06)
 
 
-def test_one_segment_tells_that_it_tells_nothing():
+def test_one_segment_says_that_it_has_no_spread():
     rng = np.random.default_rng(4)
     u = rng.normal(size=400)
     response = estimate_frequency_response(u, u, 100.0, method="h1", segment_s=4.0)
     assert np.isinf(response.std).all()
-    assert "no spread" in response.notes[0]
+    assert "no standard deviation" in response.notes[0]
 
 
 @pytest.mark.long
@@ -179,7 +179,7 @@ def test_periods_are_averaged_without_waiting_for_the_transient(periods):
     assert np.abs(ratio.mean(axis=0)).max() < 4.0 / np.sqrt(runs)
 
 
-def test_realisations_tell_nonlinear_distortion_and_one_drive_does_not():
+def test_several_realisations_show_nonlinear_distortion_and_one_drive_does_not():
     rng = np.random.default_rng(6)
     drives = [np.tile(multisine(rng), 2) for _ in range(6)]
     drives = [drive / drive.std() for drive in drives]
@@ -192,15 +192,15 @@ def test_realisations_tell_nonlinear_distortion_and_one_drive_does_not():
             inputs, outputs, 400.0, method="periodic", period_s=10.0
         )  # fmt: skip
 
-    linear, bent = answer(0.0, drives), answer(0.05, drives)
+    linear, nonlinear = answer(0.0, drives), answer(0.05, drives)
     assert not any("Nonlinear" in note for note in linear.notes)
-    assert any("Nonlinear distortion" in note for note in bent.notes)
-    share = np.median(bent.distortion_std / np.abs(bent.response))
+    assert any("Nonlinear distortion" in note for note in nonlinear.notes)
+    share = np.median(nonlinear.distortion_std / np.abs(nonlinear.response))
     assert 5.0 * np.median(linear.distortion_std / np.abs(linear.response)) < share
     # The best linear gain of u + c u^3 under a Gaussian drive of unit variance is 1 + 3 c.
-    gain = np.abs(bent.response / linear.response)
+    gain = np.abs(nonlinear.response / linear.response)
     assert gain.mean() == pytest.approx(1.15, abs=4 * share / np.sqrt(6 * gain.size))
-    inside = np.abs(bent.response - 1.15 * truth(bent)) <= INSIDE * bent.std
+    inside = np.abs(nonlinear.response - 1.15 * truth(nonlinear)) <= INSIDE * nonlinear.std
     assert inside.mean() >= 0.85
     same = answer(0.05, drives[:1] * 3)
     assert np.isnan(same.distortion_std).all()
@@ -263,17 +263,17 @@ RAMP = np.arange(100.0)
 @pytest.mark.parametrize(
     ("arguments", "how", "match"),
     [
-        ((RAMP, RAMP[:99], 1.0), {}, "equal lengths"),
+        ((RAMP, RAMP[:99], 1.0), {}, "must be equally long"),
         (([RAMP, RAMP], [RAMP], 1.0), {}, "2 records and y 1"),
         ((np.ones(100), RAMP, 1.0), {}, "excites nothing"),
         ((RAMP, RAMP, 0.0), {}, "rate_hz = 0 Hz"),
         ((RAMP[:50], RAMP[:50], 1.0), {}, "at least 64"),
         ((np.where(RAMP == 3, np.nan, RAMP), RAMP, 1.0), {}, "nan at index 3"),
-        ((RAMP, RAMP, 1.0), {"method": "etfe"}, "method = etfe; allowed are rational"),
-        ((RAMP, RAMP, 1.0), {"method": "periodic"}, "allowed is a period with the method periodic"),
-        ((RAMP, RAMP, 1.0), {"period_s": 2.0}, "and none with others"),
-        ((RAMP, RAMP, 1.0), {"segment_s": 2.0}, "h1, h2, hv alone"),
-        ((RAMP, RAMP, 1.0), {"method": "h1", "segment_s": 200.0}, "allowed is 16 to 100"),
+        ((RAMP, RAMP, 1.0), {"method": "etfe"}, "method = etfe; must be one of rational"),
+        ((RAMP, RAMP, 1.0), {"method": "periodic"}, "the method periodic requires a period"),
+        ((RAMP, RAMP, 1.0), {"period_s": 2.0}, "and the other methods take none"),
+        ((RAMP, RAMP, 1.0), {"segment_s": 2.0}, "only h1, h2 and hv take"),
+        ((RAMP, RAMP, 1.0), {"method": "h1", "segment_s": 200.0}, "must be 16 to 100"),
         ((RAMP, RAMP, 1.0), {"method": "periodic", "period_s": 10.5}, "whole number of 8"),
         ((RAMP, RAMP, 1.0), {"method": "periodic", "period_s": 60.0}, "1.67 periods of 60 s"),
         ((RAMP, RAMP, 1.0), {"method": "periodic", "period_s": 20.0}, "does not repeat every 20 s"),

@@ -30,14 +30,14 @@ def test_the_papers_chirp_and_free_decay_disagree():
     assert found.mean.std > 0.05  # widened by the Birge ratio
 
 
-def test_wide_or_missing_intervals_tell_no_agreement():
+def test_wide_or_missing_intervals_give_no_agreement():
     assert agree({"a": about(5.0, 0.1), "b": about(4.0, 3.0)}).verdict == "cannot tell"
     found = agree({"a": about(5.0, 0.1), "b": about(math.nan, math.inf)})
     assert found.verdict == "cannot tell"
     assert any(note.startswith("b is left out") for note in found.notes)
 
 
-def test_honest_intervals_seldom_disagree():
+def test_correct_intervals_seldom_disagree():
     """1 % of false alarms by chi-square and 1 % by the pairs: 10 of 500, 22 is 1 in 1,000."""
     rng = np.random.default_rng(1)
     alarms = 0

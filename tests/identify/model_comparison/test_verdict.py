@@ -1,4 +1,4 @@
-"""Verdicts: right where rivals can be told apart, "cannot tell" where they cannot."""
+"""Verdicts: right where models can be distinguished, "cannot tell" where they cannot."""
 
 import math
 from dataclasses import dataclass
@@ -65,16 +65,16 @@ def noisy(output, noise, seed=3):
 
 @pytest.mark.long
 @pytest.mark.parametrize("truth", ["mechanical", "electrical"])
-def test_alternating_polarity_tells_the_kind_of_creep(truth):
+def test_alternating_polarity_identifies_the_kind_of_creep(truth):
     found = compare(creep_hypotheses(), [record(plant_of(truth), alternating())])
     assert found.verdict == f"supports {truth}"
-    assert found.rivals[0].probability > 0.99
-    assert found.rivals[0].model["voltage_plant"]["creep"] == truth
+    assert found.candidates[0].probability > 0.99
+    assert found.candidates[0].model["voltage_plant"]["creep"] == truth
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("truth", ["mechanical", "electrical"])
-def test_small_steps_of_one_polarity_cannot_tell_the_kind_of_creep(truth):
+def test_small_steps_of_one_polarity_cannot_identify_the_kind_of_creep(truth):
     """About a level both creeps are one slow exponential.
 
     They differ by the square of a step of 2 %, times gain and share: 0.05 * 4e-4 * 0.35^2, far
@@ -90,20 +90,20 @@ def test_small_steps_of_one_polarity_cannot_tell_the_kind_of_creep(truth):
 @pytest.mark.parametrize(("omega_rad_s", "expected"), [
     (5.3, "supports rad"), (31.0, "supports hz"), (13.0, "supports neither"),
 ])  # fmt: skip
-def test_a_chirp_tells_the_reading(omega_rad_s, expected):
+def test_a_chirp_identifies_the_unit_of_the_frequency(omega_rad_s, expected):
     drive_v = 1.0 + 0.4 * linear_chirp(0.1, 10.0, 10.0, RATE_HZ)
     found = compare(reading_hypotheses(), [record(plant_of(omega_rad_s=omega_rad_s), drive_v)])
     assert found.verdict == expected
 
 
 @pytest.mark.long
-def test_noise_without_motion_tells_no_reading():
+def test_noise_without_motion_identifies_no_unit_of_the_frequency():
     rng = np.random.default_rng(8)
     silent = Record(1.0 + 0.01 * rng.normal(size=600), RATE_HZ, rng.normal(size=600),
                     np.arange(600) / RATE_HZ)  # fmt: skip
     found = compare(reading_hypotheses(), [silent])
     assert found.supported == ""
-    assert any("hardly follows the drive" in note for note in found.notes)
+    assert any("hardly depends on the drive" in note for note in found.notes)
 
 
 @pytest.mark.long
@@ -116,7 +116,7 @@ def test_a_second_resonance_is_found_where_there_is_one(second, expected):
 
 
 @pytest.mark.parametrize("two", [False, True])
-def test_modes_are_told_from_a_proportional_input_too(two):
+def test_modes_are_identified_from_a_proportional_input_too(two):
     u = np.random.default_rng(6).normal(size=1500)
     time_s = np.arange(1500) / RATE_HZ
     y = Plant(0.5, 5.11, 0.09, 0.01).simulate(u, RATE_HZ, time_s)
@@ -130,12 +130,12 @@ def test_modes_are_told_from_a_proportional_input_too(two):
 def test_a_fit_without_a_result_excludes_nothing():
     rng = np.random.default_rng(9)
     unrelated = Record(rng.normal(size=400), RATE_HZ, rng.normal(size=400), np.arange(400) / 100.0)
-    rivals = [TransferHypothesis(n, n, TransferStructure()) for n in ("a", "b")]
-    found = compare(rivals, [unrelated])
+    hypotheses = [TransferHypothesis(n, n, TransferStructure()) for n in ("a", "b")]
+    found = compare(hypotheses, [unrelated])
     assert not found.succeeded
     assert "fewer than two hypotheses could be fitted" in found.status
     known = Line("c", "c", np.zeros(400))
-    mixed = compare([known, Line("d", "d", np.ones(400)), rivals[0]], [unrelated])
+    mixed = compare([known, Line("d", "d", np.ones(400)), hypotheses[0]], [unrelated])
     assert mixed.verdict == "cannot tell"
     assert any("has no fit and is not excluded" in note for note in mixed.notes)
 
@@ -149,36 +149,37 @@ def test_in_white_noise_the_odds_are_those_of_known_gaussians():
     costs = {"a": ((seen.y - base) ** 2).sum(), "b": ((seen.y - wrong) ** 2).sum()}
     best = min(costs, key=costs.get)
     other = max(costs, key=costs.get)
-    assert found.rivals[0].name == best
+    assert found.candidates[0].name == best
     assert found.effective_samples == 400.0
-    assert math.isclose(found.rivals[1].bic, 400 * math.log(costs[other] / costs[best]),
+    assert math.isclose(found.candidates[1].bic, 400 * math.log(costs[other] / costs[best]),
                         rel_tol=1e-9)  # fmt: skip
 
 
-def test_two_models_equally_far_from_the_truth_are_seldom_told_apart():
+def test_two_models_equally_far_from_the_truth_are_seldom_distinguished():
     """The truth lies half-way: a verdict either way is wrong, allowed in 1 % of runs each.
 
     Of 300 runs 6 are expected at most; 15 or more would come up in 1 of 1,000.
     """
     base, apart = np.sin(np.arange(500) / 9.0), 0.05 * np.cos(np.arange(500) / 15.0)
-    rivals = [Line("a", "a", base + apart), Line("b", "b", base - apart)]
-    decided = sum(compare(rivals, [noisy(base, 0.1, seed)]).supported != "" for seed in range(300))
+    hypotheses = [Line("a", "a", base + apart), Line("b", "b", base - apart)]
+    records = ([noisy(base, 0.1, seed)] for seed in range(300))
+    decided = sum(compare(hypotheses, record).supported != "" for record in records)
     assert decided < 15
 
 
-def test_what_all_rivals_leave_out_does_not_decide():
+def test_what_all_candidates_leave_out_does_not_decide():
     """Both miss the same slow wave; one of them happens to lean towards it by a third."""
     base, wave = np.sin(np.arange(2000) / 9.0), np.cos(np.arange(2000) / 150.0)
-    rivals = [Line("a", "a", base + 0.03 * wave), Line("b", "b", base)]
-    found = compare(rivals, [noisy(base + 0.1 * wave, 0.01)])
-    assert found.rivals[1].bic > 0.0
+    hypotheses = [Line("a", "a", base + 0.03 * wave), Line("b", "b", base)]
+    found = compare(hypotheses, [noisy(base + 0.1 * wave, 0.01)])
+    assert found.candidates[1].bic > 0.0
     assert found.verdict == "cannot tell"
 
 
 def test_none_explains_what_none_follows():
     wave = np.cos(np.arange(2000) / 100.0)
-    rivals = [Line("a", "a", 0.0 * wave), Line("b", "b", 0.1 * np.sin(np.arange(2000) / 3.0))]
-    found = compare(rivals, [noisy(wave, 0.05)])
+    hypotheses = [Line("a", "a", 0.0 * wave), Line("b", "b", 0.1 * np.sin(np.arange(2000) / 3.0))]
+    found = compare(hypotheses, [noisy(wave, 0.05)])
     assert found.verdict == "none explains the data"
 
 
@@ -195,15 +196,15 @@ def test_the_shape_of_coloured_noise_is_that_of_the_closed_form():
 
 
 def test_bad_questions_are_refused():
-    rivals = creep_hypotheses()
+    hypotheses = creep_hypotheses()
     seen = noisy(np.arange(50.0), 0.1)
-    with pytest.raises(InputError, match="1 hypotheses; allowed are two or more"):
-        compare(rivals[:1], [seen])
-    with pytest.raises(InputError, match=r"risk = 0\.7; allowed is above 0 and below 0\.5"):
-        compare(rivals, [seen], risk=0.7)
+    with pytest.raises(InputError, match="1 hypotheses; at least two are required"):
+        compare(hypotheses[:1], [seen])
+    with pytest.raises(InputError, match=r"risk = 0\.7; must be above 0 and below 0\.5"):
+        compare(hypotheses, [seen], risk=0.7)
     with pytest.raises(InputError, match="unexplained = 2"):
-        compare(rivals, [seen], unexplained=2.0)
-    with pytest.raises(InputError, match="question = colour; allowed are reading, creep, modes"):
+        compare(hypotheses, [seen], unexplained=2.0)
+    with pytest.raises(InputError, match="question = colour; must be one of reading, creep, modes"):
         hypotheses_of("colour")
     with pytest.raises(InputError, match="spread = 3"):
         reading_hypotheses(spread=3.0)

@@ -1,4 +1,4 @@
-"""Fits of the voltage plant: known truths, honest intervals, words where the data do not tell."""
+"""Fits of the voltage plant: known truths, correct intervals, notes on identifiability."""
 
 import numpy as np
 import pytest
@@ -107,13 +107,13 @@ def test_bad_input_is_refused_in_one_line():
     good = record(truth, jumps(0.2, 1.8, 10), 1e-3)
     with pytest.raises(InputError, match="records is empty"):
         fit_voltage_plant([])
-    with pytest.raises(InputError, match="V; allowed is up to 100 V ahead of the amplifier"):
+    with pytest.raises(InputError, match="V; it must be at most 100 V ahead of the amplifier"):
         fit_voltage_plant([Record(1000.0 * good.u, RATE_HZ, good.y, good.output_time_s)])
-    with pytest.raises(InputError, match="12 outputs; 11 numbers need 22 or more"):
+    with pytest.raises(InputError, match="12 outputs; 11 parameters need at least 22"):
         fit_voltage_plant([Record(good.u, RATE_HZ, good.y[:12], good.output_time_s[:12])])
     with pytest.raises(InputError, match="The drive is 1 V throughout"):
         fit_voltage_plant([Record(np.ones(1000), RATE_HZ, good.y, good.output_time_s, None)])
-    with pytest.raises(InputError, match="powers = 9; allowed is 1 to 4"):
+    with pytest.raises(InputError, match="powers = 9; must be 1 to 4"):
         VoltageStructure(powers=9)
     with pytest.raises(InputError, match="creep = thermal"):
         VoltageStructure("thermal")

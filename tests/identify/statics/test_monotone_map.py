@@ -27,11 +27,11 @@ def test_the_weight_is_that_of_a_dense_restricted_likelihood():
     knots = np.linspace(x[0], x[-1], 13)
     problem = _Problem.of(x, y, knots)
     found = _likeliest(problem, 1.0)
-    # The bent part of the curve is random with the inverse of the penalty, the rest is free.
+    # The curved part of the curve is random with the inverse of the penalty, the rest is free.
     sizes, ways = np.linalg.eigh(problem.bending)
-    bent, free = ways[:, sizes > 1e-9 * sizes[-1]], ways[:, sizes <= 1e-9 * sizes[-1]]
+    curved, free = ways[:, sizes > 1e-9 * sizes[-1]], ways[:, sizes <= 1e-9 * sizes[-1]]
     columns = _columns(x, knots)
-    spread = columns @ bent
+    spread = columns @ curved
     spread = spread / np.sqrt(sizes[sizes > 1e-9 * sizes[-1]])
     known = columns @ free
 
@@ -136,7 +136,7 @@ def test_a_turning_curve_says_so_and_a_monotone_one_is_held():
     assert held.monotone and any("held nearly flat" in note for note in held.notes)
     with pytest.raises(InputError, match="no inverse"):
         free.inverse_std(1.0)
-    # In the flat part the abscissa is not told: its interval is wider than the part.
+    # In the flat part the abscissa is not identifiable: its interval is wider than the part.
     assert float(held.inverse_std(held.map.value(0.0))) > 0.5
 
 
@@ -156,11 +156,11 @@ def test_what_cannot_be_mapped_has_no_result_and_bad_columns_are_refused():
     rng = np.random.default_rng(10)
     fit = fit_map(rng.normal(size=300), rng.normal(size=300), monotone=True)
     assert fit.status.startswith("no result") and fit.answer()["x"] is None
-    with pytest.raises(ResultError, match="does not follow"):
+    with pytest.raises(ResultError, match="does not depend"):
         fit.value_std(0.0)
     steps = fit_map(np.repeat([0.0, 1.0, 2.0], 5), rng.normal(size=15))
-    assert "x takes 3 values only" in steps.status
+    assert "x has only 3 distinct values" in steps.status
     with pytest.raises(InputError, match="x is 1 throughout"):
         fit_map(np.ones(20), np.arange(20.0))
-    with pytest.raises(InputError, match="equal lengths"):
+    with pytest.raises(InputError, match="must be equally long"):
         fit_map(np.arange(20.0), np.arange(19.0))

@@ -124,7 +124,7 @@ def test_regions_are_sorted_by_length_and_join():
     fit = find_regions(x, np.interp(x, KNOTS, LOADS), pieces=4)
     lengths = [r.high.value - r.low.value for r in fit.regions]
     assert lengths == sorted(lengths, reverse=True) and sum(lengths) == pytest.approx(2.0)
-    # No noise: the search rests where the cost is rounding, a millionth of the range.
+    # No noise: the search stops where the cost is rounding, a millionth of the range.
     np.testing.assert_allclose(sorted_breaks(fit), KNOTS[1:-1], atol=2e-6)
     answer = fit.answer()
     assert answer["chosen"] == 0
@@ -149,9 +149,9 @@ def test_units_and_order_of_the_samples_do_not_matter(factor, shift, shuffler):
 
 def test_too_few_samples_and_bad_columns_are_refused():
     x = np.linspace(1.0, 2.0, 10)
-    with pytest.raises(InputError, match="allowed is 1 to 3"):
+    with pytest.raises(InputError, match="must be 1 to 3"):
         find_regions(x, x**2, pieces=4)
-    with pytest.raises(InputError, match="equal lengths"):
+    with pytest.raises(InputError, match="must be equally long"):
         find_regions(x, np.arange(9.0))
     with pytest.raises(InputError, match="stretch is 1 throughout"):
         find_regions(np.ones(10), x)

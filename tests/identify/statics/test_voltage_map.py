@@ -1,4 +1,4 @@
-"""Voltage maps: the paper's curve through noise and loops, limits of what a loop tells."""
+"""Voltage maps: the paper's curve through noise and loops, limits of identifiability."""
 
 import numpy as np
 import pytest
@@ -162,11 +162,11 @@ def test_what_does_not_follow_has_no_result_and_bad_columns_are_refused():
     fit = fit_voltage_map(rng.normal(size=500), rng.normal(size=500))
     assert fit.status.startswith("no result") and not fit.succeeded
     assert fit.answer()["a1_v"] is None
-    with pytest.raises(ResultError, match="does not follow"):
+    with pytest.raises(ResultError, match="does not depend"):
         _ = fit.map
-    with pytest.raises(ResultError, match="does not follow"):
+    with pytest.raises(ResultError, match="does not depend"):
         fit.curve_std(0.0)
-    with pytest.raises(InputError, match="equal lengths"):
+    with pytest.raises(InputError, match="must be equally long"):
         fit_voltage_map(np.arange(9.0), np.arange(10.0))
     with pytest.raises(InputError, match="voltage_v is 1 throughout"):
         fit_voltage_map(np.arange(9.0), np.ones(9))

@@ -37,7 +37,7 @@ def bound(plant, u, rate_hz, std, state):
     return np.sqrt(np.diag(np.linalg.inv(information)))[:4]
 
 
-def test_the_fit_reaches_the_cramer_rao_bound_with_honest_intervals():
+def test_the_fit_reaches_the_cramer_rao_bound_with_correct_intervals():
     plant, u, state = replace(PAPER, delay_s=0.01), chirp(100), [0.1, 0.0]
     clean = plant.simulate(u, 100.0, TIME_S, state) + 0.05
     std = float(np.sqrt(np.mean((clean - clean.mean()) ** 2) / 1e3))
@@ -59,7 +59,7 @@ def test_the_fit_reaches_the_cramer_rao_bound_with_honest_intervals():
 
 
 @pytest.mark.long
-def test_coloured_noise_keeps_the_intervals_honest():
+def test_coloured_noise_keeps_the_intervals_correct():
     u = chirp(100)
     clean = PAPER.simulate(u, 100.0, TIME_S)
     inside, runs = 0, 60
@@ -73,7 +73,7 @@ def test_coloured_noise_keeps_the_intervals_honest():
 
 
 @pytest.mark.parametrize("omega", [OMEGA, 2 * np.pi * 5.11])
-def test_a_chirp_and_a_step_together_tell_the_slow_branch(omega):
+def test_a_chirp_and_a_step_together_identify_the_slow_branch(omega):
     rng = np.random.default_rng(8)
     plant = Plant(0.5, omega, 0.1, 0.012, (SlowMode(0.4, 4.7),))
     u, long_s = chirp(100), np.arange(8000) / 400.0
@@ -126,7 +126,7 @@ def test_zeros_are_found():
     y = PAPER.simulate(u, 100.0, fine_s) + 0.5 * rate + 0.01 * rng.normal(size=4000)
     fit = fit_transfer([Record(u, 100.0, y, fine_s)], TransferStructure(zeros=1, delay=0.0))
     assert fit.zeros[0].real == pytest.approx(-2.0, rel=0.01)
-    with pytest.raises(ResultError, match="takes 2 and 0"):
+    with pytest.raises(ResultError, match="needs 2 and 0"):
         _ = fit.plant
 
 
@@ -139,7 +139,7 @@ def test_an_output_that_does_not_follow_gives_no_result():
             _ = fit.plant
 
 
-def test_one_step_from_rest_is_fitted_and_the_assumption_is_told():
+def test_one_step_from_rest_is_fitted_and_the_assumption_is_reported():
     rng = np.random.default_rng(12)
     y = PAPER.simulate(np.ones(1), 100.0, TIME_S) + 0.005 * rng.normal(size=4000)
     fit = fit_transfer([Record(np.ones(1), 100.0, y, TIME_S)])
@@ -154,14 +154,14 @@ def test_bad_records_and_structures_are_refused():
         Record(np.arange(10.0), 10.0, np.arange(10.0), np.zeros(10))
     with pytest.raises(InputError, match="nan at index 3"):
         Record.sampled(np.arange(9.0), np.where(np.arange(9) == 3, np.nan, np.arange(9)), 10.0)
-    with pytest.raises(InputError, match="equal lengths"):
+    with pytest.raises(InputError, match="must be equally long"):
         Record(np.arange(9.0), 10.0, np.arange(9.0), np.arange(10.0))
     with pytest.raises(InputError, match="zeros = 3"):
         TransferStructure(zeros=3)
-    with pytest.raises(InputError, match="allowed are natural_frequency_rad_s"):
+    with pytest.raises(InputError, match="must be one of natural_frequency_rad_s"):
         fit_transfer(
             [Record.sampled(np.arange(50.0), np.arange(50.0), 1.0)],
             TransferStructure(fixed={"omega": 1.0}),
         )
-    with pytest.raises(InputError, match="numbers need"):
+    with pytest.raises(InputError, match="parameters need"):
         fit_transfer([Record.sampled(np.arange(9.0), np.arange(9.0), 1.0)])

@@ -1,4 +1,4 @@
-"""What records tell and do not tell: structures, creep, swapped columns, runaway, bootstrap."""
+"""What is identifiable from records: structures, creep, swapped columns, runaway, bootstrap."""
 
 import numpy as np
 import pytest
@@ -98,16 +98,16 @@ def test_residuals_of_a_softening_plant_and_of_a_missing_mode_are_noticed():
 
 
 @pytest.mark.long
-def test_the_residual_tests_are_quiet_where_the_model_is_right():
-    quiet = np.zeros(2)
+def test_the_residual_tests_pass_where_the_model_is_right():
+    passed = np.zeros(2)
     runs = 60
     for run in range(runs):
         rng = np.random.default_rng([8, run])
         y = Plant(0.5, OMEGA, ZETA, 0.01).simulate(CHIRP, 400.0, CHIRP_S)
         fit = fit_transfer([Record.sampled(CHIRP, y + STD * rng.normal(size=4000), 400.0)])
-        quiet += [fit.residual_whiteness_p > 0.05, fit.input_correlation_p > 0.05]
+        passed += [fit.residual_whiteness_p > 0.05, fit.input_correlation_p > 0.05]
     # Binomial: 3 spreads below 95 %.
-    assert (quiet / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
+    assert (passed / runs >= 0.95 - 3 * np.sqrt(0.95 * 0.05 / runs)).all()
 
 
 @pytest.mark.long
@@ -119,14 +119,14 @@ def test_the_bootstrap_has_the_spread_of_the_covariance_and_stays_inside_it():
         # The spread of 300 draws has a relative error of 1/sqrt(600): 4 of it.
         assert drawn[name].std == pytest.approx(estimate.std, rel=0.17), name
         assert drawn[name].ci95[0] < estimate.value < drawn[name].ci95[1]
-    with pytest.raises(InputError, match="allowed is 100 or more"):
+    with pytest.raises(InputError, match="must be 100 or more"):
         bootstrap_transfer(fit, 10, np.random.default_rng(1))
 
 
-def test_swapped_columns_and_an_output_that_runs_away_are_called_so():
+def test_swapped_columns_and_an_output_that_diverges_are_named():
     (sweep, _) = creeping(5)
     swapped = fit_transfer([Record.sampled(sweep.y, sweep.u, 400.0)])
-    assert swapped.status == "no result: the input follows the output; the columns are swapped"
+    assert swapped.status == "no result: the input responds to the output; the columns are swapped"
     growing = sweep.y + 0.01 * np.exp(0.8 * CHIRP_S) * np.sin(5.0 * CHIRP_S)
     assert "not stable" in fit_transfer([Record.sampled(CHIRP, growing, 400.0)]).status
 
@@ -137,7 +137,9 @@ def test_a_gap_in_time_and_unequal_columns_are_refused():
         Record(CHIRP, 400.0, np.sin(time_s), time_s)
     with pytest.raises(InputError, match="u has 3999 values and y 4000"):
         Record.sampled(CHIRP[1:], CHIRP, 400.0)
-    with pytest.raises(InputError, match="held_at_hz = 90 Hz; allowed is 400 Hz over a whole"):
+    with pytest.raises(
+        InputError, match="held_at_hz = 90 Hz; it must be 400 Hz divided by a whole"
+    ):
         Record.sampled(CHIRP, CHIRP, 400.0, held_at_hz=90.0)
-    with pytest.raises(InputError, match="hold = linear; allowed are zero, first, band-limited"):
+    with pytest.raises(InputError, match="hold = linear; must be one of zero, first, band-limited"):
         Record.sampled(CHIRP, CHIRP, 400.0, hold="linear")

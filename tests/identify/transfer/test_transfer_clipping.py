@@ -1,4 +1,4 @@
-"""Which inputs and outputs count as clipped: none that is only held, slow or bent."""
+"""Which inputs and outputs count as clipped: none that is only held, slow or nonlinear."""
 
 import numpy as np
 import pytest

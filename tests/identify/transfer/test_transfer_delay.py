@@ -52,7 +52,7 @@ def test_one_steady_tone_determines_two_numbers():
     u = np.sin(2 * np.pi * 1.0 * t)
     y = plant.simulate(u, RATE_HZ, t)[2000:] + 0.02 * rng.normal(size=2000)
     record = Record.sampled(u[2000:], y, RATE_HZ)
-    assert "steady tones of 1 Hz, which determine 2 numbers" in fit_transfer([record]).status
+    assert "steady tones of 1 Hz, which determine 2 parameters" in fit_transfer([record]).status
 
 
 def test_resonances_come_in_order_of_their_frequency():

@@ -85,7 +85,7 @@ def test_spikes_at_random_times_of_steps_are_spikes():
 
 @pytest.mark.parametrize("applied", [True, False])
 def test_an_input_that_is_known_was_not_clipped(applied):
-    """What the fit leaves of a curved input looks like a limit to it, unless it is told better."""
+    """What the fit leaves of a curved input looks like a limit, unless `applied`."""
     rng = np.random.default_rng(3)
     u, y = recorded(rng)
     y = PLANT.simulate(np.clip(u, -0.5, 9.0), RATE_HZ, np.arange(y.size) / RATE_HZ)

@@ -1,4 +1,4 @@
-"""Deviations where the likelihood is no parabola: plants of `benchmarks/identify_board.py`."""
+"""Deviations where the likelihood is no parabola: random plants of the benchmarks."""
 
 from importlib import import_module
 
@@ -12,7 +12,7 @@ from haselab.models import Plant
 
 @pytest.fixture
 def plant(benchmarks):
-    return import_module("identify_board").case
+    return import_module("benchmarks.identification.random_plants").case
 
 
 def test_a_weak_resonance_gets_the_deviation_of_its_flat_likelihood(plant):
@@ -30,8 +30,8 @@ def test_a_resonance_that_a_line_of_the_noise_replaces_is_ambiguous(plant):
     one = plant(53)
     fit = fit_transfer([Record.sampled(one.u, one.y, one.rate_hz)], one.structure)
     assert fit.status.startswith("ambiguous")
-    assert fit.rivals[0].possible
-    assert fit.answer()["rivals"][0]["log_likelihood_below"] < 8.0
+    assert fit.other_minima[0].possible
+    assert fit.answer()["other_minima"][0]["log_likelihood_below"] < 8.0
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-2, 0.1])

@@ -1,4 +1,4 @@
-"""Error over the bound in every condition of benchmarks/sensing_accuracy.py, with fewer blocks."""
+"""Error over the bound in every condition of benchmarks/sensing/accuracy.py, with fewer blocks."""
 
 import importlib
 
@@ -9,7 +9,7 @@ BLOCKS = 480  # the rms of so many errors is known to 1 / sqrt(960) = 3.2 %
 
 @pytest.fixture(scope="module")
 def accuracy(benchmarks):
-    return importlib.import_module("sensing_accuracy")
+    return importlib.import_module("benchmarks.sensing.accuracy")
 
 
 @pytest.mark.long

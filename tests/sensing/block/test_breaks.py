@@ -5,18 +5,18 @@ import pytest
 
 from haselab.sensing import LockinConfig
 from haselab.sensing.block.dropouts import find_breaks
-from haselab.sensing.block.segments import Pieces
+from haselab.sensing.block.segments import Segments
 
 CONFIG = LockinConfig(200e3, 2000, 2000.0, 0.0, 2.5e6, search_updates=True)
 STD = 1e-3
 
 
 def searched(rng, current, stuck=None, used=None):
-    """Pieces of a constant voltage and of a current with a factor each, with noise."""
-    pieces = Pieces(CONFIG)
-    count = pieces.count
+    """Segments of a constant voltage and of a current with a factor each, with noise."""
+    segments = Segments(CONFIG)
+    count = segments.count
     phasors = np.stack([np.full(count, 0.025 + 0j), 0.08j * np.asarray(current)])[np.newaxis]
-    scale = STD * np.sqrt(pieces.quadrature)
+    scale = STD * np.sqrt(segments.quadrature)
     noise = rng.standard_normal(phasors.shape) + 1j * rng.standard_normal(phasors.shape)
     nothing = np.zeros((1, 2, count), dtype=bool)
     return find_breaks(
@@ -24,7 +24,7 @@ def searched(rng, current, stuck=None, used=None):
         np.ones((1, count), dtype=bool) if used is None else used,
         nothing if stuck is None else stuck,
         np.full((1, 2), STD**2),
-        pieces,
+        segments,
     )
 
 
@@ -41,7 +41,7 @@ def test_a_stretch_with_another_quotient_is_refused_and_named(rng, lost, factor,
     current[lost] = factor
     found = searched(rng, current)
     assert found.refused[0]
-    # The pieces at the edges belong to either part.
+    # The segments at the edges belong to either part.
     assert found.texts[0].split(" from ")[0] == text.split(" from ")[0]
     edges = [float(word) for word in found.texts[0].split() if word.replace(".", "").isdigit()]
     known = [float(word) for word in text.split() if word.replace(".", "").isdigit()]

@@ -1,4 +1,4 @@
-"""What disturbs a block is found, blanked or told; nothing wrong passes in silence."""
+"""What disturbs a block is found, blanked or reported; nothing wrong passes in silence."""
 
 from dataclasses import replace
 
@@ -33,7 +33,8 @@ def test_an_update_at_an_unknown_time_costs_no_more_than_the_pieces_it_hits(scen
     sensed = lockin.sense(stepped(case, rng, at))
     assert sensed.valid.all()
     error_f = sensed.capacitance_f - case.capacitance_f
-    # Two of 17 pieces are left out, and a level more is fitted; 200 blocks tell an rms to 5 %.
+    # Two of 17 segments are left out, and a level more is fitted; 200 blocks determine an rms to 5
+    # %.
     assert rms(error_f) < 1.3 * case.capacitance_bound_f
     assert sensed.capacitance_std_f.mean() == pytest.approx(rms(error_f), rel=0.2)
 
@@ -48,7 +49,7 @@ def test_an_update_at_a_blocks_end_settles_in_the_next_one(scene, rng, rms, heig
     readings[:, :52, 1] += height_v * tail * charge
     sensed = Lockin(scene.config(search_updates=True)).sense(readings)
     assert sensed.valid.all()
-    # Three of 17 pieces are left out: 1 / sqrt(1 - 0.17) = 1.10.
+    # Three of 17 segments are left out: 1 / sqrt(1 - 0.17) = 1.10.
     assert rms(sensed.capacitance_f - scene.capacitance_f) < 1.3 * scene.capacitance_bound_f
 
 
@@ -73,7 +74,7 @@ def test_two_updates_in_one_block_are_both_left_out(scene, rng, rms):
     sensed = Lockin(scene.config(search_updates=True)).sense(readings)
     assert sensed.valid.all()
     assert "steps at" in sensed.model(7)
-    # Four of 20 pieces are left out: 1 / sqrt(0.8) = 1.12; 200 blocks tell an rms to 5 %.
+    # Four of 20 segments are left out: 1 / sqrt(0.8) = 1.12; 200 blocks determine an rms to 5 %.
     error_f = sensed.capacitance_f - scene.capacitance_f
     assert rms(error_f) < 1.12 * 1.15 * scene.capacitance_bound_f
     assert sensed.capacitance_std_f.mean() == pytest.approx(rms(error_f), rel=0.2)

@@ -1,7 +1,7 @@
 """Blocks that the plain model does not explain: right within the stated deviation, or refused.
 
-The records are those of the sensing board (`benchmarks/sensing_cases.py`), made without the code
-under test; the bound is Cramer-Rao's for the white noise and the converter's step alone.
+The records are those of `benchmarks/sensing/disturbance_cases.py`, made without the code under
+test; the bound is Cramer-Rao's for the white noise and the converter's step alone.
 """
 
 from dataclasses import replace
@@ -16,7 +16,7 @@ BLOCKS = 60
 
 @pytest.fixture(scope="module")
 def cases(benchmarks):
-    from sensing_cases import CASES
+    from benchmarks.sensing.disturbance_cases import CASES
 
     return {case.name: case for case in CASES}
 
@@ -31,7 +31,7 @@ def rms(values):
     return float(np.sqrt(np.nanmean(np.square(values))))
 
 
-# 60 blocks tell an rms to 9 %; pieces left out for a step cost up to a fifth of the samples.
+# 60 blocks determine an rms to 9 %; segments left out for a step cost up to a fifth of the samples.
 @pytest.mark.parametrize(
     ("name", "words", "over_bound"),
     [
@@ -128,7 +128,7 @@ def test_steps_anywhere_are_right_in_nearly_all_blocks(cases, name):
     case = cases[name]
     sensed, error, std = sensed_of(case, blocks=120)
     assert sensed.valid.mean() > 0.97
-    assert rms(error) < 1.3 * case.scene.bound  # 120 blocks tell an rms to 6 %
+    assert rms(error) < 1.3 * case.scene.bound  # 120 blocks determine an rms to 6 %
     assert 0.75 < rms(std) / rms(error) < 1.33
     assert (np.abs(error[sensed.valid]) < 5.0 * std[sensed.valid]).all()
 
@@ -156,9 +156,9 @@ def test_a_block_too_short_for_models_is_refused_where_it_is_not_plain(cases):
     """2.5 carrier periods under hum, against the same without it."""
     plain, hum = cases["plain"], cases["hum 1 V, 50 Hz"]
     short = replace(plain.scene, block=250, v_peak_v=0.25)
-    quiet, _ = replace(plain, scene=short).record(80, 2)
+    clean, _ = replace(plain, scene=short).record(80, 2)
     loud, _ = replace(hum, scene=short).record(80, 2)
-    assert Lockin(short.config()).sense(quiet).valid.all()
+    assert Lockin(short.config()).sense(clean).valid.all()
     sensed = Lockin(short.config()).sense(loud)
     assert not sensed.valid.any()
     assert all("too few carrier periods" in sensed.reason_of(k) for k in range(80))

@@ -8,7 +8,7 @@ import pytest
 from haselab import _sense
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.block.drive import DriveLibrary
-from haselab.sensing.block.segments import Pieces
+from haselab.sensing.block.segments import Segments
 
 PIECES, PRICE, CUT, LEFT_OUT = 7, 8.0, 6.0, 10.0
 WIDE = _sense.PART_COLUMNS
@@ -24,7 +24,7 @@ def tables(rng):
 
 
 def exhaustive(y, columns):
-    """Least score over every choice of pieces left out; runs between them are parts."""
+    """Least score over every choice of segments left out; runs between them are parts."""
     best = np.inf
     for used in product((0, 1), repeat=PIECES):
         score, at = LEFT_OUT * (PIECES - sum(used)), 0
@@ -51,7 +51,7 @@ def test_the_cut_is_the_best_of_all(rng):
     parts, result = np.zeros((40, PIECES), _sense.PART), np.empty(40, _sense.PARTS_RESULT)
     _sense.parts(y, [np.concatenate(columns)], [2, 2, 1, 2], [PRICE, CUT, LEFT_OUT], parts, result)
     assert result["score"] == pytest.approx([exhaustive(one, columns) for one in y], rel=1e-12)
-    assert (parts["count"].sum(axis=1) < PIECES)[::2].all()  # piece 3 is left out
+    assert (parts["count"].sum(axis=1) < PIECES)[::2].all()  # segment 3 is left out
     assert (result["parts"] == (parts["count"] > 0).sum(axis=1)).all()
 
 
@@ -75,7 +75,7 @@ def test_rows_of_another_dtype_are_refused(rng):
 def test_what_a_drive_puts_into_the_carrier_is_what_the_choice_takes_off(tau_s):
     """A noise-free drive with two steps; the choice must predict its part in the carrier."""
     config = LockinConfig(200e3, 2000, 2000.0, 0.0, 2.5e6, search_updates=True)
-    pieces = Pieces(config)
+    segments = Segments(config)
     time = np.arange(2000) / 200e3
     block = 0.3 + 20.0 * time
     for start, height in ((2.3e-3, 0.2), (6.7e-3, -0.1)):
@@ -83,9 +83,9 @@ def test_what_a_drive_puts_into_the_carrier_is_what_the_choice_takes_off(tau_s):
         rise = 1.0 - np.exp(-after / tau_s) if tau_s else 1.0
         block = block + np.where(time >= start, height * rise, 0.0)
     readings = np.repeat(np.stack([block, -2.0 * block], axis=1)[np.newaxis], 20, axis=0)
-    projected = pieces.project(pieces.cut(readings))
+    projected = segments.project(segments.cut(readings))
     noise = np.full((20, 2), 1e-6)  # 1 mV rms
-    drive = DriveLibrary(pieces, expected=True).choose(projected.slow, noise, harmonics=False)
+    drive = DriveLibrary(segments, expected=True).choose(projected.slow, noise, harmonics=False)
     left = projected.carrier - drive.carrier.reshape(projected.carrier.shape)
     used = drive.used[:, np.newaxis, :, np.newaxis] & np.ones_like(left, dtype=bool)
     assert (~drive.used).sum() <= 20 * 6

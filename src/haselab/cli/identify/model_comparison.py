@@ -17,7 +17,7 @@ from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.charts import odds_chart
 from haselab.identify.model_comparison.agreement import Agreement, agree
-from haselab.identify.model_comparison.comparison import Rival, Verdict, compare
+from haselab.identify.model_comparison.comparison import CandidateModel, ModelComparison, compare
 from haselab.identify.model_comparison.hypotheses import (
     QUESTIONS,
     hypotheses_of,
@@ -107,8 +107,8 @@ def verdict(
         raise ResultError(f"{found.status}: {listed}")
     _give(found, _page(found), as_json, out)
     save_plot(plot, lambda: odds_chart(
-        found.verdict, [rival.name for rival in found.rivals],
-        [rival.probability for rival in found.rivals],
+        found.verdict, [candidate.name for candidate in found.candidates],
+        [candidate.probability for candidate in found.candidates],
     ))  # fmt: skip
 
 
@@ -120,10 +120,12 @@ def _record(file: Path, columns: ColumnOptions, options: dict[str, Any]) -> Reco
         return Record.sampled(table[source], table[output], rate_hz)
 
 
-def _give(found: Verdict | Agreement, page: Sequence[str], as_json: bool, out: Path | None) -> None:
+def _give(
+    found: ModelComparison | Agreement, page: Sequence[str], as_json: bool, out: Path | None
+) -> None:
     answer = found.answer()
-    if isinstance(found, Verdict):
-        answer |= found.rivals[0].model
+    if isinstance(found, ModelComparison):
+        answer |= found.candidates[0].model
     if out is not None:
         write_json(out, answer)
     if as_json:
@@ -132,14 +134,14 @@ def _give(found: Verdict | Agreement, page: Sequence[str], as_json: bool, out: P
         click.echo("\n".join(page))
 
 
-def _page(found: Verdict) -> list[str]:
+def _page(found: ModelComparison) -> list[str]:
     """The answer as lines to read."""
     lines = [found.verdict, ""]
     lines.append("hypothesis        misfit  parameters   2 ln odds     lead  probability")
-    lines += [_row(rival) for rival in found.rivals]
+    lines += [_row(candidate) for candidate in found.candidates]
     lines.append(f"effective number of independent samples: {found.effective_samples:.3g}")
     lines += ["", *found.notes]
-    best = found.rivals[0]
+    best = found.candidates[0]
     lines += ["", best.name]
     for name, estimate in best.estimates.items():
         low, high = estimate.ci95
@@ -149,14 +151,14 @@ def _page(found: Verdict) -> list[str]:
     return lines
 
 
-def _row(rival: Rival) -> str:
-    if rival.status != "ok":
-        return f"{rival.name:14s} {rival.status}"
-    lead = "" if rival.lead != rival.lead else f"{rival.lead:.1f}"
-    mark = "  excluded" if rival.excluded else ""
+def _row(candidate: CandidateModel) -> str:
+    if candidate.status != "ok":
+        return f"{candidate.name:14s} {candidate.status}"
+    lead = "" if candidate.lead != candidate.lead else f"{candidate.lead:.1f}"
+    mark = "  excluded" if candidate.excluded else ""
     return (
-        f"{rival.name:14s} {100.0 * rival.misfit:7.2f} % {rival.parameters:10d} "
-        f"{0.0 - rival.bic:11.1f} {lead:>8s} {rival.probability:12.3g}{mark}"
+        f"{candidate.name:14s} {100.0 * candidate.misfit:7.2f} % {candidate.parameters:10d} "
+        f"{0.0 - candidate.bic:11.1f} {lead:>8s} {candidate.probability:12.3g}{mark}"
     )
 
 

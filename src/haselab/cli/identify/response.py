@@ -16,10 +16,10 @@ from haselab.cli.common import INTEGER, REAL, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.identify.charts import response_chart
 from haselab.identify.free.response import FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
 from haselab.identify.frequency.response import RESPONSE_METHODS, estimate_frequency_response
+from haselab.identify.frequency.response_chart import response_chart
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table

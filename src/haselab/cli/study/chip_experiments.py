@@ -1,4 +1,4 @@
-"""Microcontroller experiments of the reference study (rows S26, S28), in a separate process.
+"""Microcontroller experiments of the reference study (rows S26, S28), each in its own process.
 
 They start when the study has designed its controllers, and run in parallel with the rest of it.
 All their inputs are files in the run's folder, with which `haselab run` repeats them.
@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -50,7 +50,7 @@ _PLACE = EXPERIMENTS.parent
 
 
 class ChipExperiments:
-    """The process that plays the microcontroller experiments.
+    """The processes that play the microcontroller experiments.
 
     Args:
         folder: of the run.
@@ -72,8 +72,8 @@ class ChipExperiments:
     ) -> None:
         self._folder, self._study, self._config = folder, study, config
         self._seed, self._quick, self._keep_video = seed, quick, keep_video
-        self._process: subprocess.Popen[bytes] | None = None
-        self._output: IO[bytes] | None = None
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._output: dict[str, IO[bytes]] = {}
         self._found: dict[type, object] = {}
 
     def start(self, outcome: Outcome) -> None:
@@ -87,7 +87,7 @@ class ChipExperiments:
         self._found |= {type(value): value for value in outcome.values}
         maps, dynamics = self._found.get(Maps), self._found.get(Dynamics)
         loops = self._found.get(Loops)
-        if self._process is not None or not (maps and dynamics and loops):
+        if self._processes or not (maps and dynamics and loops):
             return
         assert isinstance(maps, Maps) and isinstance(dynamics, Dynamics)
         assert isinstance(loops, Loops)
@@ -106,12 +106,14 @@ class ChipExperiments:
             },
         }
         write_text(place / "chip.toml", toml_text(rig))
-        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(self._folder), self._keep_video],
-            stdin=subprocess.PIPE, stdout=self._output, stderr=self._output,
-            start_new_session=True,  # Ctrl-C goes to the study, whose end ends this process
-        )  # fmt: skip
+        for name in (CHIP, MINIATURE):
+            output = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
+            self._output[name] = output
+            self._processes[name] = subprocess.Popen(
+                [sys.executable, "-m", __name__, str(self._folder), self._keep_video, name],
+                stdin=subprocess.PIPE, stdout=output, stderr=output,
+                start_new_session=True,  # Ctrl-C is for the study, whose end ends these
+            )  # fmt: skip
 
     def finish(self) -> Mapping[str, str]:
         """Wait for the end.
@@ -119,22 +121,28 @@ class ChipExperiments:
         Returns:
             Why an experiment was left out, by its row; the report states it, too.
         """
-        if self._process is None or self._output is None:
+        if not self._processes:
             return {}
-        path = self._folder / EXPERIMENTS
-        if self._process.wait() != 0:
-            self._output.seek(0)
-            lines = self._output.read().decode(errors="replace").strip().splitlines()
-            why = f"its process ended early: {lines[-1] if lines else 'no message'}."
-            write_json(path, {"left_out": dict.fromkeys((CHIP, MINIATURE), why)})
-        left_out = read_json(path).get("left_out", {})
+        parts = []
+        for name, process in self._processes.items():
+            path = self._folder / _part(name)
+            if process.wait() == 0:
+                parts.append(read_json(path))
+                path.unlink()
+            else:
+                self._output[name].seek(0)
+                lines = self._output[name].read().decode(errors="replace").strip().splitlines()
+                why = f"its process ended early: {lines[-1] if lines else 'no message'}."
+                parts.append({"left_out": {name: why}})
+        known = _joined(parts)
+        write_json(self._folder / EXPERIMENTS, known)
+        left_out = known["left_out"]
         rows = ((CHIP, "S26"), (MINIATURE, "S28"))
         return {row: str(left_out[name]) for name, row in rows if name in left_out}
 
     def stop(self) -> None:
-        """End the process, whatever its state."""
-        process = self._process
-        if process is not None:
+        """End the processes, whatever their state."""
+        for process in self._processes.values():
             assert process.stdin is not None
             with contextlib.suppress(OSError):
                 process.stdin.close()  # tells it to end
@@ -143,40 +151,49 @@ class ChipExperiments:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        if self._output is not None:
-            self._output.close()
+        for output in self._output.values():
+            output.close()
 
 
-def main(folder: Path, keep_video: str) -> None:
-    """Play both experiments, and the same steps with the desktop's loops.
+def main(folder: Path, keep_video: str, name: str) -> None:
+    """Play an experiment and write what is known of it; the chip's step also with desktop loops.
 
     Args:
         folder: of the run, with actuator.toml and the files of `ChipExperiments`.
         keep_video: which frames are kept.
+        name: of the experiment.
     """
     place = folder / _PLACE
     steps = load_step_study(place / "chip-steps.toml")
-    known: dict[str, Any] = {"left_out": {}, "notes": {}, "desktops": {}}
-    with _left_out(known, CHIP):
-        file = _chip_file(place / "chip.toml")
-        record_on_chip(steps, file, place / "chip.toml", folder / CHIP, keep_video)
-        known["desktops"][CHIP] = _desktops(file, place, steps)
-    with _left_out(known, MINIATURE):
-        design = _write_miniature(folder, steps)
-        known["notes"][MINIATURE] = _scaled(design)
-        at = place / "miniature.toml"
-        smaller = load_step_study(place / "miniature-steps.toml")
-        record_on_chip(smaller, _chip_file(at), at, folder / MINIATURE, keep_video)
-    write_json(folder / EXPERIMENTS, to_plain(known))
-
-
-@contextlib.contextmanager
-def _left_out(known: dict[str, Any], name: str) -> Iterator[None]:
-    """Note why an experiment cannot be played; the other one and the study continue."""
+    known = _joined([])
     try:
-        yield
-    except HaselabError as error:
+        if name == CHIP:
+            file = _chip_file(place / "chip.toml")
+            record_on_chip(steps, file, place / "chip.toml", folder / CHIP, keep_video)
+            known["desktops"][CHIP] = _desktops(file, place, steps)
+        else:
+            design = _write_miniature(folder, steps)
+            known["notes"][MINIATURE] = _scaled(design)
+            at = place / "miniature.toml"
+            smaller = load_step_study(place / "miniature-steps.toml")
+            record_on_chip(smaller, _chip_file(at), at, folder / MINIATURE, keep_video)
+    except HaselabError as error:  # which leaves the other experiment and the study as they are
         known["left_out"][name] = " ".join(str(error).split())
+    write_json(folder / _part(name), to_plain(known))
+
+
+def _part(name: str) -> Path:
+    """What the process of an experiment leaves for `ChipExperiments.finish`."""
+    return _PLACE / f"{name}.json"
+
+
+def _joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Content of experiments.json."""
+    known: dict[str, dict[str, Any]] = {"left_out": {}, "notes": {}, "desktops": {}}
+    for part in parts:
+        for key, found in part.items():
+            known[key] |= found
+    return known
 
 
 def _chip_file(path: Path) -> ChipFile:
@@ -245,4 +262,4 @@ def _end_with_the_study() -> None:
 
 if __name__ == "__main__":
     threading.Thread(target=_end_with_the_study, daemon=True).start()
-    main(Path(sys.argv[1]), sys.argv[2])
+    main(Path(sys.argv[1]), sys.argv[2], sys.argv[3])

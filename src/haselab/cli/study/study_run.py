@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -15,6 +15,7 @@ from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
+from haselab.cli.study.noise_free_run import NoiseFreeRun
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig
@@ -30,7 +31,7 @@ from haselab.study.experiment import Outcome
 from haselab.study.feasibility import check_drives
 from haselab.study.folder import sections_found, write_findings
 from haselab.study.pipeline import Findings
-from haselab.study.run import RunOptions, noise_free_results, run_study, session_header
+from haselab.study.run import RunOptions, run_study, session_header
 
 __all__ = [
     "MAX_SEED",
@@ -115,8 +116,7 @@ def execute(
     """
     rig_config = config.model_dump(mode="json")
     options = RunOptions(folder, seed, cast(KeepVideo, keep_video), rig_config, known)
-    noise_free_of = functools.partial(noise_free_results, config, study, known)
-    _execute(study, rig, options, as_json, noise_free_of, parallel)
+    _execute(study, rig, options, as_json, NoiseFreeRun(config, study, known), parallel)
 
 
 def execute_on(
@@ -138,21 +138,27 @@ def _execute(
     rig: Rig,
     options: RunOptions,
     as_json: bool,
-    noise_free_of: Callable[[Findings], dict[str, float]] | None = None,
+    noise_free_run: NoiseFreeRun | None = None,
     parallel: ParallelExperiments | None = None,
 ) -> None:
     folder = options.folder
     _check_before_anything_moves(study, rig, folder)
     progress = Interruptible(progress_bar())
     noise_free = None
+    running = ExitStack()
+    companions = [one for one in (noise_free_run, parallel) if one is not None]
+
+    def fitted(outcome: Outcome) -> None:
+        for one in companions:
+            one.start(outcome)
+
     try:
-        if parallel is None:
-            found = run_study(study, rig, options, progress)
-        else:
-            found = run_study(study, rig, options, progress, parallel.start)
-        if noise_free_of is not None:
+        if noise_free_run is not None:
+            running.enter_context(noise_free_run)
+        found = run_study(study, rig, options, progress, fitted)
+        if noise_free_run is not None:
             progress.advance(0.0, "noise-free reference run")
-            noise_free = _noise_free(noise_free_of, found)
+            noise_free = _noise_free(noise_free_run)
         if parallel is not None:
             progress.advance(0.0, "microcontroller experiments")
             for row, why in parallel.finish().items():
@@ -163,6 +169,7 @@ def _execute(
     finally:
         rig.safe()
         progress.stop()
+        running.close()
         if parallel is not None:
             parallel.stop()
     if study.is_reference:
@@ -207,12 +214,10 @@ def mark_found(folder: Path, found: Findings, recorded_in: Path | None, *, simul
     mark_sections(folder / ACTUATOR, sections_found(found), inputs, simulated=simulated)
 
 
-def _noise_free(
-    noise_free_of: Callable[[Findings], dict[str, float]], found: Findings
-) -> dict[str, float] | None:
+def _noise_free(run: NoiseFreeRun) -> dict[str, float] | None:
     """Results of the twin without noise; None, with a note, if a fit fails there."""
     try:
-        return noise_free_of(found)
+        return run.results()
     except ResultError as error:
         click.echo(f"haselab: no noise-free results: {error}", err=True)
         return None

@@ -1,1 +1,1 @@
-"""Plants in the form in which loops are simulated."""
+"""Plants in forms for the simulation of loops."""

@@ -1,4 +1,4 @@
-"""Any rational plant with a delay behind a hold: exact samples by the matrix exponential."""
+"""Exact discretisation of any rational plant with hold and delay, by the matrix exponential."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ __all__ = ["AnyPlant", "HeldModel", "PlantScale", "corners_of", "sampled_respons
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 AnyPlant = Plant | RationalModel
-_WHOLE = 1e-9  # of a sample
+_WHOLE = 1e-9  # of a sample: tolerance for whole delays
 
 
 @dataclass(frozen=True)
 class HeldModel:
-    r"""A plant between a zero-order hold and a sampler that reads the output late.
+    r"""A plant between a zero-order hold and a sampler with delay.
 
-    $x_{k+1} = \Phi x_k + \Gamma u_k,\quad v_k = C x_k + D u_k$, and $v_k$ is what a controller
-    reads `samples` samples later, 1 or more. A measurement without delay is taken just before the
-    new output, so a feed-through shows one sample later.
+    $x_{k+1} = \Phi x_k + \Gamma u_k,\quad v_k = C x_k + D u_k$, and $v_k$ is the value that a
+    controller reads `samples` samples later, 1 or more. A measurement without delay is sampled
+    just before the new output, so a feed-through appears one sample later.
 
     Args:
         step: $\Phi$. Shape `(n, n)`.
         push: $\Gamma$. Shape `(n,)`.
-        read: C, the lead of a fraction of a sample included. Shape `(n,)`.
+        read: C, including the lead by a fraction of a sample. Shape `(n,)`.
         feed: D.
         samples: whole samples of delay, 1 or more.
     """
@@ -48,9 +48,10 @@ class HeldModel:
 
     @classmethod
     def of(cls, model: RationalModel, *, period_s: float, measurement_delay_s: float) -> HeldModel:
-        """The samples of a model.
+        """Discretise a model.
 
-        Source: variation of constants in controllable form, time scaled by the poles' size.
+        Source: variation of constants in controllable form, with time scaled by the poles'
+            magnitude.
         """
         a, b, c, d, omega = _scaled_states(model)
         delay_s = model.delay_s + measurement_delay_s
@@ -73,7 +74,7 @@ class HeldModel:
 
 
 def _scaled_states(model: RationalModel) -> tuple[Floats, Floats, Floats, float, float]:
-    """Controllable form in time scaled by omega: A, b, c, d, omega."""
+    """Controllable form with time scaled by omega: A, b, c, d, omega."""
     bottom, top = np.array(model.denominator), np.array(model.numerator)
     order = bottom.size - 1
     sizes = np.abs(model.poles)
@@ -91,7 +92,7 @@ def _scaled_states(model: RationalModel) -> tuple[Floats, Floats, Floats, float,
 
 
 def _held(a: Floats, b: Floats, time: float) -> tuple[Floats, Floats]:
-    """Free motion over `time`, and the state after a unit input of that length."""
+    """Transition matrix over `time`, and the state after a unit input of that length."""
     size = b.size
     block = np.zeros((size + 1, size + 1))
     block[:size, :size], block[:size, size] = a * time, b * time
@@ -101,11 +102,11 @@ def _held(a: Floats, b: Floats, time: float) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class PlantScale:
-    """What a plant does to the sizes of numbers: where a search for gains looks.
+    """Scales of a plant: the range of a search for gains.
 
     Args:
-        gain: static gain with its sign; of a plant that integrates, the gain at `slow_rad_s`.
-        least_gain: smallest gain up to `fast_rad_s` that a controller may have to make up for.
+        gain: static gain with its sign; for an integrating plant the gain at `slow_rad_s`.
+        least_gain: smallest gain up to `fast_rad_s` that a controller may have to compensate.
         slow_rad_s: slowest pole other than 0.
         fast_rad_s: fastest pole.
     """
@@ -117,11 +118,11 @@ class PlantScale:
 
     @classmethod
     def of(cls, plant: AnyPlant) -> PlantScale:
-        """The scale of a plant."""
+        """Compute the scales of a plant."""
         sizes = np.abs(np.asarray(plant.poles, dtype=complex))
         sizes = sizes[sizes > 0.0] if (sizes > 0.0).any() else np.ones(1)
         slow, fast = float(sizes.min()), float(sizes.max())
-        with np.errstate(divide="ignore", invalid="ignore"):  # a pole on the axis
+        with np.errstate(divide="ignore", invalid="ignore"):  # a pole may be on the axis
             response = np.abs(plant.frequency_response(np.geomspace(slow, fast, 20)))
         response = response[np.isfinite(response)] if np.isfinite(response).any() else np.ones(1)
         if isinstance(plant, Plant):
@@ -135,9 +136,9 @@ class PlantScale:
 
 
 def slowed(plant: AnyPlant, factor: float) -> AnyPlant:
-    """The plant with its frequencies times `factor`, the static gain and the delay kept.
+    """Scale the frequencies of a plant, with the same static gain and delay.
 
-    Of a `Plant` the resonance moves alone, its slow branches stay.
+    For a `Plant` only the resonance changes, not its slow branches.
     """
     if isinstance(plant, Plant):
         omega = plant.natural_frequency_rad_s * factor
@@ -153,7 +154,7 @@ def slowed(plant: AnyPlant, factor: float) -> AnyPlant:
 def sampled_response_of(
     plant: AnyPlant, omega_rad_s: ArrayLike, rate_hz: float, delay_s: float
 ) -> Complexes:
-    """Response behind a hold, read `delay_s` late (besides the plant's own delay).
+    """Sampled frequency response with hold, delayed by `delay_s` plus the plant's own delay.
 
     It is not finite at an undamped pole.
     """
@@ -166,12 +167,12 @@ def sampled_response_of(
 
 @lru_cache(maxsize=64)
 def _held_model(model: RationalModel, period_s: float, delay_s: float) -> HeldModel:
-    """The samples of a model; one loop asks for its response dozens of times."""
+    """The samples of a model; the response of one loop is evaluated dozens of times."""
     return HeldModel.of(model, period_s=period_s, measurement_delay_s=delay_s)
 
 
 def corners_of(plant: AnyPlant, gains: PidGains | LinearController | None = None) -> Complexes:
-    """Poles and zeros of plant and controller other than 0, where a response bends."""
+    """Corner frequencies of a response: poles and zeros of plant and controller other than 0."""
     roots = [np.asarray(plant.poles, dtype=complex)]
     model = plant if isinstance(plant, RationalModel) else RationalModel.from_plant(plant)
     roots.append(model.zeros)

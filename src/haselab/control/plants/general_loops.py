@@ -1,4 +1,4 @@
-"""Sampled loops around any rational plant: traces of many controllers, closed-loop poles."""
+"""Sampled loops with any rational plant: traces of many controllers, closed-loop poles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 
 def _law(gains: Sequence[PidGains], period_s: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Proportional, integral and derivative gains a sample, and the filter's weight; `(C,)`."""
+    """Proportional, integral and derivative gains per sample, and the filter's weight; `(C,)`."""
     kp, ki, kd, tau = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]).T
     return kp, ki * period_s, kd / period_s, period_s / (period_s + tau)
 
@@ -26,17 +26,17 @@ def _law(gains: Sequence[PidGains], period_s: float) -> tuple[Floats, Floats, Fl
 def trace_general(
     model: RationalModel, gains: Sequence[PidGains], reference: ArrayLike, setting: LoopSetting
 ) -> tuple[Floats, Floats]:
-    """Measurements and outputs of closed loops that start at rest at 0.
+    """Simulate closed loops that start from rest at 0.
 
     The controller is that of the C core, as in `simulate_loop`.
 
     Args:
         model: plant.
         gains: controllers. Length `C`.
-        reference: one value a sample. Shape `(N,)`.
+        reference: one value per sample. Shape `(N,)`.
         setting: rate, delay and limits.
     Returns:
-        Measured and put out. Shape `(C, N)` each.
+        Measurements and controller outputs. Shape `(C, N)` each.
     """
     period_s = 1.0 / setting.rate_hz
     held = HeldModel.of(model, period_s=period_s, measurement_delay_s=setting.measurement_delay_s)
@@ -67,11 +67,11 @@ def trace_general(
 def closed_loop_poles(
     model: RationalModel, gains: Sequence[PidGains], setting: LoopSetting
 ) -> NDArray[np.complex128]:
-    """Poles of the loops in z while nothing saturates. Shape `(C, states)`."""
+    """Poles of the loops in the z-plane, without saturation. Shape `(C, states)`."""
     period_s = 1.0 / setting.rate_hz
     held = HeldModel.of(model, period_s=period_s, measurement_delay_s=setting.measurement_delay_s)
     n, late = held.push.size, held.samples
-    size = n + late + 2  # plant, outputs on their way, integrator, filter
+    size = n + late + 2  # plant, delayed outputs, integrator, filter
     rows = []
     for kp, ki, kd, weight in zip(*_law(gains, period_s), strict=True):
         measured = np.eye(size)[n]

@@ -1,4 +1,4 @@
-"""Coefficients of many plants from one sample to the next under a held input, with any delay."""
+"""Discretisation of many plants with held input and any delay."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["HeldPlants"]
 
 @dataclass(frozen=True)
 class HeldPlants:
-    r"""Real difference equations of plants whose output arrives late, exact between samples.
+    r"""Real difference equations of plants with delayed output, exact between samples.
 
-    The resonance is kept as output and rate over $\omega_n$, which have one real form for every
-    damping. Output that a controller reads `delay` samples later, after a sample with input $u$:
-    $v = z_1 + \sum_i s_i + f u$; then $z \leftarrow A z + b u$, $s_i \leftarrow d_i s_i + p_i u$.
-    With the delay $D = n T - a$, $0 < a \le T$, the state is the plant's own, moved on freely by
-    $a$: so a fraction of a sample costs one product a step.
+    The states of the resonance are output and rate over $\omega_n$, which have one real form for
+    any damping. Output that a controller reads `delay` samples later, after a sample with input
+    $u$: $v = z_1 + \sum_i s_i + f u$; then $z \leftarrow A z + b u$, $s_i \leftarrow d_i s_i + p_i
+    u$. With the delay $D = n T - a$, $0 < a \le T$, the state is the plant's own, advanced freely
+    by $a$: so a fraction of a sample costs one product per step.
 
     Args:
         free: matrix A, row by row. Shape `(B, 4)`.
@@ -29,8 +29,8 @@ class HeldPlants:
         feed: f. Shape `(B,)`.
         slow_decay: d; 0 for a branch that the plant does not have. Shape `(B, M)`.
         slow_push: p. Shape `(B, M)`.
-        rest: states at rest on a unit input, z then s. Shape `(B, 2 + M)`.
-        static_gain: output at rest on a unit input. Shape `(B,)`.
+        rest: states in steady state for a unit input, z then s. Shape `(B, 2 + M)`.
+        static_gain: output in steady state for a unit input. Shape `(B,)`.
         samples: n, 1 or more. Shape `(B,)`.
     """
 
@@ -47,7 +47,7 @@ class HeldPlants:
     def of(
         cls, plants: Sequence[Plant], *, period_s: float, measurement_delay_s: float
     ) -> HeldPlants:
-        """Coefficients of `plants`; as many slow branches as the one with the most has.
+        """Discretise `plants`, with as many slow branches as the largest number among them.
 
         Source: variation of constants; $e^{Mt} = e^{-\\zeta\\omega_n t}(\\cosh x\\, I
         + \\sinh x\\, N/\\sqrt{\\zeta^2 - 1})$ with $N^2 = (\\zeta^2 - 1) I$ (Cayley-Hamilton).
@@ -77,7 +77,7 @@ class HeldPlants:
 
 
 def _slow(plants: Sequence[Plant]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gains and time constants, `(B, M)`; gain 0 where a plant has fewer."""
+    """Gains and time constants, `(B, M)`; gain 0 if a plant has fewer."""
     branches = max(len(p.slow_modes) for p in plants)
     none = [(0.0, 1.0)]
     rows = [
@@ -92,7 +92,7 @@ def _slow(plants: Sequence[Plant]) -> tuple[NDArray[np.float64], NDArray[np.floa
 def _free(
     omega: NDArray[np.float64], zeta: NDArray[np.float64], time_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Free motion of output and rate over omega within `time_s`. Shape `(B, 2, 2)`."""
+    """Transition matrix of output and rate over omega for `time_s`. Shape `(B, 2, 2)`."""
     root = np.sqrt(zeta.astype(complex) ** 2 - 1.0)
     x = root * omega * time_s
     slowly = np.exp(-omega * time_s / (zeta + root))  # the slower pole, without cancellation

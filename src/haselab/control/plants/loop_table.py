@@ -1,4 +1,4 @@
-"""Loops as the numbers that `native/loops/loops.c` steps, and the noise on their measurements."""
+"""Loops in the form of `native/loops/loops.c`, and the noise on their measurements."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class WhiteNoise:
-    """Normal noise, made while the loops run: 20 million numbers need no memory.
+    """Normal noise, generated while the loops run, without memory for its samples.
 
-    Sample `k` of loop `b` depends on the seed, `b` and `k` alone. Numbers are cut at 5.4
+    Sample `k` of loop `b` depends on the seed, `b` and `k` only. Values are limited to 5.4
     standard deviations.
 
     Args:
-        std: standard deviation, in strain; one for all loops, or one each. Shape `()` or `(B,)`.
+        std: standard deviation, in strain; one value for all loops, or one each. Shape `()` or
+            `(B,)`.
         seed: 0 or more.
     Raises:
         InputError: a standard deviation or a seed below 0, or not finite.
@@ -44,16 +45,15 @@ class WhiteNoise:
         if std.ndim > 1 or std.size == 0 or not ((std >= 0.0) & (std < np.inf)).all():
             raise InputError(
                 f"std of the noise has shape {std.shape} and spans [{std.min(initial=np.inf):g}, "
-                f"{std.max(initial=-np.inf):g}]; allowed: one number or one a loop, 0 or more. "
-                f"Correct it."
+                f"{std.max(initial=-np.inf):g}]; it must be one value, or one per loop, 0 or more."
             )
         if self.seed < 0:
-            raise InputError(f"seed = {self.seed}; allowed: 0 or more. Correct it.")
+            raise InputError(f"seed = {self.seed}; must be 0 or more.")
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Noise as the loops take it: values, or the seeds of what is generated, or neither.
+    """Noise in the form of the loops: values, or seeds of generated noise, or neither.
 
     Args:
         values: noise. Shape `(B, N)` or `(0, 0)`.
@@ -65,10 +65,10 @@ class Disturbance:
 
     @classmethod
     def of(cls, noise: ArrayLike | WhiteNoise | None, loops: int, samples: int) -> Disturbance:
-        """What a user gave, checked.
+        """Check and convert the noise given by a user.
 
         Raises:
-            InputError: a shape that fits neither a common nor a separate noise, an infinity.
+            InputError: a shape that fits neither common nor separate noise, an infinity.
         """
         no_values, no_seeds = np.zeros((0, 0), np.float32), np.zeros(0, np.uint32)
         if noise is None:
@@ -80,19 +80,19 @@ class Disturbance:
             given = np.asarray(noise, dtype=np.float32)
         if given.shape not in ((samples,), (loops, samples)) or np.isinf(given).any():
             raise InputError(
-                f"measurement_noise has shape {given.shape} or holds an infinity; allowed: "
-                f"({samples},) or ({loops}, {samples}), finite or NaN. Correct it."
+                f"measurement_noise has shape {given.shape} or contains an infinity; it must be "
+                f"({samples},) or ({loops}, {samples}), with finite or NaN values."
             )
         return cls(np.ascontiguousarray(np.broadcast_to(given, (loops, samples))), no_seeds)
 
 
 @dataclass(frozen=True)
 class LoopTable:
-    """Loops as numbers, one row each.
+    """Loops as rows of a table.
 
     Args:
         rows: coefficients, states at the start, controller, noise. Shape `(B,)`.
-        branches: slow branches that are counted in.
+        branches: number of slow branches.
         period_s: time between samples, in s.
     """
 
@@ -108,26 +108,27 @@ class LoopTable:
         setting: LoopSetting,
         noise_std: ArrayLike = 0.0,
     ) -> LoopTable:
-        """One plant and one controller each, in one setting.
+        """Build the table from one plant and one controller per loop, with one setting.
 
         Raises:
-            InputError: no loop, unequal numbers, too many slow modes, too long a delay, a number
+            InputError: no loop, unequal numbers, too many slow modes, too long a delay, a value
                 beyond single precision.
         """
         if len(plants) != len(gains) or not plants:
             raise InputError(
-                f"{len(plants)} plants and {len(gains)} controllers; allowed: one controller each, "
-                f"1 or more. Repeat the one that is common."
+                f"{len(plants)} plants and {len(gains)} controllers; there must be one controller "
+                "per plant, 1 or more. Repeat a common one."
             )
         branches = max(len(plant.slow_modes) for plant in plants)
         if branches > _loops.SLOW:
             raise InputError(
-                f"a plant has {branches} slow modes; allowed: {_loops.SLOW}. Leave out the least."
+                f"a plant has {branches} slow modes; at most {_loops.SLOW} are possible. Leave "
+                "out the smallest."
             )
         if np.size(noise_std) not in (1, len(plants)):
             raise InputError(
-                f"noise has {np.size(noise_std)} standard deviations; allowed: 1 or {len(plants)}, "
-                f"one a loop. Correct it."
+                f"noise has {np.size(noise_std)} standard deviations; it must have 1 or "
+                f"{len(plants)}, one per loop."
             )
         period_s = 1.0 / setting.rate_hz
         held = HeldPlants.of(
@@ -135,15 +136,15 @@ class LoopTable:
         )
         if held.samples.max() >= _LONGEST_DELAY:
             raise InputError(
-                f"the longest delay takes {held.samples.max()} samples; allowed: below "
+                f"the longest delay is {held.samples.max()} samples; it must be below "
                 f"{_LONGEST_DELAY}. Lower the rate or the delay."
             )
         rows = _rows(held, gains, setting, noise_std)
         largest = float(np.abs(rows.view(np.float64)).max())
         if not largest < _LARGEST:
             raise InputError(
-                f"a loop holds {largest:g}; allowed: what single precision holds, "
-                f"below {_LARGEST:.1e}. Correct gains and plants."
+                f"a loop contains the value {largest:g}; it must be in the range of single "
+                f"precision, below {_LARGEST:.1e}. Check gains and plants."
             )
         return cls(rows, branches, period_s)
 
@@ -157,7 +158,7 @@ def _rows(
 ) -> NDArray[np.void]:
     """The loops as the C code reads them; branches that a plant does not have are 0."""
     loops, branches = held.slow_decay.shape
-    u = float(np.float32(setting.initial_u))  # as the controller has it
+    u = float(np.float32(setting.initial_u))  # as in the controller
     rows = np.zeros(loops, _loops.LOOP)
     rows["free"], rows["push"], rows["feed"] = held.free, held.push, held.feed
     rows["slow_decay"][:, :branches] = held.slow_decay

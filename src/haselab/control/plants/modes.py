@@ -1,4 +1,4 @@
-"""The plant as a sum of first-order modes: exact between samples, whatever the delay."""
+"""The plant as a sum of first-order modes: exact between samples, for any delay."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Modes:
 
     @classmethod
     def of(cls, plant: Plant) -> Modes:
-        """Partial fractions of `plant`; its delay is left to the caller."""
+        """Partial fractions of `plant`; without its delay."""
         poles = np.array(plant.poles, dtype=complex)
         pair = plant.gain * plant.natural_frequency_rad_s**2 / (poles[0] - poles[1])
         slow = [complex(mode.gain / mode.time_constant_s) for mode in plant.slow_modes]
@@ -75,16 +75,16 @@ class Modes:
 
 @dataclass(frozen=True)
 class SampledLoops:
-    """Many sampled loops as numbers: one step of plant and controller each.
+    """Coefficients of many sampled loops: one step of plant and controller each.
 
-    A loop's state is that of its plant, of its delay line, of its integrator and of its
+    A loop's state consists of the states of its plant, delay line, integrator and
     measurement filter.
 
     Args:
-        plant: plants with all delays.
+        plant: plants including all delays.
         kp: proportional gains. Shape `(B,)`.
         ki: integral gains times the period. Shape `(B,)`.
-        kd: derivative gains by the period. Shape `(B,)`.
+        kd: derivative gains over the period. Shape `(B,)`.
         weight: share of a new measurement in the filter. Shape `(B,)`.
     """
 
@@ -103,7 +103,7 @@ class SampledLoops:
         period_s: float,
         measurement_delay_s: float,
     ) -> SampledLoops:
-        """Coefficients of one plant and one controller each."""
+        """Compute the coefficients from one plant and one controller per loop."""
         kp, ki, kd, tau = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]).T
         return cls(
             plant=HeldPlants.of(plants, period_s=period_s, measurement_delay_s=measurement_delay_s),
@@ -114,7 +114,7 @@ class SampledLoops:
         )
 
     def poles(self) -> NDArray[np.complex128]:
-        """Poles of the closed loops in z, while nothing saturates. Shape `(B, states)`.
+        """Poles of the closed loops in the z-plane, without saturation. Shape `(B, states)`.
 
         A loop with a shorter delay than the longest has poles at 0 for the difference.
         """
@@ -143,7 +143,7 @@ class SampledLoops:
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
-    """Whole samples `n` and lead `a` with `delay_s = n * period_s - a`, `0 <= a < period_s`.
+    """Split a delay into whole samples `n` and lead `a`: `delay_s = n * period_s - a`, `a >= 0`.
 
     A delay within 1e-9 of a period of a whole number counts as whole.
 

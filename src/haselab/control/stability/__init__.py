@@ -1,1 +1,1 @@
-"""Stability margins, exact and on many plants."""
+"""Stability margins, exact, and for many plants."""

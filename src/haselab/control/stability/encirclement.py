@@ -16,7 +16,7 @@ __all__ = ["axis_factor", "open_loop_poles", "unstable_poles"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-_ON_AXIS = 1e-9  # real part of a pole over its size: on the axis within rounding
+_ON_AXIS = 1e-9  # real part of a pole over its magnitude; smaller counts as on the axis
 _LARGEST_TURN = 0.5  # rad between two neighbours of the grid
 _ROUNDS = 40
 _MOST_POINTS = 400_000
@@ -26,9 +26,9 @@ _DECADES = 12
 
 
 def open_loop_poles(plant: AnyPlant, gains: PidGains | LinearController) -> tuple[int, Complexes]:
-    """How many open-loop poles lie right of the axis, and those on it, conjugates included.
+    """Number of open-loop poles right of the axis, and the poles on it, including conjugates.
 
-    The controller's integrator is one of the latter.
+    The controller's integrator is on the axis.
     """
     poles = np.asarray(plant.poles, dtype=complex)
     size = np.abs(poles)
@@ -68,11 +68,11 @@ def unstable_poles(
     gains: PidGains | LinearController,
     rate_hz: float | None,
 ) -> int:
-    r"""Closed-loop poles right of the axis, or outside the unit circle of a sampled loop.
+    r"""Count closed-loop poles right of the axis, or outside the unit circle for a sampled loop.
 
     $Z = P - \Delta\arg F/\pi$ with $F = (1 + L)\prod_i (s - p_i)/(s + a)$ over the poles on the
     axis, from frequency 0 to infinity (half the rate). The grid is refined until no two
-    neighbours are further apart than half a radian in $\arg F$, and a midpoint adds no turn.
+    neighbours differ by more than half a radian in $\arg F$, and a midpoint adds no turn.
 
     Args:
         response: open-loop response at angular frequencies, in rad/s.
@@ -82,7 +82,7 @@ def unstable_poles(
         gains: controller.
         rate_hz: sampling rate, in Hz; None for a continuous loop.
     Returns:
-        The count; 1 or more where a pole lies on the axis itself.
+        The count; 1 or more if a pole is on the axis.
     Source: Nyquist (1932); the factors replace the indentations of the contour.
     """
     right, axis = open_loop_poles(plant, gains)
@@ -112,6 +112,6 @@ def unstable_poles(
     if not np.isfinite(values).all() or size.min() < _ON_THE_EDGE:
         return 1
     argument = np.unwrap(np.angle(values))
-    # F is real at frequency 0 and at the end; the first point lies near the former.
+    # F is real at frequency 0 and at the end; the first point is near the former.
     turned = argument[-1] - math.pi * round(float(argument[0]) / math.pi)
     return right - round(float(turned) / math.pi)

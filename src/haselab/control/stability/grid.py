@@ -1,4 +1,4 @@
-"""Margins of many controllers on one plant between the neighbours of one frequency grid."""
+"""Margins of many controllers for one plant, on one frequency grid."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from haselab.control.stability.margins import frequency_grid
 
 __all__ = ["GridMargins", "PlantGrid"]
 
-_TYPICAL = PidGains(1.0, 1.0, 0.1)  # sets the range of the grid
+_TYPICAL = PidGains(1.0, 1.0, 0.1)  # determines the range of the grid
 _LARGEST_TURN = 1.5  # rad between neighbours; half a turn would hide a whole one
 
 
 @dataclass(frozen=True)
 class GridMargins:
-    """Margins, good to a few per mille; each has shape `(C,)`.
+    """Margins, accurate to a few per mille; each has shape `(C,)`.
 
     Args:
-        phase_margin_deg: smallest distance of the phase from -180 degrees beside a crossover.
+        phase_margin_deg: smallest distance of the phase from -180 degrees next to a crossover.
         gain_margin_db: smallest increase of gain to a crossing of the negative real axis.
         peak_sensitivity: largest `|1/(1 + L)|` on the grid.
         crossover_rad_s: highest crossover, 0 without one.
-        stable: whether the encirclement count on the grid says so.
+        stable: whether the loop is stable by the encirclement count on the grid.
         resolved: whether the grid is fine enough for that count.
     """
 
@@ -44,13 +44,13 @@ class GridMargins:
 
 @dataclass(frozen=True)
 class PlantGrid:
-    """A plant's sampled response on its grid, ready for many controllers.
+    """A plant's sampled response on its grid, for use with many controllers.
 
     Args:
         plant: plant.
         rate_hz: sampling rate, in Hz.
         omega_rad_s: angular frequencies. Shape `(F,)`.
-        response: behind the hold, with all delays. Shape `(F,)`.
+        response: including the hold and all delays. Shape `(F,)`.
     """
 
     plant: AnyPlant
@@ -60,7 +60,7 @@ class PlantGrid:
 
     @classmethod
     def of(cls, plant: AnyPlant, setting: LoopSetting, points: int = 450) -> PlantGrid:
-        """The grid of a plant; a third more points than `points` lie about the resonance."""
+        """Create the grid of a plant; a third of `points` is added near the resonance."""
         omega = frequency_grid(plant, _TYPICAL, setting.rate_hz, points)
         sampled = sampled_response_of(plant, omega, setting.rate_hz, setting.measurement_delay_s)
         keep = np.isfinite(sampled)
@@ -72,7 +72,7 @@ class PlantGrid:
         Args:
             candidates: controllers. Length `C`.
             between: whether a crossing is interpolated between its two neighbours, for margins
-                right to 0.1 dB and 0.5 degrees; otherwise the worse neighbour counts.
+                accurate to 0.1 dB and 0.5 degrees; otherwise the worse neighbour is used.
         Returns:
             The margins, in the order of the candidates.
         """
@@ -104,7 +104,7 @@ class PlantGrid:
     def _count(
         self, loop: NDArray[np.complex128], candidates: Sequence[PidGains]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """The encirclement count on the grid as it is, and whether a turn may be missed."""
+        """The encirclement count on the given grid, and whether a turn may be missed."""
         integrates = np.array([gains.ki > 0.0 for gains in candidates])
         function = 1.0 + loop
         for flag in (True, False):

@@ -1,4 +1,4 @@
-"""Stability margins of the loop from its exact frequency response, delay included."""
+"""Stability margins of the loop from its exact frequency response, including delay."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from haselab.control.stability.encirclement import unstable_poles
 from haselab.models.rational import RationalModel
 
 __all__ = ["Crossover", "Margins", "frequency_grid", "loop_response", "margins"]
-_LEAST_DAMPING = 1e-6  # for the width of the grid about a resonance
+_LEAST_DAMPING = 1e-6  # for the width of the grid near a resonance
 _MOST_TURNS = 20_000
-_MOST_STEPS = 100  # of one root
+_MOST_STEPS = 100  # iterations for one root
 _ROOT = 2e-13  # relative
 
 
@@ -39,21 +39,21 @@ class Crossover:
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a loop is from instability.
+    """Stability margins of a loop.
 
     Args:
         stable: whether the closed loop is stable.
         phase_margin_deg: the smallest distance over all crossovers, in degrees; negative when
             the closed loop is unstable, infinite without a crossover.
         gain_margin_db: the smallest increase of gain that makes the loop unstable, in dB,
-            infinite when none does. Of an unstable loop, the (negative) change of gain to the
-            nearest crossing below, NaN when there is none.
+            infinite if none does. For an unstable loop, the (negative) change of gain to the
+            nearest lower crossing, NaN if there is none.
         gain_margin_rad_s: frequency of that instability, in rad/s (NaN when there is none).
         delay_margin_s: the smallest added delay that makes the loop unstable, in s.
         peak_sensitivity: largest `|1/(1 + L)|`.
         peak_sensitivity_rad_s: its frequency, in rad/s.
         crossovers: all gain crossovers, rising in frequency.
-        unstable_poles: closed-loop poles right of the axis, by an encirclement count.
+        unstable_poles: closed-loop poles in the right half-plane, by an encirclement count.
     """
 
     stable: bool
@@ -80,10 +80,10 @@ def loop_response(
     loop_delay_s: float,
     rate_hz: float | None,
 ) -> NDArray[np.complex128]:
-    """Open-loop response: controller, plant, delay and, when sampled, the hold.
+    """Open-loop response: controller, plant, delay and, for a sampled loop, the hold.
 
     Args:
-        plant: plant; its own delay counts.
+        plant: plant; including its own delay.
         gains: controller.
         omega_rad_s: angular frequencies, in rad/s. Shape `(...)`.
         loop_delay_s: delay besides the plant's and the hold's, in s.
@@ -110,13 +110,13 @@ def loop_response(
 def frequency_grid(
     plant: AnyPlant, gains: PidGains | LinearController, rate_hz: float | None, points: int
 ) -> NDArray[np.float64]:
-    """Angular frequencies dense enough to see every crossing, densest at the resonance.
+    """Frequency grid dense enough to resolve every crossing, densest at the resonance.
 
     Args:
         plant: plant whose resonance and slow modes set the range.
         gains: controller; its gains set the range.
         rate_hz: sampling rate, in Hz (the grid then ends at half of it), or None.
-        points: number of points of the even (logarithmic) part; a third as many again lie
+        points: number of points of the logarithmic part; a third as many again are
             around the resonance.
     Returns:
         Rising angular frequencies, in rad/s. Shape `(N,)`.
@@ -139,12 +139,12 @@ def frequency_grid(
 def _general_grid(
     model: RationalModel, gains: PidGains | LinearController, rate_hz: float | None, points: int
 ) -> NDArray[np.float64]:
-    """Even in the logarithm, and dense about each pole and zero, folded where it is sampled."""
+    """Logarithmic grid, dense near each pole and zero, aliased for a sampled loop."""
     corners = corners_of(model, gains)
     sizes = np.abs(corners) if corners.size else np.ones(1)
     level = [
         size * abs(complex(gains.frequency_response(size) * model.frequency_response(size)))
-        for size in (1.001 * sizes).tolist()  # beside a pole on the axis
+        for size in (1.001 * sizes).tolist()  # next to a pole on the axis
     ]
     reached = [value for value in level if 0.0 < value < math.inf]
     low = 1e-3 * min([*sizes.tolist(), *reached])
@@ -167,10 +167,10 @@ def margins(
     loop_delay_s: float,
     rate_hz: float | None,
 ) -> Margins:
-    """Margins of the loop, from its exact response: no rational approximation of the delay.
+    """Compute the margins of a loop from its exact response, without approximating the delay.
 
-    Crossings are bracketed on a dense grid and then solved for; the phase margin is the worst
-    over all crossovers, not that of one of them. Whether the loop is stable is counted by the
+    Crossings are bracketed on a dense grid and then solved for; the phase margin is the smallest
+    over all crossovers, not that of one of them. Stability is determined by the
     argument principle, so a plant may be unstable, integrate, ring without damping or have a
     negative gain.
 
@@ -193,9 +193,9 @@ def margins(
         (12.6039, 7.434)
     """
     if not 0.0 <= loop_delay_s < math.inf:
-        raise LimitError(f"loop delay = {loop_delay_s:g} s; allowed: 0 s or more. Correct it.")
+        raise LimitError(f"loop delay = {loop_delay_s:g} s; must be 0 s or more.")
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
-        raise LimitError(f"rate = {rate_hz:g} Hz; allowed: above 0 Hz, or none. Correct it.")
+        raise LimitError(f"rate = {rate_hz:g} Hz; must be above 0 Hz, or none.")
 
     def response(omega: ArrayLike) -> NDArray[np.complex128]:
         return loop_response(plant, gains, omega, loop_delay_s=loop_delay_s, rate_hz=rate_hz)
@@ -228,9 +228,9 @@ def margins(
 
 
 def _with_delay(omega: NDArray[np.float64], delay_s: float) -> NDArray[np.float64]:
-    """The grid, with points close enough that a delay turns the phase by less than half a radian.
+    """The grid, refined so that a delay changes the phase by less than half a radian.
 
-    Above the highest of them the refinement of the count takes over.
+    Above the highest of these points the refinement of the count is used.
     """
     if delay_s <= 0.0:
         return omega
@@ -263,12 +263,12 @@ def _axis_crossings(
     omega: NDArray[np.float64],
     loop: NDArray[np.complex128],
 ) -> list[tuple[float, float]]:
-    """Factor of gain that moves each crossing of the negative real axis to -1; its frequency."""
+    """Gain factor that moves each crossing of the negative real axis to -1, and its frequency."""
 
     def imaginary(at: NDArray[np.float64]) -> NDArray[np.float64]:
         return response(at).imag
 
-    half_rate = abs(loop[-1].imag) < 1e-9 * abs(loop[-1])  # there a sampled loop is real
+    half_rate = abs(loop[-1].imag) < 1e-9 * abs(loop[-1])  # a sampled loop is real there
     signs = (loop.imag if not half_rate else loop.imag[:-1]) > 0.0
     crossing = np.flatnonzero(signs[1:] != signs[:-1])
     crossing = crossing[(loop.real[crossing] < 0.0) & (loop.real[crossing + 1] < 0.0)]
@@ -276,7 +276,7 @@ def _axis_crossings(
     found = list(zip((1.0 / np.abs(response(roots))).tolist(), roots.tolist(), strict=True))
     flat = abs(loop[1] - loop[0]) < 1e-3 * abs(loop[0])  # no pole at 0
     if flat and abs(loop[0].imag) < 0.1 * abs(loop[0]) and loop[0].real < 0.0:
-        found.append((1.0 / abs(loop[0]), 0.0))  # a negative gain at standstill
+        found.append((1.0 / abs(loop[0]), 0.0))  # a negative static gain
     if half_rate and loop[-1].real < 0.0:
         found.append((1.0 / abs(loop[-1]), float(omega[-1])))
     return found
@@ -287,9 +287,9 @@ def _roots(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Roots between neighbours of the grid, all at once; where rounding moved one out, that end.
+    """Roots between neighbours of the grid, computed together; clamped to their interval.
 
-    A long delay makes thousands of crossings, and each call of a response costs as much as a
+    A long delay causes thousands of crossings, and each call of a response costs as much as a
     hundred of its frequencies.
 
     Source: Chandrupatla, Adv. Eng. Softw. 28 (1997), 145.

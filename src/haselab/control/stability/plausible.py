@@ -1,4 +1,4 @@
-"""Margins on plausible plants: which share of the plants drawn from a posterior keeps them."""
+"""Margins for plausible plants: share of the plants drawn from a posterior that keeps them."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from haselab.control.stability.margins import margins
 
 __all__ = ["Chance", "PlausibleMargins", "plausible_margins", "share_of"]
 
-_NEAR_DEG, _NEAR_DB = 0.5, 0.1  # beyond, the grid's error cannot change whether a margin is kept
-_NEAR_PEAK = 30.0  # sensitivity from which the count of a coarse grid is checked
+_NEAR_DEG, _NEAR_DB = 0.5, 0.1  # closer to a limit the exact margins are computed
+_NEAR_PEAK = 30.0  # sensitivity above which the count of a coarse grid is checked
 _SEARCH_POINTS = 180
 _MOST_MISS = 3.0
 _TIE = 0.01
@@ -29,16 +29,16 @@ _TIE = 0.01
 
 @dataclass(frozen=True)
 class PlausibleMargins:
-    """Margins of one controller on many plausible plants.
+    """Margins of one controller for many plausible plants.
 
-    A loop keeps a margin where it is stable and the margin is at least the demanded one.
+    A loop keeps a margin if it is stable and the margin is at least the required one.
 
     Args:
         stable: whether each loop is stable. Shape `(N,)`, as the two that follow.
         phase_margin_deg: phase margins, negative where unstable, in degrees.
-        gain_margin_db: gain margins, in dB; of an unstable loop minus infinity.
-        least_phase_deg: demanded phase margin, in degrees.
-        least_gain_db: demanded gain margin, in dB.
+        gain_margin_db: gain margins, in dB; minus infinity for an unstable loop.
+        least_phase_deg: required phase margin, in degrees.
+        least_gain_db: required gain margin, in dB.
     """
 
     stable: NDArray[np.bool_]
@@ -49,12 +49,12 @@ class PlausibleMargins:
 
     @property
     def keeps_phase(self) -> NDArray[np.bool_]:
-        """Whether each loop is stable with the demanded phase margin. Shape `(N,)`."""
+        """Whether each loop is stable with the required phase margin. Shape `(N,)`."""
         return self.stable & (self.phase_margin_deg >= self.least_phase_deg)
 
     @property
     def keeps_gain(self) -> NDArray[np.bool_]:
-        """Whether each loop is stable with the demanded gain margin. Shape `(N,)`."""
+        """Whether each loop is stable with the required gain margin. Shape `(N,)`."""
         return self.stable & (self.gain_margin_db >= self.least_gain_db)
 
     @property
@@ -64,12 +64,12 @@ class PlausibleMargins:
 
 
 def share_of(kept: NDArray[np.bool_]) -> Estimate:
-    """Share of true values, with the binomial standard error and Wilson's 95 % interval.
+    """Estimate a share, with the binomial standard error and Wilson's 95 % interval.
 
     Args:
-        kept: one truth value a draw. Shape `(N,)`.
+        kept: one value per draw. Shape `(N,)`.
     Returns:
-        The share. Its standard error is 0 where all draws agree; the interval is not.
+        The share. If all draws agree, its standard error is 0, but the interval has a width.
     Raises:
         InputError: no draw.
     Source: E. B. Wilson, Journal of the American Statistical Association 22 (1927).
@@ -80,7 +80,7 @@ def share_of(kept: NDArray[np.bool_]) -> Estimate:
     """
     count = kept.size
     if count == 0:
-        raise InputError("There is no draw to take a share of; needed is 1 or more. Draw some.")
+        raise InputError("kept is empty. Pass at least one draw.")
     share = float(np.count_nonzero(kept)) / count
     z = Z95**2 / count
     centre = (share + 0.5 * z) / (1.0 + z)
@@ -92,16 +92,16 @@ def share_of(kept: NDArray[np.bool_]) -> Estimate:
 def plausible_margins(
     plants: Sequence[AnyPlant], gains: PidGains, setting: LoopSetting, spec: DesignSpec
 ) -> PlausibleMargins:
-    """Margins of one controller on many plants.
+    """Compute the margins of one controller for many plants.
 
-    All plants go through one grid each. Where its error could change whether a margin is kept, or
-    whether the loop is stable, the exact margins take its place.
+    Each plant is evaluated on a grid. If its error could change whether a margin is kept, or
+    whether the loop is stable, the exact margins are computed instead.
 
     Args:
         plants: plausible plants. Length `N`, 1 or more.
         gains: controller.
         setting: rate, measurement delay.
-        spec: demanded phase and gain margins.
+        spec: required phase and gain margins.
     Returns:
         The margins, in the order of the plants.
     Raises:
@@ -114,7 +114,7 @@ def plausible_margins(
         (array([81.1, 82.9, 84.1]), array([ True,  True,  True]))
     """
     if not plants:
-        raise InputError("There is no plausible plant; needed is 1 or more. Draw some.")
+        raise InputError("plants is empty. Pass at least one plant.")
     rows = [_margins(plant, gains, setting, spec) for plant in plants]
     stable, phase, gain = zip(*rows, strict=True)
     return PlausibleMargins(
@@ -129,7 +129,7 @@ def plausible_margins(
 def _margins(
     plant: AnyPlant, gains: PidGains, setting: LoopSetting, spec: DesignSpec
 ) -> tuple[bool, float, float]:
-    """Whether stable, phase margin in degrees, gain margin in dB."""
+    """Stability, phase margin in degrees and gain margin in dB of each plant."""
     grid = PlantGrid.of(plant, setting).margins([gains], between=True)
     phase_deg, gain_db = float(grid.phase_margin_deg[0]), float(grid.gain_margin_db[0])
     sure = (
@@ -147,11 +147,11 @@ def _margins(
 
 @dataclass(frozen=True)
 class Chance:
-    """A demanded share of plausible plants, for a search over many candidates.
+    """A required share of plausible plants, for a search over many candidates.
 
     Args:
         grids: responses of the plausible plants.
-        share: demanded share that keeps the margins.
+        share: required share that keeps the margins.
     """
 
     grids: tuple[PlantGrid, ...]
@@ -159,15 +159,15 @@ class Chance:
 
     @classmethod
     def of(cls, plants: Sequence[AnyPlant], setting: LoopSetting, share: float) -> Chance:
-        """The responses of `plants`, computed once."""
+        """Compute the responses of `plants` once."""
         grids = tuple(PlantGrid.of(plant, setting, _SEARCH_POINTS) for plant in plants)
         return cls(grids, share)
 
     def miss(self, candidates: Sequence[PidGains], spec: DesignSpec) -> NDArray[np.float64]:
-        """How far each candidate is from the share: 0 where it is reached. Shape `(C,)`.
+        """Distance of each candidate from the required share: 0 if it is reached. Shape `(C,)`.
 
-        The missing share counts most; among equal ones, the miss of the margins by the last plant
-        that would have to keep them.
+        The missing share counts most; among equal shares, the miss of the margins by the last plant
+        required to keep them.
         """
         if not candidates:
             return np.zeros(0)

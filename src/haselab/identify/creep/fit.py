@@ -1,4 +1,4 @@
-"""Creep from a held input: exponentials or a fractional law, told by the data; a forecast."""
+"""Creep from a held input: choice between exponential, fractional and other laws; forecast."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from haselab.identify.creep.laws import (
     Span,
 )
 from haselab.identify.fit import RecordFit, rescaled
-from haselab.identify.model_choice import APART, bic, effective_count, told_apart
+from haselab.identify.model_choice import APART, bic, effective_count, is_decisive
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.projection import Basis, Solution, minimise, project
 from haselab.identify.record import Record
@@ -38,18 +38,18 @@ _KINDS = {
     "logarithmic": ("logarithmic",),
 }
 _LEAST_SAMPLES = 24
-_DRIFTS = 5.0  # standard deviations of a slope before the input changes
+_DRIFTS = 5.0  # standard deviations of a significant slope before the input changes
 _NONE, _NONE_VISIBLE, _UNSURE = "none", "no creep visible", "cannot tell"
 _POLISHED = 3
 _MOST_BRANCHES = 4
 _COLOURED = 1e-3  # whiteness below which a note says so
-_SPIKE = 8.0  # standard deviations, by the median, that normal noise does not reach
-_ROWS = 800  # while starts are tried
+_SPIKE = 8.0  # standard deviations, estimated by the median, that normal noise does not reach
+_ROWS = 800  # used to compare starts
 _ROUNDING = 1e-9  # of the output's span
-_UNTOLD = 1.0  # standard deviation of the logarithm of a time constant that tells nothing
-_BEYOND = 3.0  # record lengths: a longer time constant is not in the record
-_STRAIGHT = 0.999  # order at which a power of time is a straight line
-_WEAK = 2.0  # standard deviations of a gain below which its time constant is not told
+_LARGEST_STD = 1.0  # of the logarithm of an identifiable time constant
+_BEYOND = 3.0  # record lengths: longer time constants are not identifiable
+_STRAIGHT = 0.999  # order at which a power of time counts as a straight line
+_WEAK = 2.0  # standard deviations of a gain below which its time constant is not identifiable
 _HELD_OUT = 0.25
 _HELD = 0.02  # of the rows are updates of an input, at most, ...
 _MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
@@ -58,13 +58,14 @@ _UNKNOWN = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class _Setting:
-    """A record as it is fitted.
+    """A record prepared for the fit.
 
     Args:
-        span: its input, less the input before.
+        span: its input minus the input before the record.
         y: outputs. Shape `(N,)`.
-        kept: samples that count. Shape `(N,)`.
-        offset: whether the output at rest is fitted beside the instantaneous answer.
+        kept: samples that are fitted. Shape `(N,)`.
+        offset: whether the output before the first step is fitted besides the instantaneous
+            response.
     """
 
     span: Span
@@ -73,18 +74,18 @@ class _Setting:
     offset: bool
 
     def thinned(self) -> _Setting:
-        """At most 800 samples that count."""
+        """At most 800 of the fitted samples."""
         rows = np.flatnonzero(self.kept)
         kept = np.zeros_like(self.kept)
         kept[rows[:: max(1, math.ceil(rows.size / _ROWS))]] = True
         return _Setting(self.span, self.y, kept, self.offset)
 
     def before(self, cut: int) -> _Setting:
-        """The samples before one."""
+        """The samples before index `cut`."""
         return _Setting(self.span, self.y, self.kept & (np.arange(self.y.size) < cut), self.offset)
 
     def bases(self, law: CreepLaw, search: Floats) -> list[Basis]:
-        """Offset, input and creep on the samples that count."""
+        """Offset, input and creep on the fitted samples."""
         columns, slopes = law.columns(search, self.span)
         fixed = [self.span.inputs, np.ones(self.y.size)][: 1 + self.offset]
         shared = np.column_stack([*fixed, columns])[self.kept]
@@ -105,7 +106,7 @@ class _Setting:
 
 @dataclass(frozen=True)
 class _Fitted:
-    """A law with its numbers: `solution.shared` holds instant, offset if fitted, gains."""
+    """A law with its parameters: `solution.shared` is instant, offset if fitted, and gains."""
 
     law: CreepLaw
     solution: Solution
@@ -126,19 +127,19 @@ class _Fitted:
 class CreepFit(RecordFit[Record]):
     """Fitted creep; see `Fit` for what all fits have.
 
-    Its `residuals` are those of the samples that count.
+    Its `residuals` are those of the samples that are fitted.
 
     Args:
-        kind: the law that is given: none, prony, fractional or logarithmic.
+        kind: the law that is reported: none, prony, fractional or logarithmic.
         verdict: the law that the data support, "no creep visible", or "cannot tell".
-        bic: criterion of each kind's best law against the lowest.
-        fit_percent: NRMSE fit of the samples that count.
+        bic: criterion of each kind's best law relative to the lowest.
+        fit_percent: NRMSE fit of the fitted samples.
         validation_fit_percent: fit of the last quarter of them, forecast by the same law fitted
-            to the rest, against the spread of all: late in a creep nothing spreads but noise. NaN
-            where the rest is too short.
+            to the rest, relative to the spread of all samples, since the end of a creep varies
+            only by noise. NaN where the rest is too short.
         residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
         fitted: the creep. None: no result.
-        rivals: laws that the data do not tell from the given one, the given one first.
+        candidates: laws that the data do not distinguish from the reported one, which is the first.
         setting: the record.
     """
 
@@ -149,12 +150,12 @@ class CreepFit(RecordFit[Record]):
     validation_fit_percent: float = math.nan
     residual_whiteness_p: float = math.nan
     fitted: Creep | None = None
-    rivals: tuple[_Fitted, ...] = field(default=(), repr=False)
+    candidates: tuple[_Fitted, ...] = field(default=(), repr=False)
     setting: _Setting = field(repr=False)
 
     @property
     def model(self) -> Creep:
-        """The creep, from the input before the record on.
+        """The creep model, relative to the input before the record.
 
         Raises:
             ResultError: the fit has no result.
@@ -186,24 +187,22 @@ class CreepFit(RecordFit[Record]):
         Args:
             later_s: time after the last sample, in s.
         Returns:
-            Output. Its interval holds those of all laws that the data do not tell apart.
+            Output. Its interval covers the intervals of all laws that the data do not distinguish.
         Raises:
             ResultError: the fit has no result.
             InputError: a time that is not above 0 s.
         """
-        if not self.rivals:
+        if not self.candidates:
             raise ResultError(f"The fit has no result: {self.status}")
         if not 0.0 < later_s < math.inf:
-            raise InputError(
-                f"later_s = {later_s:g} s; allowed is above 0 s. Ask for a time after the record."
-            )
-        entries = [_forecast(self.setting, rival, later_s) for rival in self.rivals]
+            raise InputError(f"later_s = {later_s:g} s; must be above 0 s.")
+        entries = [_forecast(self.setting, candidate, later_s) for candidate in self.candidates]
         low = min(entry.ci95[0] for entry in entries)
         high = max(entry.ci95[1] for entry in entries)
         return Estimate(entries[0].value, entries[0].std, (low, high), "")
 
     def answer(self) -> JsonObject:
-        """Keys of the command's answer."""
+        """The result as a dictionary for JSON."""
         return {
             "model": self.kind,
             "verdict": self.verdict,
@@ -220,23 +219,24 @@ class CreepFit(RecordFit[Record]):
 def fit_creep(
     records: Record | Sequence[Record], model: str = "auto", *, leave_out_s: float = 0.0
 ) -> CreepFit:
-    r"""Fit creep to the answer to an input that is held between its updates.
+    r"""Fit creep to the response to an input that is held between its updates.
 
-    $y = c + J_0 u + \sum \Delta u_k\,(J(t - t_k) - J_0)$, rivals for $J$: one to four exponentials,
-    a fractional power, a Mittag-Leffler function, a logarithm, none. BIC chooses; a lead below 6 is
-    "cannot tell". A time constant that the record is too short for is NaN, with a note.
+    $y = c + J_0 u + \sum \Delta u_k\,(J(t - t_k) - J_0)$, with candidates for $J$: one to four
+    exponentials, a fractional power, a Mittag-Leffler function, a logarithm, none. BIC chooses; a
+    difference below 6 is "cannot tell". A time constant too long for the record is NaN, with a
+    note.
 
     Args:
         records: one record, its outputs read right after the input's updates
             (`Record.sampled`). With an `input_before` of None the output had settled at 0 when the
             input never changes (a step at the first sample), else at the first input.
         model: auto, prony, fractional or logarithmic.
-        leave_out_s: time after each update of the input whose outputs do not count, in s: for
-            what swings or lags for a moment.
+        leave_out_s: time after each update of the input whose outputs are not fitted, in s, to
+            exclude ringing and lag.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: fewer than 24 samples that count, unequal lengths, NaN, a column without
+        InputError: fewer than 24 fitted samples, unequal lengths, NaN, a column without
             change, an unknown model.
     Source: variable projection, Golub and Pereyra (1973); laws as in `haselab.models.creep`;
         intervals from the covariance for the noise model of the residuals.
@@ -253,25 +253,25 @@ def fit_creep(
     record = sampled(records)
     setting, stepped = _setting(record, leave_out_s)
     if model not in _KINDS:
-        raise InputError(f"model = {model}; allowed are {', '.join(_KINDS)}. Correct the name.")
+        raise InputError(f"model = {model}; must be one of {', '.join(_KINDS)}.")
     drift = _drift_before(setting, rest_known=not stepped)
     if drift is not None:
         return _no_result(setting, drift)
     if _swapped(record.u, setting.y):
         return _no_result(
             setting,
-            "the output is held between few updates, and the input moves at every row; the columns "
-            "are swapped",
+            "the output is held between few updates, and the input changes at every row; the "
+            "columns are swapped",
         )
     found = [entry for entry in _tried(_KINDS[model], setting) if _one_sided(entry, setting)]
     if not found:
-        return _no_result(setting, "no law came to rest; record longer")
+        return _no_result(setting, "no law converged; record longer")
     scored = _scored(found, setting)
     best = scored[0]
     scores: dict[str, float] = {}
     for entry in scored:
         scores.setdefault(_kind(entry), entry.bic - best.bic)
-    verdict = _kind(best) if told_apart(scores) else _UNSURE
+    verdict = _kind(best) if is_decisive(scores) else _UNSURE
     verdict = _NONE_VISIBLE if verdict == _NONE else verdict
     return _describe(setting, scored, scores, verdict, stepped)
 
@@ -294,8 +294,8 @@ def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
     moved = inputs - rest
     if not moved.any():
         raise InputError(
-            f"The input is {rest:g} throughout and before, so nothing creeps; allowed is an input "
-            "that changes. Name the right column, or record a step."
+            f"The input is {rest:g} throughout and before, so nothing creeps. It "
+            "must change. Name the right column, or record a step."
         )
     since = np.full(inputs.size, np.inf)
     for k in np.flatnonzero(np.diff(moved, prepend=0.0)):
@@ -304,21 +304,22 @@ def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
     after = int((kept & np.isfinite(since)).sum())
     if after < _LEAST_SAMPLES:
         raise InputError(
-            f"leave_out_s = {leave_out_s:g} s leaves {after} samples after an update; "
-            f"{_LEAST_SAMPLES} are needed. Leave out less, or hold the input longer."
+            f"leave_out_s = {leave_out_s:g} s leaves {after} samples after an update; at least "
+            f"{_LEAST_SAMPLES} are required. Leave out less, or hold the input longer."
         )
-    # A step at the first sample: output at rest and instantaneous answer cannot be told apart.
+    # A step at the first sample: the output before it and the instantaneous response are
+    # indistinguishable.
     return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
 
 
 def _swapped(u: Floats, y: Floats) -> bool:
-    """Whether the output is held like an input while the input moves like an output."""
+    """Whether the output is held like an input while the input varies like an output."""
     updates, moves = (np.count_nonzero(np.diff(column)) for column in (y, u))
     return bool(updates <= _HELD * u.size and moves >= _MOVING * u.size)
 
 
 def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:
-    """Why there is no creep to fit, where the output already drifts before the input changes."""
+    """Reason for no fit where the output already drifts before the input changes."""
     still = int(np.argmax(setting.span.inputs != 0.0))
     if not rest_known or still < _LEAST_SAMPLES:
         return None
@@ -330,14 +331,14 @@ def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:
     if not factors[1] ** 2 > _DRIFTS**2 * variance:
         return None
     return (
-        f"the output drifts by {factors[1]:.3g} a second before the input changes "
+        f"the output drifts by {factors[1]:.3g} per second before the input changes "
         f"({abs(factors[1]) / math.sqrt(max(variance, 1e-300)):.0f} standard deviations); wait "
         "until it has settled, or record without the drift"
     )
 
 
 def _tried(kinds: tuple[str, ...], setting: _Setting) -> list[_Fitted]:
-    """No creep, branches until one more gains nothing, fractional laws, a logarithm."""
+    """Fits of no creep, of a growing number of branches, and of the other laws."""
     wanted: list[CreepLaw] = [PowerLaw(), FractionalLaw()] if "fractional" in kinds else []
     wanted += [LogarithmicLaw()] if "logarithmic" in kinds else []
     found = [entry for law in [PronyLaw(0), *wanted] if (entry := _fit(law, setting)) is not None]
@@ -348,7 +349,8 @@ def _tried(kinds: tuple[str, ...], setting: _Setting) -> list[_Fitted]:
         if entry is None:
             break
         found.append(entry)
-        # Less than what two numbers are worth for white noise is nothing for any other.
+        # An improvement below that of two parameters for white noise is insignificant for any
+        # noise.
         if not entry.solution.cost < cost * math.exp(-2.0 * math.log(count) / count):
             break
         cost = entry.solution.cost
@@ -360,7 +362,7 @@ def _kind(entry: _Fitted) -> str:
 
 
 def _fit(law: CreepLaw, setting: _Setting) -> _Fitted | None:
-    """The best of several starts, polished on all samples."""
+    """The best of several starts, refined on all samples."""
     few, bounds = setting.thinned(), law.bounds(setting.span)
     starts = [project(start, few.bases(law, start)) for start in law.starts(setting.span)]
     starts = sorted((s for s in starts if math.isfinite(s.cost)), key=lambda s: s.cost)
@@ -376,13 +378,13 @@ def _fit(law: CreepLaw, setting: _Setting) -> _Fitted | None:
 
 
 def _one_sided(entry: _Fitted, setting: _Setting) -> bool:
-    """Whether all branches creep the same way; branches against each other fit noise."""
+    """Whether all branches creep in one direction; opposed branches fit noise."""
     gains = entry.gains(setting)
     return bool((gains >= 0.0).all() or (gains <= 0.0).all())
 
 
 def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
-    """All laws with their criterion, the best first."""
+    """All laws with their BIC, the best first."""
     richest = min(found, key=lambda entry: entry.solution.cost)
     count = int(setting.kept.sum())
     effective = effective_count(richest.solution.residuals)
@@ -423,13 +425,13 @@ def _describe(
         validation_fit_percent=_validation(setting, best),
         residual_whiteness_p=whiteness_p([residuals]),
         fitted=best.law.model(best.solution.search, instant, best.gains(setting)),
-        rivals=tuple(entry for entry in scored if entry.bic - best.bic < APART),
+        candidates=tuple(entry for entry in scored if entry.bic - best.bic < APART),
         setting=setting,
     )
 
 
 def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], Floats]:
-    """All numbers by name, and their covariance.
+    """All parameters by name, and their covariance.
 
     A time constant that the record cannot tell takes its gain with it.
     """
@@ -451,7 +453,7 @@ def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], 
         log_tau, spread = numbers[name]
         gain = "gain_" + name.split("_")[2]
         weak = abs(numbers[gain][0]) < _WEAK * numbers[gain][1]
-        if spread > _UNTOLD or weak or math.exp(log_tau) > _BEYOND * setting.span.duration_s:
+        if spread > _LARGEST_STD or weak or math.exp(log_tau) > _BEYOND * setting.span.duration_s:
             estimates[name] = Estimate(math.nan, math.inf, _UNKNOWN, "s")
             estimates[gain] = Estimate(math.nan, math.inf, _UNKNOWN, "")
     for name, known in estimates.items():
@@ -466,7 +468,7 @@ def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], 
 
 
 def _forecast(setting: _Setting, entry: _Fitted, later_s: float) -> Estimate:
-    """One law's output after the record, with the covariance of its numbers."""
+    """One law's output after the record, with the covariance of its parameters."""
     span = setting.span
     more = max(1, round(later_s * span.rate_hz))
     longer = Span(np.concatenate([span.inputs, np.full(more, span.inputs[-1])]), span.rate_hz)
@@ -483,7 +485,7 @@ def _forecast(setting: _Setting, entry: _Fitted, later_s: float) -> Estimate:
 
 
 def _validation(setting: _Setting, best: _Fitted) -> float:
-    """Fit of the last quarter of the samples, forecast by a fit to the rest."""
+    """Fit percentage of the last quarter of the samples, forecast by a fit to the rest."""
     rows = np.flatnonzero(setting.kept)
     cut = int(rows[round((1.0 - _HELD_OUT) * rows.size)])
     early = setting.before(cut)
@@ -508,33 +510,33 @@ def _notes(
     notes = []
     if whiteness_p([residuals]) < _COLOURED:
         notes.append(
-            "The residuals are not white: the law leaves something unexplained (ringing, a delay, "
-            "clipping, drift). Intervals and forecasts hold for the law, not for the truth. Leave "
+            "The residuals are not white: the law does not explain everything (ringing, a delay, "
+            "clipping, drift). Intervals and forecasts assume that the law is right. Leave "
             "ringing out with --leave-out-s."
         )
     spikes = np.abs(residuals) > _SPIKE * 1.4826 * float(np.median(np.abs(residuals)))
     if spikes.any():
         notes.append(
             f"{np.count_nonzero(spikes)} of {residuals.size} outputs are more than {_SPIKE:g} "
-            "standard deviations off the law, and are not excluded. Remove spikes first."
+            "standard deviations away from the law and are not excluded. Remove spikes first."
         )
     blind = [name for name, entry in estimates.items() if not math.isfinite(entry.std)]
     if any(name.endswith("_s") for name in blind):
         notes.append(
-            f"The record of {setting.span.duration_s:.4g} s is too short, or too noisy, for "
-            f"{', '.join(blind)}: not identifiable. Hold the input longer."
+            f"The record of {setting.span.duration_s:.4g} s is too short or too noisy for "
+            f"{', '.join(blind)}, which are not identifiable. Hold the input longer."
         )
     elif "order" in blind:
         notes.append(
-            "The creep is a straight line as far as the record tells: neither a law nor a time "
+            "Within this record the creep is a straight line, so neither a law nor a time "
             "constant is identifiable. Hold the input longer."
         )
     elif blind:
         notes.append(f"Not identifiable from this record: {', '.join(blind)}.")
     if stepped:
         notes.append(
-            "The input steps at the first sample: the output is taken to have been 0 before, so "
-            "`instant` holds what it was. Record the time before the step too."
+            "The input steps at the first sample: the output is assumed to be 0 before it, so "
+            "`instant` includes any earlier output. Record the time before the step too."
         )
     return tuple(notes)
 

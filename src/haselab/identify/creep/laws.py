@@ -1,4 +1,4 @@
-"""Creep laws to fit: what is searched in each, their answers to the input, their derivatives."""
+"""Creep laws to fit: searched parameters, responses to the input, and derivatives."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _SHORTEST = 0.3  # samples
 
 @dataclass(frozen=True)
 class Span:
-    """The input of a record, on its own clock.
+    """The input of a record at its own sampling rate.
 
     Args:
         inputs: held input, from 0 before the record. Shape `(N,)`.
-        rate_hz: samples a second, in Hz.
+        rate_hz: sampling rate, in Hz.
     """
 
     inputs: Floats
@@ -47,7 +47,7 @@ class Span:
 
     @property
     def log_times(self) -> tuple[float, float]:
-        """Logarithms of the shortest and the longest time constant in s that are searched."""
+        """Logarithms of the shortest and the longest time constant in s of the search."""
         return math.log(_SHORTEST / self.rate_hz), math.log(_LONGEST * self.duration_s)
 
 
@@ -59,31 +59,31 @@ class CreepLaw(ABC):
     @property
     @abstractmethod
     def names(self) -> tuple[str, ...]:
-        """Names of the searched numbers, then of the gains."""
+        """Names of the searched parameters, then of the gains."""
 
     @abstractmethod
     def bounds(self, span: Span) -> tuple[Floats, Floats]:
-        """Lowest and highest searched numbers; time constants by their logarithm."""
+        """Lowest and highest searched parameters; time constants by their logarithm."""
 
     @abstractmethod
     def starts(self, span: Span) -> list[Floats]:
-        """Searched numbers to begin with."""
+        """Starting values of the searched parameters."""
 
     @abstractmethod
     def columns(self, search: Floats, span: Span) -> tuple[Floats, Floats]:
-        """Answers to the input at gains of 1, shape `(N, C)`, and derivatives, `(L, N, C)`."""
+        """Responses to the input at gains of 1, shape `(N, C)`, and derivatives, `(L, N, C)`."""
 
     @abstractmethod
     def model(self, search: Floats, instant: float, gains: Floats) -> Creep:
-        """The model with these numbers."""
+        """The model with these parameters."""
 
 
 @dataclass(frozen=True)
 class PronyLaw(CreepLaw):
-    """Retarded branches; searched are the logarithms of their time constants.
+    """Prony series; the logarithms of its time constants are searched.
 
     Args:
-        count: number of branches; 0 is no creep.
+        count: number of branches; 0 means no creep.
     """
 
     count: int
@@ -91,7 +91,7 @@ class PronyLaw(CreepLaw):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the searched numbers, then of the gains."""
+        """Names of the searched parameters, then of the gains."""
         numbers = range(1, self.count + 1)
         taus = (f"time_constant_{k}_s" for k in numbers)
         return (*taus, *(f"gain_{k}" for k in numbers))
@@ -102,7 +102,7 @@ class PronyLaw(CreepLaw):
         return np.full(self.count, low), np.full(self.count, high)
 
     def starts(self, span: Span) -> list[Floats]:
-        """Pairs, triples, ... of a grid over the record."""
+        """Combinations of time constants from a grid over the record."""
         low, high = math.log(2.0 / span.rate_hz), math.log(span.duration_s)
         if self.count == 0:
             return [np.zeros(0)]
@@ -125,19 +125,19 @@ class PronyLaw(CreepLaw):
         return columns, slopes
 
     def model(self, search: Floats, instant: float, gains: Floats) -> Creep:
-        """The model with these numbers."""
+        """The model with these parameters."""
         return PronyCreep(instant, tuple(gains.tolist()), tuple(np.exp(search).tolist()))
 
 
 class _Differenced(CreepLaw):
-    """A law whose derivatives are differences."""
+    """A law with numerical derivatives."""
 
     @abstractmethod
     def _column(self, search: Floats, span: Span) -> Floats:
-        """Answer to the input at a gain of 1. Shape `(N,)`."""
+        """Response to the input at a gain of 1. Shape `(N,)`."""
 
     def columns(self, search: Floats, span: Span) -> tuple[Floats, Floats]:
-        """One column, its derivatives by central differences inside the bounds."""
+        """Response and its derivatives by central differences inside the bounds."""
         low, high = self.bounds(span)
         slopes = np.empty((search.size, span.inputs.size, 1))
         for k in range(search.size):
@@ -152,13 +152,13 @@ class _Differenced(CreepLaw):
 
 @dataclass(frozen=True)
 class PowerLaw(_Differenced):
-    """A spring-pot; searched is its order."""
+    """A spring-pot; its order is searched."""
 
     kind = "fractional"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the searched numbers, then of the gain."""
+        """Names of the searched parameters, then of the gain."""
         return ("order", "gain_1")
 
     def bounds(self, span: Span) -> tuple[Floats, Floats]:
@@ -175,19 +175,19 @@ class PowerLaw(_Differenced):
         return superpose(span.inputs, answer)
 
     def model(self, search: Floats, instant: float, gains: Floats) -> Creep:
-        """The model with these numbers."""
+        """The model with these parameters."""
         return PowerCreep(instant, float(gains[0]), float(search[0]))
 
 
 @dataclass(frozen=True)
 class FractionalLaw(_Differenced):
-    """A fractional Kelvin-Voigt branch; searched are order and logarithm of the time constant."""
+    """A fractional Kelvin-Voigt branch; order and logarithm of the time constant are searched."""
 
     kind = "fractional"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the searched numbers, then of the gain."""
+        """Names of the searched parameters, then of the gain."""
         return ("order", "time_constant_1_s", "gain_1")
 
     def bounds(self, span: Span) -> tuple[Floats, Floats]:
@@ -207,19 +207,19 @@ class FractionalLaw(_Differenced):
         return superpose(span.inputs, creep.compliance(time_s))
 
     def model(self, search: Floats, instant: float, gains: Floats) -> Creep:
-        """The model with these numbers."""
+        """The model with these parameters."""
         return FractionalCreep(instant, float(gains[0]), float(search[0]), math.exp(search[1]))
 
 
 @dataclass(frozen=True)
 class LogarithmicLaw(_Differenced):
-    """Logarithmic creep; searched is the logarithm of its time constant."""
+    """Logarithmic creep; the logarithm of its time constant is searched."""
 
     kind = "logarithmic"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the searched number, then of the gain."""
+        """Names of the searched parameter, then of the gain."""
         return ("time_constant_1_s", "gain_1")
 
     def bounds(self, span: Span) -> tuple[Floats, Floats]:
@@ -238,5 +238,5 @@ class LogarithmicLaw(_Differenced):
         return superpose(span.inputs, creep.compliance(time_s))
 
     def model(self, search: Floats, instant: float, gains: Floats) -> Creep:
-        """The model with these numbers."""
+        """The model with these parameters."""
         return LogarithmicCreep(instant, float(gains[0]), math.exp(search[0]))

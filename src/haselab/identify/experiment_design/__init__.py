@@ -1,1 +1,1 @@
-"""The next experiment: drives inside the limits of the bench, chosen by what they would show."""
+"""Experiment design: drives inside the limits of the bench, ranked by their information."""

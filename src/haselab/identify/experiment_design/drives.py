@@ -16,13 +16,13 @@ from haselab.signals import constant, linear_chirp, multisine, prbs, square
 __all__ = ["BenchLimits", "DriveCandidate", "candidate_drives", "optimal_power"]
 
 Floats = NDArray[np.float64]
-_LEAD_S = 1.0  # at the baseline before a signal begins
-_LEVELS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  # of the widest amplitude
-_SMALLER = 0.6  # a second size, for an actuator that is bent
+_LEAD_S = 1.0  # at the baseline before a signal starts
+_LEVELS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  # of the largest amplitude
+_SMALLER = 0.6  # a second amplitude, for a nonlinear actuator
 _FLIPS_HZ = (0.2, 0.5, 2.0)
 _LINES = 24  # of a multisine, spread
-_CLOSE = 12  # about the resonance
-_GUARD = 0.3  # of an optimal multisine's power on all lines alike
+_CLOSE = 12  # near the resonance
+_GUARD = 0.3  # of an optimal multisine's power spread evenly over all lines
 _ROUNDS = 100  # of the multiplicative algorithm
 _FASTEST = 4.0  # highest frequency over the natural frequency
 _STEP = 1e-5
@@ -30,16 +30,16 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class BenchLimits:
-    """What a drive may ask for.
+    """Limits that a drive has to respect.
 
     Args:
-        low_v: lowest drive, in V; below 0 the polarity can alternate.
+        low_v: lowest drive, in V; the polarity can alternate if it is below 0.
         high_v: highest drive, in V.
         slew_v_s: fastest change of the drive, in V/s.
-        update_hz: updates a second, in Hz.
+        update_hz: update rate, in Hz.
         largest_output: how far the output may go from that at the baseline, in its unit.
     Raises:
-        LimitError: an empty window, no slew, no update.
+        LimitError: an empty window, or a limit that is not above 0.
     """
 
     low_v: float
@@ -53,8 +53,8 @@ class BenchLimits:
         if not (self.low_v < self.high_v and min(positive) > 0.0):
             raise LimitError(
                 f"Window [{self.low_v:g}, {self.high_v:g}] V, {self.slew_v_s:g} V/s, "
-                f"{self.update_hz:g} Hz, output to {self.largest_output:g}; allowed are a window "
-                "of some width and the others above 0. Correct the limits."
+                f"{self.update_hz:g} Hz, output to {self.largest_output:g}; the window "
+                "must not be empty and the other limits must be above 0."
             )
 
     @classmethod
@@ -74,8 +74,8 @@ class BenchLimits:
             amplifier_gain: V per V.
             slew_v_s: of the amplifier's output, in V/s.
             current_limit_a: of the amplifier, in A.
-            capacitance_f: of the actuator and what is beside it, in F.
-            update_hz: updates a second, in Hz.
+            capacitance_f: of the actuator and everything parallel to it, in F.
+            update_hz: update rate, in Hz.
         Returns:
             Limits ahead of the amplifier.
         """
@@ -89,8 +89,8 @@ class DriveCandidate:
 
     Args:
         name: for tables.
-        says: what it does, in words.
-        drive_v: one value an update, in V. Shape `(N,)`.
+        says: description in words.
+        drive_v: one value per update, in V. Shape `(N,)`.
     """
 
     name: str
@@ -98,7 +98,7 @@ class DriveCandidate:
     drive_v: Floats
 
 
-# A drive by its size, 0 to 1 of the widest amplitude.
+# A drive as a function of its size, 0 to 1 of the largest amplitude.
 Family = Callable[[float], DriveCandidate]
 
 
@@ -108,28 +108,28 @@ def candidate_drives(
     """Step, chirp, multisines, pseudo-random and alternating drives.
 
     Args:
-        plant: the actuator as far as it is known; places the frequencies.
+        plant: prior knowledge of the actuator; determines the frequencies.
         limits: of the bench.
         duration_s: of each drive, in s.
         baseline_v: drive at which the actuator has settled, in V.
-        goal: name of the number for whose interval one multisine is optimised; another word
-            optimises it for all.
+        goal: name of the parameter for whose interval one multisine is optimised; any other word
+            optimises it for all parameters.
     Returns:
-        Candidates in up to two sizes, the larger one as large as the limits allow; the polarity
-        alternates only where the window does.
+        Candidates in up to two amplitudes, the larger at the limits; the polarity
+        alternates only where the window allows it.
     Raises:
         InputError: a baseline outside the window or at 0 V, a drive that is too short.
     """
     lowest_v = max(limits.low_v, 0.0)
     if not lowest_v <= baseline_v <= limits.high_v or baseline_v == 0.0:
         raise InputError(
-            f"baseline_v = {baseline_v:g} V; allowed is above 0 V and within "
-            f"[{lowest_v:g}, {limits.high_v:g}] V. Move it into the window."
+            f"baseline_v = {baseline_v:g} V; must be above 0 V and within "
+            f"[{lowest_v:g}, {limits.high_v:g}] V."
         )
     if not 10.0 <= duration_s * limits.update_hz <= 1e6:
         raise InputError(
-            f"duration_s = {duration_s:g} s at {limits.update_hz:g} Hz; allowed are 10 to a "
-            "million updates. Plan a longer or a shorter drive."
+            f"duration_s = {duration_s:g} s at {limits.update_hz:g} Hz; must be 10 to a "
+            "million updates."
         )
     families = _about_baseline(plant, limits, duration_s, baseline_v, goal)
     if limits.low_v < 0.0:
@@ -150,7 +150,7 @@ def candidate_drives(
 
 
 def _admissible(drive: DriveCandidate, plant: VoltagePlant, limits: BenchLimits) -> bool:
-    """Whether amplifier and actuator can follow without leaving their limits."""
+    """Whether amplifier and actuator stay within their limits."""
     largest_v = float(np.abs(np.diff(drive.drive_v)).max(initial=0.0))
     if largest_v * limits.update_hz > limits.slew_v_s:
         return False
@@ -184,18 +184,17 @@ def _about_baseline(
     lines_hz = _lines_hz(plant, long_s, highest_hz)
     if lines_hz.size == 0:
         raise InputError(
-            f"duration_s = {duration_s:g} s holds no whole period of a frequency up to "
-            f"{highest_hz:.3g} Hz, the fastest that the plant and the updates allow. Plan a longer "
-            "drive."
+            f"duration_s = {duration_s:g} s has no whole period of a frequency up to "
+            f"{highest_hz:.3g} Hz, the highest for this plant and update rate. Plan a longer drive."
         )
     power = optimal_power(plant, 2.0 * math.pi * lines_hz, baseline_v, goal)
-    # As few lines as numbers would be best for a straight plant; the rest guards against others.
+    # For a linear plant as few lines as parameters are best; more lines guard against nonlinearity.
     power = (1.0 - _GUARD) * power + _GUARD / power.size
     lowest_hz = min(0.1, 0.1 * highest_hz)
     return [
         about(
             "step",
-            "goes up and down twice, a quarter of the time each",
+            "steps up and down twice, a quarter of the time each",
             square(2.0 / long_s, long_s, rate_hz),
         ),
         about(
@@ -203,23 +202,23 @@ def _about_baseline(
             f"sweeps up to {highest_hz:.3g} Hz",
             linear_chirp(lowest_hz, highest_hz, long_s, rate_hz),
         ),
-        about("prbs", f"jumps at random, every {bit_s:.2g} s or later",
+        about("prbs", f"switches at random, at intervals of {bit_s:.2g} s or more",
               prbs(bit_s, long_s, rate_hz)),
         about(
             "multisine",
-            f"sounds {lines_hz.size} lines up to {highest_hz:.3g} Hz",
+            f"excites {lines_hz.size} lines up to {highest_hz:.3g} Hz",
             multisine(lines_hz, long_s, rate_hz),
         ),
         about(
             "optimal multisine",
-            f"sounds {lines_hz.size} lines, loudest those that tell most",
+            f"excites {lines_hz.size} lines, the most informative ones strongest",
             multisine(lines_hz, long_s, rate_hz, power),
         ),
     ]  # fmt: skip
 
 
 def _alternating(limits: BenchLimits, duration_s: float, baseline_v: float) -> list[Family]:
-    """Held, with the sign in turn, at rest, in turn again: creep of a signed voltage goes away."""
+    """Hold, alternate the sign, rest, alternate again: separates creep with the voltage's sign."""
     rate_hz = limits.update_hz
     lead = constant(baseline_v, _LEAD_S, rate_hz)
     part_s = max(duration_s - _LEAD_S, 4.0 / rate_hz) / 4.0
@@ -233,8 +232,8 @@ def _alternating(limits: BenchLimits, duration_s: float, baseline_v: float) -> l
             peak_v = level * reach_v
             return DriveCandidate(
                 f"alternation {flips_hz:g} Hz, {peak_v:.2g} V",
-                f"holds {peak_v:.3g} V, changes its sign {2 * flips_hz:g} times a second, rests at "
-                f"{baseline_v:.3g} V, and changes its sign again",
+                f"holds {peak_v:.3g} V, changes its sign {2 * flips_hz:g} times per second, rests "
+                f"at {baseline_v:.3g} V, and changes its sign again",
                 np.concatenate([lead, np.full(turns.size, peak_v), peak_v * turns, rest,
                                 peak_v * turns]),
             )  # fmt: skip
@@ -249,7 +248,7 @@ def _alternating(limits: BenchLimits, duration_s: float, baseline_v: float) -> l
 
 
 def _lines_hz(plant: VoltagePlant, period_s: float, highest_hz: float) -> Floats:
-    """Multiples of the inverse period: spread by their logarithm, and close about the resonance."""
+    """Multiples of the inverse period: logarithmically spaced, and denser near the resonance."""
     width = 3.0 * min(max(plant.damping_ratio, 0.01), 0.3)
     natural_hz = plant.natural_frequency_rad_s / (2.0 * math.pi)
     spread = np.geomspace(1.0 / period_s, highest_hz, _LINES)
@@ -259,16 +258,16 @@ def _lines_hz(plant: VoltagePlant, period_s: float, highest_hz: float) -> Floats
 
 
 def optimal_power(plant: VoltagePlant, omega_rad_s: Floats, baseline_v: float, goal: str) -> Floats:
-    r"""Power of each line of a multisine that tells the linearised plant's numbers best.
+    r"""Power of each multisine line that best identifies the linearised plant's parameters.
 
     $w_k \leftarrow w_k\, d_k^{\,1/2} / \sum_j w_j\, d_j^{\,1/2}$ with
-    $d_k = c' F^{-1} F_k F^{-1} c$ for one number; $w_k\, \mathrm{tr}(F^{-1}F_k)/n$ for all.
+    $d_k = c' F^{-1} F_k F^{-1} c$ for one parameter; $w_k\, \mathrm{tr}(F^{-1}F_k)/n$ for all.
 
     Args:
-        plant: the actuator as far as it is known.
+        plant: prior knowledge of the actuator.
         omega_rad_s: lines, in rad/s. Shape `(K,)`.
-        baseline_v: drive about which it is small, in V.
-        goal: name of the number; another word stands for all.
+        baseline_v: operating point of the linearisation, in V.
+        goal: name of the parameter; any other word means all.
     Returns:
         Powers that add up to one. Shape `(K,)`.
     Source: Fedorov, Theory of Optimal Experiments (1972); Titterington, Biometrika 62 (1975), 313.

@@ -1,4 +1,4 @@
-"""The next experiment: the drive that tells a number best, or separates rival hypotheses."""
+"""Experiment design: find the drive that best identifies a parameter or separates hypotheses."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ __all__ = ["Accuracy", "ExperimentPlan", "PlannedExperiment", "goals_of", "plan_
 
 Floats = NDArray[np.float64]
 _OUTPUTS = 400  # of a planned record
-_DOUBT = 2.0  # factor within which the systematic part is known
+_DOUBT = 2.0  # factor by which the systematic part is uncertain
 _TURN = 2.0 * math.pi
-_SECOND = (2.7, 0.1)  # frequency of a presumed second mode over the first one's, and its share
+_SECOND = (2.7, 0.1)  # frequency of an assumed second mode relative to the first one, and its share
 _NUMBERS = (
     "natural_frequency_rad_s", "damping_ratio", "delay_s", "creep_share", "creep_time_constant_s",
     "gain_1",
@@ -40,10 +40,10 @@ class Accuracy:
 
     Args:
         noise_std: of an independent sample, in the unit of the output.
-        samples_per_s: independent samples a second.
-        systematic: what the model leaves out, over the output's swing (root mean square).
+        samples_per_s: independent samples per second.
+        systematic: model error relative to the output's variation (root mean square).
     Raises:
-        InputError: a number out of range.
+        InputError: a value out of range.
     """
 
     noise_std: float = 1e-4
@@ -54,25 +54,26 @@ class Accuracy:
         if not (self.noise_std > 0.0 and self.samples_per_s > 0.0 and 0.0 <= self.systematic < 1.0):
             raise InputError(
                 f"noise_std = {self.noise_std:g}, samples_per_s = {self.samples_per_s:g}, "
-                f"systematic = {self.systematic:g}; allowed are above 0, above 0, and 0 to 1. "
-                "Correct them."
+                f"systematic = {self.systematic:g}; must be above 0, above 0, and 0 to 1."
             )
 
 
 @dataclass(frozen=True)
 class PlannedExperiment:
-    """One candidate with what it promises.
+    """One candidate drive with its predicted results.
 
     Args:
         name: for tables.
-        says: what it does, in words.
-        drive_v: one value an update, in V. Shape `(N,)`.
+        says: description in words.
+        drive_v: one value per update, in V. Shape `(N,)`.
         std: predicted standard deviation by name; relative for frequencies, damping, time
             constants and gains.
-        probability: of a right verdict whichever rival is true; NaN where a number is the goal.
-        separation: root mean square between a rival's best fit and the truth, over what is left
-            unexplained; the smaller one of both directions. NaN where a number is the goal.
-        score: by which it is ranked; more is better.
+        probability: of a right decision whichever hypothesis is true; NaN where a parameter is the
+            goal.
+        separation: root mean square between a wrong hypothesis's best fit and the truth, relative
+            to the unexplained part; the smaller of both directions. NaN where a parameter is the
+            goal.
+        score: rank criterion; larger is better.
     """
 
     name: str
@@ -84,7 +85,7 @@ class PlannedExperiment:
     score: float
 
     def to_dict(self) -> JsonObject:
-        """Keys of the answer, without the drive."""
+        """The result for JSON, without the drive."""
         return {
             "name": self.name,
             "says": self.says,
@@ -98,14 +99,14 @@ class PlannedExperiment:
 
 @dataclass(frozen=True)
 class ExperimentPlan:
-    """Candidates, the best first.
+    """Candidate drives, the best first.
 
     Args:
         status: "ok", or why there is no result.
-        goal: what was asked for.
+        goal: the requested goal.
         ranked: candidates, the best first.
         update_hz: updates of the drives a second, in Hz.
-        notes: what the reader should know, a sentence each.
+        notes: remarks for the user, one sentence each.
     """
 
     status: str
@@ -116,16 +117,16 @@ class ExperimentPlan:
 
     @property
     def succeeded(self) -> bool:
-        """Whether there is a drive that reaches the goal better than chance."""
+        """Whether a drive reaches the goal better than chance."""
         return self.status == "ok"
 
     @property
     def chosen(self) -> PlannedExperiment:
-        """The best candidate."""
+        """The best candidate drive."""
         return self.ranked[0]
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         return {
             "goal": self.goal,
             "chosen": self.chosen.name,
@@ -138,12 +139,12 @@ class ExperimentPlan:
 
 
 def goals_of(plant: VoltagePlant) -> tuple[str, ...]:
-    """All goals that can be planned for.
+    """All goals of `plan_experiment` for a plant.
 
     Args:
-        plant: the actuator as far as it is known.
+        plant: prior knowledge of the actuator.
     Returns:
-        Names of questions, "all", names of numbers.
+        Names of questions, "all", names of parameters.
     """
     known = _NUMBERS if plant.creep_share else tuple(n for n in _NUMBERS if "creep" not in n)
     return ("creep", "reading", "modes", "all", *known)
@@ -159,26 +160,26 @@ def plan_experiment(
     baseline_v: float = 1.0,
     risk: float = 0.01,
 ) -> ExperimentPlan:
-    r"""Rank drives by what a fit to their records would tell.
+    r"""Rank drives by the expected result of a fit to their records.
 
-    For a number: its standard deviation, $(c'F^{-1}c)^{1/2}$; for "all": $\ln\det F$. For a
-    question: each rival in turn is taken as true, the other one is fitted to what it predicts, and
-    the distance that remains, over noise and what the model leaves out, gives the probability that
-    `compare` decides, and decides right.
+    For a parameter: its standard deviation, $(c'F^{-1}c)^{1/2}$; for "all": $\ln\det F$. For a
+    question: each hypothesis in turn is assumed to be true, the other is fitted to its prediction,
+    and the remaining distance, relative to noise and model error, gives the probability that
+    `compare` makes the right decision.
 
     Args:
-        plant: the actuator as far as it is known.
-        goal: "creep", "reading", "modes", "all", or the name of a number.
+        plant: prior knowledge of the actuator.
+        goal: "creep", "reading", "modes", "all", or the name of a parameter.
         limits: of the bench.
         accuracy: of the output and of the model.
         duration_s: of the drive, in s.
         baseline_v: drive at which the actuator has settled before, in V.
-        risk: of the verdict.
+        risk: of a wrong decision.
     Returns:
         The plan; `status` says "ok" or why no candidate reaches the goal.
     Raises:
         InputError: an unknown goal, a baseline outside the window, a duration too short.
-    Source: Atkinson and Fedorov, Biometrika 62 (1975), 57, for separating rivals.
+    Source: Atkinson and Fedorov, Biometrika 62 (1975), 57, for discriminating between models.
     Example:
         >>> plant = VoltagePlant("mechanical", (0.06,), 5.11, 0.09, 0.0, 0.3, 4.0)
         >>> unipolar, bipolar = BenchLimits(0.0, 2.0), BenchLimits(-2.0, 2.0)
@@ -186,13 +187,11 @@ def plan_experiment(
         'alternation'
     """
     if goal not in goals_of(plant):
-        raise InputError(
-            f"goal = {goal}; allowed are {', '.join(goals_of(plant))}. Correct the goal."
-        )
+        raise InputError(f"goal = {goal}; must be one of {', '.join(goals_of(plant))}.")
     accuracy = accuracy or Accuracy()
     drives = candidate_drives(plant, limits, duration_s, baseline_v, goal)
     if not drives:
-        reason = "no result: no drive stays inside the limits; allow more slew or more output"
+        reason = "no result: no drive stays inside the limits; allow a higher slew or larger output"
         return ExperimentPlan(reason, goal, (), limits.update_hz, ())
     truths = _truths(plant, goal)
     planned = [_planned(plant, truths, drive, (goal, limits, accuracy, risk)) for drive in drives]
@@ -200,12 +199,12 @@ def plan_experiment(
     notes = _notes(plant, goal, limits, ranked)
     status = "ok"
     if not math.isfinite(ranked[0].score):
-        status = f"no result: no candidate tells {goal}; plan a longer drive or a wider window"
+        status = f"no result: no candidate identifies {goal}; plan a longer drive or a wider window"
     return ExperimentPlan(status, goal, tuple(ranked), limits.update_hz, notes)
 
 
 def _truths(plant: VoltagePlant, goal: str) -> list[tuple[VoltagePlant, VoltagePlant]]:
-    """Pairs of what is true and its rival."""
+    """Pairs of true plant and alternative."""
     if goal == "creep":
         share = plant.creep_share or 0.3
         kinds = [replace(plant, creep=kind, creep_share=share)
@@ -213,10 +212,10 @@ def _truths(plant: VoltagePlant, goal: str) -> list[tuple[VoltagePlant, VoltageP
         return [(kinds[0], kinds[1]), (kinds[1], kinds[0])]
     if goal == "reading":
         omega = plant.natural_frequency_rad_s
-        # The reading that the plant does not have lies a turn above or below.
+        # The other interpretation of the frequency axis is a factor of 2 pi above or below.
         other = omega * _TURN if omega < math.sqrt(_TURN) * 5.1 else omega / _TURN
-        rival = replace(plant, natural_frequency_rad_s=other)
-        return [(plant, rival), (rival, plant)]
+        alternative = replace(plant, natural_frequency_rad_s=other)
+        return [(plant, alternative), (alternative, plant)]
     if goal == "modes":
         omega, damping = plant.natural_frequency_rad_s, plant.damping_ratio
         second = plant.second_mode or (_SECOND[0] * omega, damping, _SECOND[1])
@@ -225,7 +224,7 @@ def _truths(plant: VoltagePlant, goal: str) -> list[tuple[VoltagePlant, VoltageP
 
 
 def _record(plant: VoltagePlant, drive: DriveCandidate, limits: BenchLimits) -> Record:
-    """What a plant would give, at times enough to show its fastest motion."""
+    """Simulated record of a plant, sampled fast enough for its fastest motion."""
     count = drive.drive_v.size
     time_s = spread_indices(count, _OUTPUTS) / limits.update_hz
     y = plant.simulate(drive.drive_v, limits.update_hz, time_s, limits.slew_v_s)
@@ -250,8 +249,8 @@ def _planned(
         return PlannedExperiment(
             drive.name, drive.says, drive.drive_v, std, math.nan, math.nan, score
         )
-    outlook = [_outlook(truth, rival, drive, (limits, accuracy, risk, samples))
-               for truth, rival in truths]  # fmt: skip
+    outlook = [_outlook(truth, alternative, drive, (limits, accuracy, risk, samples))
+               for truth, alternative in truths]  # fmt: skip
     probability = min(p for p, _ in outlook)
     separation = min(s for _, s in outlook)
     return PlannedExperiment(
@@ -261,29 +260,29 @@ def _planned(
 
 def _outlook(
     truth: VoltagePlant,
-    rival: VoltagePlant,
+    alternative: VoltagePlant,
     drive: DriveCandidate,
     task: tuple[BenchLimits, Accuracy, float, float],
 ) -> tuple[float, float]:
-    """Probability of a right verdict, and how far the rival's best fit stays away."""
+    """Probability of a right decision, and distance of the alternative's best fit."""
     limits, accuracy, risk, samples = task
     record = _record(truth, drive, limits)
-    far = 1.5  # a rival's frequency stays within this factor, as a reading does
+    far = 1.5  # the alternative's frequency stays within this factor
     structure = VoltageStructure(
-        rival.creep,
-        len(rival.gains),
-        lowest_rad_s=rival.natural_frequency_rad_s / far,
-        highest_rad_s=rival.natural_frequency_rad_s * far,
+        alternative.creep,
+        len(alternative.gains),
+        lowest_rad_s=alternative.natural_frequency_rad_s / far,
+        highest_rad_s=alternative.natural_frequency_rad_s * far,
         slew_v_s=limits.slew_v_s,
     )
-    starts = [rival]
-    if rival.creep != truth.creep:
-        starts.append(replace(rival, creep_share=0.02))  # the wrong creep may do best without any
+    starts = [alternative]
+    if alternative.creep != truth.creep:
+        starts.append(replace(alternative, creep_share=0.02))  # the wrong creep may fit best at 0
     fit = fit_voltage_plant([record], structure, starts)
     distance = math.sqrt(float((fit.residuals[0] ** 2).mean()))
     left_out = accuracy.systematic * float(record.y.std())
     ratio = distance / math.hypot(accuracy.noise_std, left_out)
-    # Gain of log-likelihood with its scatter, against the threshold of the odds.
+    # Gain of log-likelihood with its scatter, compared with the threshold of the odds.
     gain = 0.5 * samples * math.log1p(ratio**2)
     scatter = math.sqrt(samples) * ratio / (1.0 + ratio**2)
     by_odds = float(ndtr((gain + math.log(risk)) / max(scatter, 1e-9)))
@@ -300,24 +299,24 @@ def _notes(
     notes = []
     if math.isfinite(best.probability):
         notes.append(
-            f"{best.name} {best.says}: a right verdict with a probability of "
-            f"{best.probability:.2g}; rivals stay {best.separation:.2g} times apart of what is "
-            "left unexplained."
+            f"{best.name} {best.says}: probability of a right decision "
+            f"{best.probability:.2g}; the hypotheses differ by {best.separation:.2g} times the "
+            "unexplained part."
         )
         if best.probability < 0.9:
-            notes.append("Expect 'cannot tell'. A wider window or a longer drive tells more.")
+            notes.append("'cannot tell' is likely. Use a wider window or a longer drive.")
     elif goal in best.std:
         relative = "" if goal in ("delay_s", "creep_share") else " (relative)"
-        notes.append(f"{best.name} {best.says}: {goal} to {best.std[goal]:.2g}{relative}.")
+        notes.append(f"{best.name} {best.says}: {goal} to within {best.std[goal]:.2g}{relative}.")
     if goal == "creep" and limits.low_v >= 0.0:
         notes.append(
             f"The window [{limits.low_v:g}, {limits.high_v:g}] V has one polarity. Alternating "
-            "polarity separates the rivals best; it needs a bipolar amplifier and a window below "
-            "0 V."
+            "polarity separates the hypotheses best; it requires a bipolar amplifier and a window "
+            "below 0 V."
         )
     if goal == "modes" and plant.second_mode is None:
         notes.append(
             f"A second mode at {_SECOND[0]:g} times the first one's frequency with a share of "
-            f"{_SECOND[1]:g} was presumed."
+            f"{_SECOND[1]:g} was assumed."
         )
     return tuple(notes)

@@ -1,4 +1,4 @@
-"""Hull of an oscillation: the decay through its peaks, without a model of the decay between."""
+"""Envelope of an oscillation: decay rate of its peaks, without a model of the decay between."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from haselab.base import Estimate
 from haselab.models.filters import lfilter
 
-__all__ = ["Swing", "hull_decay"]
+__all__ = ["Swing", "envelope_decay"]
 
 Floats = NDArray[np.float64]
 _WINDOW_RAD = 0.6
@@ -22,13 +22,13 @@ _REFINEMENTS = 3
 
 @dataclass(frozen=True)
 class Swing:
-    """The oscillation of one trial, freed of offset and creep, its wanted peaks upwards.
+    """Oscillation of one trial without offset and creep, turned so that its peaks are positive.
 
     Args:
         time_s: times from the first sample, in s. Shape `(N,)`.
         value: oscillation. Shape `(N,)`.
         peak_rad: phase `omega t` of a peak, in rad.
-        height: expected height of a peak at time zero, which tells where peaks drown.
+        height: expected height of a peak at time zero, to find where the peaks vanish in the noise.
         decay_per_s: expected decay, for the same.
     """
 
@@ -48,20 +48,20 @@ class _Peaks:
     covariance: Floats
 
 
-def hull_decay(
+def envelope_decay(
     swings: Sequence[Swing], omega_rad_s: float, noise: tuple[Floats, float]
 ) -> Estimate | None:
     r"""Decay rate of the peaks by a weighted straight line through their logarithms.
 
-    A peak counts while five standard deviations of its height are expected, so noise does not
-    choose among them; the line has one slope for all trials and a level for each.
+    A peak counts while its expected height is above five standard deviations, so noise does not
+    select the peaks; the line has a common slope and one level per trial.
 
     Args:
-        swings: one a trial.
+        swings: one per trial.
         omega_rad_s: damped angular frequency, in rad/s.
         noise: autoregressive polynomial and variance of the innovation of the noise.
     Returns:
-        Decay rate, in 1/s; None unless one trial shows two peaks.
+        Decay rate, in 1/s; None unless one trial has two peaks.
     Source: logarithmic decrement; peak heights by parabolas of `+-0.6 rad` about each peak.
     """
     found = [_peaks(swing, omega_rad_s, noise) for swing in swings]
@@ -96,9 +96,9 @@ def _peaks(swing: Swing, omega_rad_s: float, noise: tuple[Floats, float]) -> _Pe
         weights.append(full)
     matrix = np.array(weights).reshape(len(weights), time_s.size)
     height = matrix @ swing.value
-    told = height > 0.0
-    spread = matrix[told] @ _toeplitz_times(covariance, matrix[told].T)
-    return _Peaks(np.array(at_s)[told], height[told], spread)
+    known = height > 0.0
+    spread = matrix[known] @ _toeplitz_times(covariance, matrix[known].T)
+    return _Peaks(np.array(at_s)[known], height[known], spread)
 
 
 def _covariance(noise: tuple[Floats, float], count: int) -> Floats:
@@ -121,7 +121,7 @@ def _toeplitz_times(covariance: Floats, columns: Floats) -> Floats:
 
 
 def _line(trials: Sequence[_Peaks]) -> Estimate:
-    """Slope of the logarithms of all trials, weighted by the heights that the line expects."""
+    """Slope of the logarithms of all trials, weighted by the expected heights."""
     size = sum(peaks.time_s.size for peaks in trials)
     matrix, target = np.zeros((size, 1 + len(trials))), np.zeros(size)
     covariance, height, begin = np.zeros((size, size)), np.zeros(size), 0
@@ -133,7 +133,7 @@ def _line(trials: Sequence[_Peaks]) -> Estimate:
         height[begin:end], begin = peaks.height, end
     solution, expected = np.zeros(matrix.shape[1]), height
     for _ in range(_REFINEMENTS):
-        # The logarithm of a noisy height is low by half its relative variance.
+        # The logarithm of a noisy height is biased low by half its relative variance.
         relative = covariance / np.outer(expected, expected)
         variance = np.diag(relative)
         lifted = target + 0.5 * np.diag(covariance) / height**2

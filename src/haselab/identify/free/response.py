@@ -1,4 +1,4 @@
-"""Free response of a dropped mass: decay, damped and natural frequency (eqs. 6 and 7), hulls."""
+"""Free response of a dropped mass: decay, frequencies (eqs. 6 and 7) and envelopes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from haselab.base import Estimate, InputError, JsonObject
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
 from haselab.identify.fit import CurveFit, Prediction, propagated, rescaled
-from haselab.identify.free.envelope import Swing, hull_decay
+from haselab.identify.free.envelope import Swing, envelope_decay
 from haselab.identify.noise import (
     autoregression,
     coloured_covariance,
@@ -28,7 +28,7 @@ __all__ = ["FreeResponseFit", "FreeTrial", "fit_free_response"]
 Floats = NDArray[np.float64]
 _THIN = 400
 _SIGNIFICANT = 6.0
-_AT_LEAST = 0.05  # of the logarithm: a decay so near its lowest value is at it
+_AT_LEAST = 0.05  # of the logarithm: a decay this close to its lower bound is at it
 _WHITE = 0.05
 
 
@@ -40,7 +40,7 @@ class FreeTrial:
         x: displacement or strain. Shape `(N,)`.
         time_s: rising times, in s. Shape `(N,)`.
     Raises:
-        InputError: wrong shapes, NaN, times that do not rise, no motion.
+        InputError: wrong shapes, NaN, times that do not rise, a constant motion.
     """
 
     x: Floats
@@ -52,16 +52,16 @@ class FreeTrial:
         if self.x.size != self.time_s.size or not (np.diff(self.time_s) > 0.0).all():
             raise InputError(
                 f"x has {self.x.size} values and time_s {self.time_s.size}, or the times do not "
-                "rise; allowed are equal lengths and rising times. Sort the record."
+                "rise. They must be equally long and the times must rise."
             )
         if np.ptp(self.x) == 0.0:
             raise InputError(
-                f"The motion is {self.x[0]:g} throughout; allowed is one that moves. "
+                f"The motion is {self.x[0]:g} throughout; it must be one that moves. "
                 "Name the right column."
             )
 
     def moving(self) -> FreeTrial:
-        """The motion from its largest deflection on, if it begins at rest; else all of it."""
+        """The motion from its largest deflection on, if it starts from rest; else all of it."""
         head = self.x[: max(4, self.x.size // 20)]
         if np.ptp(head) > 0.05 * np.ptp(self.x):
             return self
@@ -77,16 +77,16 @@ class FreeTrial:
 class FreeResponseFit(CurveFit):
     r"""Fit of $x = x_0 + c\,e^{-t/\tau} + A e^{-\delta t}\cos(\omega_d t - \varphi_0)$.
 
-    Time counts from the first sample, or from the release where the record begins at rest.
+    Time counts from the first sample, or from the release where the record starts from rest.
 
     See `Fit` for what all fits have. Its `parameters` are `damped_frequency_rad_s`,
     `decay_rate_per_s`, `natural_frequency_rad_s`, `damping_ratio`, and of the first trial
     `amplitude`, `phase_rad`.
 
     Args:
-        hull_positive_decay_per_s: decay through the positive peaks; None with fewer than two.
-        hull_negative_decay_per_s: the same through the negative peaks.
-        trials: the fit of each trial alone; empty for one trial.
+        envelope_positive_decay_per_s: decay through the positive peaks; None with fewer than two.
+        envelope_negative_decay_per_s: the same through the negative peaks.
+        trials: separate fit of each trial; empty for a single trial.
         r_squared: share of the variance that is explained.
         residual_whiteness_p: Ljung-Box probability.
         modelled: fitted motion of each trial. Shape `(N_r,)` each.
@@ -95,8 +95,8 @@ class FreeResponseFit(CurveFit):
         search: logarithms of decay rate and damped frequency, and with creep of its time constant.
     """
 
-    hull_positive_decay_per_s: Estimate | None = None
-    hull_negative_decay_per_s: Estimate | None = None
+    envelope_positive_decay_per_s: Estimate | None = None
+    envelope_negative_decay_per_s: Estimate | None = None
     trials: tuple[FreeResponseFit, ...] = ()
     r_squared: float = math.nan
     residual_whiteness_p: float = math.nan
@@ -139,13 +139,13 @@ class FreeResponseFit(CurveFit):
         return time_chart("Free response", time_s, measured, modelled, (output, "fit"))
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         keys = ("damped_frequency_rad_s", "decay_rate_per_s", "natural_frequency_rad_s",
                 "damping_ratio", "amplitude", "phase_rad")  # fmt: skip
         return {
             **{key: self.parameters.get(key) for key in keys},
-            "hull_positive_decay_per_s": self.hull_positive_decay_per_s,
-            "hull_negative_decay_per_s": self.hull_negative_decay_per_s,
+            "envelope_positive_decay_per_s": self.envelope_positive_decay_per_s,
+            "envelope_negative_decay_per_s": self.envelope_negative_decay_per_s,
             "r_squared": self.r_squared,
             "residual_whiteness_p": self.residual_whiteness_p,
             "trials": [trial.answer() for trial in self.trials],
@@ -155,14 +155,14 @@ class FreeResponseFit(CurveFit):
 
 
 def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None) -> FreeResponseFit:
-    r"""Joint estimate of all trials; each has its own amplitude, phase, offset and creep.
+    r"""Fit all trials jointly, each with its own amplitude, phase, offset and creep.
 
     $\omega_0 = \sqrt{\omega_d^2 + \delta^2},\quad \zeta = \delta/\omega_0$
 
     Args:
-        trials: free motions; what comes before the drop is left out.
-        creep: whether an exponential creeps beside the oscillation. None: it does if the fit
-            without it leaves coloured residuals or no result, and the one with it is better.
+        trials: free motions; samples before the drop are left out.
+        creep: whether to add exponential creep to the oscillation. None: added if the fit
+            without it has coloured residuals or no result, and the fit with it is better.
     Returns:
         The fit. With several trials the spread between them widens the intervals.
     Raises:
@@ -178,7 +178,7 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
         True
     """
     if not trials:
-        raise InputError("trials is empty; allowed is one trial or more. Give a trial.")
+        raise InputError("trials is empty. Pass at least one FreeTrial.")
     moving = [trial.moving() for trial in trials]
     joint = _fit(moving, bool(creep))
     if creep is None and not (joint.succeeded and joint.residual_whiteness_p >= _WHITE):
@@ -203,7 +203,7 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
 def _better(
     plain: FreeResponseFit, creeping: FreeResponseFit, trials: Sequence[FreeTrial]
 ) -> tuple[FreeResponseFit, bool]:
-    """The fit with creep if it explains clearly more (BIC), and whether that was taken."""
+    """The fit with creep if its BIC is clearly better, and whether it was chosen."""
     if not creeping.succeeded:
         return plain, False
     if not plain.succeeded:
@@ -216,7 +216,7 @@ def _better(
 
 
 def _basis(search: Floats, trial: FreeTrial) -> Basis:
-    """Search holds log decay, log damped frequency and, with creep, log time constant."""
+    """`search` is log decay, log damped frequency and, with creep, log time constant."""
     t = trial.time_s - trial.time_s[0]
     decay, omega = math.exp(search[0]), math.exp(search[1])
     own = _shapes(search, t)
@@ -235,9 +235,9 @@ def _basis(search: Floats, trial: FreeTrial) -> Basis:
 
 def _shapes(search: Floats, t: Floats) -> Floats:
     """Decaying cosine and sine, 1, and the creep, at times since the release. Shape `(N, 3|4)`."""
-    hull = np.exp(-math.exp(search[0]) * t)
+    envelope = np.exp(-math.exp(search[0]) * t)
     swing = math.exp(search[1]) * t
-    shapes = [hull * np.cos(swing), hull * np.sin(swing), np.ones(t.size)]
+    shapes = [envelope * np.cos(swing), envelope * np.sin(swing), np.ones(t.size)]
     if search.size == 3:
         shapes.append(np.exp(-math.exp(-search[2]) * t))
     return np.stack(shapes, axis=1)
@@ -290,22 +290,22 @@ def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
     )  # fmt: skip
     if not fit.succeeded:
         return fit
-    hulls = {sign: _hull(trials, solution, sign) for sign in (1.0, -1.0)}
+    envelopes = {sign: _envelope(trials, solution, sign) for sign in (1.0, -1.0)}
     notes = [
-        f"Fewer than two {name} peaks stand above the noise: no hull through them."
+        f"Fewer than two {name} peaks are above the noise, so there is no envelope of them."
         for sign, name in ((1.0, "positive"), (-1.0, "negative"))
-        if hulls[sign] is None
+        if envelopes[sign] is None
     ]
     white = whiteness_p(solution.residuals)
     if white < _WHITE:
-        notes.append("The residuals are not white: the motion is not one decaying cosine alone.")
+        notes.append("The residuals are not white: the motion is not a single decaying cosine.")
     return replace(
         fit,
         parameters=estimates,
         covariance=covariance,
         notes=tuple(notes),
-        hull_positive_decay_per_s=hulls[1.0],
-        hull_negative_decay_per_s=hulls[-1.0],
+        envelope_positive_decay_per_s=envelopes[1.0],
+        envelope_negative_decay_per_s=envelopes[-1.0],
         r_squared=r_squared(measured, explained),
         residual_whiteness_p=white,
     )
@@ -314,7 +314,7 @@ def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
 def _estimates(
     trials: Sequence[FreeTrial], solution: Solution
 ) -> tuple[dict[str, Estimate], Floats]:
-    """Numbers with intervals by propagation from the joint covariance, and their covariance."""
+    """Parameters with intervals by propagation from the joint covariance, and their covariance."""
     bases = [_basis(solution.search, trial) for trial in trials]
     width = sum(basis.own.shape[1] for basis in bases)
     columns, at = [], 0
@@ -361,18 +361,18 @@ def _judged(
     solution: Solution, estimates: dict[str, Estimate], settled: bool, *, decays: bool
 ) -> str:
     if not decays:
-        return "no result: no decay shows, the swing is undamped or grows; record longer"
+        return "no result: no decay is visible, the oscillation is undamped or grows; record longer"
     if not settled:
-        return "no result: the search did not come to rest; record longer or drop the creep"
+        return "no result: the search did not converge; record longer or fit without creep"
     amplitude, omega = estimates["amplitude"], estimates["damped_frequency_rad_s"]
     if amplitude.value <= _SIGNIFICANT * amplitude.std or omega.value <= 3.0 * omega.std:
-        return "no result: no decaying oscillation stands out; check the column, or trim the record"
+        return "no result: no decaying oscillation is visible; check the column, or trim the record"
     if any(e.std != e.std or math.isinf(e.std) for e in estimates.values()):
         return "no result: frequency and decay are not identifiable; record more periods"
     return "ok"
 
 
-def _hull(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estimate | None:
+def _envelope(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estimate | None:
     """Decay through the peaks of one sign, all trials pooled, offset and creep removed."""
     omega = math.exp(solution.search[1])
     decay = math.exp(solution.search[0])
@@ -388,4 +388,4 @@ def _hull(trials: Sequence[FreeTrial], solution: Solution, sign: float) -> Estim
         height = math.hypot(own[0], own[1]) * math.cos(lean)
         time_s = trial.time_s - trial.time_s[0]
         swings.append(Swing(time_s, sign * swing, phase, height, decay))
-    return hull_decay(swings, omega, (polynomial, variance * count / max(count - taken, 1)))
+    return envelope_decay(swings, omega, (polynomial, variance * count / max(count - taken, 1)))

@@ -1,4 +1,4 @@
-"""What Bode, Nyquist and Nichols charts of a frequency response need, with 95 % intervals."""
+"""Data of Bode, Nyquist and Nichols charts of a frequency response, with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class BodeChart:
     Args:
         frequency_hz: frequencies, in Hz.
         magnitude: gain, in the unit of the output per unit of the input.
-        magnitude_low: lower end; zero where the magnitude may vanish.
+        magnitude_low: lower end; zero where the magnitude may be zero.
         magnitude_high: upper end.
         phase_rad: phase without jumps, in rad.
         phase_low_rad: lower end, at most half a turn away.
@@ -41,7 +41,7 @@ class BodeChart:
 
     @classmethod
     def of(cls, frequency_hz: Floats, response: Complexes, std: Floats) -> BodeChart:
-        """The chart of a response with standard deviations of the complex gain."""
+        """Chart of a response from the standard deviations of the complex gain."""
         magnitude, phase_rad = np.abs(response), np.unwrap(np.angle(response))
         half = Z95 * std / np.sqrt(2.0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -60,7 +60,7 @@ class NyquistChart:
         frequency_hz: frequencies, in Hz.
         real: real part, in the unit of the output per unit of the input.
         imaginary: imaginary part.
-        circle: radius of the circle that holds the response with 95 %, in the same unit.
+        circle: radius of the circle that contains the response with 95 %, in the same unit.
     """
 
     frequency_hz: Floats
@@ -70,13 +70,13 @@ class NyquistChart:
 
     @classmethod
     def of(cls, frequency_hz: Floats, response: Complexes, std: Floats) -> NyquistChart:
-        """The chart of a response with standard deviations of the complex gain."""
+        """Chart of a response from the standard deviations of the complex gain."""
         return cls(frequency_hz, response.real.copy(), response.imag.copy(), _RADIUS95 * std)
 
 
 @dataclass(frozen=True)
 class NicholsChart:
-    """Magnitude over phase in the units of that chart, with 95 % intervals; all `(K,)`.
+    """Magnitude in dB over phase in degrees, with 95 % intervals; all `(K,)`.
 
     Args:
         frequency_hz: frequencies, in Hz.
@@ -84,7 +84,7 @@ class NicholsChart:
         phase_low_deg: lower end.
         phase_high_deg: upper end.
         magnitude_db: magnitude, in dB.
-        magnitude_low_db: lower end; minus infinity where the magnitude may vanish.
+        magnitude_low_db: lower end; minus infinity where the magnitude may be zero.
         magnitude_high_db: upper end.
     """
 
@@ -98,7 +98,7 @@ class NicholsChart:
 
     @classmethod
     def of(cls, frequency_hz: Floats, response: Complexes, std: Floats) -> NicholsChart:
-        """The chart of a response with standard deviations of the complex gain."""
+        """Chart of a response from the standard deviations of the complex gain."""
         bode = BodeChart.of(frequency_hz, response, std)
         phases = (bode.phase_rad, bode.phase_low_rad, bode.phase_high_rad)
         sizes = (bode.magnitude, bode.magnitude_low, bode.magnitude_high)

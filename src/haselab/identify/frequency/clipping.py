@@ -1,4 +1,4 @@
-"""Outputs that pile up at their extreme values, against what a frequency response predicts."""
+"""Detection of clipped outputs by comparison with the prediction of a frequency response."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["clipped_at"]
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _LEVELS = (0.999, 0.995, 0.99, 0.97, 0.93, 0.88, 0.8, 0.7)  # quantiles where a limit may be
-_BETTER = 50.0  # twice the gain of logarithmic likelihood that names a limit
+_BETTER = 50.0  # twice the gain of logarithmic likelihood that identifies a limit
 _FOLLOWS = 0.3  # slope of the outputs beyond a limit over the prediction; 0 where they are clipped
-_EXTREME = 0.999  # of the outputs lie below what noise adds to a limit, ...
-_CLEAR = 4.0  # ... so many standard deviations
-_EXPLAINED = 0.1  # of the outputs' energy is the most that may be left
+_EXTREME = 0.999  # of the outputs lie below the limit plus ...
+_CLEAR = 4.0  # ... this many standard deviations of the noise
+_EXPLAINED = 0.1  # largest share of the outputs' energy in the residuals
 _LEAST_ROWS = 10
 _LEAST_VISITS = 2
 
@@ -27,20 +27,20 @@ _LEAST_VISITS = 2
 def clipped_at(
     pairs: Sequence[Pair], rate_hz: float, held: bool, frequency_hz: Floats, response: Complexes
 ) -> tuple[float, ...]:
-    """Limits at which the outputs stay while the predicted outputs go on; empty without any.
+    """Limits at which the outputs stay while the prediction continues; empty without any.
 
-    The prediction is the response times the spectrum of the input. Noise and disturbances move
-    an output that follows it, too, but the outputs beyond a quantile then still rise with the
+    The prediction is the response times the spectrum of the input. Noise and disturbances also move
+    an output, but the outputs beyond a quantile then still rise with the
     prediction.
 
     Args:
         pairs: input and output of each record, without their means.
-        rate_hz: samples a second, in Hz.
+        rate_hz: sampling rate, in Hz.
         held: whether the inputs were held.
         frequency_hz: rising frequencies of the response, in Hz. Shape `(K,)`.
         response: complex gain. Shape `(K,)`.
     Returns:
-        Lower and upper limit, those that were found, in the unit of the output less its mean.
+        The lower and upper limits that were found, in the unit of the output, minus its mean.
     """
     if frequency_hz.size < 2:
         return ()
@@ -57,7 +57,7 @@ def clipped_at(
 def _predicted(
     u: Floats, rate_hz: float, held: bool, frequency_hz: Floats, response: Complexes
 ) -> Floats:
-    """The part of the output that follows the input on the lines of the response."""
+    """Output predicted from the input by the lines of the response."""
     spectrum = np.fft.rfft(u)
     at_hz = np.arange(1, spectrum.size) * rate_hz / u.size
     gain = np.interp(at_hz, frequency_hz, response, left=0.0, right=0.0)
@@ -81,7 +81,7 @@ def _rail(y: Floats, predicted: Floats) -> float | None:
         if float(along @ there) > _FOLLOWS * float(along @ along):
             continue
         if float(np.quantile(y, _EXTREME)) - rail > _CLEAR * float(there.std()):
-            continue  # an end that is reached often, not a limit
+            continue  # an extreme value that is reached often, not a limit
         off = float(((there - modelled) ** 2).sum())
         limited = float(((there - rail) ** 2).sum())
         gain = rows * math.log(off / max(limited, 1e-300))

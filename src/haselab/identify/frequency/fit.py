@@ -1,4 +1,4 @@
-"""Transfer function fitted to a measured frequency response, each line by its own variance."""
+"""Transfer function fitted to a measured frequency response by weighted least squares."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ _APART = 0.15
 _POOR = 10.0
 _RULED_OUT = 300.0  # twice the difference of logarithmic likelihoods
 _MOST_TOGETHER = 600
-_LIKELY = 16.0  # twice the difference of logarithmic likelihoods, as of a transfer function
+_LIKELY = 16.0  # twice the difference of logarithmic likelihoods, as for a transfer function
 _LEAST_RATIO = 1e-2
-_DIFFERENT = 5.0  # standard deviations between two solutions
-_UNTOLD = 1.0
-_UNTOLD_TIME = 0.5
+_DIFFERENT = 5.0  # standard deviations between solutions that count as different
+_LARGEST_STD = 1.0
+_LARGEST_STD_TIME = 0.5
 _WRONG_P = 1e-3
-_HOPELESS = 10.0  # misfits over the given standard deviations: no interval means anything
+_HOPELESS = 10.0  # misfit relative to the given std: beyond it intervals are meaningless
 _UNRELATED_P = 1e-6
 
 
@@ -51,12 +51,12 @@ class ResponseFit(RecordFit[Record]):
     the imaginary parts, of the lines.
 
     Args:
-        structure: what was fitted; its `offset` and `initial_state` have no meaning here.
+        structure: what was fitted; its `offset` and `initial_state` are not used here.
         frequency_hz: lines that were fitted, in Hz. Shape `(K,)`.
         modelled: fitted response on the lines. Shape `(K,)`.
-        chi_squared_ratio: mean squared misfit over the variance that was given; 1 when the
-            deviations of the lines are right and the structure is.
-        chi_squared_p: probability of a ratio as far from 1.
+        chi_squared_ratio: mean squared misfit over the given variance; 1 when the
+            standard deviations and the structure are right.
+        chi_squared_p: probability of a ratio at least as far from 1.
     """
 
     structure: TransferStructure
@@ -74,24 +74,25 @@ class ResponseFit(RecordFit[Record]):
 
     @property
     def plant(self) -> Plant:
-        """The plant of the fitted numbers; a delay estimated below zero becomes zero.
+        """The plant with the fitted parameters; a delay estimated below zero becomes zero.
 
         Raises:
-            ResultError: no result, a number that is not told, or not one resonance without zeros.
+            ResultError: no result, a parameter is not identifiable, or not one resonance without
+                zeros.
         """
         if not self.succeeded:
             raise ResultError(f"The fit has no result: {self.status}")
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
-                "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
+                "Plant needs 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
             )
         number = {name: estimate.value for name, estimate in self.parameters.items()}
-        untold = [name for name, value in number.items() if not math.isfinite(value)]
-        if untold:
+        unknown = [name for name, value in number.items() if not math.isfinite(value)]
+        if unknown:
             raise ResultError(
-                f"{', '.join(untold)} cannot be told from these lines; a plant takes numbers that "
-                "are. Give them as fixed, or fit a smaller structure."
+                f"Not identifiable from these lines: {', '.join(unknown)}. A Plant needs a value "
+                "for each. Give them as fixed, or fit a simpler structure."
             )
         return Plant(
             number["gain"],
@@ -120,7 +121,7 @@ class ResponseFit(RecordFit[Record]):
         return lines_chart("Frequency response and fit", self.frequency_hz, measured, self.modelled)
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract for a transfer function, with the chi-square test."""
+        """The result under the JSON keys of a transfer function, with the chi-square test."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
         return {
             **{key: self.parameters.get(key) for key in keys},
@@ -140,28 +141,28 @@ def fit_response(
     *,
     mixing: csr_array | None = None,
 ) -> ResponseFit:
-    r"""Weighted complex least squares of a transfer function on the lines of a response.
+    r"""Weighted complex least squares of a transfer function to the lines of a frequency response.
 
     $\min_\theta \sum_k |\hat G_k - G(i\omega_k; \theta)|^2/\sigma_k^2$
 
-    No first guess is needed. Neighbouring lines of one estimate share noise (overlapping windows,
-    local models). Where `mixing` tells how, all lines are weighted together by their covariance;
-    else the intervals count it by a noise model of the misfits along frequency. The size of the
-    noise is taken from the misfits in both cases.
+    No initial guess is needed. Neighbouring lines of one estimate share noise (overlapping windows,
+    local models). With `mixing`, all lines are weighted jointly by their covariance;
+    otherwise the intervals use a noise model of the misfits along frequency. The magnitude of the
+    noise is estimated from the misfits in both cases.
 
     Args:
         frequency_hz: rising frequencies above zero, in Hz. Shape `(K,)`.
         response: complex gain. Shape `(K,)`.
-        std: standard deviation of the complex gain. Lines where it is infinite are left out.
+        std: standard deviation of the complex gain. Lines with an infinite value are left out.
             Shape `(K,)`.
-        structure: what is fitted. One resonance with a delay when not given.
-        mixing: how the errors hang together, as `FrequencyResponse.mixing`. With it, the 600 lines
-            that stand most above their deviation are fitted. Shape `(2K, M)`.
+        structure: model structure. Default: one resonance with a delay.
+        mixing: correlation of the errors, as `FrequencyResponse.mixing`. With it, the 600 lines
+            with the largest signal-to-noise ratio are fitted. Shape `(2K, M)`.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: unequal lengths, frequencies that do not rise, deviations not above zero, fewer
-            lines than numbers to fit.
+        InputError: unequal lengths, frequencies that do not rise, a std that is not above zero,
+            fewer lines than parameters to fit.
     Source: Pintelon and Schoukens, System Identification (2012), chapter 9; variable projection.
     Example:
         >>> from haselab.models import Plant
@@ -177,7 +178,7 @@ def fit_response(
     problem = _problem(layout, (frequency_hz, response, std), mixing)
     ends = _search(problem)
     if not ends or not ends[0][1]:
-        return _no_result(layout, "the search did not come to rest; give more lines or fewer poles")
+        return _no_result(layout, "the search did not converge; give more lines or fit fewer poles")
     return _describe(problem, ends)
 
 
@@ -192,48 +193,48 @@ def _problem(
     if not at_hz.shape == gains.shape == deviations.shape:
         raise InputError(
             f"frequency_hz has {at_hz.size} values, response {gains.size} and std "
-            f"{deviations.size}; allowed are equal lengths. Give all three for each line."
+            f"{deviations.size}, but they must be equally long. Give all three for each line."
         )
     if not (at_hz[0] > 0.0 and (np.diff(at_hz) > 0.0).all()):
         raise InputError(
-            f"frequency_hz begins at {at_hz[0]:g} Hz or does not rise; allowed are rising "
+            f"frequency_hz begins at {at_hz[0]:g} Hz or does not rise; it must be rising "
             "frequencies above 0 Hz. Sort the lines."
         )
     if np.isnan(deviations).any() or not (deviations > 0.0).all():
         raise InputError(
-            f"std holds {deviations[~(deviations > 0.0)][0]:g}; allowed are numbers above 0, "
-            "infinite for a line that tells nothing. Give one for each line."
+            f"std contains {deviations[~(deviations > 0.0)][0]:g}; each value must be above 0, "
+            "or infinite for a line to be left out."
         )
-    told = np.isfinite(deviations)
-    if mixing is not None and told.sum() > _MOST_TOGETHER:
-        clarity = np.where(told, np.abs(gains) / deviations, 0.0)
-        told[np.argsort(clarity)[:-_MOST_TOGETHER]] = False
+    finite = np.isfinite(deviations)
+    if mixing is not None and finite.sum() > _MOST_TOGETHER:
+        clarity = np.where(finite, np.abs(gains) / deviations, 0.0)
+        finite[np.argsort(clarity)[:-_MOST_TOGETHER]] = False
     wanted = layout.free.size + int(np.isnan(layout.factor_template).sum())
-    if told.sum() < wanted:
+    if finite.sum() < wanted:
         raise InputError(
-            f"{told.sum()} lines have a finite std; {wanted} numbers need {wanted} or more. "
+            f"{finite.sum()} lines have a finite std; {wanted} parameters need at least {wanted}. "
             "Give more lines, or fit fewer poles."
         )
     if mixing is not None and mixing.shape[0] != 2 * at_hz.size:
         raise InputError(
-            f"mixing has {mixing.shape[0]} rows; allowed are {2 * at_hz.size}, two a line. Give "
-            "that of the same response."
+            f"mixing has {mixing.shape[0]} rows; it must be {2 * at_hz.size}, two per line. Give "
+            "the mixing of the same response."
         )
-    noise: LineNoise = IndependentLines(deviations[told])
+    noise: LineNoise = IndependentLines(deviations[finite])
     if mixing is not None:
-        noise = MixedLines(mixing[np.tile(told, 2)])
-    s = np.asarray(2j * np.pi * at_hz[told], dtype=np.complex128)
-    return ResponseProblem(layout, s, gains[told], math.sqrt(2.0) / deviations[told], noise)
+        noise = MixedLines(mixing[np.tile(finite, 2)])
+    s = np.asarray(2j * np.pi * at_hz[finite], dtype=np.complex128)
+    return ResponseProblem(layout, s, gains[finite], math.sqrt(2.0) / deviations[finite], noise)
 
 
 def _search(problem: ResponseProblem) -> list[tuple[Solution, bool]]:
-    """Where the first guesses end that are best and differ, and whether they came to rest.
+    """Distinct solutions from the best initial guesses, and whether each search converged.
 
-    A minimum at a delay that is half a period off has a gain of the wrong sign, and at little
-    signal it fits nearly as well: so guesses at all delays compete.
+    A minimum at a delay that is wrong by half a period has a gain of the wrong sign, and at a low
+    signal-to-noise ratio it fits nearly as well, so guesses at all delays are compared.
     """
     bounds = problem.bounds
-    # Covariances between lines cost much and hardly change the order of first guesses.
+    # Covariances between lines are expensive and hardly change the ranking of initial guesses.
     alone = replace(problem, noise=IndependentLines(math.sqrt(2.0) / problem.weight))
 
     def ranked(starts: Iterable[Floats]) -> list[Solution]:
@@ -252,9 +253,9 @@ def _search(problem: ResponseProblem) -> list[tuple[Solution, bool]]:
 def _polished(
     problem: ResponseProblem, alone: ResponseProblem, solutions: Sequence[Solution]
 ) -> list[tuple[Solution, bool]]:
-    """Ends of the first few guesses that differ, the best first.
+    """Distinct solutions from the first few guesses, the best first.
 
-    Those that the lines by themselves rule out are not searched with all covariances.
+    Solutions that the independent lines rule out are not refined with the full covariance.
     """
     scale = np.ones(problem.layout.free.size)
     if math.isnan(float(problem.layout.template[-1])):
@@ -287,7 +288,7 @@ def _ambiguity(
     estimates: dict[str, Estimate],
     ratio: float,
 ) -> str | None:
-    """A status, where another minimum explains the lines as well; None: none does."""
+    """Status naming another minimum that explains the lines as well, or None."""
     least = ends[0][0].cost
     size = problem.layout.free.size + ends[0][0].shared.size
     for other, settled in ends[1:]:
@@ -325,7 +326,8 @@ def _describe(problem: ResponseProblem, ends: Sequence[tuple[Solution, bool]]) -
     covariance = problem.noise.covariance(columns, residuals)
     factors = solution.shared.size
     if factors and not _related(solution.shared, covariance[-factors:, -factors:]):
-        return _no_result(layout, "the response is not told from noise; record louder or longer")
+        reason = "no significant response; use a larger drive or a longer record"
+        return _no_result(layout, reason)
     estimates, notes = _estimates(problem, solution, covariance)
     ratio, p = problem.noise.chi_squared(columns, residuals)
     if ratio > _HOPELESS**2:
@@ -342,8 +344,8 @@ def _describe(problem: ResponseProblem, ends: Sequence[tuple[Solution, bool]]) -
         )
     delay = estimates["delay_s"]
     if delay.value < 0.0:
-        shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
-        notes.append(f"The delay is {shown}; the plant takes 0 s.")
+        shown = "not above zero" if delay.ci95[1] >= 0.0 else "below zero (check the clocks)"
+        notes.append(f"The delay is {shown}; the plant uses 0 s.")
     modelled = problem.modelled(solution.search, solution.shared)
     status = _ambiguity(problem, ends, estimates, ratio) or "ok"
     misfit = problem.response - modelled
@@ -377,7 +379,7 @@ def _covariance(layout: Layout, estimates: dict[str, Estimate], inner: Floats) -
 
 
 def _related(factors: Floats, covariance: Floats) -> bool:
-    """Whether the gains differ from zero beyond doubt (Wald's test)."""
+    """Whether the gains differ significantly from zero (Wald's test)."""
     if not np.isfinite(covariance).all():
         return False
     wald = float(factors @ np.linalg.pinv(covariance, hermitian=True) @ factors)
@@ -387,7 +389,7 @@ def _related(factors: Floats, covariance: Floats) -> bool:
 def _estimates(
     problem: ResponseProblem, solution: Solution, inner: Floats
 ) -> tuple[dict[str, Estimate], list[str]]:
-    """All numbers by name, and a sentence for each that the lines do not tell."""
+    """All parameters by name, and a note for each that is not identifiable."""
     layout = problem.layout
     low, high = problem.bounds
     searched = dict(zip(layout.free, range(layout.free.size), strict=True))
@@ -404,7 +406,7 @@ def _estimates(
             most = math.pi / float(problem.s.imag.min())
             estimates[name] = Estimate.normal(number, std, unit)
         else:
-            most = _UNTOLD_TIME if "time_constant" in name else _UNTOLD
+            most = _LARGEST_STD_TIME if "time_constant" in name else _LARGEST_STD
             estimates[name] = Estimate.lognormal(math.exp(number), std, unit)
         if not (inside and std <= most):
             estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
@@ -417,9 +419,9 @@ def _estimates(
         at = None if known else next(free)
         std = 0.0 if at is None else math.sqrt(max(float(inner[at, at]), 0.0))
         constant = f"{name.replace('gain', 'time_constant')}_s"
-        untold = name.startswith("slow") and not math.isfinite(estimates[constant].value)
+        unknown = name.startswith("slow") and not math.isfinite(estimates[constant].value)
         estimates[name] = Estimate.normal(value, std, "")
-        if untold or not math.isfinite(std):
+        if unknown or not math.isfinite(std):
             estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
             notes.append(f"{name} is not identifiable from these lines.")
     return estimates, notes

@@ -1,4 +1,4 @@
-"""Noise on the lines of a response: independent, or shared by neighbours."""
+"""Noise of the lines of a response: independent, or correlated between neighbours."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ _RIDGE = 0.2
 
 
 class LineNoise(Protocol):
-    """What a weighted fit asks; rows are real parts of all lines, then imaginary parts."""
+    """Noise model of a weighted fit; rows are first all real, then all imaginary parts."""
 
     def whiten(self, values: Floats) -> Floats:
-        """Rows along the last axis, weighted. Shape `(..., 2K)`."""
+        """Weight the rows along the last axis. Shape `(..., 2K)`."""
 
     def covariance(self, columns: Floats, residuals: Floats) -> Floats:
-        """Of the fitted numbers, from weighted sensitivities `(2K, P)` and misfits `(2K,)`."""
+        """Covariance of the parameters, from weighted sensitivities `(2K, P)` and misfits."""
 
     def chi_squared(self, columns: Floats, residuals: Floats) -> tuple[float, float]:
-        """Mean squared misfit over the one expected, and the probability of one as far from 1."""
+        """Ratio of the mean squared misfit to its expectation, and its probability."""
 
 
 class IndependentLines:
-    """Lines by their deviations; what neighbours share shows in the misfits along frequency.
+    """Lines weighted by their std; correlation is estimated from the misfits along frequency.
 
     Args:
         std: standard deviation of the complex gains. Shape `(K,)`.
@@ -45,16 +45,16 @@ class IndependentLines:
         self._weight = np.tile(math.sqrt(2.0) / std, 2)
 
     def whiten(self, values: Floats) -> Floats:
-        """As the protocol says."""
+        """Weight the rows along the last axis."""
         return values * self._weight
 
     def covariance(self, columns: Floats, residuals: Floats) -> Floats:
-        """With an autoregressive model of the misfits, real and imaginary parts apart."""
+        """Covariance by an autoregressive model of the misfits, separately for both parts."""
         halves = np.split(columns, 2)
         return coloured_covariance(halves, np.split(residuals, 2), columns.shape[1])
 
     def chi_squared(self, columns: Floats, residuals: Floats) -> tuple[float, float]:
-        """Lines that share noise count as fewer."""
+        """Chi-square test with the effective number of correlated lines."""
         power, numbers = float(residuals @ residuals), columns.shape[1]
         shared = _shared(np.split(residuals, 2), power)
         degrees = max(residuals.size / shared - numbers, 1.0)
@@ -62,14 +62,14 @@ class IndependentLines:
 
 
 class MixedLines:
-    """Lines whose errors are known mixtures of independent numbers.
+    """Lines whose errors are known linear combinations of independent variables.
 
-    Weights are the inverse of the covariance with 20 % more on its diagonal: where the mixtures are
-    nearly alike, the exact inverse would believe differences that only the estimator's own small
-    bias makes. Intervals use the covariance itself.
+    Weights are the inverse of the covariance with 20 % more on its diagonal: where the
+    combinations are nearly alike, the exact inverse would amplify differences caused only by the
+    small bias of the estimator. Intervals use the covariance itself.
 
     Args:
-        mixing: errors are this times numbers of unit variance. Shape `(2K, M)`.
+        mixing: errors are this matrix times variables of unit variance. Shape `(2K, M)`.
     """
 
     def __init__(self, mixing: csr_array) -> None:
@@ -80,12 +80,12 @@ class MixedLines:
         self._left = np.asarray(solve_triangular(self._root, half.T, lower=True).T)
 
     def whiten(self, values: Floats) -> Floats:
-        """As the protocol says."""
+        """Weight the rows along the last axis."""
         rows = values.reshape(-1, self._root.shape[0]).T
         return np.asarray(solve_triangular(self._root, rows, lower=True).T.reshape(values.shape))
 
     def covariance(self, columns: Floats, residuals: Floats) -> Floats:
-        """That of the mixtures, in the size that the misfits show."""
+        """Covariance of the parameters, scaled to the misfits."""
         size = np.sqrt((columns**2).sum(axis=0)) + 1e-300
         scaled = columns / size
         inverse = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
@@ -94,7 +94,7 @@ class MixedLines:
         return np.asarray(ratio * inner / np.outer(size, size))
 
     def chi_squared(self, columns: Floats, residuals: Floats) -> tuple[float, float]:
-        """Against the misfits that the mixtures leave after the fit."""
+        """Chi-square test against the expected misfits after the fit."""
         basis = np.linalg.qr(columns / (np.sqrt((columns**2).sum(axis=0)) + 1e-300))[0]
         freed = self._left - basis @ (basis.T @ self._left)
         freed = freed - (freed @ basis) @ basis.T
@@ -104,7 +104,7 @@ class MixedLines:
 
 
 def _shared(residuals: Sequence[Floats], power: float) -> float:
-    """How many rows stand for one independent row."""
+    """Number of rows per independent row."""
     shared = 1.0
     for lag in range(1, min(_LAGS, residuals[0].size // 4)):
         correlation = sum(float(e[lag:] @ e[:-lag]) for e in residuals) / max(power, 1e-300)

@@ -1,4 +1,4 @@
-"""Lines of a frequency response as the estimators give them, and how a hold shows in them."""
+"""Lines of a frequency response as returned by the estimators; spectrum of a hold."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 # One record: input and output without their means, of equal length.
 Pair = tuple[Floats, Floats]
-# Lines with less than this share of the input's largest spectrum are left out.
+# Lines with a smaller share of the input's largest spectrum are left out.
 EXCITED = 5e-2
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Response on the excited lines.
+    """Response at the excited lines.
 
     Args:
         frequency_hz: frequencies, in Hz. Shape `(K,)`.
         response: complex gain. Shape `(K,)`.
         coherence: share of the output power that follows the input. Shape `(K,)`.
         std: standard deviation of the complex gain. Shape `(K,)`.
-        distortion_std: the same of nonlinear distortion in one realisation; NaN where not told.
-            Shape `(K,)`.
-        notes: what the reader should know.
+        distortion_std: the same of nonlinear distortion in one realisation; NaN where not
+            identifiable. Shape `(K,)`.
+        notes: remarks for the user.
         mixing: the errors, real parts first, then imaginary parts, are this matrix times
-            independent numbers of unit variance. None where that is not told. Shape `(2K, M)`.
+            independent variables of unit variance. None where not known.
+            Shape `(2K, M)`.
     """
 
     frequency_hz: Floats
@@ -44,11 +45,11 @@ class Lines:
 
 
 def hold_spectrum(frequency_hz: Floats, rate_hz: float) -> Complexes:
-    """Spectrum of a held input over that of its samples.
+    """Ratio of the spectrum of a held input to that of its samples.
 
     Args:
         frequency_hz: frequencies above zero, in Hz. Shape `(K,)`.
-        rate_hz: updates a second, in Hz.
+        rate_hz: update rate, in Hz.
     Returns:
         Complex factor. Shape `(K,)`.
     """

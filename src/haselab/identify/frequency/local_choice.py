@@ -1,4 +1,4 @@
-"""Which denominator each window of a spectrum gets: its own, a neighbouring resonance's, none."""
+"""Choice of denominator for each window of a spectrum: its own, a neighbour's, or none."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _ORDER = 2
 _CHUNK = 2048
-# Windows of pure noise lose a fifth of their misfit to a denominator, by chance.
+# Windows of pure noise lose a fifth of their misfit when a denominator is fitted.
 _WORTH_TUNING = 1.1
 _RESONANT = 4.0
 _REACH = 8.0
-# What a searched denominator must gain in 2 R ln(misfit): its 4 numbers by BIC, and the best of
-# several optima is taken, which counts like 2 more.
+# Gain in 2 R ln(misfit) required of a searched denominator: its 4 parameters by BIC; the best of
+# several optima is taken, which counts as 2 more.
 _PENALTY = 6.0
 
 
 @dataclass(frozen=True)
 class Centres:
-    """First factors of all windows, which are the values at their centres.
+    """First factors of all windows; these are the values at the window centres.
 
     Args:
         value: first factor. Shape `(K,)`.
         noise: variance of the complex noise on a row. Shape `(K,)`.
         spread: variance of the value at unit noise and known denominator. Shape `(K,)`.
         energy: sum of the squares of the first column. Shape `(K,)`.
-        by_row: derivatives of the value by the rows of its window. Shape `(K, R)`.
-        lender: number of the window whose denominator it has; its own where there is none.
+        by_row: derivatives of the value with respect to the rows of its window. Shape `(K, R)`.
+        lender: index of the window that the denominator comes from; its own index for none.
             Shape `(K,)`.
-        by_lender: derivatives of the value by the rows of that window. Shape `(K, R)`.
+        by_lender: derivatives of the value with respect to the rows of that window. Shape `(K, R)`.
     """
 
     value: Complexes
@@ -56,7 +56,7 @@ class Centres:
     by_lender: Complexes
 
     def widened(self, factor: Floats) -> Centres:
-        """The same values with deviations times a factor. Shape `(K,)`."""
+        """The same values with their std multiplied by a factor. Shape `(K,)`."""
         return replace(
             self,
             spread=self.spread * factor**2,
@@ -66,7 +66,7 @@ class Centres:
 
     @property
     def variance(self) -> Floats:
-        """Of the complex error of the values. Shape `(K,)`."""
+        """Variance of the complex error of the values. Shape `(K,)`."""
         alone = self.lender == np.arange(self.lender.size)
         whole = self.by_row + np.where(alone[:, None], self.by_lender, 0.0)
         lent = np.where(alone, 0.0, (np.abs(self.by_lender) ** 2).sum(axis=1))
@@ -76,13 +76,13 @@ class Centres:
 
 @dataclass(frozen=True)
 class _Choice:
-    """Denominator of each window and where it comes from.
+    """Denominator of each window and its origin.
 
     Args:
-        d: numbers of the denominator. Shape `(K, 2)`.
-        by_lender: their derivatives by the rows of the lending window. Shape `(K, 2, R)`.
-        lender: number of the window that told them; its own where there is none. Shape `(K,)`.
-        searched: how many numbers were searched in the window itself. Shape `(K,)`.
+        d: coefficients of the denominator. Shape `(K, 2)`.
+        by_lender: their derivatives with respect to the rows of window `lender`. Shape `(K, 2, R)`.
+        lender: index of the window that determined them; its own index for none. Shape `(K,)`.
+        searched: number of coefficients that were searched in the window itself. Shape `(K,)`.
     """
 
     d: Complexes
@@ -94,29 +94,29 @@ class _Choice:
 def centres(
     windows: Callable[[Floats], LocalProblem], wanted_hz: Floats, half_hz: float, *, rational: bool
 ) -> Centres:
-    """Values at the centres of windows about the wanted frequencies.
+    """Values at the centres of windows around the requested frequencies.
 
-    A window keeps the denominator that it tells itself; where it tells none beyond noise it gets
-    that of a resonance beside it, if this explains it better than none.
+    A window uses its own denominator if that is significant; otherwise it uses
+    the denominator of a neighbouring resonance, if that fits better than none.
 
     Args:
-        windows: makes the windows about some frequencies, in Hz.
+        windows: builds the windows around given frequencies, in Hz.
         wanted_hz: rising frequencies, in Hz. Shape `(K,)`.
         half_hz: half the width of a window, in Hz.
-        rational: whether there are denominators at all.
+        rational: whether denominators are fitted at all.
     """
     chunks = [slice(k, k + _CHUNK) for k in range(0, wanted_hz.size, _CHUNK)]
-    told: list[_Told] = []
+    estimated: list[_Estimated] = []
     resonances: list[_Resonance] = []
     for chunk in chunks if rational else ():
-        told.append(_told(windows(wanted_hz[chunk])))
-        resonances += _resonances(told[-1], wanted_hz[chunk], half_hz, chunk.start)
+        estimated.append(_estimated(windows(wanted_hz[chunk])))
+        resonances += _resonances(estimated[-1], wanted_hz[chunk], half_hz, chunk.start)
     parts = []
     for k, chunk in enumerate(chunks):
         problem = windows(wanted_hz[chunk])
         choice = _none(problem, chunk.start)
         if rational:
-            choice = _chosen(problem, choice, wanted_hz[chunk], half_hz, told[k], resonances)
+            choice = _chosen(problem, choice, wanted_hz[chunk], half_hz, estimated[k], resonances)
         parts.append(_values(problem, choice))
     return Centres(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -134,13 +134,13 @@ def _values(problem: LocalProblem, choice: _Choice) -> tuple[NDArray[Any], ...]:
 
 @dataclass(frozen=True)
 class _Resonance:
-    """A denominator that one window tells beyond doubt, about its own line.
+    """A denominator that one window determines significantly, relative to its own line.
 
     Args:
-        window: number of the window.
+        window: index of the window.
         frequency_hz: of its line, in Hz.
-        d: numbers of the denominator. Shape `(2,)`.
-        by_row: their derivatives by the rows of the window. Shape `(2, R)`.
+        d: coefficients of the denominator. Shape `(2,)`.
+        by_row: their derivatives with respect to the rows of the window. Shape `(2, R)`.
     """
 
     window: int
@@ -149,7 +149,7 @@ class _Resonance:
     by_row: Complexes
 
     def about(self, wanted_hz: Floats, half_hz: float) -> tuple[Complexes, Complexes]:
-        """The same denominator about other lines, and its derivatives. `(K, 2)`, `(K, 2, R)`."""
+        """The denominator relative to other lines, and its derivatives. `(K, 2)`, `(K, 2, R)`."""
         shift = (wanted_hz - self.frequency_hz) / half_hz
         first, second = self.d
         middle = 1.0 + first * shift + second * shift**2
@@ -165,12 +165,12 @@ class _Resonance:
 
 
 @dataclass(frozen=True)
-class _Told:
-    """What the windows tell of their own denominators.
+class _Estimated:
+    """Denominators estimated from each window alone.
 
     Args:
-        d: numbers of the denominators. Shape `(K, 2)`.
-        by_row: their derivatives by the rows. Shape `(K, 2, R)`.
+        d: coefficients of the denominators. Shape `(K, 2)`.
+        by_row: their derivatives with respect to the rows. Shape `(K, 2, R)`.
         cost: sum of the squared misfits. Shape `(K,)`.
         plain: the same without a denominator. Shape `(K,)`.
     """
@@ -181,7 +181,7 @@ class _Told:
     plain: Floats
 
 
-def _told(problem: LocalProblem) -> _Told:
+def _estimated(problem: LocalProblem) -> _Estimated:
     plain = solve(problem, np.zeros((problem.y.shape[0], _ORDER), dtype=np.complex128)).cost
     d = start_denominators(problem)
     solved = solve(problem, d)
@@ -191,23 +191,25 @@ def _told(problem: LocalProblem) -> _Told:
         solved = solve(problem, d)
     dual = solved.slopes.conj().transpose(0, 2, 1)
     by_row = np.linalg.pinv(dual @ solved.slopes, hermitian=True) @ dual
-    return _Told(d, np.asarray(by_row), solved.cost, plain)
+    return _Estimated(d, np.asarray(by_row), solved.cost, plain)
 
 
-def _resonances(told: _Told, wanted_hz: Floats, half_hz: float, start: int) -> list[_Resonance]:
-    """Denominators where they explain most, one within each half window."""
-    gain = told.plain / np.maximum(told.cost, 1e-300)
+def _resonances(
+    estimated: _Estimated, wanted_hz: Floats, half_hz: float, start: int
+) -> list[_Resonance]:
+    """The most significant denominators, one within each half window."""
+    gain = estimated.plain / np.maximum(estimated.cost, 1e-300)
     found = []
     for k in np.flatnonzero(gain > _RESONANT):
         near = np.abs(wanted_hz - wanted_hz[k]) <= half_hz
         if gain[k] >= gain[near].max():
             at_hz = float(wanted_hz[k])
-            found.append(_Resonance(start + int(k), at_hz, told.d[k], told.by_row[k]))
+            found.append(_Resonance(start + int(k), at_hz, estimated.d[k], estimated.by_row[k]))
     return found
 
 
 def _none(problem: LocalProblem, start: int) -> _Choice:
-    """No denominator anywhere."""
+    """The choice of no denominator in any window."""
     count, rows = problem.y.shape
     return _Choice(
         np.zeros((count, _ORDER), dtype=np.complex128),
@@ -222,15 +224,15 @@ def _chosen(
     choice: _Choice,
     wanted_hz: Floats,
     half_hz: float,
-    told: _Told,
+    estimated: _Estimated,
     resonances: Sequence[_Resonance],
 ) -> _Choice:
-    """The denominator that explains best, its own only where it gains more than chance."""
+    """The best denominator; a window's own one only if its gain is significant."""
     rows, own_number = problem.y.shape[1], choice.lender.copy()
     d, by_lender, lender, searched = (
         choice.d.copy(), choice.by_lender.copy(), choice.lender.copy(), choice.searched.copy()
     )  # fmt: skip
-    least = told.plain.copy()
+    least = estimated.plain.copy()
     for resonance in resonances:
         near = np.flatnonzero(np.abs(wanted_hz - resonance.frequency_hz) <= _REACH * half_hz)
         moved, slope = resonance.about(wanted_hz[near], half_hz)
@@ -240,7 +242,7 @@ def _chosen(
         d[at], by_lender[at], least[at] = moved[better], slope[better], cost[better]
         lender[at] = resonance.window
     limit = math.exp(_PENALTY * math.log(2.0 * rows) / (2.0 * rows))
-    own = least > limit * told.cost
-    d[own], by_lender[own] = told.d[own], told.by_row[own]
+    own = least > limit * estimated.cost
+    d[own], by_lender[own] = estimated.d[own], estimated.by_row[own]
     lender[own], searched[own] = own_number[own], _ORDER
     return _Choice(d, by_lender, lender, searched)

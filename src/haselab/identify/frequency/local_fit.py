@@ -24,8 +24,8 @@ class LocalProblem:
     """Least squares of `y = linear @ factors / (1 + slopes @ d)` in each of K windows.
 
     Args:
-        linear: columns of numerator and leakage; the first is the wanted one. `(K, R, P)`.
-        slopes: what the two numbers `d` of the denominator multiply. Shape `(K, R, 2)`.
+        linear: columns of numerator and leakage; the first is the requested one. `(K, R, P)`.
+        slopes: factors of the two coefficients `d` of the denominator. Shape `(K, R, 2)`.
         y: spectrum of the output. Shape `(K, R)`.
     """
 
@@ -34,11 +34,11 @@ class LocalProblem:
     y: Complexes
 
     def at(self, which: NDArray[Any]) -> LocalProblem:
-        """The problem of some windows."""
+        """The problem restricted to some windows."""
         return LocalProblem(self.linear[which], self.slopes[which], self.y[which])
 
     def bottom(self, d: Complexes) -> Complexes:
-        """Denominators on all rows, of at most 1e12 contrast. Shape `(K, R, 1)`."""
+        """Denominators on all rows, with a contrast of at most 1e12. Shape `(K, R, 1)`."""
         bottom = 1.0 + self.slopes @ d[:, :, None]
         least = _SINGULAR * np.abs(bottom).max(axis=1, keepdims=True)
         return np.asarray(np.where(np.abs(bottom) < least, least, bottom))
@@ -50,10 +50,10 @@ class Solved:
 
     Args:
         first: first factor. Shape `(K,)`.
-        by_row: its derivatives by the outputs. Shape `(K, R)`.
-        by_d: its derivatives by the denominator. Shape `(K, 2)`.
-        slopes: derivatives of the fitted outputs by the denominator, with the other factors
-            solved for. Shape `(K, R, 2)`.
+        by_row: its derivatives with respect to the outputs. Shape `(K, R)`.
+        by_d: its derivatives with respect to the denominator. Shape `(K, 2)`.
+        slopes: derivatives of the fitted outputs with respect to the denominator, with the other
+            factors solved for. Shape `(K, R, 2)`.
         cost: sum of the squared misfits. Shape `(K,)`.
     """
 
@@ -93,7 +93,7 @@ def _orthogonal(matrix: Complexes) -> tuple[Complexes, Complexes, Floats]:
 
 
 def start_denominators(problem: LocalProblem) -> Complexes:
-    """Denominators by least squares on the misfit times the denominator, weighted by the last.
+    """Initial denominators by iteratively weighted linear least squares.
 
     Source: Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963), 56.
     """
@@ -111,7 +111,7 @@ def start_denominators(problem: LocalProblem) -> Complexes:
 
 @dataclass
 class _Projected:
-    """Misfits with the factors solved for, and their slopes by the denominators."""
+    """Misfits with the factors solved for, and their derivatives by the denominators."""
 
     misfit: Complexes
     slopes: Complexes
@@ -148,7 +148,7 @@ def _step(now: _Projected, damping: Floats) -> Complexes:
 
 
 def tune_denominators(problem: LocalProblem, d: Complexes) -> Complexes:
-    """Denominators of least misfit of the output, from a start; all windows at once.
+    """Denominators of least output misfit from a starting value, for all windows at once.
 
     Source: Levenberg-Marquardt on the projected misfit, Kaufman, BIT 15 (1975), 49.
     """

@@ -1,4 +1,4 @@
-"""Local models of a spectrum: response and leakage are smooth about each line, noise is not."""
+"""Local models of a spectrum: response and leakage are smooth around each line, noise is not."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ Complexes = NDArray[np.complex128]
 _HALF_WINDOW = {"rational": 16, "polynomial": 6}
 _ORDER = 2
 # A line is left out when its variance is 1,000 times that of the plain ratio: the input there is
-# itself leakage, and cannot be told from that of the output.
+# itself leakage, which is indistinguishable from that of the output.
 _BLIND = 1e3
 _MOST_MIXED = 10_000
-# A window that holds only a part of a resonance determines its denominator so badly that the
-# linearised deviations are too small. Wider windows are taken where they leave no more, and their
-# deviations then hold what the two values differ by beyond those of the narrow ones.
+# A window that contains only part of a resonance determines its denominator so badly that the
+# linearised std is too small. Wider windows are used where their misfit is no larger, and their
+# std then includes the difference between both values.
 _WIDER = 3.0
 _NO_NOISIER = 1.3
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Spectra of one record on the lines above zero and below half the rate.
+    """Spectra of one record at the lines above zero and below half the rate.
 
     Args:
         frequency_hz: frequencies, in Hz, multiples of the first. Shape `(M,)`.
@@ -47,14 +47,14 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Lines about each wanted line, the records one after another.
+    """Lines around each requested line, the records one after another.
 
     Args:
-        place: distance from the wanted line, in half windows. Shape `(K, R)`.
+        place: distance from the requested line, in half windows. Shape `(K, R)`.
         u: spectrum of the input. Shape `(K, R)`.
         y: spectrum of the output. Shape `(K, R)`.
-        record: number of the record of each row. Shape `(R,)`.
-        line: number of the line of each row, over all records. Shape `(K, R)`.
+        record: index of the record of each row. Shape `(R,)`.
+        line: index of the line of each row, over all records. Shape `(K, R)`.
         mirrored: whether the row is a negative frequency, the conjugate of its line. `(K, R)`.
     """
 
@@ -71,15 +71,16 @@ def local_response(spectra: Sequence[Spectrum], method: str) -> Lines:
 
     The lines are those of the longest record.
 
-    N, T and D are of second order, T of each record its own. `polynomial` has $D = 1$. `rational`
-    has the denominator that the window itself tells; where it tells none beyond noise, that of
-    the resonance beside it, or none.
+    N, T and D are of second order, with a separate T for each record. `polynomial` has $D = 1$.
+    `rational` uses the window's own denominator; if that is not significant, that of
+    the neighbouring resonance, or none.
 
     Args:
-        spectra: one a record, all of one system.
+        spectra: one per record, all of one system.
         method: "rational" or "polynomial".
     Returns:
-        The lines where the input has 5 % or more of its largest spectrum and is told from leakage.
+        The lines where the input has 5 % or more of its largest spectrum and is distinguishable
+        from leakage.
     Source: Pintelon and Schoukens, System Identification (2012), chapter 7; McKelvey and Guerin,
         SYSID 2012, for the rational form.
     """
@@ -119,7 +120,7 @@ def local_response(spectra: Sequence[Spectrum], method: str) -> Lines:
 
 
 def _near(at_hz: Floats, reach_hz: float, values: Floats) -> Floats:
-    """Mean of the values within a reach of each frequency. Shape `(K,)`."""
+    """Mean of the values within `reach_hz` of each frequency. Shape `(K,)`."""
     start, stop = (np.searchsorted(at_hz, at_hz + side) for side in (-reach_hz, reach_hz))
     stop = np.maximum(stop, start + 1)
     total = np.concatenate([[0.0], np.cumsum(values)])
@@ -137,14 +138,14 @@ def _energy(spectra: Sequence[Spectrum], frequency_hz: Floats) -> Floats:
 
 
 def _half(spectrum: Spectrum, half_hz: float) -> int:
-    """Lines of a record on each side of a wanted one."""
+    """Number of lines of a record on each side of a requested one."""
     wide = round(half_hz / float(spectrum.frequency_hz[0]))
     return min(max(_ORDER, wide), spectrum.u.size // 2 - 1)
 
 
 def _windows(spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float) -> _Windows:
     """The neighbours of a low line include negative frequencies, the conjugates; zero is left out,
-    for the offset sits there. At the upper end the window is shifted inwards.
+    because it contains the offset. At the upper end the window is shifted inwards.
     """
     places, us, ys, owners, lines, mirrors = [], [], [], [], [], []
     before = 0
@@ -172,12 +173,13 @@ def _windows(spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float) -> 
 def _mixing(
     spectra: Sequence[Spectrum], wanted_hz: Floats, half_hz: float, found: Centres
 ) -> csr_array | None:
-    """How the noise of the lines goes into the values; None for more than 10,000 values."""
+    """Contribution of each line's noise to the values; None for more than 10,000 values."""
     count = wanted_hz.size
     if count > _MOST_MIXED:
         return None
     windows = _windows(spectra, wanted_hz, half_hz)
-    # The misfit of one window is a noisy weight; noise is smooth over another window to each side.
+    # The misfit of one window is a noisy weight; the noise level is smooth over another window on
+    # each side.
     near = np.abs(wanted_hz[:, None] - wanted_hz[None, :]) <= half_hz
     std = np.sqrt(0.5 * (near @ found.noise) / near.sum(axis=1))
     weights = np.hstack([
@@ -209,14 +211,14 @@ def harmonic_leakage(
 ) -> Centres:
     r"""Leakage $T(k)/D(k)$ of the output at the harmonics, from the lines between them.
 
-    A periodic input has nothing there, so what the output shows is transient and noise. An input
-    that was measured shows its own noise; the part of the output that goes with it is taken off.
+    A periodic input has no energy there, so the output consists of transient and noise. An input
+    that was measured contains noise; the part of the output caused by it is subtracted.
 
     Args:
         u: whole discrete Fourier transform of the input, over all periods. Shape `(N,)`.
         y: the same of the output. Shape `(N,)`.
         response: first estimate at the harmonics. Shape `(K,)`.
-        harmonics: numbers of the harmonics, rising. Shape `(K,)`.
+        harmonics: harmonic numbers, rising. Shape `(K,)`.
         periods: periods in the record, 2 or more.
     Returns:
         Leakage, its variance, and the variance of the noise on a line.
@@ -226,7 +228,7 @@ def harmonic_leakage(
     beside = reach[reach % periods != 0][: _HALF_WINDOW["rational"]]
     offsets = np.concatenate([-beside[::-1], beside])
     half = float(beside[-1])
-    # At its end the spectrum of a sampled record goes on with its beginning.
+    # The spectrum of a sampled record is periodic.
     lines = (periods * harmonics[:, None] + offsets[None, :]) % y.size
     rest = y[lines] - response[:, None] * u[lines]
     powers = (offsets / half)[:, None] ** np.arange(_ORDER + 1)

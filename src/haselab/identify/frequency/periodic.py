@@ -1,4 +1,4 @@
-"""Frequency response of a periodic drive: whole periods, noise from the lines between theirs."""
+"""Frequency response of a periodic drive: averaged periods, noise between the harmonics."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DEGREES = 20
 
 @dataclass(frozen=True)
 class _Realisation:
-    """One record on the excited lines: input of a period, response, its variance, coherence."""
+    """One record at the excited lines: input of a period, response, its variance, coherence."""
 
     u: Complexes
     response: Complexes
@@ -36,23 +36,23 @@ class _Realisation:
 
 
 def periodic_response(pairs: Sequence[Pair], rate_hz: float, period_s: float, held: bool) -> Lines:
-    r"""Mean response over whole periods; several records with other phases tell distortion.
+    r"""Mean response over whole periods; several records with different phases give the distortion.
 
-    $\hat G = (Y - T)/U$ on the lines of the period. The lines between them, which the input leaves
-    alone, tell the transient T and the variance of the noise, so nothing needs to settle. The
-    spread between records of different drives, less the noise, is the level of nonlinear
+    $\hat G = (Y - T)/U$ on the lines of the period. The lines between them, which the input does
+    not excite, give the transient T and the variance of the noise, so no settling is needed. The
+    spread between records of different drives, minus the noise, is the level of nonlinear
     distortion.
 
     Args:
-        pairs: records of two whole periods or more; what is beyond whole periods is left out at
+        pairs: records of two whole periods or more; an incomplete period is left out at
             the start.
-        rate_hz: samples a second, in Hz.
+        rate_hz: sampling rate, in Hz.
         period_s: period, in s; a whole number of samples.
-        held: whether the hold of the input is taken out.
+        held: whether the hold of the input is corrected for.
     Returns:
         Lines that every record excites with 5 % or more of its largest spectrum.
     Raises:
-        InputError: a period that is no whole number of samples, fewer than two periods, an input
+        InputError: a period that is not a whole number of samples, fewer than two periods, an input
             that does not repeat, records without a common line.
     Source: Pintelon and Schoukens, System Identification (2012), chapters 2 and 4.
     """
@@ -64,8 +64,8 @@ def periodic_response(pairs: Sequence[Pair], rate_hz: float, period_s: float, he
     loud = (means >= EXCITED * means.max(axis=1, keepdims=True)).all(axis=0)
     if not loud.any():
         raise InputError(
-            f"{len(pairs)} records excite no common line of 1/{period_s:g} s; allowed are drives "
-            "with the same lines. Give records of one drive."
+            f"{len(pairs)} records excite no common line of 1/{period_s:g} s; the drives "
+            "must have the same lines. Give records of one drive."
         )
     frequency_hz = harmonics[loud] * rate_hz / size
     parts = [
@@ -87,8 +87,9 @@ def _samples(rate_hz: float, period_s: float) -> int:
     samples = period_s * rate_hz
     if not (math.isfinite(samples) and samples >= 8.0 and abs(samples - round(samples)) < 1e-3):
         raise InputError(
-            f"period_s = {period_s:g} s is {samples:g} samples at {rate_hz:g} Hz; allowed is a "
-            "whole number of 8 or more. Correct the period, or sample in step with the drive."
+            f"period_s = {period_s:g} s is {samples:g} samples at {rate_hz:g} Hz; it must be a "
+            "whole number of 8 or more. Change the period, or synchronise the sampling with the "
+            "drive."
         )
     return round(samples)
 
@@ -98,7 +99,7 @@ def _whole(pair: Pair, size: int, period_s: float) -> Pair:
     count = pair[0].size // size
     if count < 2:
         raise InputError(
-            f"The record holds {pair[0].size / size:.3g} periods of {period_s:g} s; allowed are 2 "
+            f"The record has {pair[0].size / size:.3g} periods of {period_s:g} s; it must have 2 "
             "or more. Record longer, or use the method rational."
         )
     u, y = (x[x.size - count * size :] for x in pair)
@@ -107,7 +108,7 @@ def _whole(pair: Pair, size: int, period_s: float) -> Pair:
     if spread > _REPEATS:
         raise InputError(
             f"The input does not repeat every {period_s:g} s: {100.0 * spread:.0f} % of its power "
-            f"differs between periods; allowed are {100.0 * _REPEATS:.0f} %. Correct the period."
+            f"differs between periods; at most {100.0 * _REPEATS:.0f} % may."
         )
     return u, y
 
@@ -119,14 +120,14 @@ def _realisation(
     leakage = harmonic_leakage(u, y, output / source, harmonics, periods)
     response = (output - leakage.value) / source
     power = np.abs(response * source) ** 2
-    # Of all periods together the power is as many times larger, beside the same noise.
+    # The power of all periods together is larger by their number, at the same noise.
     coherence = power / np.maximum(power + periods * leakage.noise, 1e-300)
     variance = (leakage.noise + leakage.variance) / np.abs(source) ** 2
     return _Realisation(source / periods, response, variance, coherence)
 
 
 def _smooth(values: Floats, degrees: int) -> Floats:
-    """Means of neighbouring lines, wide enough that each has 20 degrees of freedom."""
+    """Means of neighbouring lines, wide enough for 20 degrees of freedom each."""
     half = min(math.ceil((_DEGREES / degrees - 1.0) / 2.0), (values.size - 1) // 2)
     if half <= 0:
         return values
@@ -145,7 +146,7 @@ def _pooled(frequency_hz: Floats, parts: Sequence[_Realisation]) -> Lines:
     variance, distortion = 1.0 / weight.sum(axis=0), np.full(frequency_hz.size, np.nan)
     notes: list[str] = []
     if len(parts) > 1 and _same_drive(parts):
-        notes.append("All records have the same drive, which hides nonlinear distortion.")
+        notes.append("All records have the same drive, so nonlinear distortion is not visible.")
     elif len(parts) > 1:
         degrees = 2 * (len(parts) - 1)
         spread = (np.abs(responses - response) ** 2).sum(axis=0) / (len(parts) - 1)
@@ -164,12 +165,12 @@ def _same_drive(parts: Sequence[_Realisation]) -> bool:
 
 
 def _distortion_notes(spread: Floats, noise: Floats, degrees: int) -> list[str]:
-    """A sentence where the records differ by more than noise, over all lines."""
+    """A note where the records differ by more than noise, over all lines."""
     ratio = float(np.median(spread / np.maximum(noise, 1e-300)))
     limit = float(fdtri(degrees * spread.size, _DEGREES * spread.size, 1.0 - _DISTORTED_P))
     if ratio <= max(limit, _DISTORTED):
         return []
     return [
-        f"Nonlinear distortion: records of other drives differ {math.sqrt(ratio):.2g} times more "
-        "than noise. The response is the best linear one for drives of this kind and size."
+        f"Nonlinear distortion: records of different drives differ {math.sqrt(ratio):.2g} times "
+        "more than noise. The response is the best linear one for drives of this kind and size."
     ]

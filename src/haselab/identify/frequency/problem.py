@@ -1,4 +1,4 @@
-"""A transfer function on the lines of a measured response: basis functions and first guesses."""
+"""A transfer function at the lines of a measured response: basis functions and initial guesses."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ Complexes = NDArray[np.complex128]
 _REFINEMENTS = 6
 _DELAYS = 8
 _FINER = 2
-_LATE = 32  # quarter turns of the frequency that counts most, as far as the finer ladder goes
+_LATE = 32  # quarter turns of the dominant frequency, the end of the finer delay grid
 _DAMPINGS = (0.03, 0.2, 1.0)
 _FREQUENCIES = 24
 
 
 @dataclass(frozen=True)
 class ResponseProblem:
-    """Weighted lines and the structure that is fitted to them.
+    """Weighted lines and the structure to fit.
 
     Args:
-        layout: order of the numbers.
+        layout: order of the parameters.
         s: Laplace variable of the lines, in rad/s. Shape `(K,)`.
         response: complex gain. Shape `(K,)`.
-        weight: one over the standard deviation of real and imaginary part, for first guesses.
+        weight: one over the standard deviation of real and imaginary part, for initial guesses.
             Shape `(K,)`.
-        noise: of the lines.
+        noise: noise model of the lines.
     """
 
     layout: Layout
@@ -46,7 +46,7 @@ class ResponseProblem:
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
-        """Lowest and highest searched numbers that the lines could tell apart."""
+        """Bounds of the searched parameters within which the lines can identify them."""
         omega_rad_s = self.s.imag
         slowest, fastest = float(omega_rad_s.min()), float(omega_rad_s.max())
         step = float(np.median(np.diff(omega_rad_s)))
@@ -66,7 +66,7 @@ class ResponseProblem:
 
     @property
     def middle_rad_s(self) -> float:
-        """Frequency that counts most, in rad/s."""
+        """Dominant frequency, in rad/s."""
         power = np.abs(self.response * self.weight) ** 2
         return float(np.sqrt((self.s.imag**2 * power).sum() / power.sum()))
 
@@ -87,13 +87,13 @@ class ResponseProblem:
         )
 
     def modelled(self, search: Floats, factors: Floats) -> Complexes:
-        """Response of the model on the lines. Shape `(K,)`."""
+        """Response of the model at the lines. Shape `(K,)`."""
         all_factors = self.layout.factor_template.copy()
         all_factors[np.isnan(all_factors)] = factors
         return np.asarray(self._functions(self.layout.full(search))[0] @ all_factors)
 
     def _functions(self, numbers: Floats) -> tuple[Complexes, Complexes]:
-        """Functions with a factor each `(K, S)`, and their slopes by all numbers `(L, K, S)`."""
+        """Basis functions `(K, S)` and their parameter derivatives `(L, K, S)`."""
         turn = np.exp(-self.s * numbers[-1])
         values, slopes = [], []
         for section in self.layout.sections:
@@ -112,7 +112,7 @@ class ResponseProblem:
     def _function(
         self, section: Section, numbers: Floats, power: int
     ) -> tuple[Complexes, Complexes]:
-        r"""$(s/\omega)^{power}\,a_0/A(s)$ with $\omega^n = a_0$, and its logarithmic slopes."""
+        r"""$(s/\omega)^{power}\,a_0/A(s)$ with $\omega^n = a_0$, and its log-derivatives."""
         value = np.ones(self.s.size, dtype=np.complex128)
         slope = np.zeros((numbers.size, self.s.size), dtype=np.complex128)
         size = 0.0
@@ -132,7 +132,7 @@ class ResponseProblem:
         return value * (self.s / math.exp(size / section.order)) ** power, slope
 
     def starting_points(self) -> Iterator[Floats]:
-        """First guesses: rational functions by linearised least squares for several delays.
+        """Initial guesses: rational functions by linearised least squares for several delays.
 
         Source: Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963), 56.
         """
@@ -144,7 +144,7 @@ class ResponseProblem:
                     yield numbers[self.layout.free]
 
     def later_starting_points(self) -> Iterator[Floats]:
-        """A finer and longer ladder of delays; none where the delay is known."""
+        """A finer and longer grid of delays; none when the delay is known."""
         delays = self._delays()
         fine_s = delays[1] / _FINER if len(delays) > 1 else 0.0
         for k in range(_LATE * _FINER if fine_s else 0):
@@ -165,7 +165,7 @@ class ResponseProblem:
                     yield numbers[self.layout.free]
 
     def _delays(self) -> list[float]:
-        """The known delay, or a ladder of quarter turns of the frequency that counts most."""
+        """The known delay, or a grid of quarter turns of the dominant frequency."""
         known = self.layout.template[-1]
         if not math.isnan(known):
             return [float(known)]
@@ -191,7 +191,7 @@ class ResponseProblem:
         return np.asarray(roots * scale, dtype=np.complex128)
 
     def _arranged(self, poles: Complexes, delay_s: float) -> Iterator[Floats]:
-        """Poles put to their places in the layout; slow branches from the slowest, or a ladder."""
+        """Poles in the order of the layout; slow branches from the slowest poles or a grid."""
         structure = self.layout.structure
         count = structure.slow_modes
         pairs = [(abs(p), -p.real / abs(p)) for p in poles if p.imag > 1e-9 * abs(p)]

@@ -30,7 +30,7 @@ _LEAST = 64
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """Frequency response on the lines that the input excites.
+    """Frequency response at the lines that the input excites.
 
     Args:
         frequency_hz: frequencies, in Hz. Shape `(K,)`.
@@ -38,12 +38,12 @@ class FrequencyResponse:
         coherence: share of the output power that follows the input, 0 to 1. Shape `(K,)`.
         std: standard deviation of the complex gain (real and imaginary part together). `(K,)`.
         distortion_std: the same of nonlinear distortion in one realisation of a periodic drive;
-            NaN where not told. Shape `(K,)`.
-        notes: what the reader should know.
-        mixing: how the errors of the lines hang together: real parts first, then imaginary parts,
-            they are this matrix times independent numbers of unit variance. None where that is
-            not told: for averaged segments, periods, and more than 10,000 lines. Shape `(2K, M)`.
-        status: the word ok, or why the numbers must not be used.
+            NaN where not known. Shape `(K,)`.
+        notes: remarks for the user.
+        mixing: correlation of the errors of the lines: real parts first, then imaginary parts,
+            they are this matrix times independent variables of unit variance. None where not
+            known: for averaged segments, periods, and more than 10,000 lines. Shape `(2K, M)`.
+        status: "ok", or why there is no result.
     """
 
     frequency_hz: Floats
@@ -57,7 +57,7 @@ class FrequencyResponse:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
+        """Whether the fit has a usable result."""
         return self.status == "ok"
 
     @property
@@ -67,7 +67,7 @@ class FrequencyResponse:
 
     @property
     def phase_std_rad(self) -> Floats:
-        """Standard deviation of the phase, in rad; at most that of a uniform phase. `(K,)`."""
+        """Standard deviation of the phase, in rad; at most that of a uniform one. `(K,)`."""
         ratio = self.magnitude_std / np.maximum(np.abs(self.response), 1e-300)
         return np.asarray(np.minimum(ratio, np.pi / np.sqrt(3.0)))
 
@@ -84,13 +84,13 @@ class FrequencyResponse:
         return NicholsChart.of(self.frequency_hz, self.response, self.std)
 
     def fit(self, structure: TransferStructure | None = None) -> ResponseFit:
-        """Weighted fit of a transfer function to the lines, their covariance included."""
+        """Fit a transfer function to the lines, weighted by their covariance."""
         return fit_response(
             self.frequency_hz, self.response, self.std, structure, mixing=self.mixing
         )  # fmt: skip
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract; the phase runs on without jumps."""
+        """The result under its public JSON keys; the phase is unwrapped."""
         return {
             "status": self.status,
             "frequency_hz": self.frequency_hz,
@@ -115,27 +115,27 @@ def estimate_frequency_response(
     period_s: float | None = None,
     segment_s: float | None = None,
 ) -> FrequencyResponse:
-    r"""Frequency response from one record, or from several of one system.
+    r"""Estimate a frequency response from one record, or from several of one system.
 
-    `rational` and `polynomial` take the leakage of transients out: about each line response and
+    `rational` and `polynomial` remove the leakage of transients: around each line response and
     leakage are smooth, $Y(k+r) = G(r)\,U(k+r) + T(r)$; `rational` gives both a common local
     denominator, which a lightly damped resonance needs. `h1`, `h2`, `hv` average windowed
     segments, for long noise records with noise on the output, the input, both alike. `periodic`
     averages whole periods.
 
     Args:
-        u: input. Shape `(N,)`, or one such vector a record.
+        u: input. Shape `(N,)`, or one such vector per record.
         y: output at the same moments. As `u`.
-        rate_hz: samples a second, in Hz.
+        rate_hz: sampling rate, in Hz.
         method: one of `RESPONSE_METHODS`.
-        held: whether `u` was held between its updates; its hold is then taken out.
+        held: whether `u` was held between its updates; the hold is then corrected for.
         period_s: period of the drive, in s; for `periodic`, and for it alone.
         segment_s: length of a segment, in s; for `h1`, `h2`, `hv` alone.
     Returns:
         Response on the lines where the input has 5 % or more of its largest spectrum.
     Raises:
-        InputError: unequal lengths, too few samples, an input without change, unknown method, an
-            option that another method takes.
+        InputError: unequal lengths, too few samples, a constant input, an unknown method, an
+            option of another method.
     Source: Pintelon and Schoukens, System Identification (2012), chapters 2 and 7; Bendat and
         Piersol, Random Data (2010), chapters 6 and 9.
     Example:
@@ -145,7 +145,7 @@ def estimate_frequency_response(
         True
     """
     if not 0.0 < rate_hz < np.inf:
-        raise InputError(f"rate_hz = {rate_hz:g} Hz; allowed is above 0 Hz. Give the rate.")
+        raise InputError(f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz.")
     _check_method(method, period_s, segment_s)
     pairs = _pairs(u, y)
     if method == "periodic" and period_s is not None:
@@ -164,46 +164,44 @@ def _status(limits: Sequence[float], outputs: Sequence[Floats]) -> str:
     middle = float(np.mean([output.mean() for output in outputs]))
     shown = " and ".join(f"{middle + limit:.4g}" for limit in limits)
     return (
-        f"no result: the output stays at {shown} where the response predicts that it goes on, "
-        "so it is clipped or saturated; lower the amplitude or widen the range of the sensor"
+        f"no result: the output stays at {shown} where the response predicts a change, "
+        "so it is clipped or saturated; reduce the amplitude or increase the range of the sensor"
     )
 
 
 def _check_method(method: str, period_s: float | None, segment_s: float | None) -> None:
     if method not in RESPONSE_METHODS:
-        raise InputError(
-            f"method = {method}; allowed are {', '.join(RESPONSE_METHODS)}. Choose one."
-        )
+        raise InputError(f"method = {method}; must be one of {', '.join(RESPONSE_METHODS)}.")
     if (period_s is not None) != (method == "periodic"):
         raise InputError(
-            f"period_s = {period_s} with the method {method}; allowed is a period with the method "
-            "periodic, and none with others. Give both or neither."
+            f"period_s = {period_s} with the method {method}; the method periodic requires a "
+            "period and the other methods take none."
         )
     if segment_s is not None and method not in ("h1", "h2", "hv"):
         raise InputError(
-            f"segment_s = {segment_s} with the method {method}; allowed is a segment with h1, h2, "
-            "hv alone. Leave it out."
+            f"segment_s = {segment_s} with the method {method}; only h1, h2 and hv "
+            "take a segment length. Leave it out."
         )
 
 
 def _pairs(u: object, y: object) -> list[Pair]:
-    """The records without their means."""
+    """The records with their means subtracted."""
     inputs, outputs = _vectors("u", u), _vectors("y", y)
     if len(inputs) != len(outputs):
         raise InputError(
-            f"u holds {len(inputs)} records and y {len(outputs)}; allowed are equal numbers. "
+            f"u has {len(inputs)} records and y {len(outputs)}; the numbers must be equal. "
             "Give one output for each input."
         )
     for source, output in zip(inputs, outputs, strict=True):
         if source.size != output.size:
             raise InputError(
-                f"u has {source.size} values and y {output.size}; allowed are equal lengths. "
-                "Give both at the same moments."
+                f"u has {source.size} values and y {output.size}, but they must be equally long. "
+                "Give both at the same times."
             )
         if np.ptp(source) == 0.0:
             raise InputError(
-                f"The input is {source[0]:g} throughout, so it excites nothing; allowed is one "
-                "that changes. Name the right column, or record a chirp."
+                f"The input is {source[0]:g} throughout, so it excites nothing. It "
+                "must change. Name the right column, or record a chirp."
             )
     return [(a - a.mean(), b - b.mean()) for a, b in zip(inputs, outputs, strict=True)]
 

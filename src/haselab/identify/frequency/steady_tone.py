@@ -1,4 +1,4 @@
-"""Records that hold one tone alone, long after it began."""
+"""Detection of records in steady state at a single tone."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from haselab.identify.record import Record
 __all__ = ["steady_tone_hz"]
 
 Floats = NDArray[np.float64]
-_PURE = 1e-4  # of the input's energy that may be beside its tone
+_PURE = 1e-4  # of the input's energy that may be outside its tone
 _FEWEST_PERIODS = 2.0
 _WHITE = 1e-3
 _FINER = 4  # padding of the spectrum
 
 
 def steady_tone_hz(record: Record) -> float | None:
-    """Frequency of a record whose input is one tone and whose output is the same tone and noise.
+    """Frequency of a record whose input is one tone and whose output is the same tone plus noise.
 
-    Such a record determines two numbers of a plant, whatever its length: gain and phase at that
-    frequency. A transient at its begin, another tone or a change of the input would show.
+    Whatever its length, such a record determines two parameters: gain and phase at that
+    frequency. A transient at its start, another tone or a change of the input would be detected.
 
     Args:
         record: input and output.
@@ -60,7 +60,7 @@ def steady_tone_hz(record: Record) -> float | None:
 
 
 def _beside(values: Floats, time_s: Floats, hz: float) -> Floats:
-    """What a constant and one tone leave."""
+    """Residuals of a constant and one tone."""
     angle = 2.0 * math.pi * hz * time_s
     basis = np.stack([np.ones(values.size), np.cos(angle), np.sin(angle)], axis=1)
     factors, *_ = np.linalg.lstsq(basis, values, rcond=None)

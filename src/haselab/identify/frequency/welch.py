@@ -18,32 +18,30 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _LEAST = 16
 _SEGMENTS = 8
-# Half-overlapping Hann segments share a sixth of their noise: 1/(1 + 2/36) of their number count.
+# Half-overlapping Hann segments are correlated by 1/6: 1/(1 + 2/36) of their number counts.
 _INDEPENDENT = 36.0 / 38.0
 _SHARED = 0.3
 _TELLING = 6
 _SWEEP = (
     "The input is like a single sweep (or step): each frequency is excited in few segments, and "
-    "averaged segments are wrong for it. Use the method rational, or fit a transfer function."
+    "averaged segments are not suitable. Use the method rational, or fit a transfer function."
 )
-_ALONE = (
-    "One segment has no spread, so coherence and deviations tell nothing. Give shorter segments."
-)
+_ALONE = "One segment alone gives no coherence and no standard deviation. Use shorter segments."
 
 
 def averaged_response(
     pairs: Sequence[Pair], rate_hz: float, method: str, held: bool, segment_s: float | None
 ) -> Lines:
-    r"""Response from the spectra of Hann segments that overlap by half, of all records together.
+    r"""Response from the spectra of Hann segments that overlap by half, pooled over all records.
 
     $H_1 = S_{uy}/S_{uu},\quad H_2 = S_{yy}/S_{yu},\quad H_v = \sqrt{H_1 H_2}$,
     $\mathrm{var}\,H/|H|^2 = (1 - \gamma^2)/(\gamma^2 (n - 1))$ for n independent segments.
 
     Args:
         pairs: records.
-        rate_hz: samples a second, in Hz.
+        rate_hz: sampling rate, in Hz.
         method: "h1" for noise on the output, "h2" on the input, "hv" equal shares on both.
-        held: whether the hold of the input is taken out.
+        held: whether the hold of the input is corrected for.
         segment_s: length of a segment, in s; an eighth of the longest record when not given.
     Returns:
         Lines where the input has 5 % or more of its largest spectrum.
@@ -85,14 +83,14 @@ def _size(pairs: Sequence[Pair], rate_hz: float, segment_s: float | None) -> int
     size = round(segment_s * rate_hz) if np.isfinite(segment_s) else 0
     if not _LEAST <= size <= shortest:
         raise InputError(
-            f"segment_s = {segment_s:g} s is {size} samples; allowed is {_LEAST} to {shortest}, "
-            "the shortest record. Choose a length between."
+            f"segment_s = {segment_s:g} s is {size} samples; must be {_LEAST} to {shortest}, "
+            "the length of the shortest record."
         )
     return size
 
 
 def _spectra(x: Floats, size: int) -> Complexes:
-    """Spectra of the segments, each freed of its mean. Shape `(S, size // 2 + 1)`."""
+    """Spectra of the segments, each with its mean subtracted. Shape `(S, size // 2 + 1)`."""
     segments = sliding_window_view(x, size)[:: max(1, size // 2)]
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(size) / size)
     freed = segments - segments.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Bouc-Wen hysteresis from loops: sharpness, shape and exponent from several starts."""
+"""Bouc-Wen hysteresis from loops: sharpness, shape and exponent, searched from several starts."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ _DIFFERENCE = 1e-5
 
 @dataclass(frozen=True)
 class BoucWenFamily:
-    """One memory between -1 and 1; searched are log sharpness, sigma and, if free, the exponent.
+    """One memory state in [-1, 1]; log sharpness, sigma and optionally the exponent are searched.
 
     Args:
-        free_exponent: whether the exponent is searched; else it is 1.
+        free_exponent: whether the exponent is searched; otherwise it is 1.
     """
 
     free_exponent: bool = False
 
     @property
     def factors(self) -> int:
-        """Number of memories."""
+        """Number of memory states."""
         return 1
 
     def bounds(self) -> tuple[Floats, Floats]:
-        """Lowest and highest searched numbers."""
+        """Lowest and highest searched parameters."""
         ranges = np.array([np.log(_SHARPNESS), _SIGMA, _EXPONENT])[: 2 + self.free_exponent]
         return ranges[:, 0], ranges[:, 1]
 
     def factor_bounds(self) -> tuple[Floats, Floats]:
-        """The weight is free."""
+        """The weight is unbounded."""
         return np.array([-np.inf]), np.array([np.inf])
 
     def _memory(self, search: Floats, problem: HysteresisProblem) -> Floats:
@@ -67,7 +67,7 @@ class BoucWenFamily:
         return problem.pick(memories)
 
     def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
-        """The memory, its derivatives by differences, on the problem's rows."""
+        """The memory state and its numerical derivatives on the problem's rows."""
         here = self._memory(search, problem)
         slopes = np.empty((search.size, here.size, 1))
         for k in range(search.size):
@@ -78,11 +78,11 @@ class BoucWenFamily:
 
 
 def solve_bouc_wen(problem: HysteresisProblem, curve: Numbers, free_exponent: bool) -> Solved:
-    """Best solution of several starts, ranked by what each memory explains beside a curve.
+    """Best solution of several starts, ranked by the gain of each memory state over a curve.
 
     Args:
         problem: records and rows.
-        curve: numbers of the curve alone, without a memory.
+        curve: parameters of the curve alone, without memory.
         free_exponent: whether the exponent is searched.
     Returns:
         The best solution.
@@ -106,11 +106,11 @@ def solve_bouc_wen(problem: HysteresisProblem, curve: Numbers, free_exponent: bo
 
 
 def bouc_wen_model(numbers: Numbers, scale: Scale) -> BoucWen:
-    """The model in physical units.
+    """Convert the parameters to a model in physical units.
 
     Args:
-        numbers: in the problem's units.
-        scale: these units.
+        numbers: scaled parameters.
+        scale: scaling of the problem.
     Returns:
         The model.
     """

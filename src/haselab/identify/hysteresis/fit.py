@@ -1,4 +1,4 @@
-"""Hysteresis from loops: which model the data support, its numbers, and what its inverse leaves."""
+"""Hysteresis from loops: model choice, parameters, and the benefit of the inverse."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.base.chart import Chart
 from haselab.identify.charts import loop_chart
 from haselab.identify.fit import RecordFit, rescaled, several
-from haselab.identify.hysteresis.lag import lag_rival
+from haselab.identify.hysteresis.lag import fit_lag
 from haselab.identify.hysteresis.loops import (
     LoopRecord,
     LoopWidth,
@@ -33,7 +33,7 @@ from haselab.identify.hysteresis.search import (
     rate_spread,
     search_hysteresis,
 )
-from haselab.identify.model_choice import APART, effective_count, told_apart
+from haselab.identify.model_choice import APART, effective_count, is_decisive
 from haselab.identify.noise import fit_percent, whiteness_p
 from haselab.identify.record import finite_vector
 from haselab.models.hysteresis.common import Hysteresis
@@ -48,20 +48,19 @@ _ROWS = 20_000
 _HELD_OUT = 0.25
 _MOST_OPERATORS = 20
 _COLOURED = 0.01
-_TOLD = 3.0  # standard deviations
+_TOLD = 3.0  # standard deviations of a significant loop width
 LAG = "linear lag"
 _LAG = (
-    "A linear first-order lag of {0.time_constant_s:.3g} s explains the loops {0.how}: their width "
-    "then depends on the rate, and the model here holds at this rate alone. Try `identify "
-    "transfer`."
+    "A linear first-order lag of {0.time_constant_s:.3g} s explains the loops {0.how}. Their width "
+    "then depends on the rate, and this model is valid at this rate only. Try `identify transfer`."
 )
-_BIPOLAR = 0.2  # of the larger side of the drive: the smaller one is above
-_SQUARABLE = (1e-150, 1e150)  # inputs whose squares are numbers
+_BIPOLAR = 0.2  # smallest ratio of the drive's smaller side to its larger side
+_SQUARABLE = (1e-150, 1e150)  # inputs whose squares do not overflow
 LINEAR, SQUARE = "u", "u squared"
 _UNKNOWN = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
 _BUTTERFLY = (
-    "The output follows the square of the drive (a butterfly): model and thresholds are those of "
-    "u squared. Apply the model to u squared; the root of its inverse's output is the drive."
+    "The output follows the square of the drive (a butterfly): the model and its thresholds apply "
+    "to u squared. Square the drive before the model, and take the square root after its inverse."
 )
 
 
@@ -70,23 +69,23 @@ class HysteresisFit(RecordFit[LoopRecord]):
     """A fitted hysteresis model; see `Fit` for what all fits have.
 
     Args:
-        kind: the model that is given: the one asked for, else the best of curve,
+        kind: the reported model: the requested one, otherwise the best of curve,
             prandtl-ishlinskii and bouc-wen.
         verdict: the model that the data support, "no hysteresis visible", "linear lag", or
             "cannot tell".
         records: what was fitted.
-        bic: criterion of each kind's best model against the lowest.
+        bic: criterion of each kind's best model relative to the lowest.
         cycles: width of each cycle's loop.
         width: mean of these, in the unit of the output; positive where the output lags.
         relative_width: the same over the span of the output.
-        reduction: mean distance of the branches before over that after the model is taken out:
-            what the inverse can do on loops like these; noise makes it smaller.
-        fit_percent: NRMSE fit of the samples whose memory is known.
+        reduction: mean distance of the branches before over that after compensation by the model:
+            the benefit of the inverse on such loops; noise makes it smaller.
+        fit_percent: NRMSE fit of the samples whose memory state is known.
         validation_fit_percent: NRMSE fit of the last quarter of each record, by the same model
             fitted to the rest. NaN where the rest is too short.
         residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
         fitted: the model. None: no result.
-        drive: what the model takes: "u", or "u squared" for a butterfly under a bipolar drive.
+        drive: input of the model: "u", or "u squared" for a butterfly under a bipolar drive.
     """
 
     kind: str = ""
@@ -137,7 +136,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
         return loop_chart(title, names or ("Input", "Output"), loops)
 
     def answer(self) -> JsonObject:
-        """Keys of the command's answer."""
+        """The result as a dictionary for JSON."""
         return {
             "model": self.kind,
             "drive": self.drive,
@@ -164,15 +163,15 @@ def fit_hysteresis(
     *,
     operators: int | None = None,
 ) -> HysteresisFit:
-    r"""Fit a hysteresis model with an inverse, and say whether the data support it.
+    r"""Fit an invertible hysteresis model, and test whether the data support it.
 
-    Where a drive of both signs moves the output by its square (strain of a dielectric actuator),
-    the models are fitted against the square, if that explains more.
+    If the output follows the square of a bipolar drive (strain of a dielectric actuator),
+    the models are fitted to the square, if that explains more.
 
-    Rivals are a curve without memory, play operators (rate-dependent where the records hold
-    several rates) and a Bouc-Wen memory, each with dead zones behind. BIC chooses the dead zones,
-    the number of operators and the kind; a lead below 6 is "cannot tell". Samples count from where
-    the input has once covered its range.
+    Candidates are a curve without memory, play operators (rate-dependent if the records have
+    several rates) and a Bouc-Wen memory, each followed by dead zones. BIC chooses the dead zones,
+    the number of operators and the kind; a difference below 6 is "cannot tell". Samples count after
+    the input has covered its range once.
 
     Args:
         records: loops, or one; several rates tell the rate dependence.
@@ -209,7 +208,7 @@ def fit_hysteresis(
 
 
 def _follows_square(record: LoopRecord) -> bool:
-    """Whether a drive of both signs moves the output by its square rather than by itself."""
+    """Whether the output follows the square of a bipolar drive rather than the drive."""
     u, peak = record.u, float(np.abs(record.u).max())
     if not u.min() < -_BIPOLAR * u.max() or not u.max() > -_BIPOLAR * u.min():
         return False
@@ -224,44 +223,42 @@ def _follows_square(record: LoopRecord) -> bool:
 
 
 def _fitted(records: Sequence[LoopRecord], model: str, operators: int | None) -> HysteresisFit:
-    """The models against the records' own input."""
+    """Fit the models to the records' own input."""
     scale = Scale.of(records)
     thinned, found = search_hysteresis(records, scale, _KINDS[model], operators)
     scores = {kind: candidate.bic for kind, candidate in found.items()}
     lowest = min(scores.values())
     scores = {kind: score - lowest for kind, score in scores.items()}
     best = min(scores, key=lambda name: scores[name])
-    verdict = best if told_apart(scores) else _UNSURE
+    verdict = best if is_decisive(scores) else _UNSURE
     verdict = _NONE if verdict == CURVE else verdict
     given = best if model == "auto" or model not in found else model
     fit = _describe(records, scale, found[given], rate_spread(thinned))
     if verdict == _NONE and abs(fit.width.value) > _TOLD * fit.width.std:
-        verdict = _UNSURE  # the loop is there, and none of the models is its
+        verdict = _UNSURE  # there is a loop, but no model describes it
     if verdict in (PLAYS, BOUC_WEN) and fit.reduction < 1.0:
-        verdict = _UNSURE  # the model makes a loop where the record shows a smaller one
+        verdict = _UNSURE  # the model's loop is larger than the recorded one
     if not fit.succeeded:
         return fit
     notes = fit.notes
-    if verdict != _NONE and (rival := lag_rival(records, fit.residuals, len(fit.parameters))):
-        lead = rival.lead
+    if verdict != _NONE and (lag_fit := fit_lag(records, fit.residuals, len(fit.parameters))):
+        lead = lag_fit.lead
         verdict = LAG if lead > APART else _UNSURE if lead > -APART else verdict
-        notes = (*notes, _LAG.format(rival)) if lead > -APART else notes
+        notes = (*notes, _LAG.format(lag_fit)) if lead > -APART else notes
     return replace(fit, verdict=verdict, bic=scores, notes=notes)
 
 
 def _check(model: str, operators: int | None) -> None:
     if model not in _KINDS:
-        raise InputError(f"model = {model}; allowed are {', '.join(_KINDS)}. Correct the name.")
+        raise InputError(f"model = {model}; must be one of {', '.join(_KINDS)}.")
     if operators is not None and not 1 <= operators <= _MOST_OPERATORS:
-        raise InputError(
-            f"operators = {operators}; allowed is 1 to {_MOST_OPERATORS}. Correct the number."
-        )
+        raise InputError(f"operators = {operators}; must be 1 to {_MOST_OPERATORS}.")
 
 
 def _describe(
     records: Sequence[LoopRecord], scale: Scale, chosen: Candidate, spread: float
 ) -> HysteresisFit:
-    """The chosen model on all rows, judged."""
+    """The chosen model on all rows, with status and notes."""
     masks = [record.settled() for record in records]
     problem = HysteresisProblem(records, scale, masks, _ROWS)
     start, family = chosen.solved.numbers, chosen.family
@@ -278,17 +275,17 @@ def _describe(
         covariance = np.pad(covariance, (0, missing), constant_values=np.inf)
     fitted = model_of(family, numbers, scale)
     residuals = tuple(r.y - fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records)
-    told = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
+    counted = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
     measured = [r.y[mask] for r, mask in zip(records, masks, strict=True)]
-    if not _related(measured, told):
+    if not _related(measured, counted):
         reason = "no result: the output does not follow the input; check the columns"
         return HysteresisFit(status=reason, records=tuple(records))
-    modelled = [  # a model without its past may begin beyond all outputs
+    modelled = [  # a model with an unknown past may start outside the range of the outputs
         np.clip(r.y - e, r.y.min(), r.y.max())[r.first :]
         for r, e in zip(records, residuals, strict=True)
     ]
-    span = float(np.ptp(np.concatenate(modelled))) or 1.0  # of the raw outputs, noise is a part
-    cycles, white = tuple(band_widths(records, span)), whiteness_p(told)
+    span = float(np.ptp(np.concatenate(modelled))) or 1.0  # raw outputs would include noise
+    cycles, white = tuple(band_widths(records, span)), whiteness_p(counted)
     width, relative = _means(cycles, span)
     before, after = mean_width(records, common_curve(records)), mean_width(records, residuals)
     return HysteresisFit(
@@ -303,7 +300,7 @@ def _describe(
         width=width,
         relative_width=relative,
         reduction=before / after if after > 0.0 else math.nan,
-        fit_percent=fit_percent(measured, [y - e for y, e in zip(measured, told, strict=True)]),
+        fit_percent=fit_percent(measured, [y - e for y, e in zip(measured, counted, strict=True)]),
         validation_fit_percent=_validation(records, scale, family, numbers),
         residual_whiteness_p=white,
         fitted=fitted,
@@ -311,7 +308,7 @@ def _describe(
 
 
 def _related(measured: Sequence[Floats], residuals: Sequence[Floats]) -> bool:
-    """Whether the model beats a constant by what two numbers have to be worth, and 6 more."""
+    """Whether the BIC of the model beats that of a constant by more than 6."""
     worth = effective_count(residuals)
     cost = sum(float(e @ e) for e in residuals)
     spread = sum(float(((y - y.mean()) ** 2).sum()) for y in measured)
@@ -366,15 +363,15 @@ def _notes(
     if white < _COLOURED:
         notes.append(
             "The residuals are coloured: something other than hysteresis is left, such as creep or "
-            "a resonance; the intervals take it for noise. Slower loops would tell."
+            "a resonance; the intervals treat it as noise. Record slower loops."
         )
     if blind:
         notes.append(f"Not identifiable from these loops: {', '.join(blind)}.")
     if not cycles:
-        notes.append("The input has no whole cycles, so no width of a loop is given.")
+        notes.append("The input has no whole cycles, so no loop width is reported.")
     if any(mask.all() for mask in masks) and chosen.kind != CURVE:
         notes.append(
-            "A record holds about one cycle: rest without a past is assumed before it. "
+            "A record has only about one cycle, so a zero memory state is assumed before it. "
             "Record two cycles or more."
         )
     obstacle = fitted.obstacle(max(record.rate_hz for record in records))

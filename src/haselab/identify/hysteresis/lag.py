@@ -1,4 +1,4 @@
-"""A linear lag as a rival of hysteresis: its loops look the same at one rate."""
+"""A linear lag as an alternative to hysteresis: at one rate its loops look the same."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from haselab.identify.hysteresis.loops import LoopRecord
 from haselab.identify.model_choice import bic, effective_count
 
-__all__ = ["LagRival", "lag_rival"]
+__all__ = ["LagAlternative", "fit_lag"]
 
 Floats = NDArray[np.float64]
 _PARAMETERS = 4  # offset, both gains, time constant
@@ -23,12 +23,12 @@ _STARTS = 12
 
 
 @dataclass(frozen=True)
-class LagRival:
-    """A lag with a direct part, fitted to loops.
+class LagAlternative:
+    """A first-order lag with feed-through, fitted to loops.
 
     Args:
         time_constant_s: of the lag, in s.
-        lead: criterion of the hysteresis model over that of the lag; positive: the lag is better.
+        lead: BIC of the hysteresis model minus that of the lag; positive: the lag is better.
     """
 
     time_constant_s: float
@@ -36,21 +36,21 @@ class LagRival:
 
     @property
     def how(self) -> str:
-        """How well it explains the loops, beside the hysteresis model."""
+        """How well it explains the loops, compared with the hysteresis model."""
         return "better" if self.lead > 0.0 else "about as well"
 
 
-def lag_rival(
+def fit_lag(
     records: Sequence[LoopRecord], residuals: Sequence[Floats], parameters: int
-) -> LagRival | None:
-    r"""The best $y = c + a\,u + b\,u/(\tau s + 1)$, against residuals of a hysteresis model.
+) -> LagAlternative | None:
+    r"""The best $y = c + a\,u + b\,u/(\tau s + 1)$, compared with a hysteresis model.
 
     Args:
         records: loops.
         residuals: of the hysteresis model, on all samples. Shape `(N_r,)` each.
-        parameters: how many numbers that model has.
+        parameters: number of parameters of that model.
     Returns:
-        The lag; None where no time constant between the sampling interval and the record fits.
+        The lag; None if no time constant between the sampling interval and the record length fits.
     """
     masks = [record.settled() for record in records]
     y = np.concatenate([r.y[mask] for r, mask in zip(records, masks, strict=True)])
@@ -76,12 +76,12 @@ def lag_rival(
     if at in (0, _STARTS - 1):
         return None
     found = minimize_scalar(cost, bounds=(grid[at - 1], grid[at + 1]), method="bounded")
-    told = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
-    lag = np.split(fitted(found.x), np.cumsum([e.size for e in told])[:-1])
-    richer = min((told, lag), key=lambda parts: sum(float(e @ e) for e in parts))
+    counted = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
+    lag = np.split(fitted(found.x), np.cumsum([e.size for e in counted])[:-1])
+    richer = min((counted, lag), key=lambda parts: sum(float(e @ e) for e in parts))
     effective, floor = effective_count(richer), (_ROUNDING * float(np.ptp(y))) ** 2
-    ours = sum(float(e @ e) for e in told)
+    ours = sum(float(e @ e) for e in counted)
     lead = bic(ours, y.size, effective, parameters, floor) - bic(
         float(found.fun), y.size, effective, _PARAMETERS, floor
     )
-    return LagRival(math.exp(float(found.x)), lead)
+    return LagAlternative(math.exp(float(found.x)), lead)

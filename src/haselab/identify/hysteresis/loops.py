@@ -1,4 +1,4 @@
-"""Loops in a record: which samples tell a model, and how wide each cycle's loop is."""
+"""Loops in a record: which samples identify a model, and the loop width of each cycle."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class LoopRecord:
     Args:
         u: input in order of time. Shape `(N,)`.
         y: output. Shape `(N,)`.
-        rate_hz: samples a second, in Hz.
-        counted_from_s: samples before this time set the memory and are not fitted, in s: for
-            first cycles that differ for good.
+        rate_hz: sampling rate, in Hz.
+        counted_from_s: samples before this time set the memory state and are not fitted, in s: for
+            initial cycles that differ from the later ones.
     Raises:
-        InputError: fewer than 24 samples that count, unequal lengths, NaN, a column without change.
+        InputError: fewer than 24 fitted samples, unequal lengths, NaN, a constant column.
     """
 
     u: Floats
@@ -46,36 +46,36 @@ class LoopRecord:
             column = finite_vector(name, getattr(self, name), _LEAST_SAMPLES)
             if np.ptp(column) == 0.0:
                 raise InputError(
-                    f"{name} is {column[0]:g} throughout; allowed is a column that changes. "
+                    f"{name} is {column[0]:g} throughout; it must change. "
                     "Name the right column, or record loops."
                 )
             object.__setattr__(self, name, np.ascontiguousarray(column))
         if self.u.size != self.y.size:
             raise InputError(
-                f"u has {self.u.size} values and y {self.y.size}; allowed are equal lengths. "
+                f"u has {self.u.size} values and y {self.y.size}, but they must be equally long. "
                 "Give one output for each input."
             )
         if not 0.0 < self.rate_hz < math.inf:
             raise InputError(
-                f"rate_hz = {self.rate_hz:g} Hz; allowed is above 0 Hz. Give the sampling rate."
+                f"rate_hz = {self.rate_hz:g} Hz; must be above 0 Hz. Give the sampling rate."
             )
         longest_s = (self.u.size - _LEAST_SAMPLES) / self.rate_hz
         if not 0.0 <= self.counted_from_s <= longest_s:
             raise InputError(
-                f"counted_from_s = {self.counted_from_s:g} s; allowed is 0 to {longest_s:g} s, "
-                f"which leaves {_LEAST_SAMPLES} samples. Correct it."
+                f"counted_from_s = {self.counted_from_s:g} s; must be 0 to {longest_s:g} s, "
+                f"which leaves {_LEAST_SAMPLES} samples."
             )
 
     @property
     def first(self) -> int:
-        """Number of the first sample that counts."""
+        """Index of the first sample that counts."""
         return math.ceil(self.counted_from_s * self.rate_hz - 1e-9)
 
     def settled(self) -> NDArray[np.bool_]:
-        """Samples that count, from where the input has covered its range once.
+        """Samples that count, after the input has covered its range once.
 
-        The memory before is wiped out there. All samples that count where these are less than a
-        half of them; then rest before the record is assumed.
+        Earlier memory is erased there. If these are less than half of the counted samples, all of
+        them are used and a zero memory state is assumed before the record.
         """
         low, high = float(self.u.min()), float(self.u.max())
         edge = 0.5 * (1.0 - _COVERED) * (high - low)
@@ -91,11 +91,11 @@ class LoopWidth:
     """Width of one cycle's loop.
 
     Args:
-        record: number of the record, from 0.
-        cycle: number of the cycle in it, from 0.
+        record: index of the record, from 0.
+        cycle: index of the cycle in the record, from 0.
         rate_per_s: mean rate of the input, in its unit per s.
         width: mean distance of the falling from the rising branch at equal input, in the unit of
-            the output; positive where the output lags behind the input, also where it falls as
+            the output; positive where the output lags behind the input, even if it falls as
             the input rises.
         relative_width: the same over the span of the output.
     """
@@ -107,7 +107,7 @@ class LoopWidth:
     relative_width: Estimate
 
     def to_dict(self) -> JsonObject:
-        """Plain numbers and estimates."""
+        """The result as a dictionary."""
         return {
             "record": self.record,
             "cycle": self.cycle,
@@ -132,7 +132,7 @@ def common_curve(records: Sequence[LoopRecord]) -> list[Floats]:
 
 
 def direction(records: Sequence[LoopRecord]) -> float:
-    """1 where the output rises with the input over all, -1 where it falls."""
+    """1 if the output rises with the input overall, -1 if it falls."""
     total = sum(
         float((r.u[r.first :] - r.u[r.first :].mean()) @ (r.y[r.first :] - r.y[r.first :].mean()))
         for r in records
@@ -141,13 +141,13 @@ def direction(records: Sequence[LoopRecord]) -> float:
 
 
 def band_widths(records: Sequence[LoopRecord], span: float | None = None) -> list[LoopWidth]:
-    """Width of every whole cycle that counts, with the noise model of its samples.
+    """Loop width of every complete counted cycle, with the noise model of its samples.
 
     Args:
         records: loops.
         span: of the output without noise and spikes, in its unit; None: that of the samples.
     Returns:
-        One entry a cycle; none where no order of time shows.
+        One entry per cycle; empty if the samples are not in order of time.
     Source: difference of the branches' means in cells of equal input.
     """
     sign = direction(records)
@@ -191,13 +191,13 @@ def _cycle_width(u: Floats, distance: Floats, edges: NDArray[np.int_]) -> Estima
 
 
 def mean_width(records: Sequence[LoopRecord], residuals: Sequence[Floats]) -> float:
-    """Mean distance of the branches of the residuals, without sign: what is left of the loops.
+    """Mean absolute distance of the branches of the residuals: the remaining loop width.
 
     Args:
-        records: tell the direction. Shape `(N_r,)` each.
+        records: give the direction. Shape `(N_r,)` each.
         residuals: distances from a model. Shape `(N_r,)` each.
     Returns:
-        Width, in the unit of the residuals; noise makes it larger, never smaller.
+        Width, in the unit of the residuals; noise can only increase it.
     """
     widths = [
         loop_width(r.u[r.first :], r.u[r.first :], e[r.first :])

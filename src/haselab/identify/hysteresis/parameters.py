@@ -1,4 +1,4 @@
-"""From a solved hysteresis problem to numbers in physical units, with intervals."""
+"""Convert a solved hysteresis problem to parameters in physical units, with intervals."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from haselab.models.hysteresis.common import Hysteresis
 __all__ = ["hysteresis_estimates", "model_of"]
 
 Floats = NDArray[np.float64]
-_UNTOLD = 3.0  # relative standard deviation above which a positive number is not told
+_LARGEST_STD = 3.0  # of an identifiable positive parameter, relative
 _AT_BOUND = 1e-3
 
 
 def model_of(family: Family, numbers: Numbers, scale: Scale) -> Hysteresis:
-    """The model in physical units.
+    """Convert the parameters to a model in physical units.
 
     Args:
-        family: its memory.
-        numbers: in the problem's units.
-        scale: these units.
+        family: memory model.
+        numbers: scaled parameters.
+        scale: scaling of the problem.
     Returns:
         The model.
     """
@@ -44,7 +44,7 @@ def model_of(family: Family, numbers: Numbers, scale: Scale) -> Hysteresis:
 
 
 def _names(family: Family, numbers: Numbers) -> list[str]:
-    """Names of the numbers, in the order of `Numbers.vector`."""
+    """Names of the parameters, in the order of `Numbers.vector`."""
     zones = [f"dead_zone_slope_{k + 1}" for k in range(numbers.bends.size)]
     if isinstance(family, PlayFamily):
         count = range(1, family.count + 1)
@@ -55,7 +55,7 @@ def _names(family: Family, numbers: Numbers) -> list[str]:
 
 
 def _to_physical(family: Family, numbers: Numbers, scale: Scale) -> Floats:
-    """Derivative of the physical numbers by those of the problem. Shape `(P, P)`."""
+    """Derivative of the physical with respect to the scaled parameters. Shape `(P, P)`."""
     size = numbers.vector.size
     at, memories, zones = numbers.search.size, numbers.factors.size, numbers.bends.size
     ratio = scale.half_y / scale.half_u
@@ -78,7 +78,7 @@ def _to_physical(family: Family, numbers: Numbers, scale: Scale) -> Floats:
 
 
 def _values(family: Family, numbers: Numbers, scale: Scale) -> Floats:
-    """Physical numbers in the order of `Numbers.vector`."""
+    """Physical parameters in the order of `Numbers.vector`."""
     search = numbers.search.copy()
     ratio = scale.half_y / scale.half_u
     moved = numbers.gain
@@ -97,13 +97,13 @@ def _values(family: Family, numbers: Numbers, scale: Scale) -> Floats:
 def hysteresis_estimates(
     problem: HysteresisProblem, family: Family, numbers: Numbers
 ) -> tuple[dict[str, Estimate], Floats]:
-    """All numbers with intervals, and their covariance.
+    """All parameters with intervals, and their covariance.
 
     Those at a bound or beyond the data's reach are NaN.
 
     Args:
         problem: records and rows.
-        family: the memory.
+        family: memory model.
         numbers: the solution.
     Returns:
         Estimates by name, play operators in the order of their thresholds, and the covariance in
@@ -134,7 +134,7 @@ def hysteresis_estimates(
 
 
 def _at_bound(family: Family, numbers: Numbers) -> NDArray[np.bool_]:
-    """Searched numbers that a bound stops; an exponent or a sigma there is meant to be there."""
+    """Searched parameters at a bound, except an exponent or a sigma, which may be there."""
     marks = np.zeros(numbers.vector.size, dtype=bool)
     low, high = family.bounds()
     near = _AT_BOUND * np.where(np.isfinite(high), high - low, 1.0)
@@ -148,7 +148,7 @@ def _at_bound(family: Family, numbers: Numbers) -> NDArray[np.bool_]:
 def _estimate(name: str, value: float, std: float) -> Estimate:
     unit = "s" if name.endswith("_s") else ""
     positive = name.startswith(("threshold", "sharpness", "sigma", "exponent"))
-    if not math.isfinite(std) or (positive and std > _UNTOLD * abs(value)):
+    if not math.isfinite(std) or (positive and std > _LARGEST_STD * abs(value)):
         return Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
     return Estimate.normal(value, std, unit)
 

@@ -1,4 +1,4 @@
-"""Prandtl-Ishlinskii operators from loops: thresholds, weights, rate dependence, one by one."""
+"""Prandtl-Ishlinskii operators from loops: thresholds, weights and rate dependence."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ __all__ = ["PlayFamily", "add_operator", "evenly_spaced", "play_model", "simplif
 
 Floats = NDArray[np.float64]
 _GRID = 40
-_WIDEST = 0.98  # of half the span: a wider play never moves once the input has covered its range
+_WIDEST = 0.98  # of half the span: a wider play operator never moves
 _NARROWEST = 1e-3
 _APART = 0.01
-_IDLE = 1e-3  # of the gain: a weight below it does nothing
-_FIRST_SHARES = (0.05, 0.4)  # of the middle threshold, added at the highest rate
+_IDLE = 1e-3  # of the gain: a smaller weight has no effect
+# Starting rate dependence: increase at the highest rate, relative to the middle threshold.
+_FIRST_SHARES = (0.05, 0.4)
 
 
 @dataclass(frozen=True)
 class PlayFamily:
-    """Play operators; searched are their thresholds and, last, the rate dependence in s.
+    """Play operators; their thresholds and, last, the rate dependence in s are searched.
 
     Args:
         count: number of operators.
-        side: 1 where the output lags, -1 where it leads, 0 not known yet.
+        side: 1 where the output lags, -1 where it leads, 0 if not known yet.
         rated: whether the rate dependence is searched.
         filter_s: time constant of the rate's filter, in s.
     """
@@ -47,7 +48,7 @@ class PlayFamily:
 
     @property
     def factors(self) -> int:
-        """Number of memories."""
+        """Number of memory states."""
         return self.count
 
     def bounds(self) -> tuple[Floats, Floats]:
@@ -59,12 +60,12 @@ class PlayFamily:
         return low, high
 
     def factor_bounds(self) -> tuple[Floats, Floats]:
-        """Weights of the side's sign; none below 0 for one that lags."""
+        """Weights have the sign of `side`: not below 0 if the output lags."""
         zero, free = np.zeros(self.count), np.full(self.count, np.inf)
         return (zero, free) if self.side >= 0 else (-free, zero)
 
     def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
-        """Plays and their derivatives on the problem's rows."""
+        """Play operators and their derivatives on the problem's rows."""
         thresholds = np.ascontiguousarray(search[: self.count])
         rate_s = float(search[-1]) if self.rated else 0.0
         plays: list[Floats] = []
@@ -91,15 +92,15 @@ class PlayFamily:
 def add_operator(
     problem: HysteresisProblem, family: PlayFamily, solved: Solved
 ) -> tuple[PlayFamily, Solved] | None:
-    """One more operator, where the residuals ask for it most, then all numbers solved again.
+    """Add one operator where the residuals need it most, and fit all parameters again.
 
     Args:
         problem: records and rows.
         family: operators so far.
         solved: their solution.
     Returns:
-        The larger family with its solution; None when the residuals ask for no operator.
-    Source: score test of each threshold on a grid, orthogonal to all numbers found so far.
+        The larger family with its solution; None if the residuals need no further operator.
+    Source: score test of each threshold on a grid, orthogonal to all parameters found so far.
     """
     numbers = solved.numbers
     own = numbers.search[: family.count]
@@ -116,7 +117,7 @@ def add_operator(
     columns = columns - known @ (inverse @ (known.T @ columns))
     norm = np.sqrt((columns**2).sum(axis=0))
     score = columns.T @ residuals / np.where(norm > 1e-9, norm, np.inf)
-    # One sign for all weights keeps the slopes after a reversal in order.
+    # One sign for all weights keeps the slopes after a reversal monotone.
     best = int(np.argmax(score * family.side if family.side else np.abs(score)))
     side = family.side or int(np.sign(score[best]))
     if score[best] * side <= 0.0:
@@ -132,13 +133,13 @@ def add_operator(
 def evenly_spaced(
     problem: HysteresisProblem, curve: Numbers, side: int, count: int
 ) -> tuple[PlayFamily, Solved]:
-    """Evenly spaced operators, all numbers solved from there, those without a weight left out.
+    """Fit evenly spaced operators, and drop those without a weight.
 
     Args:
         problem: records and rows.
-        curve: numbers of the curve alone.
+        curve: parameters of the curve alone.
         side: of the weights.
-        count: operators to begin with.
+        count: initial number of operators.
     Returns:
         The family with its solution.
     """
@@ -160,7 +161,7 @@ def evenly_spaced(
 def with_rate(
     problem: HysteresisProblem, family: PlayFamily, solved: Solved, filter_s: float
 ) -> tuple[PlayFamily, Solved]:
-    """The same operators with thresholds that grow with the rate.
+    """Fit the same operators with thresholds that increase with the rate.
 
     Args:
         problem: records and rows.
@@ -186,13 +187,13 @@ def with_rate(
 
 
 def simplified(family: PlayFamily, numbers: Numbers) -> tuple[PlayFamily, Numbers]:
-    """Operators that a bound or the search brought together, as one; the narrowest, as a gain.
+    """Merge operators with equal thresholds, and turn the narrowest one into a gain.
 
     Args:
         family: the operators.
-        numbers: theirs.
+        numbers: their parameters.
     Returns:
-        The family with its numbers, thresholds ascending and apart.
+        The family with its numbers, with distinct, ascending thresholds.
     """
     gain, thresholds, weights = numbers.gain, [0.0], [0.0]
     for k in np.argsort(numbers.search[: family.count]):
@@ -209,12 +210,12 @@ def simplified(family: PlayFamily, numbers: Numbers) -> tuple[PlayFamily, Number
 
 
 def play_model(family: PlayFamily, numbers: Numbers, scale: Scale) -> PrandtlIshlinskii:
-    """The model in physical units.
+    """Convert the parameters to a model in physical units.
 
     Args:
         family: the operators.
-        numbers: in the problem's units.
-        scale: these units.
+        numbers: scaled parameters.
+        scale: scaling of the problem.
     Returns:
         Model with ascending thresholds, see `simplified`.
     """

@@ -1,4 +1,4 @@
-"""Least squares common to the hysteresis models: a sum of memories behind dead zones."""
+"""Least squares common to the hysteresis models: a sum of memory states followed by dead zones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
-LEAST_GAIN = 0.01  # of the loop's own slope: a model without a gain has no inverse
+LEAST_GAIN = 0.01  # of the loop's mean slope: a model without a gain has no inverse
 _STEEPEST = 50.0
 _FLATTEST = 0.02
 _STUCK = 1e6
@@ -33,11 +33,12 @@ _STUCK = 1e6
 
 @dataclass(frozen=True)
 class Shapes:
-    """Memories of a family at some searched numbers, on the rows of a problem.
+    """Memory states for given searched parameters, on the rows of a problem.
 
     Args:
-        memories: what the linear factors multiply. Shape `(N, C)`.
-        slopes: derivatives of `memories` by the searched numbers. Shape `(L, N, C)`.
+        memories: memory states, multiplied by the linear factors. Shape `(N, C)`.
+        slopes: derivatives of `memories` with respect to the searched parameters.
+            Shape `(L, N, C)`.
     """
 
     memories: Floats
@@ -45,32 +46,32 @@ class Shapes:
 
 
 class Family(Protocol):
-    """A hysteresis model's memory, with what is searched in it."""
+    """Memory model of a hysteresis model, with its searched parameters."""
 
     @property
     def factors(self) -> int:
-        """Number of memories."""
+        """Number of memory states."""
 
     def bounds(self) -> tuple[Floats, Floats]:
-        """Lowest and highest searched numbers. Shape `(L,)` each."""
+        """Lowest and highest searched parameters. Shape `(L,)` each."""
 
     def factor_bounds(self) -> tuple[Floats, Floats]:
-        """Lowest and highest factors of the memories. Shape `(C,)` each."""
+        """Bounds of the factors of the memory states. Shape `(C,)` each."""
 
     def shapes(self, search: Floats, problem: HysteresisProblem) -> Shapes:
-        """Memories and their derivatives on the problem's rows."""
+        """Memory states and their derivatives on the problem's rows."""
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """All numbers of a model, in a problem's units.
+    """All parameters of a model, scaled as in the problem.
 
     Args:
-        search: of the family. Shape `(L,)`.
+        search: searched parameters of the family. Shape `(L,)`.
         offset: of the sum.
         gain: of the input.
-        factors: of the memories. Shape `(C,)`.
-        bends: inverse slopes of the dead zones' pieces, see `zones_of`. Shape `(M,)`.
+        factors: of the memory states. Shape `(C,)`.
+        bends: inverse slopes of the segments of the dead zones, see `zones_of`. Shape `(M,)`.
     """
 
     search: Floats
@@ -81,11 +82,11 @@ class Numbers:
 
     @property
     def vector(self) -> Floats:
-        """All in a row."""
+        """All parameters as one vector."""
         return np.concatenate([self.search, [self.offset, self.gain], self.factors, self.bends])
 
     def like(self, vector: Floats) -> Numbers:
-        """Numbers of the same structure from a row."""
+        """Parameters of the same structure from a vector."""
         at = self.search.size
         factors = vector[at + 2 : at + 2 + self.factors.size]
         rest = vector[at + 2 + self.factors.size :]
@@ -97,7 +98,7 @@ class Solved:
     """A least-squares solution.
 
     Args:
-        numbers: where the search came to rest.
+        numbers: where the search converged.
         cost: sum of the squared residuals on the problem's rows.
     """
 
@@ -107,7 +108,7 @@ class Solved:
 
 @dataclass(frozen=True)
 class Scale:
-    """Units of a problem: `u = middle_u + half_u u'`, `y = middle_y + half_y y'`.
+    """Scaling of a problem: `u = middle_u + half_u u'`, `y = middle_y + half_y y'`.
 
     `half_y` is negative where the output falls as the input rises.
     """
@@ -119,7 +120,7 @@ class Scale:
 
     @classmethod
     def of(cls, records: Sequence[LoopRecord]) -> Scale:
-        """Units in which settled inputs and outputs span from -1 to 1 and rise together."""
+        """Scaling to settled inputs and outputs that span -1 to 1 and rise together."""
         masks = [record.settled() for record in records]
         u = np.concatenate([record.u[mask] for record, mask in zip(records, masks, strict=True)])
         y = np.concatenate([record.y[mask] for record, mask in zip(records, masks, strict=True)])
@@ -134,7 +135,7 @@ def _corners(count: int) -> Floats:
 
 
 def _overlaps(y: Floats, count: int) -> tuple[Floats, Floats]:
-    """Part of the way from 0 to each output on the middle piece, and on the others.
+    """Overlap of the path from 0 to each output with the middle segment and with the others.
 
     Shapes `(N,)`, `(N, M)`.
     """
@@ -149,12 +150,12 @@ def _overlaps(y: Floats, count: int) -> tuple[Floats, Floats]:
 
 
 def zones_of(bends: Floats, scale: Scale | None = None) -> DeadZones:
-    """Dead zones whose pieces are evenly spaced in the output, so that each holds samples.
+    """Dead zones whose segments are evenly spaced in the output, so that each has samples.
 
     Args:
-        bends: inverse slopes of the pieces but the middle one, which is 1; the lowest first, as
+        bends: inverse slopes of all segments except the middle one, which is 1; lowest first, as
             many below as above it. Shape `(M,)`.
-        scale: into whose units they are put.
+        scale: target scaling, if any.
     Returns:
         Dead zones.
     """
@@ -174,13 +175,13 @@ def zones_of(bends: Floats, scale: Scale | None = None) -> DeadZones:
 
 
 class HysteresisProblem:
-    """Records in units of -1 to 1, and the rows of them that count.
+    """Scaled records and the rows that count.
 
     Args:
         records: loops.
-        scale: the units.
+        scale: scaling.
         kept: rows that count, one mask a record.
-        most: rows at most; evenly thinned to that.
+        most: largest number of rows; more are thinned evenly.
     """
 
     def __init__(
@@ -203,13 +204,13 @@ class HysteresisProblem:
         self.ends = np.cumsum([rows.size for rows in self.rows])[:-1]
 
     def pick(self, columns: Sequence[Floats]) -> Floats:
-        """The rows that count, of one array a record."""
+        """Select the rows that count from one array per record."""
         return np.concatenate(
             [column[rows] for column, rows in zip(columns, self.rows, strict=True)]
         )
 
     def sum_of(self, numbers: Numbers, shapes: Shapes) -> Floats:
-        """What enters the dead zones. Shape `(N,)`."""
+        """Input of the dead zones. Shape `(N,)`."""
         inner = numbers.offset + numbers.gain * self.u + shapes.memories @ numbers.factors
         return np.asarray(inner)
 
@@ -218,7 +219,7 @@ class HysteresisProblem:
         return self.linearised(family, numbers)[0]
 
     def linearised(self, family: Family, numbers: Numbers) -> tuple[Floats, Floats]:
-        """Residuals, and derivatives of the modelled output by `numbers.vector`.
+        """Residuals, and derivatives of the modelled output with respect to `numbers.vector`.
 
         Shapes `(N,)`, `(N, P)`.
         """
@@ -235,12 +236,12 @@ class HysteresisProblem:
         """Bounded least squares from a start.
 
         Args:
-            family: the memories.
-            start: first numbers; moved inside the bounds.
-            steps: most evaluations.
-            gain: relative gain of a step below which the search rests.
+            family: memory model.
+            start: starting parameters; moved inside the bounds.
+            steps: largest number of evaluations.
+            gain: relative gain of a step below which the search stops.
         Returns:
-            Where it came to rest.
+            Where it converged.
         """
         bounds = _bounds(family, start)
         best = start.like(np.clip(start.vector, *bounds))
@@ -265,7 +266,7 @@ class HysteresisProblem:
 
 
 def _bounds(family: Family, start: Numbers) -> tuple[Floats, Floats]:
-    """Lowest and highest numbers, in the order of `Numbers.vector`."""
+    """Bounds of the parameters, in the order of `Numbers.vector`."""
     low, high = family.bounds()
     least, most = family.factor_bounds()
     bends = np.ones(start.bends.size)
@@ -277,7 +278,7 @@ def _bounds(family: Family, start: Numbers) -> tuple[Floats, Floats]:
 def _damped_step(
     at: Floats, residuals: Floats, columns: Floats, bounds: tuple[Floats, Floats], damping: float
 ) -> Floats:
-    """Levenberg-Marquardt step of the numbers that no bound stops."""
+    """Levenberg-Marquardt step of the parameters that are not at a bound."""
     gradient = columns.T @ residuals
     stopped = ((at <= bounds[0]) & (gradient < 0.0)) | ((at >= bounds[1]) & (gradient > 0.0))
     free = np.flatnonzero(~stopped)

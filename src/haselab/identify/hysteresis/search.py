@@ -33,12 +33,12 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 CURVE, PLAYS, BOUC_WEN = "curve", "prandtl-ishlinskii", "bouc-wen"
-ONE_RATE = 1.5  # spread of the rates below which they are one
+ONE_RATE = 1.5  # spread of the rates below which they count as one rate
 _ZONES = (0, 2, 4, 8)
-_TRIED_WITH = 2  # operators, while the dead zones are chosen
+_TRIED_WITH = 2  # operators used while the dead zones are chosen
 _MOST = 10
 _SPREAD = (3, 6)
-_PATIENCE = 2  # operators that may fail to lower the criterion
+_PATIENCE = 2  # operators in a row that may fail to lower the criterion
 _ROWS = 2500
 _ROUNDING = 1e-18  # mean square of residuals, in units of half the span
 _FILTER_SAMPLES = 4.0
@@ -51,11 +51,11 @@ class Candidate:
 
     Args:
         kind: curve, prandtl-ishlinskii or bouc-wen.
-        family: its memory.
-        solved: its numbers, with their cost on the thinned rows.
-        detail: criterion within its kind, each sample taken as independent: what repeats with the
-            loop is worth its numbers, even where it is no noise.
-        bic: criterion between the kinds, with the number of samples that the residuals are worth.
+        family: memory model.
+        solved: its parameters, with their cost on the thinned rows.
+        detail: criterion within its kind, with every sample taken as independent: a part that
+            repeats with the loop justifies parameters, even if it is not noise.
+        bic: criterion between kinds, with the effective number of samples of the residuals.
     """
 
     kind: str
@@ -66,7 +66,7 @@ class Candidate:
 
 
 def rate_spread(problem: HysteresisProblem) -> float:
-    """Ratio of the high to the low rates of the input that the rows hold (90 to 10 %)."""
+    """Ratio of the high to the low rates of the input in the rows (90 % to 10 % quantile)."""
     rates = [
         np.abs(np.diff(u, prepend=u[0])) * rate_hz
         for u, rate_hz in zip(problem.inputs, problem.rates_hz, strict=True)
@@ -76,7 +76,7 @@ def rate_spread(problem: HysteresisProblem) -> float:
 
 
 class _Judge:
-    """The criterion of all rivals, with one effective number of samples."""
+    """The criterion of all candidates, with one effective number of samples."""
 
     def __init__(self, problem: HysteresisProblem, richest: Solved, family: Family) -> None:
         residuals = np.split(problem.residuals(family, richest.numbers), problem.ends)
@@ -93,7 +93,7 @@ class _Judge:
 
 
 def _best(tried: Sequence[Candidate]) -> Candidate:
-    """The best in detail, standing for its kind with the lowest criterion of all."""
+    """The best candidate within its kind, with the lowest criterion of all tried."""
     lowest = min(candidate.bic for candidate in tried)
     return replace(min(tried, key=lambda candidate: candidate.detail), bic=lowest)
 
@@ -105,7 +105,7 @@ def search_hysteresis(
 
     Args:
         records: loops.
-        scale: units of the search.
+        scale: scaling of the search.
         wanted: kinds besides the curve.
         operators: number of play operators; None: chosen by BIC.
     Returns:
@@ -124,14 +124,14 @@ def search_hysteresis(
     curved = [judge.rate(CURVE, none, curve) for curve in curves]
     found = {CURVE: _best(curved)}
     if PLAYS in wanted:
-        # Dead zones may have stood in for operators that were still to come: without them too.
+        # Dead zones may have replaced operators not yet added, so also try without them.
         plays = [
             _best_plays(problem, judge, curves[k].numbers, paths[k], operators)
             for k in sorted({0, chosen})
         ]
-        told = [candidate for candidate in plays if candidate is not None]
-        if told:
-            found[PLAYS] = _best(told)
+        available = [candidate for candidate in plays if candidate is not None]
+        if available:
+            found[PLAYS] = _best(available)
     if BOUC_WEN in wanted:
         found[BOUC_WEN] = _best_bouc_wen(problem, judge, curves)
     return problem, found
@@ -140,7 +140,7 @@ def search_hysteresis(
 def _best_bouc_wen(
     problem: HysteresisProblem, judge: _Judge, curves: Sequence[Solved]
 ) -> Candidate:
-    """The dead zones that go best with an exponent of 1, then the exponent free as well."""
+    """Choose the dead zones at an exponent of 1, then free the exponent."""
     tried = [
         judge.rate(BOUC_WEN, BoucWenFamily(), solve_bouc_wen(problem, curve.numbers, False))
         for curve in curves
@@ -153,7 +153,7 @@ def _best_bouc_wen(
 def _grow(
     problem: HysteresisProblem, path: list[tuple[PlayFamily, Solved]], count: int
 ) -> list[tuple[PlayFamily, Solved]]:
-    """The path with operators added until there are `count`, or none is asked for."""
+    """Add operators until there are `count` or no further one is needed."""
     path = list(path)
     while path[-1][0].count < count:
         following = add_operator(problem, *path[-1])
@@ -203,7 +203,7 @@ def _count(candidate: Candidate) -> int:
 
 
 def _filtered(problem: HysteresisProblem, judge: _Judge, rated: Candidate) -> Candidate:
-    """The rate's filter that explains the loops best, of time constants a factor of 2 apart."""
+    """The best filter of the rate, from time constants a factor of 2 apart."""
     family = cast(PlayFamily, rated.family)
     tried = [rated]
     for samples in _FILTERS:
@@ -211,9 +211,9 @@ def _filtered(problem: HysteresisProblem, judge: _Judge, rated: Candidate) -> Ca
         solved = problem.solve(other, rated.solved.numbers)
         tried.append(judge.rate(PLAYS, other, solved))
     lowest = min(candidate.detail for candidate in tried)
-    # Of filters that the data do not tell apart, one whose inverse is stable.
-    rivals = [candidate for candidate in tried if candidate.detail < lowest + APART]
-    return min(rivals, key=lambda candidate: (_runs_away(problem, candidate), candidate.detail))
+    # Among filters that fit equally well, one with a stable inverse.
+    equal = [candidate for candidate in tried if candidate.detail < lowest + APART]
+    return min(equal, key=lambda candidate: (_runs_away(problem, candidate), candidate.detail))
 
 
 def _runs_away(problem: HysteresisProblem, rated: Candidate) -> bool:
@@ -227,7 +227,7 @@ def _best_count(
     path: list[tuple[PlayFamily, Solved]],
     operators: int | None,
 ) -> Candidate:
-    """Operators added one by one until the criterion has failed to fall twice."""
+    """Add operators one by one until the criterion has not fallen twice."""
     if operators is not None:
         path = [entry for entry in path if entry[0].count <= operators]
         return judge.rate(PLAYS, *_grow(problem, path, operators)[-1])

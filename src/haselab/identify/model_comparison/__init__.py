@@ -1,1 +1,1 @@
-"""Which of several models a record supports."""
+"""Comparison of models: which one a record supports."""

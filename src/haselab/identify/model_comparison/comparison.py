@@ -1,4 +1,4 @@
-"""Which of some rival models do records support."""
+"""Comparison of candidate models: which one do the records support."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from haselab.identify.noise import autoregression, fit_percent, whiteness_p
 from haselab.identify.record import Record
 
 __all__ = [
+    "CandidateModel",
     "Explanation",
     "Hypothesis",
+    "ModelComparison",
     "NoiseShape",
-    "Rival",
-    "Verdict",
     "compare",
     "noise_shape",
 ]
 
 Floats = NDArray[np.float64]
 _SPECTRUM_LINES = 4096
-_FEWEST = 4.0  # independent samples; with as many, the odds ask for a tenfold misfit already
+_FEWEST = 4.0  # independent samples; with so few the odds already require a tenfold misfit
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """What a hypothesis makes of the records.
+    """Best fit of a hypothesis to the records.
 
     Args:
         status: "ok", or why there is no result.
-        parameters: fitted numbers.
+        parameters: fitted parameters.
         modelled: fitted output of each record. Shape `(M_r,)` each.
         residuals: measured minus fitted. Shape `(M_r,)` each.
-        estimates: fitted numbers by name.
-        model: the fitted model for a file, with a key for its kind; empty where it has no form.
+        estimates: fitted parameters by name.
+        model: the fitted model for a file, with a key for its kind; empty if it cannot be saved.
     """
 
     status: str
@@ -61,34 +61,34 @@ class Hypothesis(Protocol):
 
     @property
     def name(self) -> str:
-        """A word for tables."""
+        """Short name for tables."""
 
     @property
     def says(self) -> str:
-        """The statement, a sentence's end."""
+        """The statement, as the end of a sentence."""
 
     def explain(self, records: Sequence[Record], near: Explanation | None = None) -> Explanation:
-        """The best fit; `near` is a rival's fit, one more place to start from."""
+        """The best fit; `near` is the fit of another hypothesis, as an additional start."""
 
 
 @dataclass(frozen=True)
-class Rival:
-    """One hypothesis beside the others.
+class CandidateModel:
+    """One hypothesis in a comparison.
 
     Args:
         name: of the hypothesis.
-        says: what it states.
+        says: its statement.
         status: "ok", or why its fit has no result.
-        parameters: fitted numbers.
+        parameters: fitted parameters.
         fit_percent: NRMSE fit.
         misfit: root mean square of the residuals over that of the output about its means.
-        log_likelihood: with as many independent samples as the noise model allows; NaN without one.
-        bic: against that of the best hypothesis.
-        probability: with equal chances before, from `bic`.
-        lead: how far the best one is ahead, in standard deviations of what noise could decide; NaN
+        log_likelihood: with the effective number of independent samples; NaN without a fit.
+        bic: relative to that of the best hypothesis.
+        probability: from `bic`, with equal prior probabilities.
+        lead: how far the best one is ahead, in standard deviations of the noise; NaN
             for the best one.
-        excluded: whether the records speak against it.
-        estimates: fitted numbers by name.
+        excluded: whether the records exclude it.
+        estimates: fitted parameters by name.
         model: the fitted model for a file.
     """
 
@@ -107,7 +107,7 @@ class Rival:
     model: Mapping[str, Any]
 
     def to_dict(self) -> JsonObject:
-        """Keys of the answer."""
+        """The result as a dictionary for JSON."""
         return {
             "name": self.name,
             "says": self.says,
@@ -126,25 +126,25 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What the records say about rival hypotheses.
+class ModelComparison:
+    """Result of a comparison of hypotheses.
 
     Args:
         status: "ok", or why there is no result.
         verdict: "supports NAME", "cannot tell", or "none explains the data".
-        supported: name of the supported hypothesis, "" without one.
-        rivals: hypotheses, the best first.
+        supported: name of the supported hypothesis, "" if none.
+        candidates: hypotheses, the best first.
         effective_samples: independent samples of the residuals' noise model.
-        systematic: part of the output's swing that the best hypothesis leaves and that is not
-            white.
-        risk: of a wrong verdict that was allowed.
-        notes: why, a sentence each.
+        systematic: coloured part of the output's variation that the best hypothesis does not
+            explain.
+        risk: accepted probability of a wrong decision.
+        notes: reasons, one sentence each.
     """
 
     status: str
     verdict: str
     supported: str
-    rivals: tuple[Rival, ...]
+    candidates: tuple[CandidateModel, ...]
     effective_samples: float
     systematic: float
     risk: float
@@ -152,15 +152,15 @@ class Verdict:
 
     @property
     def succeeded(self) -> bool:
-        """Whether there is a verdict; "cannot tell" is one."""
+        """Whether the comparison has a result; "cannot tell" counts as one."""
         return self.status == "ok"
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         return {
             "verdict": self.verdict,
             "supported": self.supported,
-            "rivals": [rival.to_dict() for rival in self.rivals],
+            "candidates": [candidate.to_dict() for candidate in self.candidates],
             "effective_samples": self.effective_samples,
             "systematic": self.systematic,
             "risk": self.risk,
@@ -171,12 +171,12 @@ class Verdict:
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Colour of residuals, from the spectrum of their autoregressive model.
+    """Shape of the residuals' spectrum, from an autoregressive model.
 
     Args:
-        samples: white samples whose variance would be known as well.
-        strongest: spectrum at its highest over its mean.
-        white: innovation's over total variance.
+        samples: number of white samples whose variance would be known equally well.
+        strongest: maximum of the spectrum over its mean.
+        white: variance of the innovation over the total variance.
     """
 
     samples: float
@@ -185,14 +185,14 @@ class NoiseShape:
 
 
 def noise_shape(residuals: Sequence[Floats]) -> NoiseShape:
-    r"""How many independent samples coloured residuals are worth, and how strong they get.
+    r"""Effective number of samples of coloured residuals, and the peak of their spectrum.
 
     $n = N\,\bar S^2 / \overline{S^2}$, with the spectrum $S$ of an autoregressive model
 
     Args:
-        residuals: one array a record, in order of time. Shape `(M_r,)`.
+        residuals: one array per record, in order of time. Shape `(M_r,)`.
     Returns:
-        The shape; white residuals give as many samples as there are, 1 and 1.
+        The shape; for white residuals: all samples, 1 and 1.
     Source: Bartlett, J. R. Stat. Soc. Suppl. 8 (1946), 27, for the variance of a variance.
     Example:
         >>> white = np.random.default_rng(1).normal(size=1000)
@@ -219,36 +219,36 @@ def compare(
     *,
     risk: float = 0.01,
     unexplained: float = 0.3,
-) -> Verdict:
-    r"""Fit each hypothesis to the records and say which one they support.
+) -> ModelComparison:
+    r"""Fit each hypothesis to the records and determine which one they support.
 
-    A rival with as many numbers as the best is excluded when three things hold: its odds from
-    $\mathrm{BIC} = n \ln(\lVert e\rVert^2/N) + k \ln n$ are below the risk ($n$ independent
-    samples of the residuals' noise model, the same for all); its lead
+    A hypothesis with as many parameters as the best is excluded when three conditions hold: its
+    odds from $\mathrm{BIC} = n \ln(\lVert e\rVert^2/N) + k \ln n$ are below the risk ($n$
+    independent samples of the residuals' noise model, the same for all); its lead
     $(\lVert e_B\rVert^2 - \lVert e_A\rVert^2) / 2\sigma\lVert\hat y_A - \hat y_B\rVert$, a normal
-    deviate were the truth half-way between both models and the noise everywhere as strong as at its
-    strongest frequency, passes that risk; and its extra misfit is
-    larger than what the best one leaves unexplained itself, else a shortcoming that all share could
-    have decided. A rival with more numbers that fits better but not enough to be the best needs the
-    first of these alone.
+    deviate if the truth were half-way between both models and the noise were as strong as at its
+    strongest frequency everywhere, exceeds the limit for that risk; and its extra misfit is
+    larger than the unexplained part of the best one, since otherwise a deficiency common to all
+    could decide. For a hypothesis with more parameters that fits better, but not well enough to be
+    the best, the first condition is sufficient.
 
     Args:
         hypotheses: two or more.
-        records: experiments that all hypotheses have to explain together.
-        risk: allowed for a wrong verdict, 0 to 0.5.
-        unexplained: coloured part of the output's swing above which a hypothesis explains nothing.
+        records: experiments that each hypothesis has to explain jointly.
+        risk: accepted probability of a wrong decision, 0 to 0.5.
+        unexplained: coloured part of the output's variation above which a hypothesis is useless.
     Returns:
-        The verdict; `status` says "ok" or why there is none.
+        The result; `status` says "ok" or why there is none.
     Raises:
-        InputError: fewer than two hypotheses, a rate out of range, records that cannot be fitted.
-    Source: Schwarz, Ann. Stat. 6 (1978), 461; Cox, J. R. Stat. Soc. B 24 (1962), 406, for rivals
-        that do not contain each other.
+        InputError: fewer than two hypotheses, a risk out of range, records that cannot be fitted.
+    Source: Schwarz, Ann. Stat. 6 (1978), 461; Cox, J. R. Stat. Soc. B 24 (1962), 406, for models
+        that are not nested.
     """
     _check(hypotheses, risk, unexplained)
     explained = [hypothesis.explain(records) for hypothesis in hypotheses]
     first = min(explained, key=lambda e: e.cost)
     if math.isfinite(first.cost):
-        # A rival must not lose only because its search went astray.
+        # A hypothesis must not lose only because its search ended in a local minimum.
         explained = [
             e if e is first else min((h.explain(records, first), e), key=lambda other: other.cost)
             for h, e in zip(hypotheses, explained, strict=True)
@@ -259,33 +259,29 @@ def compare(
         return _no_result(f"fewer than two hypotheses could be fitted: {reasons}", risk)
     leader = min(usable, key=lambda k: explained[k].cost)
     evidence = _Evidence(records, explained, noise_shape(explained[leader].residuals), risk)
-    rivals = [
-        evidence.rival(h.name, h.says, e)
+    candidates = [
+        evidence.candidate(h.name, h.says, e)
         for h, e in zip(hypotheses, explained, strict=True)
     ]  # fmt: skip
-    return _judged(sorted(rivals, key=lambda rival: rival.bic), evidence, unexplained)
+    return _judged(sorted(candidates, key=lambda candidate: candidate.bic), evidence, unexplained)
 
 
 def _check(hypotheses: Sequence[Hypothesis], risk: float, unexplained: float) -> None:
     if len(hypotheses) < 2:
-        raise InputError(
-            f"{len(hypotheses)} hypotheses; allowed are two or more. Give a rival to compare with."
-        )
+        raise InputError(f"{len(hypotheses)} hypotheses; at least two are required.")
     if not 0.0 < risk < 0.5:
-        raise InputError(f"risk = {risk:g}; allowed is above 0 and below 0.5. Correct it.")
+        raise InputError(f"risk = {risk:g}; must be above 0 and below 0.5.")
     if not 0.0 < unexplained <= 1.0:
-        raise InputError(
-            f"unexplained = {unexplained:g}; allowed is above 0 and up to 1. Correct it."
-        )
+        raise InputError(f"unexplained = {unexplained:g}; must be above 0 and up to 1.")
 
 
-def _no_result(reason: str, risk: float) -> Verdict:
+def _no_result(reason: str, risk: float) -> ModelComparison:
     status = f"no result: {reason}"
-    return Verdict(status, "cannot tell", "", (), math.nan, math.nan, risk, ())
+    return ModelComparison(status, "cannot tell", "", (), math.nan, math.nan, risk, ())
 
 
 class _Evidence:
-    """Likelihoods of all explanations under one noise model."""
+    """Likelihoods of all fits under one noise model."""
 
     def __init__(
         self,
@@ -316,7 +312,7 @@ class _Evidence:
         return e.parameters * math.log(max(self.samples, 2.0)) - 2.0 * self._log_likelihood(e)
 
     def _lead(self, e: Explanation) -> float:
-        """How far the best one is ahead, in deviations at which noise alone would decide."""
+        """Lead of the best hypothesis, in standard deviations of the noise."""
         if e is self._best or e.status != "ok":
             return math.nan
         pairs = zip(e.modelled, self._best.modelled, strict=True)
@@ -325,11 +321,13 @@ class _Evidence:
         std = 2.0 * math.sqrt(apart * noise)
         return (e.cost - self._best.cost) / std if std > 0.0 else 0.0
 
-    def rival(self, name: str, says: str, e: Explanation) -> Rival:
-        """One line of the table."""
+    def candidate(self, name: str, says: str, e: Explanation) -> CandidateModel:
+        """The row of one hypothesis in the comparison."""
         if e.status != "ok":
             nan = math.nan
-            return Rival(name, says, e.status, 0, nan, nan, nan, math.inf, 0.0, nan, False, {}, {})
+            return CandidateModel(
+                name, says, e.status, 0, nan, nan, nan, math.inf, 0.0, nan, False, {}, {}
+            )
         bic = self._bic(e) - self._lowest
         lead = self._lead(e)
         extra = e.cost - self._best.cost
@@ -338,54 +336,56 @@ class _Evidence:
         if e.parameters <= self._best.parameters:
             far = lead > float(-ndtri(self.risk))
             excluded = excluded and far and extra >= self.systematic_cost
-        return Rival(
+        return CandidateModel(
             name, says, e.status, e.parameters, fit_percent(self._measured, e.modelled),
             math.sqrt(e.cost / self._spread), self._log_likelihood(e), bic, odds / self._weight,
             lead, excluded, e.estimates, e.model,
         )  # fmt: skip
 
 
-def _judged(rivals: Sequence[Rival], evidence: _Evidence, unexplained: float) -> Verdict:
-    best, others = rivals[0], rivals[1:]
-    left = [rival for rival in others if not rival.excluded]
+def _judged(
+    candidates: Sequence[CandidateModel], evidence: _Evidence, unexplained: float
+) -> ModelComparison:
+    best, others = candidates[0], candidates[1:]
+    left = [candidate for candidate in others if not candidate.excluded]
     percent = 100.0 * evidence.systematic
     notes = [
-        f"{best.name} explains best: it leaves {100.0 * best.misfit:.2g} % of the output's swing, "
-        + ", ".join(f"{r.name} {100.0 * r.misfit:.2g} %" for r in others)
-        + "."
+        f"{best.name} explains best: it leaves {100.0 * best.misfit:.2g} % of the output's "
+        "variation, " + ", ".join(f"{r.name} {100.0 * r.misfit:.2g} %" for r in others) + "."
     ]
     notes += [f"{r.name} has no fit and is not excluded: {r.status}" for r in others
               if r.status != "ok"]  # fmt: skip
     if best.misfit > 1.0 - unexplained:
-        notes.append("The output hardly follows the drive. Check the columns and the sensor.")
+        notes.append("The output hardly depends on the drive. Check the columns and the sensor.")
     supported = ""
     if evidence.systematic > unexplained and evidence.whiteness_p < evidence.risk:
         verdict = "none explains the data"
         notes.append(
-            f"Even the best one leaves a coloured {percent:.2g} % of the output's swing; allowed "
-            f"is {100.0 * unexplained:.2g} %. Check the columns, or think of another hypothesis."
+            f"Even the best hypothesis leaves a coloured {percent:.2g} % of the output's "
+            f"variation; the limit is {100.0 * unexplained:.2g} %. Check the columns, or add "
+            "another hypothesis."
         )
     elif evidence.samples < _FEWEST:
         verdict = "cannot tell"
         notes.append(
-            f"The residuals are worth {evidence.samples:.2g} independent samples; "
-            f"{_FEWEST:g} are needed. Record longer."
+            f"The residuals are equivalent to {evidence.samples:.2g} independent samples; "
+            f"at least {_FEWEST:g} are required. Record longer."
         )
     elif left:
         verdict = "cannot tell"
-        names = ", ".join(rival.name for rival in left)
+        names = ", ".join(candidate.name for candidate in left)
         notes.append(
-            f"Not excluded: {names}. The best one itself leaves a coloured {percent:.2g} %, and an "
-            "advantage within that may come from what all of them leave out. Ask "
-            "`haselab plan-experiment` for an experiment that separates them."
+            f"Not excluded: {names}. The best one leaves a coloured {percent:.2g} %, and an "
+            "advantage below that may be caused by effects that all of them neglect. Use "
+            "`haselab plan-experiment` to find an experiment that separates them."
         )
     else:
         supported = best.name
         verdict = f"supports {best.name}"
         notes.append(
-            f"The records say: {best.says}. The others are excluded at a risk of {evidence.risk:g}."
+            f"Supported: {best.says}. The others are excluded at a risk of {evidence.risk:g}."
         )
-    return Verdict(
-        "ok", verdict, supported, tuple(rivals), evidence.samples, evidence.systematic,
+    return ModelComparison(
+        "ok", verdict, supported, tuple(candidates), evidence.samples, evidence.systematic,
         evidence.risk, tuple(notes),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Ready-made rival hypotheses: the reading of a frequency, the kind of creep, one mode or two."""
+"""Ready-made hypotheses: unit of a printed frequency, kind of creep, one mode or two."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ __all__ = [
 ]
 
 QUESTIONS = ("reading", "creep", "modes")
-_PRINTED = 5.1  # natural frequency of the reference study, printed without a sure unit
-_SPREAD = 1.5  # the study's own values, 5.1 to 6.6 by its eq. 7, spread by 1.3
+_PRINTED = 5.1  # natural frequency of the reference study, printed with an ambiguous unit
+_SPREAD = 1.5  # the study's own values, 5.1 to 6.6 by its eq. 7, differ by a factor of 1.3
 
 
 @dataclass(frozen=True)
 class VoltageHypothesis:
-    """A statement in terms of the voltage plant.
+    """A hypothesis in terms of the voltage plant.
 
     Args:
-        name: a word for tables.
+        name: short name for tables.
         says: the statement.
-        structures: the statement's forms; the one that fits best speaks for it.
+        structures: structures that fulfil the statement; the best fit is used.
     """
 
     name: str
@@ -61,10 +61,10 @@ class VoltageHypothesis:
 
 @dataclass(frozen=True)
 class TransferHypothesis:
-    """A statement in terms of a transfer function.
+    """A hypothesis in terms of a transfer function.
 
     Args:
-        name: a word for tables.
+        name: short name for tables.
         says: the statement.
         structure: what is fitted.
     """
@@ -82,9 +82,11 @@ class TransferHypothesis:
         s = self.structure
         own = s.offset + (s.poles + s.slow_modes if s.initial_state else 0)
         free = sum(estimate.std > 0.0 for estimate in fit.parameters.values())
-        open_to = {name for rival in fit.rivals if rival.possible for name in rival.differs}
+        open_to = {
+            name for minimum in fit.other_minima if minimum.possible for name in minimum.differs
+        }
         estimates = {name: e for name, e in fit.parameters.items() if name not in open_to}
-        # Which of two minima is right does not matter here: they explain the records equally well.
+        # Ambiguous minima are accepted here: they explain the records equally well.
         parameters = free + own * len(records)
         return Explanation("ok", parameters, fit.modelled, fit.residuals, estimates, {})
 
@@ -96,25 +98,25 @@ def reading_hypotheses(
     powers: int = 2,
     slew_v_s: float = math.inf,
 ) -> tuple[Hypothesis, ...]:
-    """A frequency was printed without a sure unit: was it rad/s, Hz, or is it neither?
+    """Hypotheses about a frequency printed with an ambiguous unit: rad/s, Hz or neither.
 
     Args:
-        printed: the number.
-        spread: factor either side that still counts as the printed number, 1 to 2.5.
-        powers: of the static curve.
+        printed: the printed value.
+        spread: factor on either side that still counts as the printed value, 1 to 2.5.
+        powers: number of terms of the static curve.
         slew_v_s: fastest change of the drive, in V/s.
     Returns:
-        Hypotheses `rad`, `hz` and `neither`, all with the same free numbers.
+        Hypotheses `rad`, `hz` and `neither`, all with the same free parameters.
     Raises:
-        InputError: a spread under which the readings overlap.
+        InputError: a spread at which the hypotheses overlap.
     Example:
         >>> [hypothesis.name for hypothesis in reading_hypotheses()]
         ['rad', 'hz', 'neither']
     """
     if not (printed > 0.0 and 1.0 < spread < math.sqrt(2.0 * math.pi)):
         raise InputError(
-            f"printed = {printed:g}, spread = {spread:g}; allowed are above 0 and 1 to 2.5, where "
-            "rad/s and Hz stay apart. Correct them."
+            f"printed = {printed:g}, spread = {spread:g}; printed must be above 0 and spread 1 to "
+            "2.5, so that rad/s and Hz do not overlap."
         )
 
     def within(low: float | None, high: float | None) -> VoltageStructure:
@@ -147,19 +149,19 @@ def reading_hypotheses(
 
 
 def creep_hypotheses(*, powers: int = 2, slew_v_s: float = math.inf) -> tuple[Hypothesis, ...]:
-    """Creep of the shell, or of the charge in oil and silicone?
+    """Hypotheses about creep: of the shell, or of the charge in oil and silicone.
 
     Args:
         powers: of the static curve.
         slew_v_s: fastest change of the drive, in V/s.
     Returns:
-        Hypotheses `mechanical` and `electrical`, with the same free numbers.
+        Hypotheses `mechanical` and `electrical`, with the same free parameters.
     Example:
         >>> [hypothesis.name for hypothesis in creep_hypotheses()]
         ['mechanical', 'electrical']
     """
     says = {
-        "mechanical": "creep follows the force, whatever the polarity",
+        "mechanical": "creep follows the force, independent of the polarity",
         "electrical": "creep follows the voltage with its sign",
     }
     return tuple(
@@ -173,7 +175,7 @@ def creep_hypotheses(*, powers: int = 2, slew_v_s: float = math.inf) -> tuple[Hy
 def mode_hypotheses(
     creep: str = "mechanical", *, powers: int = 2, slew_v_s: float = math.inf
 ) -> tuple[Hypothesis, ...]:
-    """One resonance or two, from the drive voltage?
+    """Hypotheses of one or two resonances, with the drive voltage as input.
 
     Args:
         creep: "mechanical" or "electrical".
@@ -196,10 +198,10 @@ def mode_hypotheses(
 
 
 def linear_mode_hypotheses(slow_modes: int = 0) -> tuple[Hypothesis, ...]:
-    """One resonance or two, from an input to which the output is proportional?
+    """Hypotheses of one or two resonances, for a linear output.
 
     Args:
-        slow_modes: slow branches beside them.
+        slow_modes: slow branches in parallel to them.
     Returns:
         Hypotheses `one` and `two`.
     """
@@ -216,7 +218,7 @@ def linear_mode_hypotheses(slow_modes: int = 0) -> tuple[Hypothesis, ...]:
 
 
 def hypotheses_of(question: str, *, slew_v_s: float = math.inf) -> tuple[Hypothesis, ...]:
-    """The rivals of a question in `QUESTIONS`.
+    """The hypotheses of a question in `QUESTIONS`.
 
     Args:
         question: "reading", "creep" or "modes".
@@ -232,6 +234,4 @@ def hypotheses_of(question: str, *, slew_v_s: float = math.inf) -> tuple[Hypothe
         return creep_hypotheses(slew_v_s=slew_v_s)
     if question == "modes":
         return mode_hypotheses(slew_v_s=slew_v_s)
-    raise InputError(
-        f"question = {question}; allowed are {', '.join(QUESTIONS)}. Correct the question."
-    )
+    raise InputError(f"question = {question}; must be one of {', '.join(QUESTIONS)}.")

@@ -1,4 +1,4 @@
-"""Voltage to output with creep of one kind: one grey-box model for rival explanations."""
+"""Grey-box model from voltage to output with one kind of creep, for model comparison."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _THIN = 300  # outputs of a record in the first search
-_STEP = 1e-4  # of a searched number, for its derivative
+_STEP = 1e-4  # of a searched parameter, for its derivative
 _GOLDEN = 0.6180339887498949
-_FIRST, _LAST = 25, 15  # steps of the search on some outputs, and on all
-_END = 9.0  # logit of the place in its range, where a number has run to the end
-_LEANS = 6.0  # logit beyond which a number leans on its end
-_POLISHED = 4  # of the first numbers
-_TWINS = 2  # of these with one natural frequency
+_FIRST, _LAST = 25, 15  # steps of the search on thinned outputs, and on all
+_END = 9.0  # logit of the place in its range, where a parameter has reached its bound
+_LEANS = 6.0  # logit beyond which a parameter is near its bound
+_POLISHED = 4  # of the starting points
+_TWINS = 2  # starting points of one natural frequency that are refined
 _SPACING = 0.26  # of the natural frequencies that are tried first, in their logarithm
-_DEPTH, _CREEP_S = 1e-2, 0.4  # a time constant below this part of the record, and below this
-# time, is no creep
+_DEPTH, _CREEP_S = 1e-2, 0.4  # a time constant below this fraction of the record and below this
+# time is not creep
 _MOST_VOLTS = 100.0
 _SECOND = ("second_natural_frequency_rad_s", "second_damping_ratio", "second_share")
 _NAMES = (
@@ -56,17 +56,17 @@ _LONGEST_DELAY_S = 0.05
 
 @dataclass(frozen=True)
 class VoltageStructure:
-    """What is fitted.
+    """Structure of a voltage plant.
 
     Args:
         creep: "mechanical" or "electrical".
-        powers: of the static curve over the square of the voltage; 1 is a straight line.
-        two_modes: whether another resonance stands beside the first one.
-        lowest_rad_s: lowest natural frequency allowed, in rad/s. None: what the records reach.
-        highest_rad_s: highest natural frequency allowed, in rad/s. None: the same.
+        powers: of the static curve over the square of the voltage; 1 means a straight line.
+        two_modes: whether there is a second resonance.
+        lowest_rad_s: lowest natural frequency, in rad/s. None: lowest that the records can show.
+        highest_rad_s: highest natural frequency, in rad/s. None: highest that the records can show.
         slew_v_s: fastest change of the drive, in V/s.
     Raises:
-        InputError: an unknown creep, a number out of range.
+        InputError: an unknown creep, a value out of range.
     """
 
     creep: str = "mechanical"
@@ -78,30 +78,28 @@ class VoltageStructure:
 
     def __post_init__(self) -> None:
         if not 1 <= self.powers <= 4:
-            raise InputError(f"powers = {self.powers}; allowed is 1 to 4. Correct the structure.")
+            raise InputError(f"powers = {self.powers}; must be 1 to 4.")
         if not self.slew_v_s > 0.0:
-            raise InputError(
-                f"slew_v_s = {self.slew_v_s:g} V/s; allowed is above 0 V/s. Correct the structure."
-            )
+            raise InputError(f"slew_v_s = {self.slew_v_s:g} V/s; must be above 0 V/s.")
         low, high = self.lowest_rad_s or 1e-3, self.highest_rad_s or 1e6
         if not 0.0 < low < high:
             raise InputError(
-                f"Natural frequency from {low:g} to {high:g} rad/s; allowed is a range above 0. "
-                "Correct the structure."
+                f"Natural frequency from {low:g} to {high:g} rad/s; the range must rise and be "
+                "above 0."
             )
         VoltagePlant(self.creep, (1.0,), 1.0, 0.1)
 
     @property
     def size(self) -> int:
-        """Searched numbers."""
+        """Number of searched parameters."""
         return len(_NAMES) if self.two_modes else len(_NAMES) - len(_SECOND)
 
 
 @dataclass(frozen=True)
 class _Range:
-    """The searched numbers live between two ends; the search sees the logit of their place.
+    """Bounds of the parameters; the search uses the logit of the position between them.
 
-    An end is never reached, so a search that leans on it comes to rest.
+    A bound is never reached, so a search near it still converges.
     """
 
     structure: VoltageStructure
@@ -109,21 +107,21 @@ class _Range:
     high: Floats
 
     def numbers(self, search: Floats) -> Floats:
-        """In their own units, frequencies and times as logarithms."""
+        """Parameters from logits; frequencies and times as logarithms."""
         return np.asarray(self.low + (self.high - self.low) * expit(search))
 
     def slopes(self, search: Floats) -> Floats:
-        """Derivatives of `numbers`."""
+        """Derivatives of `numbers` with respect to the logits."""
         place = expit(search)
         return np.asarray((self.high - self.low) * place * (1.0 - place))
 
     def search(self, numbers: Floats) -> Floats:
-        """Inverse of `numbers`."""
+        """Logits of given parameters."""
         span = np.where(self.high > self.low, self.high - self.low, 1.0)
         return np.asarray(logit(np.clip((numbers - self.low) / span, 0.01, 0.99)))
 
     def near(self, plant: VoltagePlant) -> Floats:
-        """Where a plant lies, or the nearest place in the ranges."""
+        """Logits of a plant, moved inside the bounds."""
         second = dict(zip(_SECOND, plant.second_mode or (1.0, 0.1, 0.0), strict=True))
         names = _NAMES[: self.low.size]
         values = np.array([second[n] if n in second else getattr(plant, n) for n in names])
@@ -131,7 +129,7 @@ class _Range:
         return self.search(np.where(logarithmic, np.log(np.maximum(values, 1e-9)), values))
 
     def plant(self, search: Floats) -> VoltagePlant:
-        """The plant of searched numbers, with gains of one."""
+        """Plant from logits, with gains of one."""
         numbers = self.numbers(search)
         values = np.where(_LOGARITHMIC[: numbers.size], np.exp(numbers), numbers).tolist()
         named = dict(zip(_NAMES, values, strict=False))
@@ -152,8 +150,8 @@ class VoltagePlantFit(RecordFit[Record]):
     Args:
         structure: what was fitted.
         records: the experiments.
-        plant: with the fitted numbers, a number that is not told included; None without a result.
-        parameter_count: fitted numbers, each record's own included.
+        plant: with the fitted parameters, identifiable or not; None without a result.
+        parameter_count: fitted parameters, including each record's own.
         modelled: fitted output of each record. Shape `(M_r,)` each.
     """
 
@@ -186,7 +184,7 @@ class VoltagePlantFit(RecordFit[Record]):
         return records_chart("Voltage plant", self.records, self.residuals, output)
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         measured = [m + e for m, e in zip(self.modelled, self.residuals, strict=True)]
         return {
             **self.parameters,
@@ -202,19 +200,19 @@ def fit_voltage_plant(
     structure: VoltageStructure | None = None,
     near: Sequence[VoltagePlant] = (),
 ) -> VoltagePlantFit:
-    r"""Fit one voltage plant to all records; each has its own offset and initial state.
+    r"""Fit one voltage plant to all records, each with its own offset and initial state.
 
-    The resonance, the delay and the creep are searched; gains, offsets, initial motion and what is
-    left of earlier creep are solved for. No first guess is needed.
+    The resonance, the delay and the creep are searched; gains, offsets, initial motion and the
+    rest of earlier creep are solved for. No initial guess is needed.
 
     Args:
         records: experiments; the input is the drive in V, with its sign.
-        structure: what is fitted. Mechanical creep and two powers when not given.
-        near: plants to start from, for example a rival's; none: starts over all ranges.
+        structure: model structure. Default: mechanical creep and two powers.
+        near: plants to start from, for example of another hypothesis; none: starts over all ranges.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: no record, fewer samples than numbers, a drive that cannot be volts.
+        InputError: no record, fewer samples than parameters, a drive that is not in volts.
     Source: variable projection, Golub and Pereyra (1973) and Kaufman (1975).
     Example:
         >>> rng = np.random.default_rng(3)
@@ -249,7 +247,7 @@ def fit_voltage_plant(
         lambda search: on(records, search), best.search, limits, _LAST, 1e-5
     )
     if not math.isfinite(solution.cost):
-        reason = "no result: no start led to a finite model; record longer, or drive harder"
+        reason = "no result: no start led to a finite model; record longer, or use a larger drive"
         return VoltagePlantFit(status=reason, structure=structure)
     return _describe(records, ranges, solution, settled)
 
@@ -257,17 +255,17 @@ def fit_voltage_plant(
 def predicted_std(
     plant: VoltagePlant, records: Sequence[Record], noise_std: float, samples: float
 ) -> tuple[dict[str, float], float]:
-    r"""Standard deviations that a fit would reach: the inverse of Fisher's information.
+    r"""Predict the standard deviations of a fit from the inverse of Fisher's information.
 
-    Offset, initial motion and earlier creep of each record count as unknown.
+    Offset, initial motion and earlier creep of each record are unknown.
 
     Args:
-        plant: the truth as far as it is known.
+        plant: assumed true plant.
         records: planned experiments with the predicted output.
         noise_std: of one independent sample, in the unit of the output.
         samples: independent samples in all records together.
     Returns:
-        Standard deviation by name, relative but for delay and share; and the logarithm of the
+        Standard deviation by name, relative except for delay and share; and the logarithm of the
         information's determinant.
     Source: Ljung, System Identification, 2nd ed., sec. 13.3.
     """
@@ -275,7 +273,7 @@ def predicted_std(
     ranges = _ranges(records, structure)
     search = ranges.near(plant)
     columns = np.vstack(project(search, [_basis(ranges, r, search) for r in records]).columns)
-    # Derivatives of the numbers, gains by their logarithms, by what the columns are derivatives of.
+    # Derivatives of the parameters (logarithms of gains) with respect to the search variables.
     slopes = np.concatenate([ranges.slopes(search), 1.0 / np.array(plant.gains)])
     columns = columns / slopes
     scale = np.sqrt((columns**2).sum(axis=0))
@@ -293,40 +291,40 @@ def predicted_std(
 
 def _check(records: Sequence[Record], structure: VoltageStructure) -> None:
     if not records:
-        raise InputError("records is empty; allowed is one record or more. Give a record.")
+        raise InputError("records is empty. Pass at least one record.")
     if any(record.hold != "zero" for record in records):
         raise InputError(
-            "A record's input is not held between its updates; allowed here is hold = zero. Give "
+            "A record's input is not held between its updates; hold must be zero. Give "
             "the drive as the converter put it out."
         )
     count = sum(record.y.size for record in records)
     wanted = structure.size + structure.powers + 4 * len(records)
     if count < 2 * wanted:
         raise InputError(
-            f"The records hold {count} outputs; {wanted} numbers need {2 * wanted} or more. "
+            f"The records have {count} outputs; {wanted} parameters need at least {2 * wanted}. "
             "Record longer."
         )
     if all(np.ptp(record.u) == 0.0 for record in records):
         raise InputError(
-            f"The drive is {records[0].u[0]:g} V throughout, so it excites nothing; allowed is a "
-            "drive that changes. Name the right column, or record the time before a step too."
+            f"The drive is {records[0].u[0]:g} V throughout, so it excites nothing. It "
+            "must change. Name the right column, or record the time before a step too."
         )
     largest_v = max(float(np.abs(record.u).max()) for record in records)
     if largest_v > _MOST_VOLTS:
         raise InputError(
-            f"The drive reaches {largest_v:g} V; allowed is up to {_MOST_VOLTS:g} V ahead of the "
+            f"The drive reaches {largest_v:g} V; it must be at most {_MOST_VOLTS:g} V ahead of the "
             "amplifier. Give the drive, or divide by the amplifier's gain."
         )
 
 
 def spread_indices(count: int, wanted: int) -> NDArray[np.intp]:
-    """Some of `count` samples, one in each of `wanted` equal pieces, at no fixed distance.
+    """Some of `count` samples, one in each of `wanted` equal segments, irregularly spaced.
 
-    A fixed distance would fold some frequency onto another, or onto one phase.
+    Regular spacing would alias some frequencies.
 
     Args:
-        count: samples there are.
-        wanted: samples to keep, at most.
+        count: number of samples.
+        wanted: largest number of samples to keep.
     Returns:
         Rising indices, nearly as many as wanted. Shape `(W,)`.
     Example:
@@ -345,7 +343,7 @@ def _thinned(record: Record) -> Record:
 
 
 def _ranges(records: Sequence[Record], structure: VoltageStructure) -> _Range:
-    """Ends of the searched numbers."""
+    """Bounds of the searched parameters."""
     longest_s = max(record.duration_s for record in records)
     period_s = min(float(np.median(np.diff(record.output_time_s))) for record in records)
     reach = (math.log(2.0 * math.pi / longest_s), math.log(0.8 * math.pi / period_s))
@@ -369,7 +367,7 @@ def _ranges(records: Sequence[Record], structure: VoltageStructure) -> _Range:
 
 
 def _starts(ranges: _Range) -> list[Floats]:
-    """First numbers over the range of natural frequency and of creep."""
+    """Starting values over the range of natural frequency and of creep."""
     low, span = ranges.low, ranges.high - ranges.low
     known = {
         "damping_ratio": math.log(0.1),
@@ -396,7 +394,7 @@ def _starts(ranges: _Range) -> list[Floats]:
 
 
 def _columns(ranges: _Range, record: Record, search: Floats) -> tuple[Floats, Floats]:
-    """Responses with common factors, and those of a record's own past."""
+    """Responses with common factors, and those with factors of one record."""
     plant = ranges.plant(search)
     time_s = record.output_time_s
     slew_v_s = ranges.structure.slew_v_s
@@ -410,7 +408,7 @@ def _columns(ranges: _Range, record: Record, search: Floats) -> tuple[Floats, Fl
 
 
 def _free(plant: VoltagePlant, time_s: Floats) -> tuple[Floats, Floats]:
-    """Free motion from a displacement, and from a rate that is as large in the swing."""
+    """Free motion from a displacement, and from a velocity of equal amplitude."""
     first, second = Plant(0.0, plant.natural_frequency_rad_s, plant.damping_ratio).poles[:2]
     if first.imag:
         swing = np.exp(first * time_s)
@@ -423,7 +421,7 @@ def _free(plant: VoltagePlant, time_s: Floats) -> tuple[Floats, Floats]:
 
 
 def _apart(solutions: Sequence[Solution]) -> list[Floats]:
-    """The best starts, no more than two of one natural frequency."""
+    """The best starts, at most two of one natural frequency."""
     kept: list[Floats] = []
     for solution in solutions:
         if sum(other[_FREQUENCY] == solution.search[_FREQUENCY] for other in kept) < _TWINS:
@@ -434,7 +432,7 @@ def _apart(solutions: Sequence[Solution]) -> list[Floats]:
 
 
 def _basis(ranges: _Range, record: Record, search: Floats, *, sloped: bool = True) -> Basis:
-    """Functions of one record and their derivatives, by differences."""
+    """Functions of one record and their numerical derivatives."""
     shared, own = _columns(ranges, record, search)
     here = np.hstack([shared, own])
     slopes = np.zeros((search.size, record.y.size, shared.shape[1] + own.shape[1]))
@@ -447,7 +445,7 @@ def _basis(ranges: _Range, record: Record, search: Floats, *, sloped: bool = Tru
 def _describe(
     records: Sequence[Record], ranges: _Range, solution: Solution, settled: bool
 ) -> VoltagePlantFit:
-    """Numbers with intervals."""
+    """Parameters with intervals."""
     structure, size = ranges.structure, solution.search.size
     parameters = size + solution.shared.size + sum(factors.size for factors in solution.own)
     covariance = coloured_covariance(solution.columns, solution.residuals, parameters)
@@ -455,13 +453,13 @@ def _describe(
     std[:size] *= ranges.slopes(solution.search)
     numbers = ranges.numbers(solution.search)
     estimates: dict[str, Estimate] = {}
-    notes = [] if settled else ["The search ended before it came to rest: a flat valley."]
+    notes = [] if settled else ["The search ended before it converged: the minimum is flat."]
     for k, (at, spread) in enumerate(zip(numbers, std, strict=False)):
         name = _NAMES[k]
         unit = "rad/s" if name.endswith("_rad_s") else "s" if name.endswith("_s") else ""
         at_end = abs(float(solution.search[k])) > _LEANS
-        told = spread < (1.0 if _LOGARITHMIC[k] else 0.5)
-        if not at_end and told:
+        identifiable = spread < (1.0 if _LOGARITHMIC[k] else 0.5)
+        if not at_end and identifiable:
             estimates[name] = (
                 Estimate.lognormal(math.exp(at), spread, unit)
                 if _LOGARITHMIC[k]
@@ -469,8 +467,8 @@ def _describe(
             )
         else:
             estimates[name] = Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
-            where = "ran to the end of its range" if at_end else "is not identifiable here"
-            notes.append(f"{name} {where}: these records do not tell it.")
+            where = "reached the end of its range and is" if at_end else "is"
+            notes.append(f"{name} {where} not identifiable.")
     for k, (gain, spread) in enumerate(zip(solution.shared, std[size:], strict=True), start=1):
         estimates[f"gain_{k}"] = Estimate.normal(gain, spread, f"1/V^{2 * k}")
     modelled = tuple(r.y - e for r, e in zip(records, solution.residuals, strict=True))

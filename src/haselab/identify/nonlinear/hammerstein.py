@@ -28,20 +28,20 @@ Floats = NDArray[np.float64]
 DEGREES = (2, 3)
 _STEPS = 20
 _HALVINGS = 6
-_AT_REST = 1e-4  # of the residuals' variance: gain of a step that ends the search
+_AT_REST = 1e-4  # relative decrease of the residuals' variance that ends the search
 _WHITE = 1e-3  # whiteness above which no other start is tried
 
 
 @dataclass(frozen=True)
 class _Curve:
-    r"""$v = \sum_k c_k \phi_k(d)$, $d = (u - m)/h$; the inputs make the polynomials orthogonal.
+    r"""$v = \sum_k c_k \phi_k(d)$, $d = (u - m)/h$; with polynomials orthogonal on the inputs.
 
     Args:
         middle: m.
         half: h.
         basis: factors of $d, d^2, \dots$ of each polynomial. Shape `(D, D)`.
-        factors: c; that of `lead` is 1, because the gain of the linear part multiplies all.
-        lead: the largest one.
+        factors: c; that of `lead` is 1, since the gain of the linear part multiplies all.
+        lead: position of the largest factor.
     """
 
     middle: float
@@ -84,7 +84,7 @@ class _Curve:
     def applied(
         self, records: Sequence[Record], factors: Floats | None = None
     ) -> list[Record] | None:
-        """The records behind the curve; None where it makes an input constant."""
+        """The records after the curve; None where an input becomes constant."""
         out = []
         for r in records:
             before = r.input_before
@@ -97,7 +97,7 @@ class _Curve:
         return out
 
     def parts(self, records: Sequence[Record]) -> list[list[Record] | None]:
-        """The records behind each polynomial of the basis."""
+        """The records after each polynomial of the basis."""
         return [self.applied(records, row) for row in np.eye(self.factors.size)]
 
     def about(self, at: float) -> Floats:
@@ -124,7 +124,7 @@ class _Hammerstein:
     linear: TransferFit  # behind the curve
 
     def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
-        """Outputs by the numbers that fit the first three quarters."""
+        """Outputs simulated with a fit to the first three quarters."""
         early = shortened(records)
         if early is None:
             return None
@@ -133,7 +133,7 @@ class _Hammerstein:
         whole = None if found is None else found.curve.applied(records)
         if found is None or whole is None:
             return None
-        # An offset of the curve is part of the record's own offset, which the fit has found.
+        # An offset of the curve is part of the record's own offset, which has been fitted.
         return TransferProblem(self.layout, whole, delay_margin_s(whole)).predict(found.best.found)
 
     def simulated(self, u: Floats, rate_hz: float) -> Floats:
@@ -164,15 +164,15 @@ def fit_hammerstein(
 
     Args:
         records: experiments.
-        structure: of the linear part. One resonance with a delay when not given.
+        structure: structure of the linear part. Default: one resonance with a delay.
         degree: 2 or 3.
-        known: searched numbers of a linear fit to begin with; its delay is then taken for right.
+        known: searched parameters of a linear fit to start from; its delay is then kept.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: a degree that is not offered.
-    Source: output-error least squares by variable projection, the factors of the curve beside the
-        poles; Ljung, System Identification (1999), section 5.2.
+        InputError: a degree other than 2 or 3.
+    Source: output-error least squares by variable projection, the factors of the curve together
+        with the poles; Ljung, System Identification (1999), section 5.2.
     Example:
         >>> from haselab.models import Plant
         >>> rng = np.random.default_rng(7)
@@ -186,13 +186,14 @@ def fit_hammerstein(
     structure = structure or TransferStructure()
     layout, kind = layout_of(structure), f"hammerstein-{degree}"
     if degree not in DEGREES:
-        raise InputError(f"degree = {degree}; allowed are 2 and 3. Choose one.")
+        raise InputError(f"degree = {degree}; must be 2 or 3.")
     levels = np.unique(np.concatenate([r.u for r in records]))
     if levels.size <= degree:
         return no_fit(
             structure,
             kind,
-            f"the input has {levels.size} levels, a curve of degree {degree} needs {degree + 1}",
+            f"the input has {levels.size} levels, but a curve of degree {degree} needs "
+            f"{degree + 1}",
         )
     straight = _Curve.over(records, degree, offset=structure.offset)
     units = [straight.turned(row) for row in np.eye(degree)]
@@ -203,7 +204,7 @@ def fit_hammerstein(
         if found is None:
             continue
         solutions.append(found)
-        if not known:  # its delay among all delays
+        if not known:  # search all delays
             again = _searched(layout, records, found.curve, [])
             solutions += [] if again is None else [again]
         if solutions[-1].best.whiteness_p > _WHITE:
@@ -214,7 +215,7 @@ def fit_hammerstein(
 
 
 def _likely(curve: _Curve, records: Sequence[Record]) -> _Curve:
-    """The curve of a model of impulse responses, one for each polynomial, that is nearest.
+    """Initial curve from a model with one impulse response for each polynomial.
 
     Source: Bai, Automatica 34 (1998), 333.
     """
@@ -233,9 +234,9 @@ def _likely(curve: _Curve, records: Sequence[Record]) -> _Curve:
 def _searched(
     layout: Layout, records: Sequence[Record], curve: _Curve, known: Sequence[Floats]
 ) -> _Solution | None:
-    """Gauss-Newton steps in curve and poles together; each ends with a search for the poles."""
-    bent = curve.applied(records)
-    best = None if bent is None else best_fit(layout, bent, known)
+    """Gauss-Newton steps in curve and poles together; each is followed by a search of the poles."""
+    curved = curve.applied(records)
+    best = None if curved is None else best_fit(layout, curved, known)
     if best is None:
         return None
     margin_s = delay_margin_s(records)
@@ -248,7 +249,7 @@ def _searched(
         z = np.vstack(columns.sensitivities)
         step = np.linalg.lstsq(z, np.concatenate(columns.residuals), rcond=1e-12)[0]
         size = best.found.search.size
-        # The output is linear in the gain times the curve, so both move together.
+        # The output is linear in the gain times the curve, so both change together.
         shared = best.found.shared
         grown = float(step[size : size + shared.size] @ shared) / float(shared @ shared)
         change = np.zeros(curve.factors.size)
@@ -257,11 +258,11 @@ def _searched(
         for halving in range(_HALVINGS):
             part = 0.5**halving
             turned = curve.turned((1.0 + part * grown) * curve.factors + part * change)
-            bent = turned.applied(records)
-            if bent is None:
+            curved = turned.applied(records)
+            if curved is None:
                 continue
             start = np.clip(best.found.search + part * step[:size], *best.bounds)
-            found = best_fit(layout, bent, [start])
+            found = best_fit(layout, curved, [start])
             if found is not None and found.found.cost < best.found.cost:
                 break
             found = None
@@ -295,7 +296,7 @@ def _extended(curve: _Curve, problems: Sequence[TransferProblem | None], best: B
 
 
 def _described(layout: Layout, records: Sequence[Record], at: _Solution) -> NonlinearFit:
-    """Numbers with intervals about the mean input."""
+    """Parameters with intervals about the mean input."""
     found, curve, structure = at.best.found, at.curve, layout.structure
     own = sum(factors.size for factors in found.own)
     degree, powers = curve.factors.size, curve.factors.size - 1
@@ -364,7 +365,7 @@ def _described(layout: Layout, records: Sequence[Record], at: _Solution) -> Nonl
     )
     operation = f"{operating:.4g}"
     return NonlinearFit(
-        status="ok" if found.settled else "no result: the search did not come to rest",
+        status="ok" if found.settled else "no result: the search did not converge",
         structure=structure,
         parameters=estimates,
         covariance=covariance,

@@ -1,4 +1,4 @@
-"""What a fit with a static curve or a nonlinear spring has beyond a linear transfer function."""
+"""Result of a fit with a static curve or a nonlinear spring."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ __all__ = ["Nonlinear", "NonlinearFit", "cut", "no_fit", "remarks", "shortened"]
 
 Floats = NDArray[np.float64]
 _COLOURED = 0.05
-_HELD_OUT = 0.25  # of each record, for the check on rows that were not fitted
+_HELD_OUT = 0.25  # share of each record that is held out for validation
 
 
 class Nonlinear(Protocol):
     """A nonlinear model that can be fitted to some outputs and simulated on all."""
 
     def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
-        """Outputs by the numbers that fit the first three quarters; None: no fit."""
+        """Outputs simulated with a fit to the first three quarters; None: no fit."""
 
     def simulated(self, u: Floats, rate_hz: float) -> Floats:
         """Output for a new input, from rest at the input 0."""
@@ -45,16 +45,16 @@ class Nonlinear(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class NonlinearFit(TransferFit):
-    """A linear part with one nonlinearity; `gain`, poles and zeros are those for small motions.
+    """A linear part with one nonlinearity; `gain`, poles and zeros are those of the linearisation.
 
     Args:
         kind: its name, see `NONLINEAR` of `transfer_nonlinear`.
-        equation: the model in standard terms.
-        operating_input: input about which the linear part is the model for small changes.
+        equation: the model equation.
+        operating_input: input about which the linear part is valid.
         curve: names of the numbers of the nonlinearity, which `parameters` holds.
         fitted_records: the experiments.
-        count: of all fitted numbers.
-        model: what was fitted, for the check on rows that were not.
+        count: number of all fitted parameters.
+        model: fitted model, for validation on the held-out rows.
     """
 
     kind: str = ""
@@ -72,7 +72,7 @@ class NonlinearFit(TransferFit):
 
     @property
     def parameter_count(self) -> int:
-        """Count of all fitted numbers, the state and offset of each record included."""
+        """Count of all fitted parameters, the state and offset of each record included."""
         return self.count
 
     @cached_property
@@ -86,7 +86,7 @@ class NonlinearFit(TransferFit):
 
     @cached_property
     def validation_errors(self) -> list[Floats] | None:
-        """Errors of that simulation; None where the rest is too short."""
+        """Errors of the simulation of the last quarter; None where the rest is too short."""
         if self.model is None or any(cut(r) < 8 for r in self.records):
             return None
         modelled = self.model.simulated_after(self.records)
@@ -96,12 +96,12 @@ class NonlinearFit(TransferFit):
 
     @cached_property
     def input_correlation_p(self) -> float:
-        """Probability that the residuals have nothing to do with the input."""
+        """Probability of such residuals if they are uncorrelated with the input."""
         return input_correlation_p(self.records, self.residuals) if self.records else math.nan
 
     @property
     def linear(self) -> TransferFit:
-        """The linear part about the operating point, its covariance included.
+        """The linear part about the operating point, with its covariance.
 
         Raises:
             ResultError: the fit has no result, or the slope of the curve is not different from 0.
@@ -112,7 +112,7 @@ class NonlinearFit(TransferFit):
         if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
             raise ResultError(
                 f"The slope of the output over the input at {self.operating_input:.4g} does not "
-                "differ from 0, so no linear model describes small changes there. Record about "
+                "differ from 0, so no linear model describes small changes there. Record around "
                 "the input that the loop will use."
             )
         names = [name for name in self.parameters if name not in self.curve]
@@ -156,11 +156,11 @@ class NonlinearFit(TransferFit):
 
     @property
     def posterior(self) -> PlantPosterior:
-        """The numbers of the linear part with their covariance."""
+        """The parameters of the linear part with their covariance."""
         return self.linear.posterior
 
     def answer(self) -> JsonObject:
-        """The keys of a transfer function for small motions, and the nonlinearity."""
+        """The JSON keys of the linearised transfer function, and the nonlinearity."""
         linear = [name for name in self.parameters if name not in self.curve]
         at = [list(self.parameters).index(name) for name in linear]
         table = {name: self.parameters[name] for name in linear}
@@ -177,26 +177,26 @@ class NonlinearFit(TransferFit):
 
 
 def cut(record: Record) -> int:
-    """Count of outputs before those that are held out."""
+    """Number of outputs before the held-out part."""
     return int((1.0 - _HELD_OUT) * record.y.size)
 
 
 def shortened(records: Sequence[Record]) -> list[Record] | None:
-    """The records without the outputs that are held out; None where the rest is too short."""
+    """The records without the held-out part; None where the rest is too short."""
     if any(cut(r) < 8 or np.ptp(r.y[: cut(r)]) == 0.0 for r in records):
         return None
     return [replace(r, y=r.y[: cut(r)], output_time_s=r.output_time_s[: cut(r)]) for r in records]
 
 
 def remarks(whiteness_p: float, gain: Estimate) -> list[str]:
-    """What limits the use of a nonlinear fit and of its linear part."""
+    """Notes on limitations of a nonlinear fit and of its linear part."""
     said = []
     if whiteness_p < _COLOURED:
-        said.append("The residuals are not white: the model leaves something unexplained.")
+        said.append("The residuals are not white: the model does not explain everything.")
     if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
         said.append(
             "The gain does not differ from 0 at the operating point: there is no linear model to "
-            "design with. Record about the input that the loop will use."
+            "design with. Record around the input that the loop will use."
         )
     return said
 

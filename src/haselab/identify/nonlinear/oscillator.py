@@ -27,24 +27,24 @@ _AT = _identify.OSCILLATOR  # places among the numbers of oscillator.h
 _PLACES = (_AT["log_omega"], _AT["log_zeta"], _AT["gain"], _AT["delay"])
 _SPRING = {2: _AT["q2"], 3: _AT["q3"]}
 _BEGIN = [_AT["start"], _AT["rate"]]
-_SHARES = (0.0, 0.1, 0.4, 1.5, -0.1, -0.4)  # of the spring's force that is cubic
-_FIRST = 3000  # outputs on which starts are compared
+_SHARES = (0.0, 0.1, 0.4, 1.5, -0.1, -0.4)  # cubic share of the spring's force
+_FIRST = 3000  # outputs used to compare starts
 _FIRST_STEPS = 8
 _STEPS = 60
 _WHITE = 1e-3  # whiteness above which no other start is tried
 _KEPT = 2
-_AT_REST = 1e-4  # of the residuals' variance: gain of a step that ends the search
-_MOST = 1e4  # of the output's swing: a motion beyond runs away
+_AT_REST = 1e-4  # relative decrease of the residuals' variance that ends the search
+_MOST = 1e4  # of the output's span: a larger motion has diverged
 
 
 @dataclass(frozen=True)
 class _Oscillator:
-    """Which numbers are searched: the plant's free ones, those of the curve, those of each record.
+    """Searched parameters: free ones of the plant, of the curve, and of each record.
 
     Args:
-        structure: of the linear part; its fixed numbers stay.
+        structure: of the linear part; its fixed parameters are kept.
         powers: of the spring, or of the curve of the output.
-        spring: whether the spring has them, not the output.
+        spring: whether they belong to the spring, not the output.
     """
 
     structure: TransferStructure
@@ -60,28 +60,28 @@ class _Oscillator:
 
     @property
     def given(self) -> Floats:
-        """Fixed numbers of the plant as they are searched, else NaN. Shape `(4,)`."""
+        """Fixed parameters of the plant in searched form, else NaN. Shape `(4,)`."""
         layout = layout_of(self.structure)
         omega, zeta, delay = layout.template
         return np.array([omega, zeta, layout.factor_template[0], delay])
 
     @property
     def free(self) -> NDArray[np.intp]:
-        """Positions of the plant's numbers that are searched."""
+        """Positions of the plant's free parameters."""
         return np.flatnonzero(np.isnan(self.given))
 
     @property
     def own(self) -> int:
-        """Numbers of one record: where it starts, and its offset."""
+        """Number of parameters of one record: initial state and offset."""
         return 2 * self.structure.initial_state + self.structure.offset
 
     @property
     def shared(self) -> int:
-        """Numbers that all records have in common."""
+        """Number of parameters common to all records."""
         return self.free.size + len(self.powers)
 
     def names(self) -> tuple[str, ...]:
-        """Names of the numbers of the nonlinearity."""
+        """Names of the nonlinearity's parameters."""
         stem = "stiffness_ratio" if self.spring else "output_curve"
         return tuple(f"{stem}_{k}" for k in self.powers)
 
@@ -96,7 +96,7 @@ class _End:
 
 
 class _Search:
-    """Least squares over some records; numbers as in `_Oscillator`."""
+    """Least squares over several records; parameters as in `_Oscillator`."""
 
     def __init__(self, model: _Oscillator, records: Sequence[Record]) -> None:
         self.model, self.records = model, records
@@ -105,7 +105,7 @@ class _Search:
         self._largest = _MOST * max(float(np.ptp(r.y)) for r in records)
 
     def at(self, numbers: Floats) -> _End | None:
-        """Residuals and sensitivities; None where the motion runs away."""
+        """Residuals and sensitivities; None where the motion diverges."""
         size = numbers.size
         residuals, columns, cost = [], [], 0.0
         for i, r in enumerate(self.records):
@@ -157,7 +157,7 @@ class _Search:
         return modelled, z
 
     def minimise(self, start: Floats, bounds: tuple[Floats, Floats], steps: int) -> _End | None:
-        """Levenberg-Marquardt search, the numbers of the plant inside their bounds."""
+        """Levenberg-Marquardt search, with bounds on the parameters of the plant."""
         end = self.at(start)
         if end is None:
             return None
@@ -195,7 +195,7 @@ class _Fitted:
     bounds: tuple[Floats, Floats]
 
     def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
-        """Outputs by the numbers that fit the first three quarters."""
+        """Outputs simulated with a fit to the first three quarters."""
         early = shortened(records)
         if early is None:
             return None
@@ -237,7 +237,7 @@ def fit_spring(
     powers: tuple[int, ...] = (3,),
     linear: Best | None = None,
 ) -> NonlinearFit:
-    r"""Fit a resonance whose spring is cubic (Duffing's equation) to all records.
+    r"""Fit a resonance with a cubic spring (Duffing's equation) to all records.
 
     $\ddot x + 2\zeta\omega_n\dot x + \omega_n^2(x + q_2 x^2 + q_3 x^3) = g\,\omega_n^2 u(t - T_d)$,
     $y = x + y_0$: `stiffness_ratio_2` and `stiffness_ratio_3` are $q_2 = k_2/k$ and $q_3 = k_3/k$
@@ -245,9 +245,9 @@ def fit_spring(
 
     Args:
         records: experiments.
-        structure: two poles, no zeros or slow branches; its fixed numbers stay.
+        structure: two poles, no zeros or slow branches; its fixed parameters are kept.
         powers: `(3,)`, or `(2, 3)` for a spring that differs between both directions.
-        linear: the linear fit to begin with; None: it is searched.
+        linear: linear fit to start from; None: it is fitted first.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -273,15 +273,15 @@ def fit_output_curve(
     powers: tuple[int, ...] = (2, 3),
     linear: Best | None = None,
 ) -> NonlinearFit:
-    r"""Fit a resonance whose output is seen through a curve (Wiener model) to all records.
+    r"""Fit a resonance followed by a static curve of the output (Wiener model) to all records.
 
     $y = x + q_2 x^2 + q_3 x^3 + y_0$, with $x$ the output of the linear part
 
     Args:
         records: experiments.
-        structure: two poles, no zeros or slow branches; its fixed numbers stay.
+        structure: two poles, no zeros or slow branches; its fixed parameters are kept.
         powers: of the curve, 2 or 3 each.
-        linear: as of `fit_spring`.
+        linear: as in `fit_spring`.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -305,7 +305,7 @@ def _fit(
             "needs 2, 0 and 0. Fit one resonance."
         )
     if not powers or not set(powers) <= {2, 3}:
-        raise InputError(f"powers = {powers}; allowed are 2 and 3. Correct them.")
+        raise InputError(f"powers = {powers}; must be 2 or 3.")
     model = _Oscillator(structure, powers, spring)
     kind = model.kind
     layout = layout_of(structure)
@@ -328,7 +328,7 @@ def _fit(
         ends = [found, *(whole.minimise(e.numbers, bounds, _STEPS) for e in best)]
         found = min((e for e in ends if e is not None), key=lambda e: e.cost, default=None)
     if found is None:
-        return no_fit(structure, kind, "the motion of every start runs away")
+        return no_fit(structure, kind, "the motion diverges from every start")
     return _described(model, settled, found, bounds)
 
 
@@ -342,7 +342,7 @@ def _begin(record: Record) -> Record:
 def _bounds(
     model: _Oscillator, low: Floats, high: Floats, searched: NDArray[np.intp]
 ) -> tuple[Floats, Floats]:
-    """Those of the linear search, in the order of the plant's numbers; a gain has none."""
+    """Bounds of the linear search, in the order of the plant's parameters; a gain has none."""
     place = {0: 0, 1: 1, 2: 3}  # of a layout's numbers
     lowest, highest = np.full(4, -np.inf), np.full(4, np.inf)
     for k, at in enumerate(searched):
@@ -351,7 +351,7 @@ def _bounds(
 
 
 def _starts(model: _Oscillator, linear: Best, records: Sequence[Record]) -> list[Floats]:
-    """The linear fit, its stiffness split into a linear and a cubic part in several ways.
+    """Starts from the linear fit, with several splits of its stiffness into linear and cubic.
 
     For the same mean energy a cubic part $q_3$ adds $3 q_3 \\langle x^2\\rangle$ to the stiffness.
     """
@@ -360,7 +360,7 @@ def _starts(model: _Oscillator, linear: Best, records: Sequence[Record]) -> list
     factors = layout.factor_template.copy()
     factors[np.isnan(factors)] = linear.found.shared
     modelled = [r.y - e for r, e in zip(linear.records, linear.columns.residuals, strict=True)]
-    # What the output of the model is without its own offset is not known here: its mean is close.
+    # The model output without its offset is not known here; its mean is a close approximation.
     moved = [m - m.mean() for m in modelled]
     swing = float(np.mean(np.concatenate(moved) ** 2))
     starts = []
@@ -392,7 +392,7 @@ def _described(
     freed, own = _freed(found.columns, shared, model.own)
     inner = coloured_covariance(freed, found.residuals, found.numbers.size, own)
     if not np.isfinite(inner).all():
-        return no_fit(structure, kind, "the numbers are not identifiable")
+        return no_fit(structure, kind, "the parameters are not identifiable")
     plant = model.given.copy()
     plant[model.free] = found.numbers[: model.free.size]
     jacobian = np.zeros((4 + len(model.powers), shared))
@@ -411,7 +411,7 @@ def _described(
     curve = found.numbers[model.free.size : shared]
     for k, name in enumerate(model.names()):
         estimates[name] = Estimate.normal(float(curve[k]), float(std[4 + k]), "")
-    order = [0, 1, 3, 2, *range(4, 4 + curve.size)]  # as a linear fit has them
+    order = [0, 1, 3, 2, *range(4, 4 + curve.size)]  # order of a linear fit
     names = list(estimates)
     estimates = {names[k]: estimates[names[k]] for k in order}
     modelled = [r.y - e for r, e in zip(records, found.residuals, strict=True)]
@@ -427,7 +427,7 @@ def _described(
         else f"y = x + {terms} + offset, x = G(s) u with one resonance (Wiener)"
     ).replace("+ -", "- ")
     return NonlinearFit(
-        status="ok" if found.settled else "no result: the search did not come to rest",
+        status="ok" if found.settled else "no result: the search did not converge",
         structure=structure,
         parameters=estimates,
         covariance=covariance[np.ix_(order, order)],
@@ -436,8 +436,8 @@ def _described(
         residual_whiteness_p=whiteness_p(found.residuals),
         residuals=found.residuals,
         notes=(
-            "Gain, natural frequency and damping ratio are the linear model for small motions "
-            "about the input 0.",
+            "Gain, natural frequency and damping ratio belong to the linear model for small "
+            "motions about the input 0.",
             *remarks(whiteness_p(found.residuals), estimates["gain"]),
         ),
         kind=kind,
@@ -453,7 +453,7 @@ def _described(
 def _freed(
     columns: Sequence[Floats], shared: int, own: int
 ) -> tuple[list[Floats], list[Floats] | None]:
-    """Common sensitivities freed of each record's own functions, and these, orthonormal."""
+    """Common sensitivities orthogonal to each record's own functions, and these functions."""
     if not own:
         return [z[:, :shared] for z in columns], None
     freed, bases = [], []

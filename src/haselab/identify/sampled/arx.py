@@ -28,7 +28,7 @@ _MOST = {"na": 12, "nb": 64, "nk": 1000}
 _SEARCH_ORDER = 4
 _SEARCH_DELAY = 12
 _WHITE = 0.05
-_BIASED = 10.0  # per cent of fit that prediction may be better than simulation without a note
+_BIASED = 10.0  # per cent by which prediction may fit better than simulation without a note
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class ArxOrders:
     """Size of a difference equation.
 
     Args:
-        na: outputs that it remembers.
-        nb: inputs that it remembers.
-        nk: samples from an input to the first output that knows of it.
+        na: number of earlier outputs.
+        nb: number of inputs.
+        nk: delay in samples from an input to the first output that depends on it.
     Raises:
-        InputError: an order that is not allowed.
+        InputError: an order out of range.
     """
 
     na: int = 2
@@ -51,13 +51,11 @@ class ArxOrders:
         for name, least in (("na", 0), ("nb", 1), ("nk", 0)):
             value, most = getattr(self, name), _MOST[name]
             if not least <= value <= most:
-                raise InputError(
-                    f"{name} = {value}; allowed is {least} to {most}. Choose an order in between."
-                )
+                raise InputError(f"{name} = {value}; must be {least} to {most}.")
 
     @property
     def memory(self) -> int:
-        """Samples before the first that the equation can predict."""
+        """Number of samples before the first predicted one."""
         return max(self.na, self.nb + self.nk - 1)
 
 
@@ -72,10 +70,10 @@ class ArxFit(RecordFit[Record]):
         orders: its size.
         model: the equation about the operating point; None without a result.
         record: what was fitted.
-        operating_point: input and output that were taken off.
+        operating_point: input and output that were subtracted.
         fit_percent: of the simulated output, initial state fitted.
         prediction_fit_percent: of the output predicted one sample ahead.
-        validation_fit_percent: simulation of the last quarter from a fit to the first three.
+        validation_fit_percent: simulation of the last quarter with a fit to the first three.
         residual_whiteness_p: of the prediction errors.
         aic: Akaike's criterion.
         bic: Schwarz's criterion.
@@ -99,17 +97,17 @@ class ArxFit(RecordFit[Record]):
 
     @property
     def a(self) -> tuple[Estimate, ...]:
-        """Factors of the earlier outputs."""
+        """Coefficients of the earlier outputs."""
         return tuple(self.parameters.values())[: self._fitted().a.size]
 
     @property
     def b(self) -> tuple[Estimate, ...]:
-        """Factors of the inputs."""
+        """Coefficients of the inputs."""
         return tuple(self.parameters.values())[self._fitted().a.size :]
 
     @property
     def static_gain(self) -> Estimate:
-        """Output per input at rest."""
+        """Static gain: output per input in steady state."""
         model = self._fitted()
         below = float(model.denominator.sum())
         by_a = np.full(self.orders.na, -model.static_gain / below)
@@ -120,7 +118,7 @@ class ArxFit(RecordFit[Record]):
     def modes(self) -> tuple[JsonObject, ...]:
         """Poles in continuous time, the slowest first, with frequency and damping or time constant.
 
-        A pole at z <= 0 has none and is left out.
+        A pole at z <= 0 has no counterpart and is left out.
         """
         model, found = self._fitted(), []
         for z in sorted(model.poles, key=lambda pole: -abs(pole)):
@@ -134,23 +132,27 @@ class ArxFit(RecordFit[Record]):
                 "pole_rad_s": [float(s.real), float(s.imag)],
             }
             if real:
-                mode["time_constant_s"] = self._told(-1.0 / s.real, (slope / s**2).real, "s")
+                mode["time_constant_s"] = self._mode_estimate(
+                    -1.0 / s.real, (slope / s**2).real, "s"
+                )
             else:
                 size, turned = abs(s), slope * np.conj(s)
-                mode["natural_frequency_rad_s"] = self._told(size, turned.real / size, "rad/s")
+                mode["natural_frequency_rad_s"] = self._mode_estimate(
+                    size, turned.real / size, "rad/s"
+                )
                 damping = -s.real / size
                 by = -slope.real / size - damping * turned.real / size**2
-                mode["damping_ratio"] = self._told(damping, by, "")
+                mode["damping_ratio"] = self._mode_estimate(damping, by, "")
             found.append(mode)
         return tuple(found)
 
     def _pole_slope(self, z: complex) -> NDArray[np.complex128]:
-        """Derivatives of a pole by `a`."""
+        """Derivatives of a pole with respect to `a`."""
         na = self.orders.na
         by_z = np.polyval(np.polyder(self._fitted().denominator), z)
         return np.asarray([-(z ** (na - j)) / by_z for j in range(1, na + 1)])
 
-    def _told(self, value: float, slope: Floats, unit: str) -> Estimate:
+    def _mode_estimate(self, value: float, slope: Floats, unit: str) -> Estimate:
         part = self.covariance[: self.orders.na, : self.orders.na]
         return Estimate.normal(value, math.sqrt(max(float(slope @ part @ slope), 0.0)), unit)
 
@@ -176,15 +178,15 @@ class ArxFit(RecordFit[Record]):
         return sampled_chart("ARX model", self.record, self.residuals[0], names)
 
     def answer(self) -> JsonObject:
-        """Numbers by name, for JSON."""
-        told = self.succeeded
+        """The result as a dictionary for JSON."""
+        usable = self.succeeded
         return {
             "orders": {"na": self.orders.na, "nb": self.orders.nb, "nk": self.orders.nk},
-            "a": list(self.a) if told else None,
-            "b": list(self.b) if told else None,
-            "static_gain": self.static_gain if told else None,
-            "modes": list(self.modes) if told else None,
-            "continuous": self._continuous() if told else None,
+            "a": list(self.a) if usable else None,
+            "b": list(self.b) if usable else None,
+            "static_gain": self.static_gain if usable else None,
+            "modes": list(self.modes) if usable else None,
+            "continuous": self._continuous() if usable else None,
             "operating_point": list(self.operating_point),
             "fit_percent": self.fit_percent,
             "prediction_fit_percent": self.prediction_fit_percent,
@@ -215,14 +217,14 @@ def fit_arx(
 
     $\min \sum_k (y_k + \sum_i a_i y_{k-i} - \sum_j b_j u_{k-n_k-j+1})^2$
 
-    The best for a plant whose disturbance passes through the same poles. Where noise is added by
-    the sensor it is biased, the more the faster the sampling: take `fit_transfer` then.
+    This is optimal if the disturbance passes through the poles of the plant. If noise is added by
+    the sensor, the fit is biased, the more the faster the sampling; use `fit_transfer` then.
 
     Args:
         records: one record whose input and output were sampled together (`Record.sampled`).
         orders: size of the equation. None: na and nb up to 4 and nk from 1 to 12 are tried.
         criterion: "bic" or "aic", by which the orders are chosen.
-        remove_means: take the means off first; else the zeros of the columns are the rest.
+        remove_means: subtract the means first; otherwise zero is the operating point.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -241,9 +243,7 @@ def fit_arx(
         True
     """
     if criterion not in _CRITERIA:
-        raise InputError(
-            f"criterion = {criterion}; allowed are {', '.join(_CRITERIA)}. Choose one of them."
-        )
+        raise InputError(f"criterion = {criterion}; must be one of {', '.join(_CRITERIA)}.")
     record = driven(records)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
@@ -252,7 +252,7 @@ def fit_arx(
     least = orders.memory + 2 * (orders.na + orders.nb)
     if inputs.size <= least:
         raise InputError(
-            f"The record has {inputs.size} samples; allowed are more than {least} for na = "
+            f"The record has {inputs.size} samples; it must have more than {least} for na = "
             f"{orders.na}, nb = {orders.nb}, nk = {orders.nk}. Record longer, or lower the orders."
         )
     return _fit(record, inputs, outputs, orders, point)
@@ -267,29 +267,29 @@ def _regressors(u: Floats, y: Floats, orders: ArxOrders, first: int) -> Floats:
 
 
 def _solved(u: Floats, y: Floats, orders: ArxOrders) -> tuple[Floats, Floats, Floats]:
-    """Numbers, their covariance and the prediction errors."""
+    """Coefficients, their covariance and the prediction errors."""
     columns = _regressors(u, y, orders, orders.memory)
     target = y[orders.memory :]
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0.0] = 1.0
     left, sizes, right = np.linalg.svd(columns / scale, full_matrices=False)
-    told = sizes > 1e-12 * sizes[0]
-    sizes = np.where(told, sizes, np.inf)
+    regular = sizes > 1e-12 * sizes[0]
+    sizes = np.where(regular, sizes, np.inf)
     numbers = right.T @ ((left.T @ target) / sizes) / scale
     errors = target - columns @ numbers
     freedom = max(target.size - numbers.size, 1)
     covariance = (right.T / sizes**2) @ right * float(errors @ errors) / freedom
-    blind = (np.abs(right[~told]) > 1e-6).any(axis=0)
+    blind = (np.abs(right[~regular]) > 1e-6).any(axis=0)
     covariance[blind, blind] = np.inf
     return numbers, covariance / np.outer(scale, scale), errors
 
 
 def _chosen(u: Floats, y: Floats, criterion: str) -> ArxOrders:
-    """The orders of the lowest criterion; all are judged on the samples that the largest leaves."""
+    """The orders of the lowest criterion; all are compared on the samples left by the largest."""
     most_delay = min(_SEARCH_DELAY, max(1, y.size // 8))
     largest = ArxOrders(_SEARCH_ORDER, most_delay + _SEARCH_ORDER - 1, 1)
     all_columns = np.column_stack([_regressors(u, y, largest, largest.memory), y[largest.memory :]])
-    # Any choice of columns has the same least squares on the triangle as on the record.
+    # Least squares on the triangular factor equals that on the record for any choice of columns.
     triangle: Floats = np.asarray(np.linalg.qr(all_columns, mode="r"))
     count = all_columns.shape[0]
     floor = count * (1e-12 * float(np.ptp(y))) ** 2
@@ -330,7 +330,7 @@ def _fit(
     status = "ok"
     if not np.isfinite(np.diag(covariance)).all():
         status = (
-            "no result: the record does not tell these orders apart; lower na or nb, or excite "
+            "no result: the data do not support these orders; lower na or nb, or excite "
             "the plant with more frequencies"
         )
     names = [f"a_{i + 1}" for i in range(orders.na)] + [f"b_{i + 1}" for i in range(orders.nb)]
@@ -377,7 +377,7 @@ def _free(model: ArxModel, count: int) -> Floats:
 
 
 def _validation_percent(u: Floats, y: Floats, rate_hz: float, orders: ArxOrders) -> float:
-    """Fit to three quarters of the record, judged on the last quarter."""
+    """Fit to three quarters of the record, validated on the last quarter."""
     cut = (3 * y.size) // 4
     if min(cut, y.size - cut) <= orders.memory + 2 * (orders.na + orders.nb):
         return math.nan
@@ -395,12 +395,13 @@ def _notes(
     elif predicted - simulated > _BIASED and simulated < 90.0:
         notes.append(
             f"The output is predicted to {predicted:.0f} % but simulated to {simulated:.0f} % "
-            "only: noise was taken for dynamics. Use `haselab identify transfer`."
+            "only, so the dynamics are biased by noise. Use `haselab identify transfer`."
         )
     if whiteness < _WHITE:
         notes.append(
-            f"The prediction errors are not white (p = {whiteness:.2g}): the numbers are biased "
-            "and the intervals too narrow. Raise the orders, or use `haselab identify transfer`."
+            f"The prediction errors are not white (p = {whiteness:.2g}): the coefficients are "
+            "biased and the intervals too narrow. Raise the orders, or use `haselab identify "
+            "transfer`."
         )
     if not model.has_continuous:
         notes.append("A pole at z <= 0 has no continuous counterpart; lower na.")

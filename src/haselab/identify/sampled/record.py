@@ -54,13 +54,13 @@ def driven(records: Record | Sequence[Record]) -> Record:
     Returns:
         The record.
     Raises:
-        InputError: as `sampled`, or an input without change.
+        InputError: as `sampled`, or a constant input.
     """
     record = sampled(records)
     if np.ptp(record.u) == 0.0:
         raise InputError(
-            f"The input is {record.u[0]:g} throughout, so it excites nothing; allowed is an input "
-            "that changes. Name the right column, or record a chirp or a step."
+            f"The input is {record.u[0]:g} throughout, so it excites nothing. It "
+            "must change. Name the right column, or record a chirp or a step."
         )
     return record
 

@@ -39,8 +39,8 @@ class SubspaceFit(RecordFit[Record]):
         record: what was fitted.
         operating_point: input and output that were taken off.
         model: about the operating point; None without a result.
-        singular_values: what each further state explains. Shape `(block_rows,)`.
-        static_gain: output per input at rest.
+        singular_values: significance of each further state. Shape `(block_rows,)`.
+        static_gain: output per input in steady state.
         modes: poles in continuous time, the slowest first, each with its frequency and damping or
             its time constant.
         fit_percent: of the simulated output, initial state fitted.
@@ -89,7 +89,7 @@ class SubspaceFit(RecordFit[Record]):
         return sampled_chart("Subspace model", self.record, self.residuals[0], names)
 
     def answer(self) -> JsonObject:
-        """Numbers by name, for JSON."""
+        """The result as a dictionary for JSON."""
         model = self.model
         return {
             "order": None if model is None else model.b.size,
@@ -116,19 +116,19 @@ def fit_subspace(
     bootstrap: int = 50,
     seed: int = 1,
 ) -> SubspaceFit:
-    """State model by projections of the record on its own past.
+    """Fit a state model by projections of the record on its own past (subspace method).
 
-    The space that the states span comes from one triangle and one singular value decomposition;
-    input matrix, feedthrough and first state are the least squares of the simulated output. The
-    intervals come from repeated fits to the simulation with noise of the residuals' colour.
+    The space of the states is found from one QR and one singular value decomposition;
+    input matrix, feedthrough and first state are least-squares fits to the simulated output. The
+    intervals are bootstrapped with noise that has the residuals' spectrum.
 
     Args:
         records: one record whose input and output were sampled together (`Record.sampled`).
         order: states. None: up to the largest gap of the singular values, by their ratio.
-        block_rows: samples of past and of future that are looked at; above the order.
-        remove_means: take the means off first; what is left of an offset counts as a state.
-        bootstrap: repeated fits for the intervals; 0 leaves them open.
-        seed: of these fits.
+        block_rows: number of past and future samples; above the order.
+        remove_means: subtract the means first; a remaining offset counts as a state.
+        bootstrap: number of bootstrap replicates for the intervals; 0: no intervals.
+        seed: seed of the bootstrap.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -152,7 +152,7 @@ def fit_subspace(
     count = _gap(values) if order is None else order
     if values[count - 1] <= _LEAST_GAP * values[0]:
         none = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
-        reason = f"no result: the record tells no {count} states; lower the order"
+        reason = f"no result: the data do not support {count} states; lower the order"
         return SubspaceFit(
             status=reason, record=record, operating_point=point, model=None,
             singular_values=values, static_gain=none, modes=(), fit_percent=math.nan,
@@ -188,18 +188,18 @@ def _check(record: Record, order: int | None, block_rows: int) -> None:
     least = 8 * block_rows
     if block_rows < 2 or record.u.size < least:
         raise InputError(
-            f"block_rows = {block_rows} for {record.u.size} samples; allowed are 2 or more, and "
-            f"{least} samples or more for these. Lower block_rows, or record longer."
+            f"block_rows = {block_rows} for {record.u.size} samples; must be 2 or more, and "
+            f"with {least} samples or more. Lower block_rows, or record longer."
         )
     if order is not None and not 1 <= order < min(block_rows, _MOST_ORDER + 1):
         raise InputError(
-            f"order = {order}; allowed is 1 to {min(block_rows - 1, _MOST_ORDER)}. "
+            f"order = {order}; must be 1 to {min(block_rows - 1, _MOST_ORDER)}. "
             "Lower the order, or raise block_rows."
         )
 
 
 def _space(u: Floats, y: Floats, rows: int) -> tuple[Floats, Floats]:
-    """Singular values, and the space of the states' outputs."""
+    """Singular values, and the extended observability space."""
     columns = u.size - 2 * rows + 1
 
     def shifted(v: Floats, first: int) -> Floats:
@@ -212,7 +212,7 @@ def _space(u: Floats, y: Floats, rows: int) -> tuple[Floats, Floats]:
 
 
 def _gap(values: Floats) -> int:
-    """States before the largest ratio of two neighbours."""
+    """Number of states before the largest ratio of neighbouring singular values."""
     most = min(_MOST_ORDER, values.size - 1)
     floor = _LEAST_GAP * values[0]
     logs = np.log(np.maximum(values[: most + 1], floor))
@@ -220,7 +220,7 @@ def _gap(values: Floats) -> int:
 
 
 def _model(u: Floats, y: Floats, space: Floats, rate_hz: float) -> tuple[StateSpaceModel, Floats]:
-    """State matrix from the shift of the space; the rest by least squares of the output."""
+    """State matrix from the shift of the space; the others by least squares."""
     shift = np.linalg.lstsq(space[:-1], space[1:], rcond=None)[0]
     a = np.asarray(shift, dtype=np.float64)
     size = a.shape[0]
@@ -239,7 +239,7 @@ def _model(u: Floats, y: Floats, space: Floats, rate_hz: float) -> tuple[StateSp
 def _repeated(
     simulated: Floats, residuals: Floats, count: int, rng: np.random.Generator
 ) -> list[Floats]:
-    """The simulation with other noise of the same colour."""
+    """Bootstrap fits to the simulation with new noise of the same spectrum."""
     if count == 0:
         return []
     polynomial, variance = autoregression([residuals])
@@ -250,10 +250,10 @@ def _repeated(
 
 
 def _rates(model: StateSpaceModel) -> Complexes:
-    """Continuous poles with a frequency of 0 or above, the slowest first."""
+    """Continuous poles with non-negative frequency, the slowest first."""
     z = model.poles
-    told = z[(z.imag > -1e-12) & ~((np.abs(z.imag) <= 1e-12) & (z.real <= 0.0))]
-    s = np.log(told) * model.rate_hz
+    kept = z[(z.imag > -1e-12) & ~((np.abs(z.imag) <= 1e-12) & (z.real <= 0.0))]
+    s = np.log(kept) * model.rate_hz
     return np.asarray(s[np.argsort(np.abs(s.real))])
 
 
@@ -316,7 +316,7 @@ def _modes(model: StateSpaceModel, estimates: dict[str, Estimate]) -> tuple[dict
 
 
 def _estimate(value: float, repeats: list[float], unit: str) -> Estimate:
-    """Robust spread of the repeats: half the width of the middle 68 %."""
+    """Estimate with a robust spread: half the width of the middle 68 % of the replicates."""
     if len(repeats) < 8:
         return Estimate(float(value), math.inf, (-math.inf, math.inf), unit)
     low, high = np.quantile(repeats, [0.1587, 0.8413])
@@ -329,7 +329,7 @@ def _notes(model: StateSpaceModel, whiteness: float) -> tuple[str, ...]:
         notes.append("The model is unstable; lower the order, or record longer.")
     if whiteness < _WHITE:
         notes.append(
-            f"Output minus simulation is not white (p = {whiteness:.2g}): noise is coloured, or "
-            "the order too low."
+            f"Output minus simulation is not white (p = {whiteness:.2g}): the noise is coloured, "
+            "or the order is too low."
         )
     return tuple(notes)

@@ -22,7 +22,7 @@ class BreakGrid:
     Args:
         places: rising candidates; the first and the last are the ends of the record. Shape `(G,)`.
         counts: samples before each place; the last counts all. Shape `(G,)`.
-        quadratics: cost of the straight piece from place i with value u to place j with value v,
+        quadratics: cost of the straight segment from place i with value u to place j with value v,
             as `(uu, uv, vv, u, v, 1)` coefficients. Shape `(G, G, 6)`.
         levels: values between which the line may choose, for pruning. Shape `(V,)`.
     """
@@ -47,7 +47,7 @@ class BreakGrid:
 
 
 def _quadratics(x: Floats, y: Floats, places: Floats, counts: NDArray[np.int_]) -> Floats:
-    """Coefficients of all pieces from running sums; the value goes linearly from u to v."""
+    """Coefficients of all segments from running sums; the value goes linearly from u to v."""
     x, shift = x - places.mean(), places.mean()
     rows = np.stack([np.ones_like(x), x, x * x, y, x * y, y * y])
     running = np.concatenate([np.zeros((6, 1)), np.cumsum(rows, axis=1)], axis=1)[:, counts]
@@ -64,17 +64,17 @@ def _quadratics(x: Floats, y: Floats, places: Floats, counts: NDArray[np.int_]) 
 
 
 def best_breaks(grid: BreakGrid, most: int, least: int) -> dict[int, list[Floats]]:
-    """Inner break points of the best broken lines on the grid, for each number of pieces.
+    """Inner break points of the best broken lines on the grid, for each number of segments.
 
-    The cost up to a place is, for each way to get there, a square function of the value there.
-    Of these only those are kept that are lowest at some level.
+    For each way to reach a place, the cost up to it is a quadratic function of the value there.
+    Only functions that are lowest at some level are kept.
 
     Args:
         grid: candidates.
-        most: largest number of straight pieces.
-        least: fewest samples in a piece.
+        most: largest number of straight segments.
+        least: fewest samples in a segment.
     Returns:
-        By number of pieces up to 3 sets of break points, the best first; a number is missing
+        By number of segments, up to 3 sets of break points, the best first; a number is missing
         when no set leaves enough samples.
     Source: after Fearnhead, Maidstone and Letchford, J. Comput. Graph. Stat. 28 (2019), 265.
     """
@@ -99,7 +99,7 @@ def best_breaks(grid: BreakGrid, most: int, least: int) -> dict[int, list[Floats
 def _extended(
     grid: BreakGrid, reached: dict[int, tuple[Floats, NDArray[np.int_]]], end: int, least: int
 ) -> tuple[Floats, NDArray[np.int_]] | None:
-    """Square functions `(a, b, c)` of the value at `end`, and the places on their way."""
+    """Quadratic functions `(a, b, c)` of the value at `end`, and their break points so far."""
     functions, paths = [], []
     for start, (before, path) in reached.items():
         if start >= end or grid.counts[end] - grid.counts[start] < least:
@@ -121,7 +121,7 @@ def _extended(
 
 
 def _lowest(functions: Floats) -> Floats:
-    """Minimum of each square function."""
+    """Minimum of each quadratic function."""
     a, b, c = functions.T
     return np.asarray(c - np.where(a > 0.0, b**2 / (4.0 * np.where(a > 0.0, a, 1.0)), 0.0))
 
@@ -129,7 +129,7 @@ def _lowest(functions: Floats) -> Floats:
 def _pruned(
     grid: BreakGrid, functions: Floats, paths: NDArray[np.int_]
 ) -> tuple[Floats, NDArray[np.int_]]:
-    """The functions that are lowest at some level."""
+    """Keep the functions that are lowest at some level."""
     powers = np.stack([grid.levels**2, grid.levels, np.ones(grid.levels.size)])
     kept = np.unique(np.argmin(functions @ powers, axis=0))
     return functions[kept], paths[kept]

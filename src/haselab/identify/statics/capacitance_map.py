@@ -21,7 +21,7 @@ from haselab.models.maps import LinearMap
 __all__ = ["CapacitanceMapFit", "fit_capacitance_map"]
 
 Floats = NDArray[np.float64]
-_ONE_EDGE = "The record has one edge only: rising and falling could not be averaged."
+_ONE_EDGE = "The record has one edge only, so rising and falling edges could not be averaged."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class CapacitanceMapFit(CurveFit):
 
     @property
     def map(self) -> LinearMap:
-        """The map of the fitted numbers.
+        """The linear map with the fitted parameters.
 
         Raises:
             ResultError: the fit has no result.
@@ -63,7 +63,7 @@ class CapacitanceMapFit(CurveFit):
         )  # fmt: skip
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         return {
             "slope": self.parameters.get("slope"),
             "offset": self.parameters.get("offset"),
@@ -78,7 +78,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
 
     $\varepsilon = k\,C_r + \varepsilon_0$. The samples of each edge are averaged in cells of equal
     strain, the two edges of a cell are averaged, and the line goes through these means, each
-    with the same weight. So neither the time spent at a strain nor the hysteresis shifts it.
+    with the same weight. The time spent at a strain and the hysteresis therefore do not shift it.
 
     Args:
         relative_capacitance: in order of time, any unit. Shape `(N,)`.
@@ -86,7 +86,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: fewer than 8 samples, unequal lengths, NaN, a column without change.
+        InputError: fewer than 8 samples, unequal lengths, NaN, a constant column.
     Source: reference study, eq. 5. Intervals: the larger of two, from the misfit along the line
         and from the noise in time, each with its own noise model.
     Example:
@@ -100,7 +100,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     """
     c, e = _checked(relative_capacitance, strain)
     if trend(c, e) == 0:
-        reason = "no result: the strain does not follow the capacitance; check the columns"
+        reason = "no result: the strain does not depend on the capacitance; check the columns"
         return CapacitanceMapFit(status=reason, x=c, strain=e)
     middle, half = float(c.mean()), 0.5 * float(np.ptp(c))
     columns = np.column_stack([(c - middle) / half, np.ones_like(c)])
@@ -144,7 +144,7 @@ def _checked(relative_capacitance: ArrayLike, strain: ArrayLike) -> tuple[Floats
 
 @dataclass(frozen=True)
 class _Cells:
-    """Weights that average samples to cells of equal strain, both edges alike.
+    """Weights that average the samples in cells of equal strain, with equal weight for both edges.
 
     Args:
         index: row of the mean that a sample belongs to; -1 outside. Shape `(N,)`.
@@ -184,7 +184,7 @@ class _Cells:
 
 
 def _time_covariance(cells: _Cells, means: Floats, residuals: Floats) -> Floats:
-    """Covariance of the line's numbers for noise that is coloured in time."""
+    """Covariance of slope and offset for noise that is coloured in time."""
     hold = means[cells.index] * cells.weight[:, None]
     polynomial, variance = autoregression([residuals])
     padded = np.vstack([hold[::-1], np.zeros_like(hold)])

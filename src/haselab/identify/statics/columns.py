@@ -1,4 +1,4 @@
-"""Checks of measured columns that all static fits share: lengths, change, units that cannot be."""
+"""Checks of measured columns shared by all static fits: length, variation, plausible units."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["paired", "plausible_strain", "plausible_stretch", "plausible_voltage
 
 Floats = NDArray[np.float64]
 _LONGEST = 30.0  # stretch: above the break of any elastomer
-_LARGEST_STRAIN = 5.0  # above the actuation strain of any elastomer
+_LARGEST_STRAIN = 5.0  # larger than the actuation strain of any elastomer
 _SMALLEST_STRAIN = 1e-7  # span that no camera or gauge of such a test resolves
 _HIGHEST_V = 1e5
 _KILOVOLTS_V = 20.0  # span below which volts of an amplifier's output could be kilovolts
@@ -21,7 +21,7 @@ _KILOVOLTS_V = 20.0  # span below which volts of an amplifier's output could be 
 def paired(
     first: str, one: object, second: str, two: object, *, least: int, record: str
 ) -> tuple[Floats, Floats]:
-    """Two finite columns of one length, both of which change.
+    """Check two columns: finite, equally long, neither constant.
 
     Args:
         first: name of the first column.
@@ -33,18 +33,18 @@ def paired(
     Returns:
         Both columns as numbers. Shape `(N,)`.
     Raises:
-        InputError: too few values, NaN, unequal lengths, a column without change.
+        InputError: too few values, NaN, unequal lengths, a constant column.
     """
     x, y = finite_vector(first, one, least), finite_vector(second, two, least)
     if x.size != y.size:
         raise InputError(
-            f"{first} has {x.size} values and {second} {y.size}; allowed are equal lengths. "
+            f"{first} has {x.size} values and {second} {y.size}, but they must be equally long. "
             f"Give one {second} for each {first}."
         )
     for name, column in ((first, x), (second, y)):
         if np.ptp(column) == 0.0:
             raise InputError(
-                f"{name} is {column[0]:g} throughout; allowed is a column that changes. "
+                f"{name} is {column[0]:g} throughout; it must change. "
                 f"Name the right column, or {record}."
             )
     return x, y
@@ -54,23 +54,23 @@ def plausible_stretch(stretch: Floats, other: str, values: Floats) -> None:
     """Refuse a column that cannot be stretch: loads or stresses, strain, per cent.
 
     Args:
-        stretch: column that should be it. Shape `(N,)`.
-        other: name of the column beside it.
-        values: that column, to tell whether the two were swapped. Shape `(N,)`.
+        stretch: column that should be the stretch. Shape `(N,)`.
+        other: name of the other column.
+        values: that column, to detect swapped columns. Shape `(N,)`.
     Raises:
         InputError: a value not above 0, or above 30.
     """
     low, high = float(stretch.min()), float(stretch.max())
     if low > 0.0 and high <= _LONGEST:
         return
-    got = f"stretch lies in [{low:g}, {high:g}]; allowed is above 0 to {_LONGEST:g}"
+    got = f"stretch lies in [{low:g}, {high:g}]; must be above 0 and at most {_LONGEST:g}"
     beside = float(values.min()) > 0.5 and 1.0 < float(values.max()) <= _LONGEST
-    swapped = f"{other} looks like stretch: are the two columns swapped?"
+    swapped = f"{other} looks like stretch. Are the two columns swapped?"
     if high > _LONGEST:
-        load = "This looks like a load or a stress: name the right column."
+        load = "This looks like a load or a stress. Name the right column."
         per_cent = "If this is per cent, give 1 + strain/100."
         raise InputError(f"{got}. {swapped if beside else load if high > 1000.0 else per_cent}")
-    hint = f" Or {swapped}" if beside else ""
+    hint = f" Or: {swapped}" if beside else ""
     raise InputError(f"{got} (1 is the natural length). Give stretch, not strain.{hint}")
 
 
@@ -78,31 +78,31 @@ def plausible_strain(strain: Floats, other: str, values: Floats) -> None:
     """Refuse a column that cannot be strain: per cent, millimetres, a swapped column.
 
     Args:
-        strain: column that should be it. Shape `(N,)`.
-        other: name of the column beside it.
+        strain: column that should be the strain. Shape `(N,)`.
+        other: name of the other column.
         values: that column. Shape `(N,)`.
     Raises:
-        InputError: a size above 5, or no more change than 1e-7.
+        InputError: a magnitude above 5, or a span below 1e-7.
     """
     size, span = float(np.abs(strain).max()), float(np.ptp(strain))
     swapped = size > _LARGEST_STRAIN or span < _SMALLEST_STRAIN
     if not swapped:
         return
     fits = np.abs(values).max() <= 1.0 and np.ptp(values) >= 100.0 * _SMALLEST_STRAIN
-    hint = f"{other} looks like strain: are the two columns swapped?"
+    hint = f"{other} looks like strain. Are the two columns swapped?"
     if size > _LARGEST_STRAIN:
         raise InputError(
-            f"strain reaches {size:g}; allowed is up to {_LARGEST_STRAIN:g} (1 is twice the "
+            f"strain reaches {size:g}; must be at most {_LARGEST_STRAIN:g} (1 is twice the "
             f"length). {hint if fits else 'If it is in per cent, divide it by 100.'}"
         )
     raise InputError(
-        f"strain spans {span:g}; allowed is at least {_SMALLEST_STRAIN:g}. "
+        f"strain spans {span:g}; must be at least {_SMALLEST_STRAIN:g}. "
         f"{hint if fits else 'Name the right column.'}"
     )
 
 
 def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:
-    """Refuse voltages that cannot be; a note for those that may be kilovolts.
+    """Refuse implausible voltages; return a note for those that may be kilovolts.
 
     Args:
         voltage_v: column of voltages. Shape `(N,)`.
@@ -114,12 +114,12 @@ def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:
     size = float(np.abs(voltage_v).max())
     if size > _HIGHEST_V:
         raise InputError(
-            f"voltage_v reaches {size:g} V; allowed is up to {_HIGHEST_V:g} V. "
+            f"voltage_v reaches {size:g} V; must be at most {_HIGHEST_V:g} V. "
             "Give volts, or name the right column."
         )
     if size < _KILOVOLTS_V:
         return (
-            f"voltage_v reaches {size:.3g} V only and is taken as the drive before the amplifier; "
-            "if the column is in kV, multiply it by 1000.",
+            f"voltage_v reaches {size:.3g} V only and is taken as the drive ahead of the "
+            "amplifier; if the column is in kV, multiply it by 1000.",
         )
     return ()

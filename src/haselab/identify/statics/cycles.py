@@ -19,19 +19,19 @@ _BENDS = 5
 
 
 def rising_edges(values: Floats) -> NDArray[np.int_]:
-    """1 on the edges that rise, -1 on those that fall; an edge ends where a move back is large.
+    """1 on the edges that rise, -1 on those that fall; an edge ends at a large reversal.
 
     Args:
         values: in order of time. Shape `(N,)`.
     Returns:
-        Direction of each sample. All 0 where no order of time shows: over an eighth of the
-        samples would be turning points.
+        Direction of each sample. All 0 when the samples are not in order of time, that is, when
+        more than an eighth of the samples are turning points.
     Example:
         >>> rising_edges(np.array([0.0, 1.0, 2.0, 1.9, 3.0, 2.0, 1.0])).tolist()
         [1, 1, 1, 1, 1, -1, -1]
     """
     back = _REVERSAL * float(np.ptp(values))
-    # A first edge in no direction: it begins with whichever extreme is left first.
+    # The first edge has no direction yet: it begins at the extreme that is left first.
     turns, direction, lowest, highest = [0], 0, 0, 0
     for i, value in enumerate(values):
         lowest = i if value < values[lowest] else lowest
@@ -51,7 +51,7 @@ def rising_edges(values: Floats) -> NDArray[np.int_]:
 
 
 def loop_cells(strain: Floats, edges: NDArray[np.int_]) -> NDArray[np.intp]:
-    """Cell of equal strain of each sample, as many cells as leave 8 samples of an edge in each.
+    """Cell of equal strain of each sample, with at least 8 samples of an edge in each cell.
 
     Args:
         strain: strains. Shape `(N,)`.
@@ -66,11 +66,11 @@ def loop_cells(strain: Floats, edges: NDArray[np.int_]) -> NDArray[np.intp]:
 
 
 def loop_width(strain: Floats, voltage_v: Floats, residuals: Floats) -> float:
-    """Mean distance of the two branches at equal strain; 0 when there is one branch only.
+    """Mean distance of the two branches at equal strain; 0 for a single branch.
 
     Args:
         strain: strains in order of time. Shape `(N,)`.
-        voltage_v: tells the direction. Shape `(N,)`.
+        voltage_v: gives the direction. Shape `(N,)`.
         residuals: distance of each sample from a common curve. Shape `(N,)`.
     Returns:
         Width, in the unit of `residuals`.
@@ -86,19 +86,20 @@ def loop_width(strain: Floats, voltage_v: Floats, residuals: Floats) -> float:
 
 
 def trend(x: Floats, y: Floats) -> int:
-    """1 when `y` rises with `x`, -1 when it falls, 0 when neither is beyond doubt.
+    """1 when `y` rises with `x`, -1 when it falls, 0 when the trend is not significant.
 
     Args:
         x: abscissa, in order of time. Shape `(N,)`.
         y: ordinate. Shape `(N,)`.
     Returns:
-        Sign of the regression line, tested with the noise model of what a bent curve leaves.
+        Sign of the regression line, tested with the noise model of the residuals of a quadratic
+        curve.
     """
     scaled = 2.0 * (x - x.min()) / np.ptp(x) - 1.0
-    bent = legvander(scaled, min(_BENDS, x.size // 4))
-    residuals = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
+    columns = legvander(scaled, min(_BENDS, x.size // 4))
+    residuals = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
     line = np.column_stack([scaled - scaled.mean(), np.ones_like(scaled)])
     slope = float(np.linalg.lstsq(line, y, rcond=None)[0][0])
-    variance = float(coloured_covariance([line], [residuals], bent.shape[1])[0, 0])
-    told = slope**2 > ndtri(_UNRELATED_P / 2.0) ** 2 * variance
-    return int(np.sign(slope)) if told else 0
+    variance = float(coloured_covariance([line], [residuals], columns.shape[1])[0, 0])
+    significant = slope**2 > ndtri(_UNRELATED_P / 2.0) ** 2 * variance
+    return int(np.sign(slope)) if significant else 0

@@ -1,7 +1,7 @@
-r"""Sum of two exponentials by separable least squares, regular where the two rates meet.
+r"""Sum of two exponentials by separable least squares, well-conditioned where the two rates meet.
 
 $V = e^{\mu x}(c \cosh \delta x + s \sinh(\delta x)/\delta)$ over $x$ from -1 to 1: the searched
-numbers are the mean rate $\mu$ and $\delta^2$, the factors are $c$ and $s$.
+parameters are the mean rate $\mu$ and $\delta^2$, the factors are $c$ and $s$.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _MOST_RATE = 10.0  # of either exponential: e-folds per half span
-_LEAST_SPLIT = 0.05  # half the difference of the two rates: below it they count as one
-_LEAST_SLOPE = 1e-3  # of a monotone curve, against the mean slope of the record
+_LEAST_SPLIT = 0.05  # half the difference of the two rates: below it the rates count as equal
+_LEAST_SLOPE = 1e-3  # of a monotone curve, relative to the mean slope of the record
 _GROUPS = 300
 _STARTS, _APART = 6, 1.5
 _LOW = np.array([-_MOST_RATE, _LEAST_SPLIT**2])
@@ -34,7 +34,7 @@ _HIGH = np.array([_MOST_RATE, _MOST_RATE**2])
 
 
 def shapes_at(search: Floats, x: Floats) -> tuple[Floats, Floats]:
-    """The two functions and their derivatives by the searched numbers.
+    """The two functions and their derivatives with respect to the searched parameters.
 
     Args:
         search: mean rate and square of the split. Shape `(2,)`.
@@ -52,14 +52,14 @@ def shapes_at(search: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def coefficients(numbers: Floats, middle: float, half: float) -> tuple[Floats, Floats]:
-    """Amplitudes and rates over the strain, `a1, b1, a2, b2` with `b1 > b2`.
+    """Amplitudes and rates as functions of strain, `a1, b1, a2, b2` with `b1 > b2`.
 
     Args:
         numbers: mean rate, square of the split, both factors. Shape `(4,)`.
         middle: strain at `x = 0`.
-        half: strain per `x`.
+        half: strain per unit of `x`.
     Returns:
-        Coefficients `(4,)` and their derivatives by `numbers` `(4, 4)`.
+        Coefficients `(4,)` and their derivatives with respect to `numbers` `(4, 4)`.
     """
     mean, square, c, s = numbers
     split = math.sqrt(square)
@@ -82,13 +82,13 @@ def least_split_reached(search: Floats) -> bool:
 
 
 def search_free(x: Floats, v: Floats) -> Solution:
-    """Least squares from a grid of both rates.
+    """Least squares without a monotonicity limit, started from a grid of both rates.
 
     Args:
         x: abscissa from -1 to 1. Shape `(N,)`.
         v: ordinate. Shape `(N,)`.
     Returns:
-        The best solution of some polished starts, which differ from each other.
+        The best solution found from several different starts.
     """
     few = _grouped(x, v)
     starts = sorted((project(at, _bases(*few, at)) for at in _grid()), key=lambda s: s.cost)
@@ -103,13 +103,13 @@ def search_free(x: Floats, v: Floats) -> Solution:
 
 
 def _distance(one: Solution, other: Solution) -> float:
-    """Larger difference of the mean rates and of the splits."""
+    """The larger of two differences: of the mean rates and of the splits."""
     by_mean = abs(one.search[0] - other.search[0])
     return float(max(by_mean, abs(math.sqrt(one.search[1]) - math.sqrt(other.search[1]))))
 
 
 def _polished(start: Floats, x: Floats, v: Floats) -> Solution:
-    """Local minimum; along the edge of least split when it lies there."""
+    """Local minimum; on the bound of the smallest split when it lies there."""
     found = minimise(lambda at: _bases(x, v, at), start, (_LOW, _HIGH), iterations=200)[0]
     if not least_split_reached(found.search):
         return found
@@ -133,20 +133,20 @@ def _bases(x: Floats, v: Floats, search: Floats) -> list[Basis]:
 
 
 def _grid() -> list[Floats]:
-    """Mean rates and splits that keep both rates within the range."""
+    """Starting mean rates and splits for which both rates are within the range."""
     splits = (_LEAST_SPLIT, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5)
     pairs = [(m, s) for m in np.linspace(-8.0, 8.0, 33) for s in splits]
     return [np.array([m, s**2]) for m, s in pairs if abs(m) + s <= _MOST_RATE]
 
 
 def _grouped(x: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """Means of neighbours in `x`, few enough to try many starts."""
+    """Means of neighbours in `x`, few enough to try many starting points."""
     groups = np.array_split(np.argsort(x, kind="stable"), min(_GROUPS, x.size))
     return np.array([x[g].mean() for g in groups]), np.array([v[g].mean() for g in groups])
 
 
 def _end_slopes(search: Floats, sign: int, reach: float) -> Floats:
-    """Derivatives of the functions by `x` at both ends of the range, times `sign`. `(2, 2)`."""
+    """Slopes of the functions at both ends of the range, times `sign`. Shape `(2, 2)`."""
     mean, square = search
     even, odd = shapes_at(search, np.array([-reach, reach]))[0].T
     return sign * np.column_stack([mean * even + square * odd, mean * odd + even])
@@ -157,13 +157,13 @@ def _least_slope(v: Floats) -> float:
 
 
 def is_steep(solution: Solution, v: Floats, sign: int, reach: float) -> bool:
-    """Whether the curve keeps the least slope for all `x` within `reach`; its ends decide."""
+    """Whether the curve has at least the minimum slope within `reach`; checked at both ends."""
     slopes = _end_slopes(solution.search, sign, reach) @ solution.shared
     return bool((slopes >= _least_slope(v)).all())
 
 
 def search_monotone(x: Floats, v: Floats, sign: int, reach: float) -> Solution:
-    """Least squares among the curves that keep the least slope for all `x` within `reach`.
+    """Least squares among the curves with at least the minimum slope for all `x` within `reach`.
 
     Args:
         x: abscissa from -1 to 1. Shape `(N,)`.
@@ -171,7 +171,7 @@ def search_monotone(x: Floats, v: Floats, sign: int, reach: float) -> Solution:
         sign: 1 for a curve that rises, -1 for one that falls.
         reach: end of the range, on both sides.
     Returns:
-        The solution; its `columns` are those without the limit.
+        The solution; its `columns` are those of the unconstrained problem.
     Source: Nelder and Mead, Comput. J. 7 (1965), 308, for the two rates.
     """
 
@@ -194,9 +194,9 @@ def search_monotone(x: Floats, v: Floats, sign: int, reach: float) -> Solution:
 
 
 def _held_factors(at: Floats, x: Floats, v: Floats, sign: int, reach: float) -> Floats:
-    """Best factors whose curve keeps the least slope at both ends.
+    """Best factors whose curve has at least the minimum slope at both ends.
 
-    The problem is convex: the best has neither limit active, one of them, or both.
+    The problem is convex: at the optimum neither limit, one of them or both are active.
     """
     shapes = shapes_at(at, x)[0]
     ends, least = _end_slopes(at, sign, reach), _least_slope(v)

@@ -1,4 +1,4 @@
-"""Hyperelastic law from stress and stretch, with the stiffness of electrodes beside it."""
+"""Hyperelastic law from stress and stretch, optionally with the stiffness of the electrodes."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ __all__ = [
 Floats = NDArray[np.float64]
 _LEAST_SAMPLES = 6
 _GRID = 200
-_MOVED = 2.0  # standard deviations on half the range
-_SOFT_PA, _STIFF_PA = 100.0, 1e9  # moduli between which a rubber's may lie
+_MOVED = 2.0  # standard deviations by which a parameter changes on half the range
+_SOFT_PA, _STIFF_PA = 100.0, 1e9  # plausible moduli of a rubber
 _STANDARD = ("uniaxial", "pure_shear", "equibiaxial")
 
 
@@ -47,8 +47,8 @@ class SheetTest:
         nominal_stress_pa: force along the length over the natural cross-section, in Pa. `(N,)`.
         deformation: what the test does to the width.
     Raises:
-        InputError: fewer than 6 samples, unequal lengths, NaN, a column without change, or a
-            column that cannot be stretch.
+        InputError: fewer than 6 samples, unequal lengths, NaN, a constant column, or a
+            column that is not a stretch.
     """
 
     stretch: Floats
@@ -66,8 +66,8 @@ class SheetTest:
         pull = length - 1.0 / (length**3 * width**2)
         if float(pull @ y) < 0.0 and float(pull.min()) < 0.0 < float(y.min() + np.ptp(y)):
             raise InputError(
-                f"nominal_stress_pa pulls where stretch, in [{x.min():g}, {x.max():g}], is below "
-                "the natural length; allowed is stress of the sign of the deformation. "
+                f"nominal_stress_pa is tensile where the stretch, in [{x.min():g}, {x.max():g}], "
+                "is below 1; stress and deformation must have the same sign. "
                 "Give stretch, not strain."
             )
         object.__setattr__(self, "stretch", x[order])
@@ -75,7 +75,7 @@ class SheetTest:
 
     @property
     def sample(self) -> Sample:
-        """The test as the search takes it."""
+        """The test in the form that the search uses."""
         length, width = self.deformation.stretches(self.stretch)
         return Sample(self.stretch, length, width, self.nominal_stress_pa)
 
@@ -87,14 +87,14 @@ class SheetTest:
 
 @dataclass(frozen=True)
 class StressPrediction:
-    """Stress that a fitted law gives, without the electrodes.
+    """Stress predicted by a fitted law, without the electrodes.
 
     Args:
-        stretch: as asked. Shape `(M,)`.
+        stretch: as requested. Shape `(M,)`.
         nominal_stress_pa: of the law, in Pa. Shape `(M,)`.
-        std_pa: standard deviation from that of the numbers; infinite where one that matters is
-            not told. Shape `(M,)`.
-        notes: what the reader should know, a sentence each.
+        std_pa: standard deviation from the covariance of the parameters; infinite where a relevant
+            one is not identifiable. Shape `(M,)`.
+        notes: remarks for the user, one sentence each.
     """
 
     stretch: Floats
@@ -126,7 +126,7 @@ class HyperelasticFit(CurveFit):
 
     @property
     def stretch_range(self) -> tuple[float, float]:
-        """Lowest and highest recorded stretch of all tests; the numbers depend on it."""
+        """Lowest and highest recorded stretch of all tests; the parameters depend on it."""
         ranges = [test.stretch_range for test in self.tests]
         return min(low for low, _ in ranges), max(high for _, high in ranges)
 
@@ -140,9 +140,9 @@ class HyperelasticFit(CurveFit):
 
     @property
     def law(self) -> HyperelasticLaw:
-        """The chosen law with its fitted numbers, without the electrode spring.
+        """The chosen law with its fitted parameters, without the electrode spring.
 
-        A number that is not told has the value of the fitted curve.
+        A parameter that is not identifiable keeps the value of the fitted curve.
 
         Raises:
             ResultError: the fit has no result.
@@ -170,7 +170,7 @@ class HyperelasticFit(CurveFit):
     def predict(
         self, stretch: ArrayLike, deformation: Deformation | None = None
     ) -> StressPrediction:
-        """Stress of the law, with its deviation, and a note where it is asked outside the data.
+        """Predict the stress, with its standard deviation and a note outside the data.
 
         Args:
             stretch: stretches. Shape `(M,)`.
@@ -192,19 +192,19 @@ class HyperelasticFit(CurveFit):
     def _asked_outside(self, stretch: Floats, kind: Deformation) -> tuple[str, ...]:
         same = [test.stretch_range for test in self.tests if test.deformation == kind]
         if not same:
-            return (f"No test of the kind {kind.kind} was fitted; the law is carried over to it.",)
+            return (f"No {kind.kind} test was fitted; the law is extrapolated to it.",)
         low, high = min(r[0] for r in same), max(r[1] for r in same)
         outside = stretch[(stretch < low) | (stretch > high)]
         if not outside.size:
             return ()
         far = float(outside[np.argmax(np.maximum(low - outside, outside - high))])
         return (
-            f"The law was asked at stretch {far:g}, outside the data of [{low:g}, {high:g}]; "
-            "there it is a guess.",
+            f"Stretch {far:g} is outside the data of [{low:g}, {high:g}]; "
+            "the prediction is an extrapolation.",
         )
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         return {
             "model": self.best.model,
             "parameters": dict(self.best.parameters),
@@ -255,7 +255,7 @@ def fit_hyperelastic(
         lateral_stretch: the fixed lateral stretch, where the width is clamped.
         prestretch: of a sheet stretched both ways before the test.
         electrode_natural: stretch at which electrodes bonded to the sheet are free of force; their
-            linear spring is then fitted beside the law. None: no electrodes.
+            linear spring is then fitted together with the law. None: no electrodes.
         electrode_stiffening: fit a cubic term of that spring too.
     Returns:
         The chosen law and all candidates.
@@ -290,9 +290,9 @@ def fit_hyperelastic_tests(
     $\min \sum_t \sum_i (P_{ti} - P(\lambda_{ti}) - k\,e_{ti} - q\,e_{ti}^3)^2$ with
     $e = \lambda - \lambda_e$
 
-    The moduli are solved for, the shape numbers searched from many starts. The last terms are those
-    of the electrodes, natural at $\lambda_e$, where they are wanted. Laws that soften within the
-    data and laws of which the data leave a number open are ranked behind the others.
+    The moduli are solved for; the shape parameters are searched from many starts. The last terms
+    are those of optional electrodes, stress-free at $\lambda_e$. Laws that soften within the
+    data, and laws with a parameter that is not identifiable, are ranked behind the others.
 
     Args:
         tests: one or more, each with its own deformation.
@@ -317,9 +317,9 @@ def fit_hyperelastic_tests(
         True
     """
     if not tests:
-        raise InputError("No test was given; allowed are one or more. Give stretch and stress.")
+        raise InputError("No test was given. Pass at least one SheetTest.")
     if model != "auto" and model not in LAWS:
-        raise InputError(f"model = {model}; allowed are auto, {', '.join(LAWS)}. Choose one.")
+        raise InputError(f"model = {model}; must be one of auto, {', '.join(LAWS)}.")
     if electrode_stiffening and electrode_natural is None:
         raise InputError(
             "electrode_stiffening needs electrode_natural, the stretch at which the electrodes are "
@@ -335,7 +335,7 @@ def fit_hyperelastic_tests(
     best = fitted[0]
     status = "ok"
     if not best.settled:
-        status = f"no result: {best.model} ran to the end of its range; take a wider stretch range"
+        status = f"no result: {best.model} reached its search limit; use a wider stretch range"
     elif not best.r_squared > 0.0:
         status = "no result: no law explains the data better than their mean; check the columns"
     notes = _notes(best, tests, electrodes) if status == "ok" else ()
@@ -355,8 +355,8 @@ def fit_hyperelastic_tests(
 
 
 def _rank(candidate: Candidate) -> tuple[bool, bool, bool, float]:
-    untold = any(math.isnan(e.value) for e in candidate.parameters.values())
-    return not candidate.settled, candidate.softens_at is not None, untold, candidate.aicc
+    unknown = any(math.isnan(e.value) for e in candidate.parameters.values())
+    return not candidate.settled, candidate.softens_at is not None, unknown, candidate.aicc
 
 
 def _law(candidate: Candidate) -> HyperelasticLaw:
@@ -365,7 +365,7 @@ def _law(candidate: Candidate) -> HyperelasticLaw:
 
 
 def _judged(candidate: Candidate, tests: Sequence[SheetTest]) -> Candidate:
-    """The candidate with the place from which it softens within the data."""
+    """The candidate with the stretch from which it softens within the data."""
     if not candidate.settled:
         return candidate
     law = _law(candidate)
@@ -375,7 +375,7 @@ def _judged(candidate: Candidate, tests: Sequence[SheetTest]) -> Candidate:
 
 
 def _softening(law: HyperelasticLaw, kind: Deformation, low: float, high: float) -> float | None:
-    """Stretch from which the stress does not rise; up to the full length of the chains."""
+    """Lowest stretch at which the stress stops rising, up to the full length of the chains."""
     x = np.linspace(low, high, _GRID)
     length, width = kind.stretches(x)
     stress, beyond = np.zeros(0), _GRID + 1
@@ -391,11 +391,11 @@ def _softening(law: HyperelasticLaw, kind: Deformation, low: float, high: float)
 
 
 def _spread(candidate: Candidate, length: Floats, width: Floats) -> Floats:
-    """Standard deviation of the law's stress from the covariance of its numbers."""
+    """Standard deviation of the law's stress from the covariance of its parameters."""
     names = [name for name in candidate.numbers if name not in ELECTRODE_NAMES]
     place = [list(candidate.numbers).index(name) for name in names]
     covariance = candidate.covariance[np.ix_(place, place)]
-    told = np.isfinite(np.diag(covariance))
+    known = np.isfinite(np.diag(covariance))
     slopes = np.zeros((length.size, len(names)))
     for k, name in enumerate(names):
         step = 1e-6 * max(abs(candidate.numbers[name]), 1e-6)
@@ -406,8 +406,8 @@ def _spread(candidate: Candidate, length: Floats, width: Floats) -> Floats:
                 law_from_parameters(candidate.model, numbers).nominal_stress_pa(length, width)
             )
         slopes[:, k] = (sides[0] - sides[1]) / (2.0 * step)
-    part = slopes[:, told]
-    variance = np.einsum("ni,ij,nj->n", part, covariance[np.ix_(told, told)], part)
+    part = slopes[:, known]
+    variance = np.einsum("ni,ij,nj->n", part, covariance[np.ix_(known, known)], part)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
@@ -415,22 +415,22 @@ def _notes(
     best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
 ) -> tuple[str, ...]:
     return (
-        *_untold_note(best),
+        *_identifiability_note(best),
         *_softening_notes(best, tests),
         *_range_notes(best, tests, electrodes),
         *_unit_notes(tests),
     )
 
 
-def _untold_note(best: Candidate) -> list[str]:
-    untold = [name for name, e in best.parameters.items() if math.isnan(e.value)]
-    if not untold:
+def _identifiability_note(best: Candidate) -> list[str]:
+    unknown = [name for name, e in best.parameters.items() if math.isnan(e.value)]
+    if not unknown:
         return []
     reason = (
-        "the chains are far from their full length" if {"lambda_m", "jm"} & set(untold)
-        else "fewer terms explain them as well"
+        "the chains are far from their full length" if {"lambda_m", "jm"} & set(unknown)
+        else "fewer terms fit as well"
     )  # fmt: skip
-    return [f"The data do not tell {', '.join(untold)}: {reason}."]
+    return [f"Not identifiable from these data: {', '.join(unknown)} ({reason})."]
 
 
 def _softening_notes(best: Candidate, tests: Sequence[SheetTest]) -> list[str]:
@@ -457,7 +457,7 @@ def _softening_notes(best: Candidate, tests: Sequence[SheetTest]) -> list[str]:
 def _range_notes(
     best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
 ) -> list[str]:
-    """Whether the numbers of the lower half of the range are others."""
+    """A note where the parameters of the lower half of the range differ."""
     halves = []
     for test in tests:
         sample = test.sample
@@ -476,8 +476,8 @@ def _range_notes(
     if not moved:
         return []
     return [
-        f"On the lower half of the stretches the numbers are others ({', '.join(moved)}): they "
-        "hold for this range only."
+        f"On the lower half of the stretches the parameters differ ({', '.join(moved)}): they "
+        "are valid for this range only."
     ]
 
 
@@ -490,6 +490,6 @@ def _unit_notes(tests: Sequence[SheetTest]) -> list[str]:
         return []
     other = "kPa or MPa" if modulus_pa < _SOFT_PA else "a unit below Pa"
     return [
-        f"A shear modulus of {modulus_pa:.3g} Pa is that of no rubber: is nominal_stress_pa in "
-        f"{other}?"
+        f"A shear modulus of {modulus_pa:.3g} Pa is implausible for rubber. Is nominal_stress_pa "
+        f"in in {other}?"
     ]

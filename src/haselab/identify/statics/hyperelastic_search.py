@@ -1,4 +1,4 @@
-"""One hyperelastic law through several tests: moduli solved for, shape numbers searched."""
+"""Fit one hyperelastic law to several tests: moduli solved for, shape parameters searched."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Floats = NDArray[np.float64]
 ELECTRODE_NAMES = ("electrode_spring_pa", "electrode_cubic_pa")
 _EXPONENTS = (-10.0, 20.0)
 _ONE_EXPONENT = (0.05, 20.0)  # one term of negative exponent is far too stiff in biaxial tension
-_LEAST_APART = 0.1  # of two exponents: below it their moduli are one
-_UNTOLD = 0.5  # relative deviation of a limiting stretch at which its interval reaches infinity
-_WIDEST = 10.0  # half the interval of an exponent that still counts as told
+_LEAST_APART = 0.1  # of two exponents: closer ones count as one term
+_LARGEST_STD = 0.5  # of a limiting stretch, relative; above, its interval is infinite
+_WIDEST = 10.0  # largest half interval of an identifiable exponent
 _GROUPS = 40  # samples of a test for the many starts
 _POLISHED = 4
 _EDGE = 1e-6
@@ -33,7 +33,7 @@ _EDGE = 1e-6
 
 @dataclass(frozen=True)
 class Electrodes:
-    """Electrodes bonded to the sheet: a spring beside the law.
+    """Electrodes bonded to the sheet: a spring parallel to the sheet.
 
     Args:
         natural: stretch of the length at which they are free of force.
@@ -45,11 +45,11 @@ class Electrodes:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the fitted numbers, in Pa for each unit of stretch, or of its cube."""
+        """Of the fitted parameters, in Pa for each unit of stretch, or of its cube."""
         return ELECTRODE_NAMES if self.stiffening else ELECTRODE_NAMES[:1]
 
     def columns(self, length: Floats) -> list[Floats]:
-        """Stress of each number set to 1; length of shape `(N,)`."""
+        """Stress for each parameter set to 1; `length` has shape `(N,)`."""
         beyond = length - self.natural
         return [beyond, beyond**3][: len(self.names)]
 
@@ -60,8 +60,8 @@ class Sample:
 
     Args:
         stretch: as recorded. Shape `(N,)`.
-        length: stretch of the length from the natural one. Shape `(N,)`.
-        width: of the width. Shape `(N,)`.
+        length: stretch along the length, from the natural length. Shape `(N,)`.
+        width: stretch across the width. Shape `(N,)`.
         stress_pa: nominal stress. Shape `(N,)`.
     """
 
@@ -71,11 +71,11 @@ class Sample:
     stress_pa: Floats
 
     def taken(self, rows: NDArray[np.bool_]) -> Sample:
-        """Some of the rows."""
+        """The marked rows."""
         return Sample(self.stretch[rows], self.length[rows], self.width[rows], self.stress_pa[rows])
 
     def grouped(self) -> Sample:
-        """Means of neighbours, few enough to try many starts."""
+        """Means of neighbours, few enough to try many starting points."""
         parts = np.array_split(np.arange(self.stretch.size), min(_GROUPS, self.stretch.size))
         columns = (self.stretch, self.length, self.width, self.stress_pa)
         return Sample(*(np.array([column[part].mean() for part in parts]) for column in columns))
@@ -87,16 +87,16 @@ class Candidate:
 
     Args:
         model: name of the law.
-        parameters: its numbers, and those of the electrodes when asked for; one that the data do
-            not tell is nan with an infinite interval.
-        numbers: the same as they make the fitted curve, told or not.
-        covariance: of `numbers`, in their order, linear about the fit. Shape `(P, P)`.
+        parameters: its parameters and those of the electrodes, if fitted; one that is not
+            identifiable is NaN with an infinite interval.
+        numbers: the same parameters as used by the fitted curve, identifiable or not.
+        covariance: of `numbers`, in their order, linearised about the fit. Shape `(P, P)`.
         r_squared: share of the variance that is explained.
         aic: Akaike's criterion.
         aicc: the same, corrected for few samples; the lowest of the candidates is the best.
         bic: Schwarz's criterion.
         modelled_pa: fitted nominal stress of each test in the order given, in Pa.
-        settled: whether the search came to rest at a curve, not at the end of its range.
+        settled: whether the search converged at a curve, not at the end of its range.
         softens_at: recorded stretch within the range from which the stress falls; None: nowhere.
     """
 
@@ -115,7 +115,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class _Shape:
-    """The numbers on which a law depends not linearly, searched without bounds of their own."""
+    """The nonlinear parameters of a law, transformed so that the search needs no bounds."""
 
     names: tuple[str, ...]
     low: Floats
@@ -125,23 +125,23 @@ class _Shape:
 
     @property
     def exponents(self) -> bool:
-        """Whether they are exponents, so that the end of the range means that they are untold."""
+        """Whether they are exponents; one at the end of its range is then not identifiable."""
         return self.names[0].startswith("alpha")
 
 
 def _growing(limit: float) -> tuple[Callable[[float], float], Callable[[float], float]]:
-    """A number above `limit` from one without bounds, and its slope."""
+    """Map an unbounded parameter to one above `limit`; return the map and its slope."""
     return (lambda s: limit * (1.0 + math.exp(s))), (lambda s: limit * math.exp(s))
 
 
 def _shape_of(name: str, samples: Sequence[Sample]) -> _Shape | None:
-    """The nonlinear numbers of a law; None for laws that are linear in all of them."""
+    """The nonlinear parameters of a law; None for laws that are linear in all of them."""
     invariant = max(
         float((t.length**2 + t.width**2 + 1.0 / (t.length * t.width) ** 2).max()) for t in samples
     )
     reach = math.sqrt(invariant / 3.0)
     if name in ("arruda-boyce", "gent"):
-        # Above the largest value that the data need.
+        # Larger than any value that the data require.
         label = "lambda_m" if name == "arruda-boyce" else "jm"
         limit = reach if name == "arruda-boyce" else invariant - 3.0
         return _Shape((label,), np.array([-9.0]), np.array([14.0]), *_growing(limit))
@@ -160,7 +160,7 @@ def _shape_of(name: str, samples: Sequence[Sample]) -> _Shape | None:
 
 
 def _terms(name: str) -> int:
-    """Terms of an Ogden law."""
+    """Number of terms of an Ogden law."""
     return int(name.partition("-")[2] or 1)
 
 
@@ -175,7 +175,7 @@ def _linear_names(name: str) -> list[str]:
 def _columns(
     name: str, shape: _Shape | None, search: Floats, test: Sample, electrodes: Electrodes | None
 ) -> Floats:
-    """Stress of each linear number set to 1, with the shape numbers of the search."""
+    """Stress for each linear parameter set to 1, at given shape parameters."""
     linear = _linear_names(name)
     fixed = {}
     if shape is not None:
@@ -200,7 +200,7 @@ def _bases(
         values = _columns(name, shape, search, test, electrodes)
         slopes = np.zeros((search.size, *values.shape))
         for k in range(search.size):
-            # Central difference; its error of 1e-10 moves an interval, not the estimate.
+            # Central difference; its error of 1e-10 affects an interval, not the estimate.
             step = np.zeros(search.size)
             step[k] = 1e-5
             above, below = (
@@ -213,12 +213,12 @@ def _bases(
 
 
 def fit_law(name: str, samples: Sequence[Sample], electrodes: Electrodes | None) -> Candidate:
-    """Grid of the shape numbers, then Gauss-Newton.
+    """Fit one law: grid of the shape parameters, then Gauss-Newton.
 
     Args:
         name: of the law.
-        samples: the tests, which have all numbers in common.
-        electrodes: fitted beside the law; None: none.
+        samples: the tests; they share all parameters.
+        electrodes: fitted together with the law, or None.
     Returns:
         The fitted law.
     """
@@ -250,7 +250,7 @@ def fit_law(name: str, samples: Sequence[Sample], electrodes: Electrodes | None)
 def _starts(
     name: str, shape: _Shape, samples: Sequence[Sample], electrodes: Electrodes | None
 ) -> list[Floats]:
-    """The grid, the lowest cost first; of several terms those with positive moduli."""
+    """Starting points of lowest cost first; for several terms those with positive moduli."""
     target = np.concatenate([test.stress_pa for test in samples])
     several, found = len(shape.names) > 1, []
     for search in _grid(shape):
@@ -262,18 +262,18 @@ def _starts(
 
 
 def _positive(solution: Solution, shape: _Shape) -> bool:
-    """Whether the moduli of all terms are."""
+    """Whether the moduli of all terms are positive."""
     return bool((solution.shared[: len(shape.names)] > 0.0).all())
 
 
 def _fewer_terms(name: str) -> str:
-    """The Ogden law of one term less."""
+    """Name of the Ogden law with one term fewer."""
     count = _terms(name) - 1
     return "ogden" if count == 1 else f"ogden-{count}"
 
 
 def _with_idle_term(name: str, fewer: Candidate) -> Candidate:
-    """The law of one term more whose last term does nothing, since none of those tried helps."""
+    """The law with one more term of zero modulus, since no other term improves the fit."""
     count = _terms(name)
     single = {"mu_pa": "mu1_pa", "alpha": "alpha1"}
     extra = {f"mu{count}_pa": 0.0, f"alpha{count}": 2.0}
@@ -292,12 +292,12 @@ def _with_idle_term(name: str, fewer: Candidate) -> Candidate:
 
 
 def _unknown(unit: str) -> Estimate:
-    """A number that the data do not tell."""
+    """Estimate of a parameter that is not identifiable."""
     return Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
 
 
 def _grid(shape: _Shape) -> list[Floats]:
-    """Starts: 31 of one number; of several exponents all rising sets of a few."""
+    """Starting points: 31 for one parameter; rising combinations for several exponents."""
     count = len(shape.names)
     if count == 1:
         return [np.array([s]) for s in np.linspace(shape.low[0], shape.high[0], 33)[1:-1]]
@@ -306,7 +306,7 @@ def _grid(shape: _Shape) -> list[Floats]:
 
 
 def _ordered(solution: Solution, count: int) -> Solution:
-    """Terms with rising exponents."""
+    """Sort the terms by rising exponent."""
     order = np.argsort(solution.search)
     if count == 1 or (np.diff(order) > 0).all():
         return solution
@@ -329,7 +329,7 @@ def _candidate(
     free = np.ones(count, dtype=bool)
     scale = np.ones(count)
     if shape is not None:
-        # A number at the end of the range has no slope to tell its spread from.
+        # A parameter at the end of its range has no slope from which to estimate its spread.
         inside = (solution.search > shape.low + _EDGE) & (solution.search < shape.high - _EDGE)
         free[:searched] = inside
         scale[:searched] = [shape.slope(float(s)) for s in solution.search]
@@ -343,17 +343,17 @@ def _candidate(
     order = np.concatenate([np.arange(searched, count), np.arange(searched)])
     covariance = covariance[np.ix_(order, order)]
     std = dict(zip(numbers, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True))
-    untold = _untold(numbers, std)
+    unknown = _not_identifiable(numbers, std)
     estimates = {
         label: student_estimate(value, std[label], quantile, "Pa" if label.endswith("_pa") else "")
-        if label not in untold
+        if label not in unknown
         else _unknown("Pa" if label.endswith("_pa") else "")
         for label, value in numbers.items()
     }
     if "lambda_m" in numbers:
         limit = estimates["lambda_m"]
         estimates["chain_segments"] = (
-            _unknown("") if "lambda_m" in untold
+            _unknown("") if "lambda_m" in unknown
             else student_estimate(limit.value**2, 2.0 * limit.value * limit.std, quantile, "")
         )  # fmt: skip
     modelled = tuple(t.stress_pa - e for t, e in zip(samples, solution.residuals, strict=True))
@@ -365,12 +365,12 @@ def _candidate(
     )  # fmt: skip
 
 
-def _untold(numbers: dict[str, float], std: dict[str, float]) -> set[str]:
-    """Names of the numbers that the data do not tell."""
+def _not_identifiable(numbers: dict[str, float], std: dict[str, float]) -> set[str]:
+    """Names of the parameters that are not identifiable."""
     found = {label for label in numbers if not math.isfinite(std[label])}
     for label in ("lambda_m", "jm"):
-        # These are above a limit: an interval down to zero is one up to infinity.
-        if label in numbers and not std[label] < _UNTOLD * numbers[label]:
+        # These parameters are above a limit: an interval down to zero means one up to infinity.
+        if label in numbers and not std[label] < _LARGEST_STD * numbers[label]:
             found.add(label)
     exponents = [label for label in numbers if label.startswith("alpha")]
     for label in exponents:
@@ -386,7 +386,7 @@ def _untold(numbers: dict[str, float], std: dict[str, float]) -> set[str]:
 
 
 def _criteria(likelihood: float, samples: int, numbers: int) -> tuple[float, float, float]:
-    """Akaike's, the same corrected for few samples, Schwarz's; the noise's variance counts.
+    """AIC, AICc and BIC; the variance of the noise counts as a parameter.
 
     `likelihood` is twice the negative logarithm of the likelihood, without its constant.
     """

@@ -1,4 +1,4 @@
-"""Any static map as a smooth, on request monotone, spline; the data choose how smooth."""
+"""Static map as a smoothing spline, optionally monotone; the data determine the smoothness."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _MOST_PIECES = 40
 _LEAST_PIECES = 4
 _SAMPLES_A_PIECE = 3
 _LEAST_SAMPLES = 8
-_LEAST_SLOPE = 1e-3  # of a monotone map, against the mean slope
-_STIFFNESS = (-10.0, 8.0)  # decades of the weight of the bending, against that of the data
+_LEAST_SLOPE = 1e-3  # of a monotone map, relative to the mean slope
+_STIFFNESS = (-10.0, 8.0)  # decades of the weight of the curvature, relative to that of the data
 _ROUNDS = 4
-_FEW = 30  # independent samples below which the spread of the noise is a guess
+_FEW = 30  # independent samples below which the noise level is poorly known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class MapFit(CurveFit):
         y: the same. Shape `(N,)`.
         curve: the map; None without a result.
         monotone: whether the curve rises, or falls, everywhere.
-        effective_parameters: numbers that the curve really uses; 2 is a straight line.
+        effective_parameters: effective degrees of freedom; 2 is a straight line.
         hysteresis_width: mean distance of the rising and the falling branch at equal x; 0 when
             there is one branch only.
         r_squared: share of the variance that the curve explains.
@@ -72,7 +72,7 @@ class MapFit(CurveFit):
     def value_std(self, x: ArrayLike) -> Floats:
         """Standard deviation of the value, in the unit of y.
 
-        Noise and what the smoothing may hide both count.
+        Includes the noise and the smoothing bias.
 
         Args:
             x: abscissas. Shape `(...)`.
@@ -87,7 +87,7 @@ class MapFit(CurveFit):
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(x.shape))
 
     def inverse_std(self, y: ArrayLike) -> Floats:
-        """Standard deviation of the abscissa at which the map gives `y`, linear about the map.
+        """Standard deviation of the abscissa at which the map gives `y`, linearised about the map.
 
         Args:
             y: values. Shape `(...)`.
@@ -113,13 +113,13 @@ class MapFit(CurveFit):
         )
 
     def answer(self) -> JsonObject:
-        """Numbers by name, for JSON; arrays go over the knots."""
-        told = self.succeeded
+        """The result for JSON; arrays have one value per knot."""
+        usable = self.succeeded
         return {
-            "x": self.map.knots if told else None,
-            "y": self.map.values if told else None,
-            "y_std": self.value_std(self.map.knots) if told else None,
-            "slope": self.map.slopes if told else None,
+            "x": self.map.knots if usable else None,
+            "y": self.map.values if usable else None,
+            "y_std": self.value_std(self.map.knots) if usable else None,
+            "slope": self.map.slopes if usable else None,
             "monotone": self.monotone,
             "effective_parameters": self.effective_parameters,
             "hysteresis_width": self.hysteresis_width,
@@ -133,10 +133,10 @@ def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
     r"""Penalised least squares of a quadratic spline.
 
     $\min \sum_i (y_i - f(x_i))^2 + \lambda \int f''^2$, with $f' \ge$ a thousandth of the mean
-    slope where a monotone map is asked for
+    slope for a monotone map
 
-    The weight $\lambda$ is that of the largest restricted likelihood. Noise that is coloured in
-    time, or a hysteresis loop, counts for as few samples as it is worth.
+    The weight $\lambda$ maximises the restricted likelihood. Noise that is coloured in
+    time, or a hysteresis loop, reduces the effective number of samples.
 
     Args:
         x: abscissas in order of time. Shape `(N,)`.
@@ -145,7 +145,7 @@ def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: fewer than 8 samples, unequal lengths, NaN, a column without change.
+        InputError: fewer than 8 samples, unequal lengths, NaN, a constant column.
     Source: Ramsay, Statistical Science 3 (1988), 425; Wood, J. R. Stat. Soc. B 73 (2011), 3, for
         the weight; Nychka, J. Am. Stat. Assoc. 83 (1988), 1134, for the intervals.
     Example:
@@ -161,8 +161,8 @@ def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
     sign = trend(x, y)
     if distinct < 4 or (monotone and sign == 0):
         reason = (
-            f"no result: x takes {distinct} values only; record a sweep of it" if distinct < 4
-            else "no result: y does not follow x; check the columns, or leave out monotone"
+            f"no result: x has only {distinct} distinct values; record a sweep of x" if distinct < 4
+            else "no result: y does not depend on x; check the columns, or fit without monotone"
         )  # fmt: skip
         return MapFit(status=reason, x=x, y=y)
     knots = np.linspace(x.min(), x.max(), pieces + 1)
@@ -212,15 +212,15 @@ def _columns(x: Floats, knots: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Least squares with a penalty, in sums over the samples.
+    """Penalised least squares, as sums over the samples.
 
     Args:
         columns: functions of the start and the slopes. Shape `(N, P)`.
         y: values. Shape `(N,)`.
         gram: `columns' columns`. Shape `(P, P)`.
         moment: `columns' y`. Shape `(P,)`.
-        bending: integral of the squared second derivative, as a form of the numbers, scaled to
-            the size of `gram`. Shape `(P, P)`.
+        bending: integral of the squared second derivative, as a quadratic form of the parameters,
+            scaled to the size of `gram`. Shape `(P, P)`.
     """
 
     columns: Floats
@@ -240,12 +240,12 @@ class _Problem:
         return cls(columns, y, gram, columns.T @ y, bending)
 
     def solved(self, weight: float, share: float) -> Floats:
-        """Numbers of the least sum; `share` of the samples count."""
+        """Parameters of the smallest sum when a `share` of the samples counts."""
         matrix = share * self.gram + weight * self.bending
         return np.asarray(np.linalg.solve(matrix, share * self.moment))
 
     def held(self, weight: float, share: float, sign: int, least: float) -> Floats:
-        """The same with slopes of one sign."""
+        """The same with all slopes of one sign."""
         triangle = np.linalg.cholesky(share * self.gram + weight * self.bending).T
         target = np.linalg.solve(triangle.T, share * self.moment)
         low = np.full(self.moment.size, least if sign > 0 else -np.inf)
@@ -254,7 +254,7 @@ class _Problem:
         return np.asarray(lsq_linear(triangle, target, (low, high), method="bvls").x)
 
     def spread(self, weight: float, share: float, cost: float) -> tuple[Floats, float]:
-        """Covariance of the numbers, and how many of them are used."""
+        """Covariance of the parameters, and the effective degrees of freedom."""
         inverse = np.asarray(np.linalg.inv(share * self.gram + weight * self.bending))
         effective = float(np.trace(inverse @ self.gram) * share)
         freedom = max(self.y.size - effective / share, 1.0) if share < 1.0 else 0.0
@@ -263,7 +263,7 @@ class _Problem:
 
 
 def _weighed(problem: _Problem) -> tuple[float, float]:
-    """Weight of the bending, and the share of the samples that coloured noise leaves."""
+    """Weight of the curvature, and the share of the samples that are independent."""
     share = 1.0
     weight = _likeliest(problem, share)
     for _ in range(_ROUNDS):
@@ -278,7 +278,7 @@ def _weighed(problem: _Problem) -> tuple[float, float]:
 
 
 def _likeliest(problem: _Problem, share: float) -> float:
-    """Weight of the largest restricted likelihood."""
+    """Weight that maximises the restricted likelihood."""
     samples = max(share * problem.y.size, 4.0)
     total = share * float(problem.y @ problem.y)
     floor = 1e-14 * total
@@ -303,15 +303,15 @@ def _notes(curve: SplineMap, held: NDArray[np.bool_], samples: float) -> tuple[s
     if held.any():
         low, high = curve.knots[held].min(), curve.knots[held].max()
         notes.append(
-            f"The data turn back somewhere in [{low:.4g}, {high:.4g}]; the curve is held nearly "
-            "flat there, and its inverse is not told."
+            f"The data are not monotone somewhere in [{low:.4g}, {high:.4g}]; the curve is held "
+            "nearly flat there, and its inverse is not identifiable."
         )
     elif not curve.is_monotone:
         turn = float(curve.knots[1:][np.diff(np.sign(curve.slopes)) != 0][0])
-        notes.append(f"The curve turns near x = {turn:.4g} and has no inverse; ask for monotone.")
+        notes.append(f"The curve turns near x = {turn:.4g} and has no inverse. Use monotone.")
     if samples < _FEW:
         notes.append(
-            f"The residuals are so coloured that the record is worth {samples:.0f} independent "
-            "samples; the intervals are rough. Record more cycles."
+            f"The residuals are correlated, so the record is equivalent to {samples:.0f} "
+            "independent samples and the intervals are rough. Record more cycles."
         )
     return tuple(notes)

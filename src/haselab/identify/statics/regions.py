@@ -32,13 +32,13 @@ _ROUNDING = 1e-9  # of the load's span: residuals below it do not count for BIC
 
 @dataclass(frozen=True)
 class Region:
-    """One straight piece.
+    """One straight segment.
 
     Args:
         low: stretch at its lower end.
         high: stretch at its upper end.
         slope_n: load per unit stretch, in N.
-        r_squared: share of the load's variance within the piece that the line explains.
+        r_squared: share of the load's variance within the segment that the line explains.
     """
 
     low: Estimate
@@ -65,10 +65,10 @@ class RegionsFit(CurveFit):
     on, in the order of the stretch; its `residuals` are load minus line at `stretch`, in N.
 
     Args:
-        regions: straight pieces, the longest first.
+        regions: straight segments, the longest first.
         r_squared: share of the load's variance that the broken line explains.
-        bic: Bayesian information criterion of each number of pieces that was tried, against that
-            of the chosen number.
+        bic: Bayesian information criterion for each number of segments that was tried, relative to
+            that of the chosen number.
         stretch: stretches, sorted. Shape `(N,)`.
         load_n: load at `stretch`, in N. Shape `(N,)`.
     """
@@ -105,7 +105,7 @@ class RegionsFit(CurveFit):
         )  # fmt: skip
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         return {
             "regions": [region.to_dict() for region in self.regions],
             "chosen": self.chosen if self.regions else None,
@@ -117,16 +117,16 @@ class RegionsFit(CurveFit):
 
 
 def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = None) -> RegionsFit:
-    r"""Fit a continuous broken line; its straight pieces are the linear regions.
+    r"""Fit a continuous broken line; its straight segments are the linear regions.
 
     $\min \sum_i \bigl(F_i - c - \sum_k s_k\,(\lambda_i - \lambda_k)_+\bigr)^2$ over the break
-    points too: the best of a grid is found exactly, then moved freely. Each piece holds three
+    points too: the best of a grid is found exactly, then refined. Each segment has three
     samples or more.
 
     Args:
         stretch: stretches, in any order. Shape `(N,)`.
         load_n: loads, in N. Shape `(N,)`.
-        pieces: number of straight pieces. None: the number of up to six that BIC prefers.
+        pieces: number of straight segments. None: the number of up to six that BIC prefers.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -151,9 +151,9 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = Non
         if pieces is None or count == pieces
     }
     if not tried:
-        reason = "no result: the stretches are too few or too repeated for the pieces; fit fewer"
+        reason = "no result: too few distinct stretches for these segments; fit fewer segments"
         return RegionsFit(status=reason, stretch=x, load_n=y)
-    # The largest number of pieces leaves the least of the curve in its residuals.
+    # The residuals of the largest number of segments contain the least of the curve.
     share = independent_share(tried[max(tried)].residuals)
     scores = {count: _bic(solution, count, y, share) for count, solution in tried.items()}
     chosen = min(scores, key=lambda count: scores[count])
@@ -169,8 +169,8 @@ def _checked(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None) -> tuple
     most = x.size // _LEAST_SAMPLES
     if pieces is not None and not 1 <= pieces <= most:
         raise InputError(
-            f"pieces = {pieces}; allowed is 1 to {most}, a third of the {x.size} samples. "
-            "Fit fewer pieces, or record more loads."
+            f"pieces = {pieces}; must be 1 to {most}, a third of the {x.size} samples. "
+            "Fit fewer segments, or record more loads."
         )
     order = np.argsort(x, kind="stable")
     return x[order], y[order]
@@ -188,7 +188,7 @@ def _bases(x: Floats, y: Floats, breaks: Floats) -> list[Basis]:
 
 
 def _best(x: Floats, y: Floats, starts: list[Floats]) -> Solution:
-    """The best of some lines on the grid, its break points moved between their neighbours."""
+    """The best of several lines on the grid, with its break points refined."""
     found = []
     for start in starts:
         on_grid = project(start, _bases(x, y, start))
@@ -200,9 +200,9 @@ def _best(x: Floats, y: Floats, starts: list[Floats]) -> Solution:
 
 
 def _settled(x: Floats, y: Floats, solution: Solution) -> Solution:
-    """The line after a search without derivatives, which the kinks of the cost do not stop.
+    """Refine the line without derivatives, since the cost has kinks.
 
-    The derivative by a break point jumps where that passes a sample.
+    The derivative with respect to a break point jumps where it passes a sample.
     """
     start = solution.search
     if start.size == 0:
@@ -228,13 +228,13 @@ def _settled(x: Floats, y: Floats, solution: Solution) -> Solution:
 
 
 def _filled(x: Floats, breaks: Floats) -> bool:
-    """Whether each piece holds enough samples."""
+    """Whether each segment has enough samples."""
     counts = np.histogram(x, bins=np.concatenate([[-np.inf], breaks, [np.inf]]))[0]
     return bool((counts >= _LEAST_SAMPLES).all())
 
 
 def _bic(solution: Solution, pieces: int, y: Floats, share: float) -> float:
-    """Schwarz's criterion for the samples that coloured residuals are worth."""
+    """Schwarz's criterion with the effective number of samples of coloured residuals."""
     floor = y.size * (_ROUNDING * float(np.ptp(y))) ** 2
     samples = share * y.size
     return samples * math.log((solution.cost + floor) / y.size) + 2 * pieces * math.log(samples)
@@ -242,11 +242,11 @@ def _bic(solution: Solution, pieces: int, y: Floats, share: float) -> float:
 
 @dataclass(frozen=True)
 class _Spread:
-    """What the intervals of a broken line need.
+    """Quantities needed for the intervals of a broken line.
 
     Args:
-        covariance: of break points and factors, for the samples that the residuals are worth.
-        inflation: of the variance of each, against that of white noise in all samples.
+        covariance: of break points and factors, for the effective number of samples.
+        inflation: of the variance of each, relative to white noise.
         quantile: of Student's distribution for 95 %.
     """
 
@@ -267,7 +267,7 @@ class _Spread:
 
 
 def _break_estimates(x: Floats, y: Floats, solution: Solution, spread: _Spread) -> list[Estimate]:
-    """Break points; an interval ends where the best line through a moved one is too bad."""
+    """Break points with profile-likelihood intervals."""
     std = np.sqrt(np.maximum(np.diag(spread.covariance), 0.0))
     found = []
     for k, place in enumerate(solution.search):
@@ -285,7 +285,7 @@ def _break_estimates(x: Floats, y: Floats, solution: Solution, spread: _Spread) 
 def _profile_end(
     x: Floats, y: Floats, solution: Solution, k: int, reach: float, allowed: float
 ) -> float:
-    """Place of break point `k` at which the cost is `allowed` above the least, by the secant."""
+    """Place of break point `k` where the cost exceeds the minimum by `allowed` (secant method)."""
     place = float(solution.search[k])
     if not math.isfinite(reach) or reach == 0.0 or not solution.cost > 0.0:
         return place + reach
@@ -297,7 +297,7 @@ def _profile_end(
         if not ends[0] < at < ends[1]:
             return ends[0] if step < 0.0 else ends[1]
         cost, others = _cost_with(x, y, others, k, at)
-        # The root of the excess is nearly a straight line of the step.
+        # The square root of the excess is nearly linear in the step.
         share = math.sqrt(max(cost - solution.cost, 0.0) / allowed)
         if abs(share - 1.0) < _PROFILE_GAP:
             break
@@ -312,7 +312,7 @@ def _profile_end(
 
 
 def _cost_with(x: Floats, y: Floats, breaks: Floats, k: int, at: float) -> tuple[float, Floats]:
-    """Least cost with break point `k` held, the others free between their neighbours."""
+    """Least cost with break point `k` held, the others free."""
     start = np.delete(breaks, k)
     left = int((start < at).sum())
     fences = np.concatenate([[x[0]], np.sort(np.append(start, at)), [x[-1]]])
@@ -344,7 +344,7 @@ def _describe(x: Floats, y: Floats, solution: Solution, bic: dict[int, float]) -
     residuals = solution.residuals[0]
     regions = []
     for k in range(breaks.size + 1):
-        # The slope of a piece is the sum of all changes up to it.
+        # The slope of a segment is the sum of all changes up to it.
         part = slice(breaks.size + 1, breaks.size + 2 + k)
         slope = student_estimate(
             factors[1 : 2 + k].sum(), math.sqrt(max(covariance[part, part].sum(), 0.0)),

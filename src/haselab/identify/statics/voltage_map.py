@@ -95,7 +95,7 @@ class VoltageMapFit(CurveFit):
         )  # fmt: skip
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         return {
             **{name: self.parameters.get(name) for name in _NAMES},
             "monotone": self.monotone,
@@ -108,7 +108,7 @@ class VoltageMapFit(CurveFit):
 
 @dataclass(frozen=True)
 class _Curve:
-    """The fitted curve over `x = (strain - middle) / half`, see `exponentials`.
+    """The fitted curve as a function of `x = (strain - middle) / half`, see `exponentials`.
 
     Args:
         middle: middle of the record's strains.
@@ -151,7 +151,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
 
     $V = a_1 e^{b_1 \varepsilon} + a_2 e^{b_2 \varepsilon}$: the rates are searched from a grid,
     the amplitudes are solved for. A curve that would turn within the range is held back to a
-    slope of a thousandth of the mean one; the intervals are those without that limit.
+    slope of a thousandth of the mean slope; the intervals ignore that limit.
 
     Args:
         strain: strains in order of time, dimensionless. Shape `(N,)`.
@@ -159,9 +159,9 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: fewer than 8 samples, unequal lengths, NaN, a column without change.
+        InputError: fewer than 8 samples, unequal lengths, NaN, a constant column.
     Source: reference study, eq. 4; variable projection, Golub and Pereyra (1973); intervals from
-        the covariance for the noise model of the residuals, the hysteresis being part of these.
+        the covariance for the noise model of the residuals, which include the hysteresis.
     Example:
         >>> strain = np.linspace(-0.045, 0.147, 200)
         >>> voltage_v = VoltageMap(1.324, 3.124, -0.2805, -26.92).voltage_v(strain)
@@ -176,7 +176,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
     x = (e - middle) / half
     sign = trend(x, v)
     if sign == 0:
-        reason = "no result: the voltage does not follow the strain; check the columns"
+        reason = "no result: the voltage does not depend on the strain; check the columns"
         return VoltageMapFit(status=reason, strain=e, voltage_v=v)
     reach = 1.0 + 2.0 * _MARGIN
     solution = search_free(x, v)
@@ -190,7 +190,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
 
 
 def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """Both columns, and a note where the voltage may be kilovolts."""
+    """Check both columns; return a note where the voltage may be in kilovolts."""
     e, v = paired(
         "strain", strain, "voltage_v", voltage_v, least=8, record="record a triangle test"
     )
@@ -201,7 +201,7 @@ def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats, t
 def _describe(
     e: Floats, v: Floats, curve: _Curve, solution: Solution, limited: bool
 ) -> VoltageMapFit:
-    """Numbers with intervals, judged."""
+    """Parameters with intervals, status and notes."""
     (estimates, covariance), residuals = curve.estimates(), solution.residuals[0]
     chart = curve.map
     return VoltageMapFit(

@@ -1,4 +1,4 @@
-"""Intervals of a transfer function by repeated experiments on paper: the bootstrap."""
+"""Intervals of a transfer function by repeated simulated experiments (bootstrap)."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def bootstrap_transfer(
 ) -> dict[str, Estimate]:
     """Estimates whose intervals are percentiles over repeated, simulated experiments.
 
-    Each draw is the fitted output with new noise, of the colour that the residuals have; it is
-    fitted from the fitted numbers on. So curvature shows in the interval, which the covariance of
-    the fit leaves out.
+    Each draw is the fitted output with new noise, with the spectrum of the residuals; it is
+    fitted again, starting from the fitted parameters. The interval therefore includes the
+    curvature, which the covariance of the fit leaves out.
 
     Args:
         fit: a fit with a result.
         draws: number of simulated experiments, 100 or more.
-        rng: source of the noise.
+        rng: random generator of the noise.
     Returns:
-        All numbers of the fit by name: fitted value, standard deviation and 2.5 and 97.5
-        percentiles of the draws. What the records do not tell stays without a number, what is
-        fixed has no spread.
+        All parameters of the fit by name: fitted value, standard deviation and 2.5 and 97.5
+        percentiles of the draws. A parameter that is not identifiable stays NaN; a fixed one
+        has no spread.
     Raises:
         InputError: too few draws.
         ResultError: the fit has no result.
@@ -57,8 +57,7 @@ def bootstrap_transfer(
     """
     if draws < _LEAST:
         raise InputError(
-            f"draws = {draws}; allowed is {_LEAST} or more, for the ends of a 95 % interval. "
-            "Raise it."
+            f"draws = {draws}; must be {_LEAST} or more, for the ends of a 95 % interval."
         )
     if fit.best is None:
         raise ResultError(f"The fit has no result: {fit.status}")
@@ -77,7 +76,7 @@ def bootstrap_transfer(
 def _drawn(
     fit: TransferFit, layout: Layout, draws: int, rng: np.random.Generator
 ) -> Iterator[Floats]:
-    """Numbers and factors of each simulated experiment."""
+    """Searched parameters and factors of each simulated experiment."""
     assert fit.best is not None
     columns, start = fit.best.columns, fit.best.found.search
     polynomial, variance = noise_behind(fit.residuals, columns.sensitivities, columns.own)

@@ -19,8 +19,8 @@ from haselab.identify.transfer.fit import TransferFit, fit_transfer
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.identify.transfer.nonlinear import (
     beats_linear,
-    linear_rivals,
-    nonlinear_rivals,
+    linear_candidates,
+    nonlinear_candidates,
 )
 from haselab.models.filters import lfilter
 
@@ -41,7 +41,7 @@ class Candidate:
 
     Args:
         fit: its fit.
-        bic: Bayesian information criterion, the noise model of the best fit taken for all.
+        bic: Bayesian information criterion, with the noise model of the best fit for all.
     """
 
     fit: TransferFit
@@ -50,11 +50,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class TransferChoice:
-    """The structure that the records support, and its rivals.
+    """The structure that the records support, and all other candidates.
 
     Args:
         candidates: all that were fitted, the lowest criterion first.
-        notes: what the reader of the numbers should know, a sentence each.
+        notes: remarks for the user, one sentence each.
     """
 
     candidates: tuple[Candidate, ...]
@@ -67,16 +67,16 @@ class TransferChoice:
 
     @property
     def status(self) -> str:
-        """The word ok, or why there is no result."""
+        """ "ok", or why there is no result."""
         return self.fit.status
 
     @property
     def succeeded(self) -> bool:
-        """Whether the numbers may be used."""
+        """Whether the fit has a usable result."""
         return self.fit.succeeded
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract, and the candidates with their criterion."""
+        """The result under its public JSON keys, and the candidates with their criterion."""
         lowest = self.candidates[0].bic
         return {
             **self.fit.answer(),
@@ -89,13 +89,13 @@ class TransferChoice:
         }
 
 
-def _told(structure: TransferStructure) -> dict[str, Any]:
+def _structure_dict(structure: TransferStructure) -> dict[str, Any]:
     return {name: getattr(structure, name) for name in _VARIED}
 
 
 def _described(fit: TransferFit) -> dict[str, Any]:
     kind = fit.kind if isinstance(fit, NonlinearFit) else None
-    return {**_told(fit.structure), _NONLINEAR: kind}
+    return {**_structure_dict(fit.structure), _NONLINEAR: kind}
 
 
 def choose_transfer(
@@ -111,12 +111,12 @@ def choose_transfer(
 
     Args:
         records: experiments.
-        start: where the search begins, and what is kept of what does not vary. One resonance with a
-            delay when not given.
-        varied: what may change, of `poles`, `zeros`, `delay` (estimated or zero), `slow_modes`, and
-            `nonlinear` (a curve of the input or the output, a cubic spring).
+        start: first structure; its fields that are not varied are kept. Default: one resonance
+            with a delay.
+        varied: which of these may change: `poles`, `zeros`, `delay` (estimated or zero),
+            `slow_modes`, and `nonlinear` (a curve of the input or the output, a cubic spring).
     Returns:
-        The chosen fit and all others.
+        The chosen fit and all other candidates.
     Raises:
         InputError: as of `fit_transfer`; an unknown name in `varied`.
     Source: Schwarz, Ann. Stat. 6 (1978), 461.
@@ -133,9 +133,7 @@ def choose_transfer(
     allowed = (*_VARIED, _NONLINEAR)
     unknown = sorted(set(varied) - set(allowed))
     if unknown:
-        raise InputError(
-            f"varied names {', '.join(unknown)}; allowed are {', '.join(allowed)}. Correct it."
-        )
+        raise InputError(f"varied names {', '.join(unknown)}; must be one of {', '.join(allowed)}.")
     fits = [fit_transfer(records, start)]
     tried = {_key(fits[0].structure)}
     ranked = _ranked(fits)
@@ -158,23 +156,23 @@ def choose_transfer(
 def _with_nonlinear(
     records: Sequence[Record], linear: Sequence[Candidate], start: TransferStructure
 ) -> tuple[list[Candidate], tuple[str, ...]]:
-    """All candidates, a nonlinear one first if it beats the linear ones; what is to be said."""
+    """All candidates, a nonlinear one first if it beats the linear ones, and notes."""
     chosen = linear[0].fit
     structures = [chosen.structure]
     if _key(start) != _key(chosen.structure):
         structures.append(start)
     fits: list[TransferFit] = [c.fit for c in linear]
     known = {_key(fit.structure) for fit in fits}
-    richer = [fit for fit in linear_rivals(chosen) if _key(fit.structure) not in known]
-    nonlinear = nonlinear_rivals(records, structures, chosen)
+    richer = [fit for fit in linear_candidates(chosen) if _key(fit.structure) not in known]
+    nonlinear = nonlinear_candidates(records, structures, chosen)
     everything = _ranked([*fits, *richer, *nonlinear])
     criterion = {id(c.fit): c.bic for c in everything}
-    rivals = [c for c in everything if not isinstance(c.fit, NonlinearFit)]
-    best = rivals[0] if rivals[0].fit.residuals else None
+    linear_ones = [c for c in everything if not isinstance(c.fit, NonlinearFit)]
+    best = linear_ones[0] if linear_ones[0].fit.residuals else None
     for candidate in everything:
         fit = candidate.fit
         if not chosen.succeeded and fit.residual_whiteness_p < _WHITE:
-            continue  # what the linear fit has named, such as a clipped input, is left in it
+            continue  # keep causes found by the linear fit, such as a clipped input
         if isinstance(fit, NonlinearFit) and beats_linear(
             fit, candidate.bic, best.fit if best else None, best.bic if best else math.inf
         ):
@@ -197,7 +195,7 @@ def _words(structure: TransferStructure) -> str:
 
 
 def _fit_or_not(records: Sequence[Record], structure: TransferStructure) -> TransferFit:
-    """The fit; a structure for which there are too few samples has no result."""
+    """The fit; with too few samples for the structure, a fit without a result."""
     try:
         return fit_transfer(records, structure)
     except InputError as error:
@@ -205,11 +203,11 @@ def _fit_or_not(records: Sequence[Record], structure: TransferStructure) -> Tran
 
 
 def _key(structure: TransferStructure) -> tuple[object, ...]:
-    return tuple(_told(structure).values())
+    return tuple(_structure_dict(structure).values())
 
 
 def _neighbours(at: TransferStructure, varied: Sequence[str]) -> Iterator[TransferStructure]:
-    """Structures one step away."""
+    """Structures that differ by one step."""
     if "slow_modes" in varied:
         if at.slow_modes < _MOST_SLOW:
             yield replace(at, slow_modes=at.slow_modes + 1)
@@ -228,7 +226,7 @@ def _neighbours(at: TransferStructure, varied: Sequence[str]) -> Iterator[Transf
         if at.poles > 1:
             yield replace(at, poles=at.poles - 1, zeros=min(at.zeros, at.poles - 2))
     if "poles" in varied and "zeros" in varied and at.poles + 2 <= _MOST_POLES:
-        yield replace(at, poles=at.poles + 2, zeros=at.zeros + 2)  # one resonance more
+        yield replace(at, poles=at.poles + 2, zeros=at.zeros + 2)  # one more resonance
 
 
 def _ranked(fits: Sequence[TransferFit]) -> list[Candidate]:
@@ -236,7 +234,8 @@ def _ranked(fits: Sequence[TransferFit]) -> list[Candidate]:
     good = [fit for fit in fits if fit.succeeded]
     if not good:
         return [Candidate(fit, math.inf) for fit in fits]
-    # Excluded outputs (spikes, clipping) differ between fits, so each energy is a mean.
+    # Excluded outputs (spikes, clipping) differ between fits, so each energy is normalised by its
+    # count.
     closest = min(good, key=lambda fit: _energy(fit, np.ones(1)) / _count(fit))
     polynomial = autoregression(closest.residuals)[0]
     count = max(_count(fit) for fit in good)
@@ -261,15 +260,15 @@ def _energy(fit: TransferFit, polynomial: Floats) -> float:
 
 
 def _hidden_creep(ranked: Sequence[Candidate]) -> tuple[str, ...]:
-    """A sentence where a slow branch could hide, or is there but not told."""
+    """A note where a slow branch may be present but is not identifiable."""
     chosen = ranked[0].fit
-    rivals = (c.fit for c in ranked if c.fit.structure.slow_modes > chosen.structure.slow_modes)
-    richer = next(rivals, None)
+    larger = (c.fit for c in ranked if c.fit.structure.slow_modes > chosen.structure.slow_modes)
+    richer = next(larger, None)
     if chosen.structure.slow_modes or richer is None:
         return ()
     if richer.succeeded and math.isfinite(richer.parameters["slow_time_constant_s"].std):
         return ()
     return (
-        "Creep is not identifiable from these records: a slow branch may be there or not. Add a "
-        "step that lasts several times as long as the creep.",
+        "Creep is not identifiable from these records: a slow branch may or may not be present. "
+        "Add a step that lasts several times as long as the creep.",
     )

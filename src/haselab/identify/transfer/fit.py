@@ -20,7 +20,7 @@ from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.prediction import fitted_output, predict
 from haselab.identify.record import Record, finite_vector
 from haselab.identify.residual_tests import input_correlation_p
-from haselab.identify.transfer.checks.ambiguity import Rival, ambiguity, rivals_of
+from haselab.identify.transfer.checks.ambiguity import OtherMinimum, ambiguity, find_other_minima
 from haselab.identify.transfer.checks.diagnosis import diagnosed
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer.parameters import (
@@ -43,16 +43,16 @@ __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
 Floats = NDArray[np.float64]
 _HELD_OUT = 0.25
 _MOST_RECORDS = 64
-_RUNAWAY = 1.3  # growth in an eighth of a record
-_SWAPPED = 50.0  # per cent of fit the wrong way round
+_RUNAWAY = 1.3  # growth per eighth of a record
+_SWAPPED = 50.0  # per cent of fit with the columns swapped
 _LITTLE = 30.0  # per cent of fit
 _RELATED = 1e-3
 _UNEXPLAINED = (
-    "no result: the model explains {:.1f} % of the output, and what is left still follows the "
+    "no result: the model explains {:.1f} % of the output, and the residuals still follow the "
     "input; check --input and --output, or fit more poles"
 )
 _RESTING = (
-    "A step at t = 0 cannot be told from an initial state: rest before the step is assumed. "
+    "A step at t = 0 is indistinguishable from an initial state; rest before it is assumed. "
     "Record the time before the step too."
 )
 
@@ -70,9 +70,9 @@ class TransferFit(RecordFit[Record]):
         zeros: zeros of the fast part, in rad/s.
         fit_percent: NRMSE fit of all samples.
         residual_whiteness_p: Ljung-Box probability; below 0.05 something is unexplained.
-        best: what the search found; None without a result.
-        rivals: other minima that the search met, with their likelihoods.
-        ambiguous: two models explain the records: the fit is right, its numbers may not be.
+        best: solution of the search; None without a result.
+        other_minima: other minima found by the search, with their likelihoods.
+        ambiguous: two models explain the records: the fit is good, but its parameters may be wrong.
     """
 
     structure: TransferStructure
@@ -81,17 +81,17 @@ class TransferFit(RecordFit[Record]):
     fit_percent: float = math.nan
     residual_whiteness_p: float = math.nan
     best: Best | None = field(default=None, repr=False)
-    rivals: tuple[Rival, ...] = ()
+    other_minima: tuple[OtherMinimum, ...] = ()
     ambiguous: bool = False
 
     @property
     def records(self) -> tuple[Record, ...]:
-        """The experiments, an unknown input before them replaced by the likelier one."""
+        """The experiments, an unknown input before them replaced by the more likely guess."""
         return () if self.best is None else tuple(self.best.records)
 
     @property
     def parameter_count(self) -> int:
-        """Count of all fitted numbers, the state and offset of each record included."""
+        """Count of all fitted parameters, the state and offset of each record included."""
         if self.best is None:
             return 0
         found = self.best.found
@@ -114,9 +114,9 @@ class TransferFit(RecordFit[Record]):
 
     @cached_property
     def input_correlation_p(self) -> float:
-        """Probability that the residuals have nothing to do with the input.
+        """Probability of such residuals if they are uncorrelated with the input.
 
-        Below 0.05 some of the dynamics is missing.
+        Below 0.05 part of the dynamics is missing from the model.
         """
         if self.best is None:
             return math.nan
@@ -131,10 +131,10 @@ class TransferFit(RecordFit[Record]):
 
     @property
     def plant(self) -> Plant:
-        """The plant of the fitted numbers; a delay estimated below zero becomes zero.
+        """The plant with the fitted parameters; a delay estimated below zero becomes zero.
 
         Raises:
-            ResultError: the fit has no result, a number that the records do not tell, or is not
+            ResultError: the fit has no result, a parameter is not identifiable, or the fit is not
                 one resonance without zeros.
         """
         if not self.succeeded:
@@ -142,14 +142,14 @@ class TransferFit(RecordFit[Record]):
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
-                "plant takes 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
+                "Plant needs 2 and 0. Fit again with poles = 2, zeros = 0 and slow modes."
             )
         number = {name: estimate.value for name, estimate in self.parameters.items()}
         blind = [name for name, value in number.items() if math.isnan(value)]
         if blind:
             raise ResultError(
-                f"{', '.join(blind)} not identifiable from these records; a plant takes numbers. "
-                "Add a record that tells, or fit a simpler structure."
+                f"{', '.join(blind)} not identifiable from these records; a Plant needs a value "
+                "for each. Add a record that excites them, or fit a simpler structure."
             )
         return Plant(
             number["gain"],
@@ -171,8 +171,8 @@ class TransferFit(RecordFit[Record]):
         gain, delay_s = (self.parameters[name].value for name in ("gain", "delay_s"))
         if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
             raise ResultError(
-                "A gain, pole, zero or delay is not identifiable from these records; a model "
-                "takes numbers. Add a record that tells, or fit a simpler structure."
+                "A gain, pole, zero or delay is not identifiable from these records; a "
+                "model needs values. Add a record that excites them, or fit a simpler structure."
             )
         fast = self.poles[: self.structure.poles]
         model = RationalModel.from_poles(fast, self.zeros, gain, max(delay_s, 0.0))
@@ -180,10 +180,10 @@ class TransferFit(RecordFit[Record]):
 
     @property
     def posterior(self) -> PlantPosterior:
-        """The numbers with their covariance, from which `design_plausible` draws plants.
+        """The parameters with their covariance, from which `design_plausible` draws plants.
 
         Raises:
-            InputError: a number is not identifiable.
+            InputError: a parameter is not identifiable.
             ResultError: the fit has no result.
         """
         if not self.succeeded:
@@ -223,7 +223,7 @@ class TransferFit(RecordFit[Record]):
         return records_chart(title, self.records, self.residuals, (names or ("", "Output"))[1])
 
     def answer(self) -> JsonObject:
-        """The keys of the public contract."""
+        """The result under its public JSON keys."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
         return {
             **{key: self.parameters.get(key) for key in keys},
@@ -237,9 +237,9 @@ class TransferFit(RecordFit[Record]):
             "status": self.status,
             "notes": list(self.notes),
             "covariance": covariance_table(self.parameters, self.covariance),
-            "rivals": [
+            "other_minima": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
-                for r in self.rivals
+                for r in self.other_minima
             ],
         }
 
@@ -250,21 +250,22 @@ def fit_transfer(
     *,
     applied: bool = False,
 ) -> TransferFit:
-    r"""Fit one transfer function to all records; each has its own initial state and offset.
+    r"""Fit one transfer function to all records, each with its own initial state and offset.
 
     $\min_{\theta, c} \sum_r \lVert y_r - \Phi_r(\theta)\, c \rVert^2$: the poles and the delay are
-    searched, gains, states and offsets are solved for. The input is held as it really was; the
-    output is predicted exactly at its own times. No first guess is needed.
+    searched, gains, states and offsets are solved for. The input is interpolated by its actual
+    hold; the output is predicted exactly at its own times. No initial guess is needed.
 
     Args:
-        records: experiments, or one; a chirp and a step together tell fast and slow parts.
-        structure: what is fitted. One resonance with a delay when not given.
+        records: experiments, or one; a chirp and a step together identify the fast and the slow
+            part.
+        structure: model structure. Default: one resonance with a delay.
         applied: whether the inputs are known to have been applied as recorded, by the same clock:
-            a clipped or slew-limited input and a drifting clock are no rival explanations then.
+            a clipped or slew-limited input and a drifting clock are then not considered as causes.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: no record, or fewer samples than numbers to fit.
+        InputError: no record, or fewer samples than parameters to fit.
     Source: variable projection, Golub and Pereyra (1973) and Kaufman (1975); intervals from the
         covariance for the noise model of the residuals.
     Example:
@@ -291,13 +292,13 @@ def fit_transfer(
     alone = all(np.ptp(record.u) == 0.0 for record in records)
     if fit.succeeded or not (structure.initial_state and alone):
         return fit
-    # One step at t = 0 looks like a free decay from another state, so only rest can be assumed.
+    # One step at t = 0 looks like a free decay from another state, so rest has to be assumed.
     fit = _fit(layout_of(replace(structure, initial_state=False)), records, applied=applied)
     return replace(fit, notes=(*fit.notes, _RESTING))
 
 
 def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
-    """Why steady tones cannot determine the numbers; None: they can, or there is more."""
+    """Why steady tones cannot determine the parameters; None when the records suffice."""
     if not layout.structure.initial_state:
         return None
     tones: set[float] = set()
@@ -312,13 +313,13 @@ def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
         return None
     shown = " and ".join(f"{tone:.4g} Hz" for tone in sorted(tones))
     return (
-        f"input and output are steady tones of {shown}, which determine {2 * len(tones)} numbers, "
-        f"not {numbers}; excite more frequencies, or record the begin from rest"
+        f"input and output are steady tones of {shown}, which determine {2 * len(tones)} "
+        f"parameters, not {numbers}; excite more frequencies, or include the start from rest"
     )
 
 
 def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> TransferFit:
-    """Search, then describe."""
+    """Search the parameters, then describe the result."""
     _check_size(layout, records)
     tried: list[Best] = []
     for variant in _variants(records):
@@ -326,7 +327,7 @@ def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> Transfe
         search = best_fit(layout, variant, known)
         tried += [] if search is None else [search]
     if not tried:
-        return _no_result(layout, "no start led to a stable model; record longer, or fewer poles")
+        return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
     found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
     fit = _describe(layout, found.best)
     if found.fault is not None:
@@ -335,14 +336,14 @@ def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> Transfe
 
 
 def _doubtful(fit: TransferFit) -> bool:
-    """Whether the columns may be swapped: little is explained, or nothing was found."""
+    """Whether the columns may be swapped: the fit explains little or has no result."""
     if fit.succeeded or fit.ambiguous:
         return fit.fit_percent < _SWAPPED and fit.residual_whiteness_p < _RELATED
     return not math.isfinite(fit.fit_percent)
 
 
 def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
-    """What is wrong with records that have no result, if it shows."""
+    """Cause of a fit without a result, if it can be detected."""
     if any(_runs_away(record) for record in records):
         return (
             "no result: the output grows to the end of the record, so the plant is not stable "
@@ -352,12 +353,12 @@ def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
         turned = [Record.sampled(r.y, r.u, r.input_rate_hz) for r in records]
         backwards = _fit(layout_of(replace(structure, delay=0.0, fixed={})), turned, applied=True)
         if backwards.succeeded and backwards.fit_percent > _SWAPPED:
-            return "no result: the input follows the output; the columns are swapped"
+            return "no result: the input responds to the output; the columns are swapped"
     return None
 
 
 def _runs_away(record: Record) -> bool:
-    """Whether the output grows by a third and more in each of the last eighths of the record."""
+    """Whether the output grows by a third or more in each of the last eighths of the record."""
     parts = np.array_split(record.y - np.median(record.y[: max(1, record.y.size // 8)]), 8)
     size = np.sqrt([float(part @ part) / part.size for part in parts])
     return bool((size[4:] > _RUNAWAY * size[3:-1]).all())
@@ -366,21 +367,21 @@ def _runs_away(record: Record) -> bool:
 def _check_size(layout: Layout, records: Sequence[Record]) -> None:
     if len(records) > _MOST_RECORDS:
         raise InputError(
-            f"records holds {len(records)} experiments; allowed are up to {_MOST_RECORDS}. "
-            "Fit them in parts and compare, or leave some out."
+            f"There are {len(records)} records; at most {_MOST_RECORDS} are possible. "
+            "Fit groups of records and compare the results, or leave some out."
         )
     count = sum(record.y.size for record in records)
     own = layout.structure.offset + sum(s.order for s in layout.sections)
     wanted = layout.free.size + len(layout.factor_names) + own * len(records)
     if count < 2 * wanted:
         raise InputError(
-            f"The records hold {count} outputs; {wanted} numbers need {2 * wanted} or more. "
+            f"The records have {count} outputs; {wanted} parameters need at least {2 * wanted}. "
             "Record longer, or fit fewer poles."
         )
 
 
 def _variants(records: Sequence[Record]) -> list[list[Record]]:
-    """The records with each guess for an input before the record that is not known."""
+    """The records with each guess of an unknown input before the record."""
     choices = []
     for record in records:
         if record.input_before is not None:
@@ -399,21 +400,21 @@ def _no_result(layout: Layout, reason: str) -> TransferFit:
 
 
 def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
-    """Numbers with intervals, judged."""
+    """Parameters with intervals, status and notes."""
     records, found = best.records, best.found
     residuals = best.columns.residuals
     own = sum(factors.size for factors in found.own)
     parameters = found.search.size + found.shared.size + own
     inner = coloured_covariance(best.columns.sensitivities, residuals, parameters, best.columns.own)
     if not found.settled:
-        return _no_result(layout, "the search did not come to rest; record longer or fewer poles")
+        return _no_result(layout, "the search did not converge; record longer or fit fewer poles")
     if found.shared.size and not np.isfinite(np.diag(inner)[-found.shared.size :]).any():
         return _no_result(
             layout, "no gain is identifiable; fit fewer poles or zeros, or give the delay"
         )
     if not follows_input(best):
         return _no_result(
-            layout, "the output does not follow the input; check the columns and the sensor"
+            layout, "the output does not respond to the input; check the columns and the sensor"
         )
     size = found.search.size
     factors, better = profiled(layout, best, np.sqrt(np.maximum(np.diag(inner)[:size], 0.0)))
@@ -427,8 +428,10 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
     numbers = layout.full(found.search)
     estimates, covariance, notes = numbers_of(layout, best, inner)
     problem = TransferProblem(layout, records, delay_margin_s(records))
-    rivals = rivals_of(layout, problem, residuals, best.others, estimates) if best.others else ()
-    doubt = ambiguity(rivals, estimates)
+    other_minima: tuple[OtherMinimum, ...] = ()
+    if best.others:
+        other_minima = find_other_minima(layout, problem, residuals, best.others, estimates)
+    doubt = ambiguity(other_minima, estimates)
     return TransferFit(
         status=doubt or "ok",
         structure=layout.structure,
@@ -441,7 +444,7 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
         residuals=tuple(residuals),
         notes=(*notes, *_notes(layout.structure, best, estimates)),
         best=best,
-        rivals=rivals,
+        other_minima=other_minima,
         ambiguous=bool(doubt),
     )
 
@@ -466,10 +469,11 @@ def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estima
     notes = []
     delay = estimates["delay_s"]
     if delay.value < 0.0:
-        shown = "no different from zero" if delay.ci95[1] >= 0.0 else "below zero: check the clocks"
-        notes.append(f"The delay is {shown}; the plant takes 0 s.")
+        zero = delay.ci95[1] >= 0.0
+        shown = "not significantly above zero" if zero else "below zero (check the clocks)"
+        notes.append(f"The delay is {shown}; the plant uses 0 s.")
     if structure.zeros == structure.poles and structure.delay == "auto":
-        notes.append("With as many zeros as poles the delay is taken as 0 s; give --delay if not.")
+        notes.append("With as many zeros as poles the delay is assumed to be 0 s.")
     if best.whiteness_p < 0.05:
-        notes.append("The residuals are not white: the model leaves something unexplained.")
+        notes.append("The residuals are not white: the model does not explain everything.")
     return notes

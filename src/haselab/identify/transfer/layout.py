@@ -1,4 +1,4 @@
-"""What is fitted as a transfer function, and where each of its numbers sits in the search."""
+"""Structure of a transfer function, and the order of its parameters in the search."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ _MAX_POLES = 6
 
 @dataclass(frozen=True)
 class TransferStructure:
-    r"""What is fitted: $[B(s)/A(s) + \sum_i c_i/(\tau_i s + 1)]\, e^{-s T_d}$ with nuisances.
+    r"""Structure of the model $[B(s)/A(s) + \sum_i c_i/(\tau_i s + 1)]\, e^{-s T_d}$.
 
     Args:
-        poles: poles of the fast part, 1 to 6; two make a resonance.
-        zeros: zeros of the fast part, at most as many as poles. As many: the output follows a jump
-            of the input at once, as an acceleration does.
-        delay: "auto" to estimate it, or a known delay in s. A feed-through with "auto" has none.
-        slow_modes: slow branches beside the fast part.
-        offset: whether each record has its own constant.
-        initial_state: whether each record starts in its own state.
-        fixed: known numbers by name: `natural_frequency_rad_s`, `damping_ratio`,
+        poles: poles of the fast part, 1 to 6; two form a resonance.
+        zeros: zeros of the fast part, at most as many as poles. With as many, the output follows a
+            jump of the input at once, as an acceleration does.
+        delay: "auto" to estimate it, or a known delay in s. With feed-through, "auto" means no
+            delay.
+        slow_modes: slow branches in parallel to the fast part.
+        offset: whether each record has its own constant offset.
+        initial_state: whether each record has its own initial state.
+        fixed: known parameters by name: `natural_frequency_rad_s`, `damping_ratio`,
             `slow_time_constant_s`, `gain`, `slow_gain`; with several of a kind, `..._2` in front
             of the unit.
     Raises:
-        InputError: a number of poles, zeros or branches that makes no sense.
+        InputError: a number of poles, zeros or branches out of range.
     """
 
     poles: int = 2
@@ -48,19 +49,19 @@ class TransferStructure:
     def __post_init__(self) -> None:
         if not 1 <= self.poles <= _MAX_POLES:
             raise InputError(
-                f"poles = {self.poles}; allowed is 1 to {_MAX_POLES}. Two make one resonance."
+                f"poles = {self.poles}; must be 1 to {_MAX_POLES}. Two form one resonance."
             )
         if not 0 <= self.zeros <= self.poles:
             raise InputError(
-                f"zeros = {self.zeros}; allowed is 0 to {self.poles}, at most as many as poles. "
+                f"zeros = {self.zeros}; must be 0 to {self.poles}, at most as many as poles. "
                 "Lower the zeros or add a pole."
             )
         if not 0 <= self.slow_modes <= 3:
-            raise InputError(f"slow_modes = {self.slow_modes}; allowed is 0 to 3. Lower it.")
+            raise InputError(f"slow_modes = {self.slow_modes}; must be 0 to 3.")
         known_delay = isinstance(self.delay, (int, float)) and 0.0 <= self.delay < math.inf
         if self.delay != "auto" and not known_delay:
             raise InputError(
-                f"delay = {self.delay}; allowed is auto or a finite number of seconds, 0 or above. "
+                f"delay = {self.delay}; must be auto or a finite number of seconds, 0 or above. "
                 "Give auto to estimate it."
             )
 
@@ -70,7 +71,7 @@ class Section:
     """A group of poles with a common denominator.
 
     Args:
-        pairs: positions of `(log natural frequency, log damping ratio)` in the searched numbers.
+        pairs: positions of `(log natural frequency, log damping ratio)` in the searched parameters.
         reals: positions of `log time constant`.
         zeros: zeros of the section.
     """
@@ -85,7 +86,7 @@ class Section:
         return 2 * len(self.pairs) + len(self.reals)
 
     def poles(self, numbers: Floats) -> list[complex]:
-        """Poles at all numbers of a layout, in rad/s."""
+        """Poles for given parameters of the layout, in rad/s."""
         values = []
         for at_omega, at_zeta in self.pairs:
             omega, zeta = math.exp(numbers[at_omega]), math.exp(numbers[at_zeta])
@@ -96,15 +97,15 @@ class Section:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each searched number and each factor of a structure sits.
+    """Positions of the searched parameters and factors of a structure.
 
     Args:
         structure: what is fitted.
-        names: searched numbers, in order; the delay is last.
-        template: their values where fixed, else NaN. Shape `(L,)`.
+        names: searched parameters, in order; the delay is last.
+        template: their fixed values, else NaN. Shape `(L,)`.
         sections: fast part first, then the slow branches.
-        factor_names: common factors, in order.
-        factor_template: their values where fixed, else NaN. Shape `(S,)`.
+        factor_names: factors common to all records, in order.
+        factor_template: their fixed values, else NaN. Shape `(S,)`.
     """
 
     structure: TransferStructure
@@ -116,11 +117,11 @@ class Layout:
 
     @property
     def free(self) -> NDArray[np.intp]:
-        """Positions of the numbers that are searched."""
+        """Positions of the parameters that are not fixed."""
         return np.flatnonzero(np.isnan(self.template))
 
     def ordered(self, search: Floats) -> Floats:
-        """Searched numbers with the resonances in order of their frequency, if none is fixed."""
+        """Searched parameters with the resonances in order of their frequency, if none is fixed."""
         pairs = self.sections[0].pairs
         numbers = self.full(search)
         if len(pairs) < 2 or not np.isnan(self.template[: 2 * len(pairs)]).all():
@@ -131,7 +132,7 @@ class Layout:
         return np.asarray(numbers[self.free])
 
     def full(self, search: Floats) -> Floats:
-        """All numbers, the fixed ones included."""
+        """All parameters, including the fixed ones."""
         numbers = self.template.copy()
         numbers[self.free] = search
         return numbers
@@ -142,7 +143,7 @@ def _numbered(stem: str, unit: str, index: int) -> str:
 
 
 def layout_of(structure: TransferStructure) -> Layout:
-    """Order of the numbers of a structure; an unknown name in `fixed` is an `InputError`."""
+    """Layout of a structure; an unknown name in `fixed` is an `InputError`."""
     names: list[str] = []
     pairs, reals = [], []
     for i in range(structure.poles // 2):
@@ -162,11 +163,11 @@ def layout_of(structure: TransferStructure) -> Layout:
     if structure.delay != "auto":
         fixed["delay_s"] = float(structure.delay)
     elif structure.zeros == structure.poles:
-        fixed["delay_s"] = 0.0  # a jump that comes at once has no slope by the delay
+        fixed["delay_s"] = 0.0  # an immediate jump has no derivative with respect to the delay
     unknown = sorted(set(fixed) - set(names) - set(factors))
     if unknown:
         raise InputError(
-            f"fixed names {', '.join(unknown)}; allowed are {', '.join([*names, *factors])}. "
+            f"fixed names {', '.join(unknown)}; must be one of {', '.join([*names, *factors])}. "
             "Correct the name."
         )
     template = np.array([_inner(name, fixed.get(name)) for name in names])
@@ -177,11 +178,11 @@ def layout_of(structure: TransferStructure) -> Layout:
 
 
 def _inner(name: str, value: float | None) -> float:
-    """Searched form of a fixed number: the logarithm, except for the delay; NaN when free."""
+    """Fixed value as the search uses it: the logarithm, except for the delay; NaN when free."""
     if value is None:
         return math.nan
     if name == "delay_s":
         return float(value)
     if not value > 0.0:
-        raise InputError(f"fixed {name} = {value:g}; allowed is above 0. Correct the number.")
+        raise InputError(f"fixed {name} = {value:g}; must be above 0.")
     return math.log(value)

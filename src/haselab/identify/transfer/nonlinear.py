@@ -1,4 +1,4 @@
-"""Nonlinear rivals of a linear transfer function, and what it takes to prefer one."""
+"""Nonlinear alternatives to a linear transfer function, and the criterion to prefer one."""
 
 from __future__ import annotations
 
@@ -23,11 +23,17 @@ from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import best_fit
 from haselab.identify.transfer.start import delay_margin_s
 
-__all__ = ["NONLINEAR", "beats_linear", "fit_nonlinear", "linear_rivals", "nonlinear_rivals"]
+__all__ = [
+    "NONLINEAR",
+    "beats_linear",
+    "fit_nonlinear",
+    "linear_candidates",
+    "nonlinear_candidates",
+]
 
 Floats = NDArray[np.float64]
 NONLINEAR = ("hammerstein-2", "hammerstein-3", "duffing", "duffing-asymmetric", "wiener")
-_WORSE = 4.0  # twice the loss of logarithmic likelihood on held-out rows that noise explains
+_WORSE = 4.0  # twice the loss of logarithmic likelihood on held-out rows that noise can explain
 _WHITE = 1e-3
 _ONE = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
 
@@ -39,16 +45,16 @@ def fit_nonlinear(
 
     Args:
         records: experiments.
-        structure: of the linear part. One resonance with a delay when not given.
+        structure: structure of the linear part. Default: one resonance with a delay.
         kind: one of `NONLINEAR`: a polynomial of degree 2 or 3 of the input, a spring with a cubic
             or a quadratic and a cubic part, a curve of the output.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: an unknown kind, or a structure that the model cannot have.
+        InputError: an unknown kind, or a structure that the model does not support.
     """
     if kind not in NONLINEAR:
-        raise InputError(f"nonlinear = {kind}; allowed are {', '.join(NONLINEAR)}. Choose one.")
+        raise InputError(f"nonlinear = {kind}; must be one of {', '.join(NONLINEAR)}.")
     family, _, which = kind.partition("-")
     if family == "hammerstein":
         return fit_hammerstein(records, structure, int(which))
@@ -57,16 +63,16 @@ def fit_nonlinear(
     return fit_spring(records, structure, (2, 3) if which else (3,))
 
 
-def nonlinear_rivals(
+def nonlinear_candidates(
     records: Sequence[Record], structures: Sequence[TransferStructure], linear: TransferFit
 ) -> list[NonlinearFit]:
     """All nonlinear models: one resonance, and curves of the input ahead of each structure.
 
-    Where one model leaves white residuals, the delay is known, and the others begin from it.
+    Once one model leaves white residuals, its delay is the start of the others.
 
     Args:
         records: experiments.
-        structures: of the linear part; that of `linear` first.
+        structures: of the linear part; the structure of `linear` first.
         linear: the best linear fit.
     """
     first = structures[0]
@@ -95,8 +101,8 @@ def nonlinear_rivals(
     return fits
 
 
-def linear_rivals(linear: TransferFit) -> list[TransferFit]:
-    """Linear fits with one number more: what they explain is no nonlinearity."""
+def linear_candidates(linear: TransferFit) -> list[TransferFit]:
+    """Linear fits with one more parameter: what they explain is not a nonlinearity."""
     if linear.best is None or linear.residual_whiteness_p > _WHITE:
         return []
     measured = [r.y for r in linear.records]
@@ -122,7 +128,7 @@ def beats_linear(
 ) -> bool:
     """Whether a nonlinear model is preferred to the best linear one.
 
-    Its criterion has to be 6 lower (odds of 20 to 1), and on the last quarter of each record,
+    Its BIC has to be lower by 6 (odds of 20 to 1), and on the last quarter of each record,
     simulated by a fit to the rest, it must not be worse. Without a linear fit it has to leave white
     residuals.
     """

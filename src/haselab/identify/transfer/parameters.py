@@ -1,4 +1,4 @@
-"""Numbers of a fitted transfer function with their intervals, and which of them are not told."""
+"""Parameters of a fitted transfer function: intervals and identifiability."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ __all__ = ["covariance_table", "follows_input", "numbers_of", "poles_of", "zeros
 
 Floats = NDArray[np.float64]
 _UNRELATED_P = 1e-6
-_WHITE = 1e-3  # whiteness of residuals above which their variance alone counts
-_UNTOLD = 1.0  # relative standard deviation of a number that the records do not tell
-_UNTOLD_TIME = 0.5
+_WHITE = 1e-3  # whiteness of the residuals above which they count as white
+_LARGEST_STD = 1.0  # relative standard deviation of a parameter that is not identifiable
+_LARGEST_STD_TIME = 0.5
 _TOLD_WELL = 0.1
 _ENDLESS = 10.83  # chi-square with one degree, 0.1 %
 _REMEDY = {
     "slow_gain": " Add a step record.",
     "slow_time_constant_s": " Add a step record.",
-    "delay_s": " Give it, or drop the zeros.",
+    "delay_s": " Give the delay, or fit no zeros.",
 }
 
 
 def numbers_of(
     layout: Layout, best: Best, inner: Floats
 ) -> tuple[dict[str, Estimate], Floats, list[str]]:
-    """All numbers by name with their covariance, and a sentence for each that is not told.
+    """All parameters by name, their covariance, and a note for each that is not identifiable.
 
-    The fixed ones have no spread.
+    Fixed parameters have no spread.
     """
     numbers = layout.full(best.found.search)
     factors = layout.factor_template.copy()
@@ -69,14 +69,14 @@ def numbers_of(
 
 
 def covariance_table(estimates: dict[str, Estimate], covariance: Floats) -> JsonObject:
-    """The numbers with the covariance that the search had: logarithms where it searched them.
+    """The parameters with their covariance as searched: logarithms where these were searched.
 
     Args:
-        estimates: all numbers by name.
+        estimates: all parameters by name.
         covariance: of `estimates`, in their order. Shape `(P, P)`.
     Returns:
         `names`, `logarithmic`, `values`, `matrix`, see `PlantPosterior`; NaN and infinity where
-        a number is not identifiable.
+        a parameter is not identifiable.
     """
     values = np.array([estimate.value for estimate in estimates.values()])
     logarithmic = [
@@ -93,12 +93,12 @@ def covariance_table(estimates: dict[str, Estimate], covariance: Floats) -> Json
 
 
 def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> NDArray[np.bool_]:
-    """Which numbers the records do not tell.
+    """Mark the parameters that are not identifiable.
 
-    A frequency or damping with a relative standard deviation above 1, a time constant above 0.5
-    or one that might as well be endless, a delay above a tenth of the record, the gain of a slow
-    branch whose time constant is not told or that is uncertain by the gain of all. A number at the
-    end of its range is not told either.
+    Not identifiable are a frequency or damping with a relative standard deviation above 1, a time
+    constant above 0.5 or indistinguishable from infinity, a delay above a tenth of the record, the
+    gain of a slow branch whose time constant is not identifiable or that is uncertain by the gain
+    of all. A total gain, and a parameter at the end of its range.
     """
     names = (*layout.names, *layout.factor_names)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -113,7 +113,7 @@ def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> ND
         elif i < len(layout.names):
             lowest, highest = ends.get(name, (-math.inf, math.inf))
             inside = lowest < math.log(values[i]) < highest
-            most = _UNTOLD_TIME if "time_constant" in name else _UNTOLD
+            most = _LARGEST_STD_TIME if "time_constant" in name else _LARGEST_STD
             blind[i] = not (inside and std[i] <= most * values[i])
             if not blind[i] and name.startswith("slow") and std[i] > _TOLD_WELL * values[i]:
                 blind[i] = _endless(layout, best, i)
@@ -126,24 +126,24 @@ def _blind(layout: Layout, best: Best, values: Floats, covariance: Floats) -> ND
 
 
 def _endless(layout: Layout, best: Best, at: int) -> bool:
-    """Whether the data cannot tell the time constant from one ten times the longest record."""
+    """Whether the time constant is indistinguishable from ten times the longest record."""
     longest_s = max(record.duration_s for record in best.records)
     fixed = {**layout.structure.fixed, layout.names[at]: 10.0 * longest_s}
     held = layout_of(replace(layout.structure, fixed=fixed))
     others = layout.free != at
     bounds = best.bounds[0][others], best.bounds[1][others]
-    rival = TransferProblem(held, best.records, delay_margin_s(best.records)).minimise(
+    endless = TransferProblem(held, best.records, delay_margin_s(best.records)).minimise(
         best.found.search[others], bounds, gain=1e-7
     )
     count = sum(record.y.size for record in best.records)
-    return rival.cost - best.found.cost < _ENDLESS * best.found.cost / count
+    return endless.cost - best.found.cost < _ENDLESS * best.found.cost / count
 
 
 def follows_input(best: Best) -> bool:
-    """Whether the response to the input differs from zero beyond doubt.
+    """Whether the response to the input differs significantly from zero.
 
-    The size of the fitted response is estimated with its noise as if its shape were given, and
-    tested with as many degrees as there are numbers that shaped it.
+    The size of the fitted response is estimated with its noise as if its shape were known, and
+    tested with as many degrees of freedom as there are shape parameters.
     """
     found, columns = best.found, best.columns
     if found.shared.size == 0:
@@ -164,11 +164,11 @@ def follows_input(best: Best) -> bool:
 def poles_of(
     layout: Layout, numbers: Floats, estimates: dict[str, Estimate]
 ) -> tuple[complex, ...]:
-    """Poles, in rad/s; NaN for a slow branch whose time constant is not told."""
+    """Poles, in rad/s; NaN for a slow branch whose time constant is not identifiable."""
     poles = [pole for section in layout.sections for pole in section.poles(numbers)]
     fast = layout.structure.poles
-    told = [e.value for name, e in estimates.items() if name.startswith("slow_time_constant")]
-    slow = [complex(-1.0 / tau) if tau == tau else complex(math.nan, math.nan) for tau in told]
+    taus = [e.value for name, e in estimates.items() if name.startswith("slow_time_constant")]
+    slow = [complex(-1.0 / tau) if tau == tau else complex(math.nan, math.nan) for tau in taus]
     return (*poles[:fast], *slow)
 
 

@@ -1,4 +1,4 @@
-"""Records and a structure as the C code takes them (`native/identification/transfer.h`)."""
+"""Records and a structure in the form of the C code (`native/identification/transfer.h`)."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from haselab.models.filters import resample_poly
 __all__ = ["Columns", "Found", "TransferProblem", "fine_input"]
 
 Floats = NDArray[np.float64]
-_FINER = 8  # straight lines between so many points a sample stand for a band-limited input
+_FINER = 8  # points per sample of the polygon that represents a band-limited input
 _ITERATIONS = 100
 _GAIN = 1e-9  # of the cost: a thousandth of a standard deviation with 1,000 outputs
 
 
 @dataclass(frozen=True)
 class Found:
-    """Best factors at some searched numbers.
+    """Best factors for given searched parameters.
 
     Args:
-        search: searched numbers. Shape `(L,)`.
+        search: searched parameters. Shape `(L,)`.
         shared: common factors. Shape `(S,)`.
         own: factors of each record. Shape `(Q,)` each.
         cost: sum of the squared residuals.
-        settled: whether the search came to rest.
+        settled: whether the search converged.
     """
 
     search: Floats
@@ -42,11 +42,11 @@ class Found:
 
 @dataclass(frozen=True)
 class Columns:
-    """What a solution leaves, record by record.
+    """Residuals and sensitivities of a solution, record by record.
 
     Args:
         residuals: measured minus modelled. Shape `(M_r,)` each.
-        sensitivities: to searched numbers and common factors, freed of the record's own
+        sensitivities: to searched parameters and common factors, orthogonal to the record's own
             functions. Shape `(M_r, L + S)` each.
         own: the record's own functions, orthonormal. Shape `(M_r, Q)` each.
     """
@@ -57,13 +57,13 @@ class Columns:
 
 
 class TransferProblem:
-    """Least squares over some records.
+    """Least-squares problem over several records.
 
     Args:
-        layout: order of the numbers.
+        layout: order of the parameters.
         records: experiments.
-        margin_s: the delay may become this much smaller than zero.
-        share: only this share of each record's outputs, from its start.
+        margin_s: how far below zero the delay may go.
+        share: share of each record's outputs that is used, from its start.
     """
 
     def __init__(
@@ -106,18 +106,18 @@ class TransferProblem:
         )
 
     def predict(self, found: Found) -> list[Floats]:
-        """Output of each record by the numbers and factors of a solution found elsewhere."""
+        """Output of each record for a solution that was found on other data."""
         own = [factors.tolist() for factors in found.own]
         output = self._native.predict(found.search.tolist(), found.shared.tolist(), own)
         return np.split(output, self._ends)
 
 
 def fine_input(record: Record) -> tuple[Floats, float]:
-    """Input and its rate, in Hz; a band-limited input becomes a fine polygon."""
+    """Input and its rate, in Hz; a band-limited input is refined to a polygon."""
     u, rate_hz = record.u, record.input_rate_hz
     if record.hold == "band-limited":
         u = resample_poly(u, _FINER, 1, window=("kaiser", 9.0), padtype="line")
-        # Straight lines damp a tone by 1 - (omega T)^2/12; the second difference puts that back.
+        # Straight lines damp a tone by 1 - (omega T)^2/12; the second difference corrects that.
         u[1:-1] -= np.diff(u, 2) / 12.0
         rate_hz *= _FINER
     return np.ascontiguousarray(u), rate_hz

@@ -1,4 +1,4 @@
-"""Deviations checked by the likelihood itself, where it is not a parabola over their width."""
+"""Standard deviations checked against the profile likelihood, which may not be a parabola."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from haselab.identify.transfer.start import delay_margin_s
 __all__ = ["profiled"]
 
 Floats = NDArray[np.float64]
-_NARROW = 0.01  # relative standard deviation, or phase, below which the parabola is taken as given
+_NARROW = 0.01  # relative standard deviation, or phase, below which the parabola is assumed
 _FAR = 4.0  # standard deviations at which the profile is compared with it
 _FARTHEST = 64.0
-_FLAT = 0.7  # of the parabola's rise: a profile below is flatter
-_LESS = 1e-5  # relative fall of the cost that is a better solution
+_FLAT = 0.7  # of the parabola's rise: a smaller rise is a flatter profile
+_LESS = 1e-5  # relative decrease of the cost that counts as a better solution
 _GAIN = 1e-7
 
 
 def profiled(layout: Layout, best: Best, std: Floats) -> tuple[Floats, Best | None]:
-    """Compare the cost with its parabola at 4 standard deviations to both sides of each number.
+    """Compare the cost with its parabola at 4 standard deviations to both sides of each parameter.
 
-    One number is held there and the others are searched again. Where the cost rises less than the
-    parabola, the deviation is widened to a quarter of the distance at which it has risen as much.
+    One parameter is fixed there and the others are searched again. Where the cost rises less than
+    the parabola, the deviation is widened to a quarter of the distance at which it has risen as
+    much.
 
     Args:
         layout: order of the numbers.
         best: the solution.
-        std: standard deviations of the searched numbers, from the sensitivities. Shape `(S,)`.
+        std: standard deviations of the searched parameters, from the sensitivities. Shape `(S,)`.
     Returns:
         Factors for the deviations, infinite where the cost never rises, shape `(S,)`; and a
-        solution of lower cost, if the search came upon one.
+        solution of lower cost, if the search found one.
     Source: Bates and Watts, Nonlinear Regression Analysis (1988), chapter 6 (profile t plots).
     """
     found, size = best.found, std.size
@@ -65,7 +66,7 @@ def profiled(layout: Layout, best: Best, std: Floats) -> tuple[Floats, Best | No
 def _side(
     problem: TransferProblem, best: Best, at: int, std: float, rise: float
 ) -> tuple[float, Floats | None]:
-    """Factor for a deviation on one side; numbers of lower cost that were met on the way."""
+    """Factor for a deviation on one side; parameters of lower cost that were found on the way."""
     low, high = best.bounds
     start, least = best.found.search, best.found.cost
     wanted = (_FAR * std) ** 2 * rise

@@ -1,4 +1,4 @@
-"""The global search of a transfer function: likely starts first, all of them where in doubt."""
+"""Global search for a transfer function: likely starts first, all of them in case of doubt."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from haselab.identify.noise import whiteness_p
 from haselab.identify.record import Record
-from haselab.identify.transfer.checks.ambiguity import stands_alone
+from haselab.identify.transfer.checks.ambiguity import has_unique_delay
 from haselab.identify.transfer.layout import Layout, layout_of
 from haselab.identify.transfer.problem import Columns, Found, TransferProblem
 from haselab.identify.transfer.start import (
@@ -30,16 +30,16 @@ from haselab.identify.transfer.start import (
 __all__ = ["Best", "best_fit", "has_line", "settled"]
 
 Floats = NDArray[np.float64]
-_FEW = 150  # outputs for each searched number, on which starts are ranked and polished
+_FEW = 150  # outputs per searched parameter used to rank and refine starts
 _RULED_OUT = 100.0  # twice the difference of logarithmic likelihoods on fewer outputs
-_ABOUT = 9  # delays about the best one at which fewer poles are tried
-_FULL = 6  # solutions that are polished on all outputs
-_MOST = 40_000  # outputs on which a likely start is tried at once
+_ABOUT = 9  # delays near the best one at which fewer poles are tried
+_FULL = 6  # solutions that are refined on all outputs
+_MOST = 40_000  # largest number of outputs on which a likely start is tried directly
 _LIKELY = 2
 _WHITE = 1e-3
 _CANDIDATES = 2  # for the three numbers of one resonance; 2 more for each further number
 _APART = 0.15
-_LINE = 0.02  # damping ratio below which a pair beside others may fit the noise
+_LINE = 0.02  # damping ratio below which a pair among others may fit the noise
 _DAMPED = 0.3
 _PLACES = 6
 
@@ -49,12 +49,12 @@ class Best:
     """The best solution that was found.
 
     Args:
-        records: the experiments that it belongs to.
-        found: its numbers.
+        records: the experiments that were fitted.
+        found: its parameters.
         columns: its residuals and sensitivities.
-        bounds: lowest and highest searched numbers.
+        bounds: lowest and highest searched parameters.
         whiteness_p: Ljung-Box probability of the residuals.
-        others: further solutions that searches from other starts came to.
+        others: further solutions from other starts.
     """
 
     records: Sequence[Record]
@@ -68,10 +68,10 @@ class Best:
 def best_fit(
     layout: Layout, records: Sequence[Record], known: Sequence[Floats] = ()
 ) -> Best | None:
-    """The best of several starts; None when none leads to a finite model.
+    """Fit from several starts; None when none leads to a finite model.
 
-    A likely start ends the search where nothing is left to explain and no other delay could
-    explain as much. Else starts at all delays are ranked and polished on fewer outputs, the
+    A likely start ends the search when its residuals are white and no other delay could
+    explain as much. Otherwise starts at all delays are ranked and refined on fewer outputs, the
     likely ones on all.
     """
     problem = TransferProblem(layout, records, delay_margin_s(records))
@@ -91,12 +91,12 @@ def best_fit(
     if not known and sum(record.y.size for record in records) <= _MOST:
         for start in islice(starts, _LIKELY):
             used.append(start)
-            if explains(start) and stands_alone(layout, tried[-1].columns.residuals, records):
+            if explains(start) and has_unique_delay(layout, tried[-1].columns.residuals, records):
                 if not any(True for _ in _without_lines(layout, tried[-1].found.search)):
                     return tried[-1]
                 break
     found = list(known) or _polished(layout, records, [*used, *starts], delay_grid(layout, records))
-    explained = [explains(start) for start in found]  # all, so that rivals are known
+    explained = [explains(start) for start in found]  # all of them, so that other minima are known
     if not any(explained) and not known:
         nearest = min(tried, key=lambda best: best.found.cost, default=None)
         for start in _from_simpler(layout, records, nearest):
@@ -113,7 +113,7 @@ def best_fit(
 def _from_simpler(
     layout: Layout, records: Sequence[Record], nearest: Best | None
 ) -> Iterator[Floats]:
-    """Starts from the fit with one fast pole fewer, at delays about the best one."""
+    """Starts from the fit with one fast pole fewer, at delays near the best one."""
     structure = layout.structure
     if structure.poles <= 2 or structure.fixed:
         return
@@ -130,17 +130,17 @@ def _from_simpler(
 
 
 def has_line(layout: Layout, search: Floats) -> bool:
-    """Whether one of several pairs is nearly undamped, as one that fits a line of the noise."""
+    """Whether one of several pole pairs is nearly undamped, as a pair that fits noise."""
     numbers = layout.full(search)
     pairs = layout.sections[0].pairs
     return layout.structure.poles > 2 and any(numbers[z] < math.log(_LINE) for _, z in pairs)
 
 
 def _without_lines(layout: Layout, search: Floats) -> Iterator[Floats]:
-    """Starts with a damped pair in the place of one that is nearly undamped.
+    """Starts with a damped pair in place of one that is nearly undamped.
 
-    Beside other poles such a pair may fit one line of the noise, and hide a resonance that hardly
-    shows.
+    Among other poles such a pair may fit one line of the noise and hide a weakly excited
+    resonance.
     """
     pairs = layout.sections[0].pairs
     numbers = layout.full(search)
@@ -164,7 +164,7 @@ def settled(
     start: Floats,
     bounds: tuple[Floats, Floats],
 ) -> Best | None:
-    """The solution that a start leads to, its numbers in order; None: no finite one."""
+    """The solution from one start, its parameters in order; None: no finite one."""
     found = problem.minimise(start, bounds)
     if not math.isfinite(found.cost):
         return None
@@ -178,7 +178,7 @@ def settled(
 def _polished(
     layout: Layout, records: Sequence[Record], starts: Iterable[Floats], delays_s: Floats
 ) -> list[Floats]:
-    """Solutions on fewer outputs that the others do not rule out, the best first."""
+    """Solutions on fewer outputs that are not ruled out by better ones, the best first."""
     bounds = search_bounds(layout, records)
     reduced = thinned(records, _FEW * layout.free.size)
     few = TransferProblem(layout, reduced, delay_margin_s(records))
@@ -218,7 +218,7 @@ def _ranked(
 
 
 def _distinct(ranked: Sequence[Found], scale: Floats) -> Iterator[Found]:
-    """Those that differ from all earlier ones by 15 % in a number, or half the grid in delay."""
+    """Solutions that differ from all earlier ones by 15 % in a parameter or half a delay step."""
     kept: list[Found] = []
     for found in ranked:
         if all((scale * np.abs(found.search - f.search)).max(initial=0.0) > _APART for f in kept):

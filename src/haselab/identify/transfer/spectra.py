@@ -1,4 +1,4 @@
-"""Poles of the rational function that spectra suggest, for many delays at once."""
+"""Poles of the rational function that fits the spectra, for many delays at once."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["Lines", "lines_of", "rational_poles"]
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _REFINEMENTS = 4  # weighted by the denominator of the round before
-_INSTRUMENTS = 3  # rounds in which the modelled output takes the place of the measured one
+_INSTRUMENTS = 3  # rounds in which the modelled output replaces the measured one
 _MAX_LINES = 400
 
-_CHUNK = 16  # delays at once
+_CHUNK = 16  # delays computed at once
 
 
 @dataclass(frozen=True)
 class Lines:
-    """One record on an even grid, and the lines of its spectrum that hold its energy.
+    """One record on an even grid, and the spectral lines that contain its energy.
 
     Args:
         record: the experiment.
         grid_s: even times of the output, in s. Shape `(N,)`.
         y: spectrum of the output at the lines. Shape `(L,)`.
-        picked: which lines, counted from the first above 0 Hz. Shape `(L,)`.
+        picked: indices of the lines, counted from the first above 0 Hz. Shape `(L,)`.
     """
 
     record: Record
@@ -49,7 +49,7 @@ class Lines:
         return np.asarray(2j * np.pi * (self.picked + 1) / (self.step_s * self.grid_s.size))
 
     def input_at(self, delay_s: float) -> Floats:
-        """The held input at the middle of each output's interval, `delay_s` late. Shape `(N,)`."""
+        """Held and delayed input at the middle of each output's interval. Shape `(N,)`."""
         return _input_at(self.record, self.grid_s + 0.5 * self.step_s - delay_s)
 
     def inputs(self, delays_s: Floats) -> Complexes:
@@ -67,9 +67,9 @@ def _input_at(record: Record, times_s: Floats) -> Floats:
 
 
 def lines_of(record: Record, share: float, most: int = _MAX_LINES) -> Lines:
-    """Lines up to the band that holds `share` of the output's energy.
+    """Lines of the band that contains `share` of the output's energy.
 
-    Where these are more than `most`, half of them are the strongest and the others evenly spread.
+    Of more than `most` lines, half are the strongest ones and the others evenly spaced.
     """
     times_s = record.output_time_s
     step_s = float(times_s[-1] - times_s[0]) / (times_s.size - 1)
@@ -100,7 +100,7 @@ def rational_poles(
         order: poles.
         zeros: zeros, at most as many.
         delays_s: delays, in s. Shape `(D,)`.
-        refined: whether instrumental variables follow, which noise does not bias.
+        refined: whether to refine by instrumental variables, which are not biased by noise.
     Returns:
         Poles, in rad/s. Shape `(1, D, order)`; `(2, D, order)` where refined, before and after.
     Source: Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963), 56; transients after
@@ -152,8 +152,8 @@ def _poles_of_chunk(
         bottom = np.concatenate(
             [factors[:, :order] / size[:, :order], np.ones((delays_s.size, 1))], axis=1
         )
-        # The size of the denominator is that of its roots mirrored to the left, so stable or not
-        # does not matter here.
+        # The magnitude of the denominator does not change when its roots are mirrored to the left,
+        # so their stability does not matter here.
         shown = bottom @ powers.T
         square = np.maximum(shown.real**2 + shown.imag**2, 1e-18)
         if k in (_REFINEMENTS - 1, rounds - 1):

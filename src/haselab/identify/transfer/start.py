@@ -29,14 +29,14 @@ __all__ = [
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 SHARES = (0.99, 0.9)  # of the output's energy: the bands that are tried
-_A_PERIOD = 8  # delays of the grid a period of the output's motion
-_REACH = 0.5  # of the record: the longest delay
+_A_PERIOD = 8  # delays of the grid per period of the output's motion
+_REACH = 0.5  # of the record: the longest delay that is tried
 _MOST_DELAYS = 400
-_FEW_LINES = 160  # for many delays
+_FEW_LINES = 160  # spectral lines when many delays are tried
 
 
 def thinned(records: Sequence[Record], most: int) -> list[Record]:
-    """The same records with every k-th output only, `most` outputs or fewer in all."""
+    """The same records with every k-th output only, at most `most` outputs in all."""
     total = sum(record.y.size for record in records)
     stride = max(1, math.ceil(total / most))
     kept = []
@@ -50,13 +50,13 @@ def thinned(records: Sequence[Record], most: int) -> list[Record]:
 
 
 def delay_margin_s(records: Sequence[Record]) -> float:
-    """How far below zero a delay is searched, so that an interval around zero stays honest."""
+    """How far below zero a delay is searched, so that an interval around zero is not truncated."""
     step_s = min(r.output_step_s for r in records)
     return 4.0 * max(step_s, min(1.0 / r.input_rate_hz for r in records))
 
 
 def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Floats]:
-    """Lowest and highest searched numbers that the records could tell apart."""
+    """Bounds of the searched parameters within which the records can identify them."""
     span_s = max(record.duration_s for record in records)
     step_s = min(r.output_step_s for r in records)
     low, high = [], []
@@ -65,7 +65,7 @@ def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Fl
         if name == "delay_s":
             pair = (-delay_margin_s(records), _REACH * span_s)
         elif name.startswith("natural_frequency"):
-            # Above half the output's rate a ringing cannot be told from a slower one.
+            # Above half the output's rate a ringing is aliased to a lower frequency.
             pair = (math.log(0.1 / span_s), math.log(math.pi / step_s))
         elif name.startswith("damping_ratio"):
             pair = (math.log(1e-5), math.log(100.0))
@@ -77,13 +77,13 @@ def search_bounds(layout: Layout, records: Sequence[Record]) -> tuple[Floats, Fl
 
 
 def starting_points(layout: Layout, records: Sequence[Record]) -> Iterator[Floats]:
-    """Starting values of the searched numbers, the more likely ones first.
+    """Starting values of the searched parameters, the most likely first.
 
-    Sanathanan-Koerner iterations on the spectra, with polynomials for the transients, for some
+    Sanathanan-Koerner iterations on the spectra, with polynomials for the transients, for several
     delays and bands; then a coarse grid.
 
     Args:
-        layout: order of the numbers.
+        layout: order of the parameters.
         records: experiments.
     Source: Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963), 56; transients after
         Pintelon and Schoukens, System Identification (2012), chapter 6.
@@ -102,9 +102,9 @@ def starting_points(layout: Layout, records: Sequence[Record]) -> Iterator[Float
 
 
 def delay_grid(layout: Layout, records: Sequence[Record]) -> Floats:
-    """Delays close enough that a search from the nearest one finds the right minimum.
+    """Delays spaced closely enough that a search from the nearest one finds the right minimum.
 
-    A search in the delay settles within a quarter period of the motion that holds the output's
+    A search in the delay converges within a quarter period of the motion with most of the output's
     energy; the grid has eight points a period.
     """
     known = layout.template[-1]
@@ -128,7 +128,7 @@ def delay_grid(layout: Layout, records: Sequence[Record]) -> Floats:
 def delayed_starts(
     layout: Layout, records: Sequence[Record], delays_s: Floats, share: float
 ) -> Iterator[Floats]:
-    """Starting values at each of many delays, from the band that holds a share of the energy."""
+    """Starting values at each of many delays, from the band that contains a share of the energy."""
     lines = [lines_of(r, share, _FEW_LINES) for r in records]
     for order, zeros, taus in _orders(layout, records):
         for found in rational_poles(lines, order, zeros, delays_s, refined=True):
@@ -150,14 +150,14 @@ def _orders(
 def richer_start(
     layout: Layout, simpler: Layout, search: Floats, records: Sequence[Record]
 ) -> Iterator[Floats]:
-    """The numbers of a fit with fewer fast poles, and fast poles beside them.
+    """The parameters of a fit with fewer fast poles, extended by fast poles.
 
-    Such a start is no worse than that fit, so that more poles never fit worse.
+    Such a start is as good as that fit, so more poles never fit worse.
 
     Args:
-        layout: order of the numbers.
-        simpler: that of the fit, with fewer poles and all else alike.
-        search: its searched numbers.
+        layout: order of the parameters.
+        simpler: layout of that fit, with fewer poles and otherwise identical.
+        search: its searched parameters.
         records: experiments.
     """
     numbers = simpler.full(search)
@@ -171,7 +171,7 @@ def richer_start(
 
 
 def coarse_grid(layout: Layout, records: Sequence[Record]) -> Iterator[Floats]:
-    """Starting values on a grid of frequency and damping, for records that the spectra mislead."""
+    """Starting values on a grid of frequency and damping, if the spectra are misleading."""
     span_s = max(record.duration_s for record in records)
     step_s = min(r.output_step_s for r in records)
     taus = _time_constants(records, layout.structure.slow_modes)[:1]
@@ -203,7 +203,7 @@ def _time_constants(records: Sequence[Record], count: int) -> list[tuple[float, 
 def _arranged(
     layout: Layout, poles: Complexes, taus: Sequence[tuple[float, ...]], delay_s: float
 ) -> Iterator[Floats]:
-    """Poles put to their places in the layout; slow branches from the slowest or from `taus`."""
+    """Poles in the order of the layout; slow branches from the slowest poles or from `taus`."""
     structure = layout.structure
     upper = sorted((p for p in poles if p.imag > 1e-9 * abs(p)), key=abs)
     reals = sorted((p.real for p in poles if abs(p.imag) <= 1e-9 * abs(p)), key=abs)

@@ -1,4 +1,4 @@
-"""The actuator file: its sections, the maps in it, and what a file of a model must hold."""
+"""The actuator file: its sections, its maps, and the required keys of model files."""
 
 from haselab.models.actuator.sections import ActuatorTables, ControllerSection
 from haselab.models.actuator.strain_map import StrainMap

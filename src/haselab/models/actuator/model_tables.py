@@ -1,6 +1,6 @@
-"""What the files of models must hold: names, types and ranges, checked before any arithmetic.
+"""Schema of model files: names, types and ranges of keys, checked before any arithmetic.
 
-The ranges are wider than any actuator's. They keep every power and quotient of a model's numbers
+The ranges are wider than for any actuator. They keep every power and quotient of a model's values
 inside double precision.
 """
 
@@ -26,7 +26,7 @@ _LARGEST, _FASTEST_RAD_S, _LONGEST_S = 1e30, 1e7, 1e7
 
 
 def _value(item: Any) -> Any:
-    """The value of an estimate; anything else as it is."""
+    """The value of an estimate; anything else unchanged."""
     return item["value"] if isinstance(item, dict) and "value" in item else item
 
 
@@ -41,7 +41,7 @@ _Factors = Annotated[list[Number], Field(min_length=1, max_length=_MOST_FACTORS)
 
 
 def _delay(item: Any) -> Any:
-    """A delay that was estimated below zero, within its error, is zero."""
+    """Replace a delay estimated below zero, within its error, by zero."""
     value = _value(item)
     return max(0.0, value) if isinstance(item, dict) and isinstance(value, float) else value
 
@@ -56,7 +56,7 @@ class _SlowModeTable(_Table):
 
 
 class PolesTable(_Table):
-    """A model by its gain, poles and zeros, with slow branches beside it."""
+    """A model by its gain, poles and zeros, with parallel slow branches."""
 
     gain: _Quantity
     delay_s: Annotated[_Delay, BeforeValidator(_delay)] = 0.0
@@ -66,7 +66,7 @@ class PolesTable(_Table):
 
 
 class PlantTable(PolesTable):
-    """A resonance with slow branches."""
+    """A resonance with parallel slow branches."""
 
     natural_frequency_rad_s: _Frequency
     damping_ratio: _Damping
@@ -90,7 +90,7 @@ class RationalTable(_Table):
 
 
 class CovarianceTable(_Table):
-    """Numbers of a model with their covariance, see `PlantPosterior`; null: not identifiable."""
+    """Parameters of a model with their covariance, see `PlantPosterior`; null: not identifiable."""
 
     names: Annotated[list[str], Field(min_length=1, max_length=_MOST_FACTORS)]
     logarithmic: Annotated[list[bool], Field(max_length=_MOST_FACTORS)]
@@ -115,7 +115,7 @@ class VoltagePlantTable(_Table):
 
 
 class EstimateTable(_Table):
-    """An estimate as `--json` writes it; a number that is not identifiable is null."""
+    """An estimate as `--json` writes it; a value that is not identifiable is null."""
 
     value: Number | None
     std: Number | None

@@ -1,7 +1,7 @@
-"""What the sections of actuator.toml must hold: names, types and ranges of their keys.
+"""Schema of actuator.toml: names, types and ranges of the keys of each section.
 
-Every section and every key is optional: a file grows as an actuator becomes known. Keys that are
-not listed here are left alone.
+Every section and every key is optional: a file grows step by step. Keys that are
+not listed here are kept unchanged.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _Section(BaseModel):
 
 
 class Geometry(_Section):
-    """Sizes of the actuator, in m."""
+    """Dimensions of the actuator, in m."""
 
     zero_length_m: _Length | None = None  # between the fiducials at zero strain
     width_m: _Length | None = None
@@ -51,7 +51,7 @@ class Geometry(_Section):
 
 
 class ActuatorSection(_Section):
-    """What the actuator is."""
+    """Kind and geometry of the actuator."""
 
     name: str = ""
     kind: str = "planar-hasel"
@@ -75,29 +75,29 @@ class StrainMapTable(_Section):
     residual_std: Number | None = None
 
     def map(self) -> StrainMap:
-        """The map of these numbers.
+        """The map with these coefficients.
 
         Raises:
-            InputError: a range or a band whose lower end is not the lower one.
+            InputError: a range or a band whose ends are in the wrong order.
         """
         known = {name: value for name, value in self if value is not None}
         return StrainMap(**known)
 
 
 class SensingSection(_Section):
-    """What turns monitors into capacitance and capacitance into strain.
+    """Conversion of monitor readings to capacitance and of capacitance to strain.
 
-    The calibration of the monitors lies in the same section; `haselab calibrate` writes and reads
+    The calibration of the monitors is in the same section; `haselab calibrate` writes and reads
     its keys.
     """
 
     carrier_hz: Annotated[Number, Field(gt=0, le=1e9)] | None = None
-    scale_s: tuple[Number, Number] | None = None  # admittance for equal monitors, in S
+    scale_s: tuple[Number, Number] | None = None  # admittance for equal readings, in S
     strain_map: StrainMapTable | None = None
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the section holds a calibration."""
+        """Whether the section contains a calibration."""
         return self.scale_s is not None
 
 
@@ -113,7 +113,7 @@ class VoltageMapTable(_Section):
     covariance: tuple[tuple[_Variance, ...], ...] | None = None
 
     def map(self) -> VoltageMap:
-        """The map of these numbers.
+        """The map with these coefficients.
 
         Raises:
             InputError: an empty range of strains.
@@ -133,9 +133,10 @@ class DriveSection(_Section):
 
 
 class ModelSection(_Section):
-    """The model in its linear form; the numbers themselves are kept as they are.
+    """The linear model; its keys are kept unchanged.
 
-    They are those of `PlantTable`, `PolesTable` or `RationalTable`, the same as in a model.json.
+    The keys are those of `PlantTable`, `PolesTable` or `RationalTable`, the same as in a
+    model.json.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -146,10 +147,10 @@ class ModelSection(_Section):
     covariance: CovarianceTable | None = None
 
     def plant(self) -> Plant:
-        """One resonance with slow branches.
+        """The model as one resonance with slow branches.
 
         Raises:
-            InputError: the section holds another kind of model.
+            InputError: the section contains another kind of model.
         """
         return Plant.from_dict(self.model_dump())
 
@@ -169,9 +170,9 @@ class LoopTable(_Section):
 
 
 class ControllerSection(_Section):
-    """A controller: its kind, its parameters by name, its limits; and further ones beside it.
+    """A controller: kind, parameters by name and limits, with alternative controllers.
 
-    A name tells two controllers of one kind apart; without one, the kind is the name.
+    A name distinguishes two controllers of one kind; without one, the kind is the name.
     """
 
     kind: str = "pid"
@@ -184,7 +185,7 @@ class ControllerSection(_Section):
 
     @property
     def is_known(self) -> bool:
-        """Whether the section holds a controller: PI and PID need gains, other kinds may not."""
+        """Whether the section defines a controller: PI and PID need gains, other kinds may not."""
         return bool(self.parameters) or self.kind not in ("pi", "pid")
 
     @property
@@ -203,13 +204,13 @@ class ControllerSection(_Section):
             return self.all_kinds[kind]
         kinds = ", ".join(reversed(self.all_kinds))
         raise InputError(
-            f"[controller] holds no controller of kind {kind!r}; it holds {kinds or 'none'}. "
+            f"[controller] has no controller of kind {kind!r}, only {kinds or 'none'}. "
             "Design one with: haselab design ACTUATOR.toml"
         )
 
 
 class ActuatorTables(_Section):
-    """Everything that one actuator.toml holds."""
+    """All sections of one actuator.toml."""
 
     actuator: ActuatorSection = ActuatorSection()
     sensing: SensingSection = SensingSection()
@@ -288,5 +289,5 @@ def missing(section: str, command: str) -> InputError:
     """The error for a section that a command needs and a file lacks."""
     how = f"{command} --actuator A.toml" if "FILE" in command else f"{command} A.toml"
     return InputError(
-        f"The actuator file has no [{section}]. Type it, or let this command write it: {how}."
+        f"The actuator file has no [{section}]. Add it by hand, or with this command: {how}."
     )

@@ -18,11 +18,11 @@ _BEYOND = 0.25  # of the width of the fitted range, on either side
 
 @dataclass(frozen=True)
 class StrainMap:
-    r"""Strain of the capacitance: $\varepsilon = ((r\,C + q)\,C + k)\,C + \varepsilon_0$.
+    r"""Strain as a function of capacitance: $\varepsilon = ((r\,C + q)\,C + k)\,C + \varepsilon_0$.
 
-    The one map from farads to strain: measured by `haselab.sensing.strain.fit_strain_map`, kept in
+    The only map from farads to strain: measured by `haselab.sensing.strain.fit_strain_map`, kept in
     `[sensing.strain_map]` of actuator.toml, used by the loop on the desktop and compiled into the
-    microcontroller. Without covariance, range or band, nothing is known about its uncertainty.
+    microcontroller. Without covariance, range or band its uncertainty is unknown.
 
     Args:
         slope_per_f: in 1/F.
@@ -30,15 +30,15 @@ class StrainMap:
         curvature_per_f2: in 1/F^2; 0 for the study's straight line.
         cubic_per_f3: in 1/F^3; 0 for a line or a parabola.
         covariance: of slope, offset, curvature and cubic factor; rows and columns of 0 for a known
-            number. Shape `(4, 4)`.
+            coefficient. Shape `(4, 4)`.
         range_f: lowest and highest capacitance of the record that was fitted, in F.
         band: lowest and highest deviation of the strain from the map.
-        coverage: share of the deviations that the band is to contain.
-        held_out_coverage: share that was inside in cycles left out of fit and band.
+        coverage: share of the deviations that the band should contain.
+        held_out_coverage: share inside the band, for cycles left out of fit and band.
         hysteresis_strain: largest distance between the rising and the falling branch, in strain.
         residual_std: root mean square of the deviations, in strain.
     Raises:
-        InputError: numbers that are not finite, a range or a band that is empty.
+        InputError: coefficients that are not finite, a range or a band that is empty.
     Example:
         >>> line = StrainMap(4.923e8, -0.276, range_f=(5e-10, 8e-10), band=(-0.002, 0.002))
         >>> [round(float(end), 4) for end in line.interval(7.6e-10)]
@@ -60,8 +60,8 @@ class StrainMap:
     def __post_init__(self) -> None:
         if not np.isfinite(self.coefficients).all():
             raise InputError(
-                f"The strain map has the numbers {self.coefficients}, but they must be finite. "
-                "Fit the map again."
+                f"The strain map has the coefficients {self.coefficients}, but they must be "
+                "finite. Fit the map again."
             )
         for name, ends in (("range_f", self.range_f), ("band", self.band)):
             if ends is not None and not ends[0] <= ends[1]:
@@ -78,7 +78,7 @@ class StrainMap:
 
     @property
     def coefficients(self) -> tuple[float, float, float, float]:
-        """Slope, offset, curvature and cubic factor, as the C core takes them."""
+        """Slope, offset, curvature and cubic factor, as the C core uses them."""
         return self.slope_per_f, self.offset, self.curvature_per_f2, self.cubic_per_f3
 
     def strain(self, capacitance_f: ArrayLike) -> Floats:
@@ -90,8 +90,8 @@ class StrainMap:
             Strain, the same shape.
         """
         c = np.asarray(capacitance_f, dtype=np.float64)
-        bent = self.cubic_per_f3 * c + self.curvature_per_f2
-        return np.asarray((bent * c + self.slope_per_f) * c + self.offset)
+        slope = self.cubic_per_f3 * c + self.curvature_per_f2
+        return np.asarray((slope * c + self.slope_per_f) * c + self.offset)
 
     def std(self, capacitance_f: ArrayLike) -> Floats:
         """Standard deviation of the map itself, by its covariance; NaN without one.
@@ -109,7 +109,7 @@ class StrainMap:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def inside(self, capacitance_f: ArrayLike) -> NDArray[np.bool_]:
-        """Whether the map was fitted there; the shape of `capacitance_f`. NaN is not inside."""
+        """Whether each capacitance is in the fitted range; False for NaN."""
         c = np.asarray(capacitance_f, dtype=np.float64)
         low_f, high_f = (-math.inf, math.inf) if self.range_f is None else self.range_f
         return np.asarray((c >= low_f) & (c <= high_f))
@@ -129,7 +129,7 @@ class StrainMap:
         return low_f - beyond_f, high_f + beyond_f
 
     def interval(self, capacitance_f: ArrayLike) -> tuple[Floats, Floats]:
-        """Ends of the strain's interval: the map and its band.
+        """Ends of the strain's interval: the map plus its band.
 
         Args:
             capacitance_f: any shape, in F.
@@ -156,12 +156,12 @@ class StrainMap:
         return middle + self.band[0], middle + self.band[1]
 
     def slope_at(self, capacitance_f: float) -> float:
-        """Derivative of the strain by the capacitance, in 1/F, at a capacitance in F."""
+        """Slope of the strain over the capacitance, in 1/F, at a capacitance in F."""
         c = capacitance_f
         return (3.0 * self.cubic_per_f3 * c + 2.0 * self.curvature_per_f2) * c + self.slope_per_f
 
     def rebased(self, zero: float) -> StrainMap:
-        """The same map of a strain that counts from another length.
+        """The same map for a strain relative to another length.
 
         Args:
             zero: strain of this map that becomes 0.

@@ -1,4 +1,4 @@
-"""The maps as sections of actuator.toml: the inverse of what `sections` reads."""
+"""Convert maps to sections of actuator.toml: the inverse of `sections`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["strain_map_section", "voltage_map_section"]
 
 
 def strain_map_section(to_strain: StrainMap) -> Mapping[str, object]:
-    """`[sensing.strain_map]` of a map.
+    """Convert a strain map to the section `[sensing.strain_map]`.
 
     Args:
         to_strain: capacitance in F to strain.
     Returns:
-        Its keys; None for what the map does not have.
+        Its keys; None for missing properties.
     Example:
         >>> {k: v for k, v in strain_map_section(StrainMap(4.9e8, -0.27)).items() if v}
         {'slope_per_f': 490000000.0, 'offset': -0.27, 'coverage': 0.95}
@@ -31,5 +31,5 @@ def strain_map_section(to_strain: StrainMap) -> Mapping[str, object]:
 
 
 def voltage_map_section(to_volt: VoltageMap) -> Mapping[str, object]:
-    """`[drive.voltage_map]` of a map from strain to voltage, and its range of strains."""
+    """Convert a voltage map to the section `[drive.voltage_map]`, with its range of strains."""
     return asdict(to_volt)

@@ -1,4 +1,4 @@
-"""What hysteresis models share: a stepped memory, an asymmetric curve behind it, inverses."""
+"""Common parts of hysteresis models: stepped memory, asymmetric output curve, inverses."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DeadZones:
-    r"""One-sided dead-zone operators: what makes a loop asymmetric, or saturates it.
+    r"""One-sided dead-zone operators, which make a loop asymmetric or saturate it.
 
     $S(h) = h + \sum_{d_j \ge c} w_j \max(h - d_j, 0) + \sum_{d_j < c} w_j \min(h - d_j, 0)$
 
     Args:
         thresholds: ascending, in the unit of the output. Shape `(M,)`.
         weights: change of slope beyond each, dimensionless. Shape `(M,)`.
-        centre: where the slope is 1, in the unit of the output.
+        centre: point where the slope is 1, in the unit of the output.
     Raises:
         InputError: unequal lengths, NaN, thresholds that do not ascend.
     Source: Kuhnen, Eur. J. Control 9 (2003), 407, section 4.
@@ -43,17 +43,17 @@ class DeadZones:
         if len(self.thresholds) != len(self.weights) or not np.isfinite(numbers).all():
             raise InputError(
                 f"The dead zones have {len(self.thresholds)} thresholds and {len(self.weights)} "
-                "weights; allowed are as many of each, all finite. Give a weight for each."
+                "weights. Give one finite weight for each threshold."
             )
         if not (np.diff(self.thresholds) > 0.0).all():
             raise InputError(
-                f"The dead zones have the thresholds {self.thresholds}; allowed are ascending "
-                "ones. Sort them."
+                f"The dead zones have the thresholds {self.thresholds}; they must "
+                "ascend. Sort them."
             )
 
     @property
     def slopes(self) -> Floats:
-        """Slope of each straight piece, the lowest first. Shape `(M + 1,)`."""
+        """Slope of each straight segment, the lowest first. Shape `(M + 1,)`."""
         upper = np.asarray(self.thresholds) >= self.centre
         weights = np.asarray(self.weights, dtype=np.float64)
         above = 1.0 + np.cumsum(weights[upper])
@@ -72,7 +72,7 @@ class DeadZones:
         return d, d + columns @ np.asarray(self.weights, dtype=np.float64)
 
     def columns(self, values: Floats) -> Floats:
-        """Derivatives of the curve by the weights: the operators themselves.
+        """Derivatives of the curve with respect to the weights: the operators themselves.
 
         Args:
             values: arguments, in the unit of the output. Shape `(N,)`.
@@ -96,7 +96,7 @@ class DeadZones:
         return _broken_line(h, *self._corners(), self.slopes)
 
     def invert(self, values: ArrayLike) -> Floats:
-        """Arguments for which `apply` gives the values; a curve that does not rise is refused.
+        """Invert `apply`; a curve that does not rise is refused.
 
         Args:
             values: in the unit of the output. Shape `(...)`.
@@ -128,11 +128,11 @@ NO_DEAD_ZONES = DeadZones()
 
 @dataclass(frozen=True)
 class HysteresisState:
-    """Memory of a hysteresis model between two blocks.
+    """State of a hysteresis model between two blocks.
 
     Args:
-        memory: the model's own numbers, the last input at the end. Shape `(S,)`.
-        rate_hz: samples a second, in Hz.
+        memory: the model's memory states, with the last input at the end. Shape `(S,)`.
+        rate_hz: sampling rate, in Hz.
     """
 
     memory: Floats
@@ -147,18 +147,18 @@ class Hysteresis(ABC):
 
     @abstractmethod
     def init(self, rate_hz: float = 1.0, input_before: float = 0.0) -> HysteresisState:
-        """State of a model that has rested, without a past, at `input_before`.
+        """Initial state of a model at rest at `input_before`, without a past.
 
         Args:
-            rate_hz: samples a second, in Hz; matters only to a rate-dependent model.
-            input_before: input at rest.
+            rate_hz: sampling rate, in Hz; used only by a rate-dependent model.
+            input_before: input before the record.
         Returns:
-            State, for `step` and for `inverse_step` alike.
+            State, for both `step` and `inverse_step`.
         """
 
     @abstractmethod
     def obstacle(self, rate_hz: float = 1.0) -> str:
-        """Why there is no inverse at this rate, with what to do; empty when there is one."""
+        """Why there is no inverse at this rate, and what to do; empty if there is one."""
 
     @abstractmethod
     def _run(self, memory: Floats, rate_hz: float, u: Floats, y: Floats) -> None:
@@ -169,10 +169,10 @@ class Hysteresis(ABC):
         """Input from output without offset and dead zones; `memory` is changed in place."""
 
     def step(self, state: HysteresisState, u: ArrayLike) -> tuple[HysteresisState, Floats]:
-        """Outputs of a block of inputs.
+        """Simulate one block of inputs.
 
         Args:
-            state: from `init` or the block before.
+            state: from `init` or the previous block.
             u: inputs. Shape `(B,)`.
         Returns:
             State after the block, and outputs of shape `(B,)`.
@@ -185,11 +185,11 @@ class Hysteresis(ABC):
         return HysteresisState(memory, state.rate_hz), self.dead_zones.apply(out + self.offset)
 
     def inverse_step(self, state: HysteresisState, y: ArrayLike) -> tuple[HysteresisState, Floats]:
-        """Inputs for which `step` gives a block of outputs.
+        """Compute the inputs for one block of desired outputs.
 
         Args:
-            state: from `init` or the block before.
-            y: wanted outputs. Shape `(B,)`.
+            state: from `init` or the previous block.
+            y: desired outputs. Shape `(B,)`.
         Returns:
             State after the block, and inputs of shape `(B,)`.
         Raises:
@@ -205,11 +205,11 @@ class Hysteresis(ABC):
         return HysteresisState(memory, state.rate_hz), inputs
 
     def simulate(self, u: ArrayLike, rate_hz: float = 1.0, input_before: float = 0.0) -> Floats:
-        """Outputs of a whole record, from `init`. Arguments and errors as in `init`, `step`."""
+        """Simulate a whole record from `init`. Arguments and errors as in `init` and `step`."""
         return self.step(self.init(rate_hz, input_before), u)[1]
 
     def invert(self, y: ArrayLike, rate_hz: float = 1.0, input_before: float = 0.0) -> Floats:
-        """Inputs for a whole record of wanted outputs, as `inverse_step` from `init`."""
+        """Compute the inputs for a whole record of desired outputs, from `init`."""
         return self.inverse_step(self.init(rate_hz, input_before), y)[1]
 
 
@@ -217,7 +217,7 @@ def _block(name: str, values: ArrayLike) -> Floats:
     block = np.ascontiguousarray(values, dtype=np.float64)
     if block.ndim != 1 or not np.isfinite(block).all():
         raise InputError(
-            f"{name} has shape {block.shape} or holds NaN; allowed is a finite vector. "
+            f"{name} has shape {block.shape} or contains NaN; it must be a finite vector. "
             "Give one number for each sample."
         )
     return block

@@ -19,24 +19,25 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PrandtlIshlinskii(Hysteresis):
-    r"""Play operators in parallel, thresholds that grow with the input's rate, dead zones behind.
+    r"""Parallel play operators, optionally with rate-dependent thresholds, then dead zones.
 
     $x_i(t_k) = \min(u_k + r_i,\ \max(u_k - r_i,\ x_i(t_{k-1}))),\quad
     r_i = \alpha_i + \beta\,\varrho_{k-1},\quad
     y = S\bigl(c + p_0 u + \textstyle\sum_i p_i x_i\bigr)$
 
     $\varrho$ is $|\dot u|$ behind a first-order filter. It is that of the sample before, so that
-    the inverse knows the thresholds before it knows its own output. All thresholds grow alike:
-    their distances never shrink, which the inverse needs to be exact.
+    the inverse can compute the thresholds before its own output. All thresholds grow equally:
+    their distances never shrink, which is required for an exact inverse.
 
     Args:
         gain: $p_0$, output per unit of input.
         thresholds: $\alpha_i$, ascending, above 0, in the unit of the input. Shape `(n,)`.
-        weights: $p_i$; of the sign of `gain` where the output lags, of the other where it leads.
+        weights: $p_i$; with the sign of `gain` if the output lags, opposite if it leads.
             Shape `(n,)`.
         offset: $c$.
         rate_dependence_s: $\beta$, threshold per unit of rate, in s. 0: rate-independent.
-        rate_filter_s: time constant of the filter of the rate, in s. 0: the plain difference.
+        rate_filter_s: time constant of the filter of the rate, in s. 0: the difference of
+            successive inputs.
         dead_zones: $S$.
     Raises:
         InputError: unequal lengths, NaN, thresholds that do not ascend from above 0, a negative
@@ -65,28 +66,28 @@ class PrandtlIshlinskii(Hysteresis):
         if len(self.thresholds) != len(self.weights) or not np.isfinite(numbers).all():
             raise InputError(
                 f"The play operators have {len(self.thresholds)} thresholds and "
-                f"{len(self.weights)} weights; allowed are as many of each, all finite. "
-                "Give a weight for each."
+                f"{len(self.weights)} weights. "
+                "Give one finite weight for each threshold."
             )
         if not (np.diff([0.0, *self.thresholds]) > 0.0).all():
             raise InputError(
-                f"The play operators have the thresholds {self.thresholds}; allowed are ascending "
-                "ones above 0. Sort them; a threshold of 0 belongs to the gain."
+                f"The play operators have the thresholds {self.thresholds}; they must "
+                "ascend from above 0. Sort them; a threshold of 0 belongs to the gain."
             )
         if min(times) < 0.0:
             raise InputError(
-                f"rate_dependence_s = {times[0]:g} s, rate_filter_s = {times[1]:g} s; allowed is "
-                "0 s or more. Correct them."
+                f"rate_dependence_s = {times[0]:g} s, rate_filter_s = {times[1]:g} s; both must be "
+                "0 s or more."
             )
 
     def pull(self, rate_hz: float) -> float:
-        """Share of a new rate that the filter takes in one sample, at `rate_hz` in Hz."""
+        """Coefficient of the rate's filter for one sample, at `rate_hz` in Hz."""
         if self.rate_filter_s == 0.0:
             return 1.0
         return -math.expm1(-1.0 / (rate_hz * self.rate_filter_s))
 
     def plays(self, rate_hz: float) -> Plays:
-        """The operators at a sampling rate in Hz, as the extension steps them."""
+        """The operators at a sampling rate in Hz, in the form of the extension."""
         return Plays(
             np.asarray(self.thresholds, dtype=np.float64),
             np.asarray(self.weights, dtype=np.float64),
@@ -97,32 +98,32 @@ class PrandtlIshlinskii(Hysteresis):
         )
 
     def init(self, rate_hz: float = 1.0, input_before: float = 0.0) -> HysteresisState:
-        """State of a model that has rested, without a past, at `input_before`.
+        """Initial state of a model at rest at `input_before`, without a past.
 
         Args:
-            rate_hz: samples a second, in Hz; matters only to a rate-dependent model.
-            input_before: input at rest.
+            rate_hz: sampling rate, in Hz; used only by a rate-dependent model.
+            input_before: input before the record.
         Returns:
-            State: the plays, the filtered rate, the last input.
+            State: the play operators, the filtered rate and the last input.
         Raises:
             InputError: a rate that is not above 0 Hz.
         """
         if not 0.0 < rate_hz < math.inf:
             raise InputError(
-                f"rate_hz = {rate_hz:g} Hz; allowed is above 0 Hz. Give the sampling rate."
+                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz. Give the sampling rate."
             )
         memory = np.full(len(self.thresholds) + 2, float(input_before))
         memory[-2] = 0.0
         return HysteresisState(memory, rate_hz)
 
     def feedback(self, rate_hz: float = 1.0) -> float:
-        r"""How strongly the inverse feeds its own rate back to itself; below 1 it is stable.
+        r"""Feedback factor of the inverse's own rate; the inverse is stable below 1.
 
         $\beta\,g f\,\max_m |p_1 + \dots + p_m| / |p_0 + \dots + p_m|$, from the characteristic
         polynomial $\lambda^2 - (1 - g + c)\lambda + c$ of the inverse on a monotone branch
 
         Args:
-            rate_hz: samples a second, in Hz.
+            rate_hz: sampling rate, in Hz.
         Returns:
             The product $c$, dimensionless; 0 when rate-independent.
         """
@@ -133,7 +134,7 @@ class PrandtlIshlinskii(Hysteresis):
         return self.rate_dependence_s * self.pull(rate_hz) * rate_hz * share
 
     def obstacle(self, rate_hz: float = 1.0) -> str:
-        """Why there is no inverse at this rate, with what to do; empty when there is one."""
+        """Why there is no inverse at this rate, and what to do; empty if there is one."""
         slopes = np.cumsum([self.gain, *self.weights])
         if not (slopes * np.sign(self.gain) > 0.0).all():
             return (
@@ -147,8 +148,8 @@ class PrandtlIshlinskii(Hysteresis):
             )
         if self.feedback(rate_hz) >= 1.0:
             return (
-                f"The inverse feeds its own rate back {self.feedback(rate_hz):.3g} times, so it "
-                "runs away; allowed is below 1. Raise rate_filter_s, or set rate_dependence_s to "
+                f"The feedback factor of the inverse is {self.feedback(rate_hz):.3g}, so it "
+                "diverges; it must be below 1. Raise rate_filter_s, or set rate_dependence_s to "
                 "0 for a rate-independent inverse."
             )
         return ""

@@ -1,1 +1,1 @@
-"""The model of one block: segments, drive, tones, and what the model does not explain."""
+"""Model of one block: segments, drive, tones, and unexplained blocks."""

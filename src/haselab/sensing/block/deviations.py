@@ -1,4 +1,4 @@
-"""Deviations of a record, checked by how much the blocks scatter."""
+"""Check of the stated standard deviations against the scatter of the blocks."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from haselab.sensing.sensed import Sensed
 __all__ = ["audited"]
 
 Floats = NDArray[np.float64]
-_WINDOW = 301  # blocks over which the scatter is taken
-_LAGS = (1, 3)  # blocks between the neighbours
+_WINDOW = 301  # blocks over which the scatter is evaluated
+_LAGS = (1, 3)  # distances of the compared blocks
 _FEWEST = 20
-_CLEAR = 4.0  # standard deviations of the scatter's estimate
+_CLEAR = 4.0  # standard deviations of the estimated scatter
 _EFFICIENCY = 1.7  # standard deviation of the median of second differences, times root of count
 _NORMAL = 1.4826  # standard deviation over the median of a normal variable's size
 _TEXT = "scatter of the blocks beyond their noise"
 
 
 def audited(sensed: Sensed) -> Sensed:
-    """Widen standard deviations where the blocks scatter more than they say.
+    """Widen standard deviations that are smaller than the scatter of the blocks.
 
     Noise and tones near the carrier can be constant within a block and differ from block to block.
-    They scatter both parts of the impedance alike, while a strain moves the reactance smoothly and
-    the resistance with it. So the second differences of the reactance from block to block, and
-    those of the resistance less what goes with the reactance, are compared with their standard
-    deviations. The smaller of both ratios counts.
+    They scatter both parts of the impedance equally, while a strain changes the reactance smoothly
+    and the resistance with it. Therefore the second differences of the reactance between blocks,
+    and those of the resistance without the part correlated with the reactance, are compared with
+    their standard deviations. The smaller of both ratios is used.
 
     Args:
         sensed: blocks of one record, in order.
     Returns:
-        The same with wider deviations and a text for the blocks concerned.
+        The same results with wider standard deviations, and a text for these blocks.
     Example:
         >>> from haselab.sensing import Lockin, LockinConfig
         >>> config = LockinConfig(200e3, 2000, 2000.0, 0.0, ohm_per_ratio=1e6)
@@ -53,7 +53,7 @@ def audited(sensed: Sensed) -> Sensed:
     if count < _FEWEST:
         return sensed
     with np.errstate(invalid="ignore", divide="ignore"):
-        std = sensed.resistance_std_ohm  # of either part
+        std = sensed.resistance_std_ohm  # of either quadrature
         reactance = sensed.capacitance_f / sensed.capacitance_std_f * std
         ratios = [_beyond(sensed.resistance_ohm, reactance, std, lag) for lag in _LAGS]
     ratio = np.fmax.reduce(ratios)
@@ -73,7 +73,7 @@ def audited(sensed: Sensed) -> Sensed:
 
 
 def _beyond(resistance: Floats, reactance: Floats, std: Floats, lag: int) -> Floats:
-    """Scatter about the neighbours over its deviation; NaN where it is not clearly above 1."""
+    """Scatter relative to its std; NaN where it is not clearly above 1."""
     found = np.full(std.size, np.nan)
     if std.size <= 2 * lag:
         return found
@@ -86,7 +86,7 @@ def _beyond(resistance: Floats, reactance: Floats, std: Floats, lag: int) -> Flo
     if known.size < _FEWEST:
         return found
     one, other = one[known], other[known]
-    one = one - other * (one @ other) / (other @ other)  # a resistance that moves with the strain
+    one = one - other * (one @ other) / (other @ other)  # without the part due to strain
     window = min(_WINDOW, known.size)
     spread = np.minimum(*(_NORMAL * _medians(np.abs(d), window) for d in (one, other)))
     spread[spread < 1.0 + _CLEAR * _EFFICIENCY / np.sqrt(window)] = np.nan
@@ -96,7 +96,7 @@ def _beyond(resistance: Floats, reactance: Floats, std: Floats, lag: int) -> Flo
 
 
 def _medians(values: Floats, window: int) -> Floats:
-    """Medians about each value; that of all where the window holds half of them."""
+    """Running medians; the overall median if the window contains half of the values."""
     if values.size < 2 * window:
         return np.full(values.size, np.median(values))
     return np.asarray(median_filter(values, window, mode="mirror"))

@@ -13,24 +13,24 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _CLEAR = 4.5  # standard deviations of a harmonic's quadrature
-_IN_PHASE = 0.06  # of a harmonic: what noise and skew leave beside the phase of a saturation
+_IN_PHASE = 0.06  # of a harmonic: tolerance for noise and skew of the phase of a saturation
 
 
 def distorted(
     harmonic: Complexes, std: Floats, voltage: Complexes, current: Complexes
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Blocks in which a monitor saturates, and blocks with harmonics of the carrier.
+    """Find blocks in which a monitor saturates, and blocks with harmonics of the carrier.
 
-    A static curve turns a sine into harmonics whose phases are those of the sine, each n times as
-    large, or the opposite ones; a flat top makes the third one so that it takes off the peaks.
-    Harmonics of the generator pass the actuator: those of the current follow from those of the
-    voltage by the impedance that the carrier has shown. They are no error of C.
+    A static curve creates harmonics whose phases are n times that of the sine,
+    or opposite to that; for a flat top the third harmonic lowers the peaks.
+    Harmonics of the generator pass through the actuator: those of the current follow from those of
+    the voltage by the impedance at the carrier. They cause no error of C.
 
     Args:
         harmonic: phasors of the harmonics, `(blocks, 2, harmonics)`.
-        std: of one quadrature of them.
+        std: standard deviation of one quadrature.
         voltage: phasor of the carrier, `(blocks,)`.
-        current: the same.
+        current: the same for the current.
     Returns:
         Two arrays of shape `(blocks,)`.
     """
@@ -40,7 +40,7 @@ def distorted(
     harmonic = harmonic * np.conj(carriers / size)[:, :, np.newaxis] ** orders
     single = _saturates(harmonic, _beyond_load(harmonic, carriers, orders), std)
     seen = (np.abs(harmonic) > _CLEAR * std).any(axis=(1, 2))
-    # The same of the mean over the record: what one block hides in its noise.
+    # The same for the mean over the record, since noise hides it in one block.
     typical = np.median(size, axis=0)
     weight = (size[:, :, np.newaxis] / np.maximum(std, 1e-12 * size[:, :, np.newaxis])) ** 2
     total = np.maximum(weight.sum(axis=0), 1e-300)
@@ -57,24 +57,24 @@ def distorted(
 
 
 def _beyond_load(harmonic: Complexes, carriers: Complexes, orders: NDArray[np.int_]) -> Complexes:
-    """Harmonics of the current less those that the voltage's drive through the load."""
+    """Harmonics of the current minus those caused by the voltage's harmonics."""
     z = carriers[:, 0] / carriers[:, 1]
     at = z.real[:, np.newaxis] + 1j * z.imag[:, np.newaxis] / orders
-    # Each channel is turned by its own carrier: n angles of the current, n of the voltage.
+    # Rotate each channel by n times the phase of its own carrier.
     lead = carriers[:, 1] / carriers[:, 0]
     lead = (lead / np.abs(lead))[:, np.newaxis] ** orders
     return np.asarray(harmonic[:, 1] - harmonic[:, 0] / at / lead)
 
 
 def _saturates(harmonic: Complexes, excess: Complexes, std: Floats) -> NDArray[np.bool_]:
-    """Blocks whose harmonics are those of a curve that bends down, on either channel."""
+    """Blocks whose harmonics are those of a saturation, on either channel."""
     third = HARMONICS.index(3)
     limit = _CLEAR * std
     size = np.abs(harmonic)
     clear = size > limit
     aligned = (~clear | (np.abs(harmonic.imag) < np.maximum(limit, _IN_PHASE * size))).all(axis=2)
     down = clear[:, :, third] & (harmonic[:, :, third].real < 0.0)
-    # Both monitors agree on a third harmonic that passes the load: the generator's.
+    # A third harmonic on both monitors that agrees with the load is the generator's.
     load = size[:, 1, third] / np.maximum(size[:, 0, third], 1e-300)
     error = np.hypot(std[:, 0, third] * load, std[:, 1, third])
     tolerance = np.maximum(_CLEAR * error, _IN_PHASE * size[:, 1, third])

@@ -1,4 +1,4 @@
-"""The plan of a block: its pieces, which of them count, and the least squares that follows."""
+"""Plan of a block: its segments, which of them count, and the resulting least squares."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ __all__ = ["BlockPlan", "Weights", "make_plan"]
 
 Floats = NDArray[np.float64]
 
-_LANES = 16  # of core/hs_lockin.c: a piece of so many samples wastes none
+_LANES = 16  # of core/hs_lockin.c: a segment of a multiple of these samples wastes none
 _SHORTEST = 64
-_FEW = 5  # pieces of a block, enough to tell its noise and what disturbs it
+_FEW = 5  # segments of a block, enough to estimate its noise and disturbances
 _LONGEST = 65535
 _ALL = _sense.ROOM
-_TESTED = 6  # full pieces beside an update: their levels have three parameters
-_PERIODS = 2.0  # that count, at least
+_TESTED = 6  # full segments beside an update: their levels have three parameters
+_PERIODS = 2.0  # fewest counted carrier periods
 _PERIODS_ALONE = 1.0 - 1e-9
 
 
 class Weights(NamedTuple):
-    """What the least squares of a choice makes of readings of variance 1; shape `(choices,)`.
+    """Variances of the least-squares estimates for readings of variance 1; shape `(choices,)`.
 
     Args:
         quadrature: variance of one quadrature of a phasor.
         level: variance of the mean level.
         slope: variance of the slope, per s^2.
-        middle_s: mean time of the samples that count, from the block's first sample.
+        middle_s: mean time of the counted samples, from the block's first sample.
     """
 
     quadrature: Floats
@@ -44,12 +44,12 @@ class Weights(NamedTuple):
 
 @dataclass(frozen=True)
 class BlockPlan:
-    """What is known of every block before the first one comes.
+    """Precomputed data of every block.
 
     Args:
-        native: for the C code.
+        native: plan for the C code.
         weights: of each choice; the first is the planned one.
-        local_normal: normal matrix of a full piece over cosine, sine, 1 and sample / piece.
+        local_normal: normal matrix of a full segment over cosine, sine, 1 and sample / segment.
     """
 
     native: _sense.Plan
@@ -65,34 +65,35 @@ class _Choice(NamedTuple):
     middle_s: float
 
 
-def _piece_length(config: LockinConfig) -> int:
-    """Samples of a full piece: at least a carrier period.
+def _segment_length(config: LockinConfig) -> int:
+    """Samples of a full segment: at least a carrier period.
 
-    Short where pieces are left out, long where all count: each one costs time.
+    Short where segments are left out, long where all count, since each one costs time.
     """
     period = config.rate_hz / config.carrier_hz
     whole = config.blank[0] == config.blank[1] and not config.search_updates
-    pieces = _FEW if whole else _sense.PIECES
-    least = max(period, _SHORTEST, config.block_samples / pieces)
+    segments = _FEW if whole else _sense.PIECES
+    least = max(period, _SHORTEST, config.block_samples / segments)
     return min(_LANES * int(np.ceil(least / _LANES - 1e-9)), config.block_samples)
 
 
 def make_plan(config: LockinConfig, *, alone: bool = False, vectors: int = 512) -> BlockPlan:
-    """Plan the least squares of one configuration.
+    """Plan the least squares for one configuration.
 
     Args:
         config: of the readings.
-        alone: the block is one piece, of a carrier period at least; its neighbours add to it.
+        alone: whether the block is one segment of at least a carrier period, combined with its
+            neighbours.
         vectors: bits of the widest vector instructions that may be used, 0 for none. The results
             are the same.
     Returns:
         The plan.
     Raises:
         InputError: fewer than two carrier periods count, the carrier is above a third of the
-            sampling rate, or a block is beyond what the C code holds.
+            sampling rate, or a block exceeds the limit of the C code.
     """
     n = config.block_samples
-    m = n if alone else _piece_length(config)
+    m = n if alone else _segment_length(config)
     _check(config, m, _PERIODS_ALONE if alone else _PERIODS)
     angle = 2.0 * np.pi * config.carrier_hz / config.rate_hz * np.arange(m)
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -103,7 +104,7 @@ def make_plan(config: LockinConfig, *, alone: bool = False, vectors: int = 512) 
     turn = np.zeros(_ALL)
     turn[: starts.size] = 2.0 * np.pi * (config.carrier_hz / config.rate_hz * starts % 1.0)
     turns = np.stack([np.cos(turn), np.sin(turn)])
-    if starts.size == 1:  # a piece that stands alone still turns on to the next block
+    if starts.size == 1:  # the phase of a single segment still advances to the next block
         step = 2.0 * np.pi * (config.carrier_hz / config.rate_hz * m % 1.0)
         turns[:, 1] = np.cos(step), np.sin(step)
     local = _inverse(_normal(cosine, sine, (np.arange(m) - 0.5 * (m - 1)) / m))
@@ -128,13 +129,13 @@ def make_plan(config: LockinConfig, *, alone: bool = False, vectors: int = 512) 
     return BlockPlan(native, weights, _normal(cosine, sine, np.arange(m) / m))
 
 
-def _check(config: LockinConfig, piece: int, least: float) -> None:
+def _check(config: LockinConfig, segment: int, least: float) -> None:
     low, high = config.blank
     n = config.block_samples
     if config.search_updates and 0 < low < high < n:
         raise InputError(
-            f"Samples [{low}, {high}) are blanked in mid-block and updates are searched for as "
-            "well; a block has one step. Blank the start, or state the update."
+            f"Samples [{low}, {high}) are blanked in mid-block, and updates are searched for as "
+            "well, but a block can have only one step. Blank the start, or specify the update."
         )
     used = n - (high - low)
     periods = used * config.carrier_hz / config.rate_hz
@@ -142,11 +143,11 @@ def _check(config: LockinConfig, piece: int, least: float) -> None:
         raise InputError(
             f"Lock-in at {config.carrier_hz:g} Hz has {periods:g} periods in {used} samples of "
             f"{config.rate_hz:g} Hz; at least {least:.2g} periods and a carrier up to "
-            f"{config.rate_hz / 3:g} Hz are needed. Lengthen the block, or sample faster."
+            f"{config.rate_hz / 3:g} Hz are required. Lengthen the block, or sample faster."
         )
-    if piece > _LONGEST:
+    if segment > _LONGEST:
         raise InputError(
-            f"A block of {n} samples is beyond {_LONGEST * _sense.PIECES}. Shorten the block."
+            f"A block of {n} samples is longer than {_LONGEST * _sense.PIECES}. Shorten the block."
         )
 
 
@@ -162,8 +163,8 @@ def _normal(cosine: Floats, sine: Floats, ramp: Floats) -> Floats:
 def _choices(config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> list[
     _Choice
 ]:  # fmt: skip
-    """The planned choice, and with a search one for an update in each place."""
-    normals = _piece_normals(config, starts, sizes)
+    """The planned choice, and, with a search, one for an update in each segment."""
+    normals = _segment_normals(config, starts, sizes)
     low, high = config.blank
     ends = starts + sizes
     used = ~((starts < high) & (ends > low)) if high > low else np.ones(starts.size, dtype=bool)
@@ -173,7 +174,7 @@ def _choices(config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.
             left = used.copy()
             left[k : k + 2] = False
             planned.append(left)
-            if k > 1:  # the last block's update still settles in the first piece
+            if k > 1:  # the previous block's update still settles in the first segment
                 early = left.copy()
                 early[0] = False
                 planned.append(early)
@@ -189,10 +190,10 @@ def _choices(config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.
     return [choice for choice in found if choice is not None]
 
 
-def _piece_normals(
+def _segment_normals(
     config: LockinConfig, starts: NDArray[np.int64], sizes: NDArray[np.int64]
 ) -> Floats:
-    """Normal matrix of each piece over cosine, sine, 1 and the block's ramp."""
+    """Normal matrix of each segment over cosine, sine, 1 and the block's ramp."""
     n = config.block_samples
     index = np.arange(n)
     angle = 2.0 * np.pi * (config.carrier_hz / config.rate_hz * index % 1.0)
@@ -214,14 +215,14 @@ def _choice(
     *,
     planned: bool,
 ) -> _Choice | None:
-    """Least squares over the pieces that count, with a step where they are interrupted."""
+    """Least squares over the segments that count, with a step where they are interrupted."""
     n, full = config.block_samples, sizes == sizes[0]
     tested = int((used & full).sum())
     if not tested or sizes[used].sum() < _PERIODS_ALONE * (config.rate_hz / config.carrier_hz):
         return None
     gap = np.flatnonzero(~used)
     after = used & (np.arange(used.size) > gap[-1]) if gap.size else np.zeros_like(used)
-    if gap.size and not (after & full).any():  # a level of its own takes what would show a tail
+    if gap.size and not (after & full).any():  # a separate level would absorb a tail
         used, after = used & ~after, np.zeros_like(used)
     if not (used & ~after).any() or not after.any():
         after = np.zeros_like(used)

@@ -1,4 +1,4 @@
-"""Current over voltage from the phasors of the pieces of a block, and how far to trust it."""
+"""Ratio of current to voltage from the phasors of a block's segments, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.sensing.block.segments import Pieces
+from haselab.sensing.block.segments import Segments
 
-__all__ = ["Ratio", "ratio_of_pieces"]
+__all__ = ["Ratio", "ratio_of_segments"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _RARE = 1e-4  # chance that noise alone leaves a block unexplained
-_MOST_OUTLIERS = 3  # pieces of a block that are left out for a transient
-_COMMON = 12.0  # scatter of the voltage over that of the ratio: the carrier itself changes
-_POOLED = 8  # blocks that tell the record's noise
-_WILD = 4.0  # scatter over that of the record, variances: no noise does this in one block alone
-_LINES = (2, 3, 4)  # of a block's spectrum; the parabola takes the one below
-_EVEN = 0.3  # of the phasors' scatter that is left where an even turn explains it
-_ALIKE = 2.0  # quartiles of the scatter; by chance 1.4 with 20 pieces
-_COLOURED = 0.2  # logarithm of a ratio of noise densities that matters
-_SMALL = 1e-6  # of the carrier: below, rounding
+_MOST_OUTLIERS = 3  # segments of a block that are left out for a transient
+_COMMON = 12.0  # scatter of the voltage over that of the ratio when the carrier itself changes
+_POOLED = 8  # blocks needed to estimate the record's noise
+_WILD = 4.0  # variance ratio to the record that noise does not reach in one block alone
+_LINES = (2, 3, 4)  # of a block's spectrum; the parabola includes the lower one
+_EVEN = 0.3  # share of the phasors' scatter left after removing a constant frequency offset
+_ALIKE = 2.0  # quartile ratio of the scatter; by chance 1.4 with 20 segments
+_COLOURED = 0.2  # logarithm of a ratio of noise densities that counts as coloured
+_SMALL = 1e-6  # of the carrier: less is rounding
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,17 @@ class Ratio:
 
     Args:
         voltage: mean phasor.
-        current: the same, such that the quotient is the estimate.
-        relative_std: of either part of the quotient, over its size.
-        turn: rad a sample that the carrier runs ahead of its nominal frequency.
-        modulated: the carrier changes within the block, on both monitors alike.
-        left_out: pieces that a transient hit.
-        unexplained: what is left is not noise.
-        scatter: relative, of a piece.
-        middle_samples: of what counted, from the block's first sample.
-        coloured: noise around the carrier that differs from that of the readings.
-        turns: the carrier's phase runs ahead evenly, which `turn` explains.
-        strongest: distance of the strongest line in what is left from the carrier, cycles a sample.
+        current: the same, so that the ratio is the estimate.
+        relative_std: standard deviation of either part of the ratio, relative to its magnitude.
+        turn: frequency offset of the carrier, in rad per sample.
+        modulated: whether the carrier changes within the block, equally on both monitors.
+        left_out: number of segments affected by a transient.
+        unexplained: whether the residuals are not noise.
+        scatter: relative scatter of a segment.
+        middle_samples: mean time of the counted samples, from the block's first sample.
+        coloured: whether the noise near the carrier differs from that of the readings.
+        turns: whether a constant frequency offset `turn` explains the phase.
+        strongest: distance of the strongest residual line from the carrier, in cycles per sample.
     """
 
     voltage: Complexes
@@ -60,7 +60,7 @@ class Ratio:
 
 
 def _beyond(freedom: Floats, deviations: float = 3.3) -> Floats:
-    """Chi-square over its degrees of freedom that noise stays below (Wilson and Hilferty)."""
+    """Limit of chi-square over its degrees of freedom for noise (Wilson and Hilferty)."""
     middle, width = 1.0 - 2.0 / (9.0 * freedom), deviations * np.sqrt(2.0 / (9.0 * freedom))
     return np.asarray(np.maximum(middle + width, 0.0) ** 3)
 
@@ -71,31 +71,31 @@ def _mean(values: Complexes, weight: Floats) -> Complexes:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The ratio of one choice of pieces."""
+    """The ratio for one choice of segments."""
 
-    y: Complexes  # relative change of the quotient of the means
+    y: Complexes  # relative change of the ratio of the means
     rest: Complexes
-    scatter: Floats  # variance of one part of a piece's relative error
+    scatter: Floats  # variance of one part of a segment's relative error
     freedom: Floats
     gain: Floats  # variance of y over `scatter`
     modulated: NDArray[np.bool_]
     voltage: Complexes
     current: Complexes
     turn: Floats
-    middle: Floats  # of what counted, from -1 at the block's start to 1 at its end
+    middle: Floats  # mean time of the counted samples, from -1 at the block's start to 1 at its end
     turns: NDArray[np.bool_]
 
 
-def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], pieces: Pieces) -> _Fit:
+def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], segments: Segments) -> _Fit:
     weight = used.astype(np.float64)
     count = weight.sum(axis=1)
     pairs = v[:, 1:] * np.conj(v[:, :-1]) * (used[:, 1:] & used[:, :-1])
-    turn = np.angle(pairs.sum(axis=1)) / pieces.length
+    turn = np.angle(pairs.sum(axis=1)) / segments.length
     voltage, current = _mean(v, weight), _mean(i, weight)
     tiny = 1e-300
     m = v / np.where(np.abs(voltage) > tiny, voltage, tiny)[:, np.newaxis]
     e = i / np.where(np.abs(current) > tiny, current, tiny)[:, np.newaxis] - m
-    basis = np.asarray(np.polynomial.legendre.legvander(pieces.middles, 2), dtype=np.float64)
+    basis = np.asarray(np.polynomial.legendre.legvander(segments.middles, 2), dtype=np.float64)
     about_v = weight * np.abs(m - 1.0) ** 2
     plain = _trend(e, weight, basis)
     modulated = about_v.sum(axis=1) > _COMMON * (weight * np.abs(plain) ** 2).sum(axis=1)
@@ -107,15 +107,15 @@ def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], pieces: Pieces) ->
     scatter = (np.abs(rest) ** 2).sum(axis=1) / freedom
     y = np.where(modulated, _mean(e / np.where(shape == 0.0, 1.0, shape), own), 0.0)
     gain = 1.0 / own.sum(axis=1)
-    middle = (own * pieces.middles).sum(axis=1) / own.sum(axis=1)
-    still = v * np.exp(-1j * np.outer(turn * pieces.length, np.arange(pieces.count)))
+    middle = (own * segments.middles).sum(axis=1) / own.sum(axis=1)
+    still = v * np.exp(-1j * np.outer(turn * segments.length, np.arange(segments.count)))
     about = (weight * np.abs(still - _mean(still, weight)[:, np.newaxis]) ** 2).sum(axis=1)
     turns = about < _EVEN * np.abs(voltage) ** 2 * about_v.sum(axis=1)
     return _Fit(y, rest, scatter, freedom, gain, modulated, voltage, current, turn, middle, turns)
 
 
 def _trend(values: Complexes, weight: Floats, basis: Floats) -> Complexes:
-    """What weighted least squares over a few columns leaves."""
+    """Residuals of weighted least squares over a few columns."""
     normal = np.einsum("bp,pj,pk->bjk", weight, basis, basis)
     normal += 1e-12 * np.eye(basis.shape[1]) * weight.sum(axis=1)[:, np.newaxis, np.newaxis]
     right = np.einsum("bp,pj,bp->bj", weight, basis, values)
@@ -124,7 +124,7 @@ def _trend(values: Complexes, weight: Floats, basis: Floats) -> Complexes:
 
 
 def _not_white(rest: Complexes, used: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Floats]:
-    """Whether a line stands out of what is left, or one piece follows the other, and the line."""
+    """Whether the residuals have a significant line or correlated neighbours, and the line."""
     count = used.sum(axis=1).astype(np.float64)
     total = (np.abs(rest) ** 2).sum(axis=1)
     power = np.abs(np.fft.fft(rest, axis=1)) ** 2
@@ -136,35 +136,36 @@ def _not_white(rest: Complexes, used: NDArray[np.bool_]) -> tuple[NDArray[np.boo
     return (share > limit) | (next_ > 3.0 / np.sqrt(count)), cycles
 
 
-def ratio_of_pieces(
+def ratio_of_segments(
     phasors: Complexes,
     used: NDArray[np.bool_],
     extra: Floats,
     variance: Floats,
-    pieces: Pieces,
+    segments: Segments,
     refused: NDArray[np.bool_] | None = None,
 ) -> Ratio:
-    """Quotient of the means; of the pieces one by one where the carrier itself changes.
+    """Ratio of the means, or mean of the segments' ratios where the carrier itself changes.
 
-    What is left of each piece's quotient about a parabola tells the noise around the carrier,
-    whatever the noise elsewhere. Where it is not clearly more than the white noise of the readings,
-    scaled as the median of the record asks, that is taken: its own error is smaller.
+    The residuals of each segment's ratio about a parabola give the noise near the carrier,
+    independent of other noise. Where they do not clearly exceed the white noise of the readings,
+    scaled by the median of the record, that noise is used: its own error is smaller.
 
     Args:
-        phasors: `(blocks, 2, pieces)`, voltage and current.
-        used: pieces that count, `(blocks, pieces)`.
-        extra: variance of a quadrature that the drive's parameters cost, for readings of variance
+        phasors: `(blocks, 2, segments)`, voltage and current.
+        used: segments that count, `(blocks, segments)`.
+        extra: variance of a quadrature added by the drive's parameters, for readings of variance
             1, `(blocks,)`.
         variance: of the readings, `(blocks, 2)`.
-        pieces: of the blocks.
-        refused: blocks that are known to be wrong, `(blocks,)`; they tell nothing of the record.
+        segments: segments of the blocks.
+        refused: blocks that are known to be wrong, `(blocks,)`; they are not used for the record's
+            noise.
     Returns:
         See `Ratio`.
     """
     v, i = phasors[:, 0], phasors[:, 1]
     used = used.copy()
     start = used.sum(axis=1)
-    fit = _fit(v, i, used, pieces)
+    fit = _fit(v, i, used, segments)
     white = _white(fit, variance)
     for _ in range(_MOST_OUTLIERS):
         share = np.abs(fit.rest) ** 2
@@ -172,26 +173,26 @@ def ratio_of_pieces(
         worst = share.argmax(axis=1)
         count = used.sum(axis=1).astype(np.float64)
         limit = 1.0 - (_RARE / count) ** (1.0 / (count - 1.0))
-        high = _beyond(fit.freedom) * white * pieces.quadrature
+        high = _beyond(fit.freedom) * white * segments.quadrature
         hit = (share.max(axis=1) > limit * total) & (fit.scatter > high)
-        hit &= count > max(5, pieces.count // 2)
+        hit &= count > max(5, segments.count // 2)
         if not hit.any():
             break
         used[hit, worst[hit]] = False
-        fit = _fit(v, i, used, pieces)
+        fit = _fit(v, i, used, segments)
     high = _beyond(fit.freedom)
-    expected = white * pieces.quadrature
+    expected = white * segments.quadrature
     over = fit.scatter / np.maximum(expected, 1e-300)
     coloured, cycles = _not_white(fit.rest, used)
     taken = np.ones(len(over), dtype=bool) if refused is None else ~refused
     taken &= ~(coloured & (over > high))
     prior, near = expected, 1.0
     low, common, most = np.quantile(over[taken], (0.25, 0.5, 0.75)) if taken.any() else (0, 1, 1)
-    # Noise of one kind throughout, not disturbances of any size.
+    # Only if the noise is uniform, not for disturbances of varying size.
     if taken.sum() >= max(_POOLED, len(over) // 2) and most < _ALIKE * low:
         clear = 5.0 / np.sqrt(taken.sum() * float(fit.freedom.mean()))
         prior = expected * common if abs(np.log(max(common, 1e-12))) > clear else expected
-        near = _near_carrier(fit.rest, taken & used.all(axis=1), pieces)
+        near = _near_carrier(fit.rest, taken & used.all(axis=1), segments)
     own = (fit.scatter >= high * prior) | (fit.scatter < _beyond(fit.freedom, -4.5) * prior)
     scatter = np.where(own, fit.scatter, prior)
     unexplained = coloured & (fit.scatter > high * expected)
@@ -207,33 +208,33 @@ def ratio_of_pieces(
         start - used.sum(axis=1),
         unexplained,
         np.sqrt(fit.scatter),
-        0.5 * (fit.middle + 1.0) * pieces.samples - 0.5,
-        cycles / pieces.length,
+        0.5 * (fit.middle + 1.0) * segments.samples - 0.5,
+        cycles / segments.length,
         np.abs(np.log(np.maximum(near * scatter / np.maximum(expected, 1e-300), 1e-12)))
         > _COLOURED,
         fit.turns,
     )
 
 
-def _near_carrier(rest: Complexes, blocks: NDArray[np.bool_], pieces: Pieces) -> float:
-    """Noise density close to the carrier over its mean in the band of a piece, of the record."""
+def _near_carrier(rest: Complexes, blocks: NDArray[np.bool_], segments: Segments) -> float:
+    """Noise density close to the carrier relative to its mean in the band of a segment."""
     count, many = rest.shape[1], int(blocks.sum())
     if many < max(_POOLED, len(rest) // 2) or count < 2 * _LINES[-1] + 4:
         return 1.0
     lines = [*_LINES, *(-k for k in _LINES)]
     power = (np.abs(np.fft.fft(rest[blocks], axis=1)[:, lines]) ** 2).mean(axis=1)
     total = (np.abs(rest[blocks]) ** 2).sum(axis=1)
-    # White noise of which a parabola is taken.
-    basis = np.polynomial.legendre.legvander(pieces.middles, 2)
+    # White noise with a parabola subtracted.
+    basis = np.polynomial.legendre.legvander(segments.middles, 2)
     waves = np.exp(2j * np.pi * np.outer(lines, np.arange(count)) / count)
     white = (np.abs(waves - waves @ basis @ np.linalg.pinv(basis)) ** 2).sum(axis=1).mean()
     near = float(np.median(power / np.maximum(total, 1e-300))) * (count - 3.0) / float(white)
-    near /= 1.0 - 1.0 / (3.0 * len(lines))  # the median of such a mean lies below its mean
+    near /= 1.0 - 1.0 / (3.0 * len(lines))  # the median of such a mean is below its mean
     clear = max(_COLOURED, 6.0 / np.sqrt(many * len(lines)))
     return near if abs(np.log(max(near, 1e-12))) > clear else 1.0
 
 
 def _white(fit: _Fit, variance: Floats) -> Floats:
-    """Relative variance of the quotient for white noise, for a quadrature of variance 1."""
+    """Relative variance of the ratio for white noise, for a quadrature of variance 1."""
     sizes = np.maximum(np.abs(np.stack([fit.voltage, fit.current], axis=1)), 1e-300)
     return np.asarray((variance / sizes**2).sum(axis=1))

@@ -1,4 +1,4 @@
-"""What a record shows as a whole: tones, and the step of its converter."""
+"""Properties of a whole record: tones, and the step of its converter."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ Floats = NDArray[np.float64]
 
 _MOST_BLOCKS = 16
 _MOST_LINES = 8
-_LOBE = 5  # bins to each side that a line of the window takes
-_NEIGHBOURS = 60  # bins to each side that tell the floor
-_EACH = 4  # of the thinned bins a median is made for one
-_CLEAR = 60.0  # line over the floor's median, of the power: by noise, exp(-60 ln 2) of a bin
-_SAMPLE = 8000  # readings that show the step of the converter
-_RUNS = 16  # in which they are taken
-_COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not look like noise
+_LOBE = 5  # bins to each side covered by a line of the window
+_NEIGHBOURS = 60  # bins to each side that give the noise floor
+_EACH = 4  # thinned bins per median
+# Power of a line over the median of the floor; noise reaches it with probability exp(-60 ln 2).
+_CLEAR = 60.0
+_SAMPLE = 8000  # readings used to find the step of the converter
+_RUNS = 16  # runs in which they are taken
+_COARSE = 0.6  # noise and rounding together, in steps: below, rounding does not act as noise
 _ONE_STEP, _ALTERNATING = 1.0, 0.25  # of the converter; largest variance of two values
 _CLEAR_TONE = 1e3  # power of a tone over the median of the spectrum
 _BESIDE_TONE = 0.05  # power of a second one over the first
@@ -40,13 +41,13 @@ _TONE_WIDTH = 3  # lines of the spectrum on either side
 
 @dataclass(frozen=True)
 class Lines:
-    """Tones of a record, beside the carrier and its harmonics.
+    """Tones of a record other than the carrier and its harmonics.
 
     Args:
-        hz: those that a block separates from the carrier, the strongest first.
+        hz: frequencies that a block separates from the carrier, the strongest first.
         peak: their amplitudes on the two monitors, `(lines, 2)`.
-        modulation_hz: distance of side lines that stand on both sides of the carrier; 0: none.
-        hum_hz: 50 or 60 where that line is there, else 0.
+        modulation_hz: distance of side lines on both sides of the carrier; 0: none.
+        hum_hz: 50 or 60 if that line is present, else 0.
         hum: its amplitude on the two monitors.
     """
 
@@ -58,13 +59,13 @@ class Lines:
 
 
 def find_lines(readings: NDArray[np.generic], config: LockinConfig) -> Lines:
-    """Lines in the spectrum of a stretch of blocks in a row.
+    """Find lines in the spectrum of successive blocks.
 
     Args:
-        readings: blocks `(blocks, block_samples, 2)`, the stretch where most is wrong.
-        config: of them.
+        readings: blocks `(blocks, block_samples, 2)`, those with the largest disturbance.
+        config: configuration of the lock-in.
     Returns:
-        What stands out of the floor around it.
+        The significant lines.
     """
     flat = np.ascontiguousarray(readings[:_MOST_BLOCKS].reshape(-1, 2).T, dtype=np.float64)
     window = _window(flat.shape[1])
@@ -112,7 +113,7 @@ def _window(samples: int) -> Floats:
 
 
 def _floor(power: Floats) -> Floats:
-    """Median of the neighbours: a line does not raise it."""
+    """Noise floor: median of the neighbours, robust against a line."""
     step = max(1, (2 * _NEIGHBOURS + 1) // 16)
     thin = np.pad(power[::step], ((8, 8), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(thin, 17, axis=0)[::_EACH]
@@ -123,7 +124,7 @@ def _floor(power: Floats) -> Floats:
 
 
 def _offset(power: Floats, k: int) -> float:
-    """Of the line from the bin of its largest value, by a parabola through the logarithms."""
+    """Offset of a line from its largest bin, by a parabola through the logarithms."""
     if not 0 < k < len(power) - 1:
         return 0.0
     a, b, c = np.log(power[k - 1 : k + 2].sum(axis=1) + 1e-300)
@@ -162,7 +163,7 @@ def _hum(
 
 
 def hum_text(lines: Lines) -> str:
-    """Words for the hum; nothing where there is none."""
+    """Text for the hum; empty without hum."""
     if not lines.hum_hz:
         return ""
     return f"hum of {max(lines.hum):.2g} V at {lines.hum_hz:g} Hz"
@@ -174,7 +175,7 @@ def strongest_tones(channel: Floats, rate_hz: float, least_hz: float) -> list[fl
     Args:
         channel: readings, shape `(samples,)`.
         rate_hz: samples per second.
-        least_hz: tones below are not looked for.
+        least_hz: lower tones are ignored.
     Example:
         >>> time_s = np.arange(4000) / 1e4
         >>> tones = np.sin(2 * np.pi * 950 * time_s) + np.sin(2 * np.pi * 1000 * time_s)
@@ -200,7 +201,7 @@ def strongest_tones(channel: Floats, rate_hz: float, least_hz: float) -> list[fl
 
 
 def converter_step(readings: NDArray[np.generic]) -> Floats:
-    """Distance of neighbouring values of each channel; 0 where they do not repeat.
+    """Smallest step between values of each channel; 0 if values do not repeat.
 
     Args:
         readings: blocks `(blocks, block_samples, 2)`.
@@ -210,7 +211,7 @@ def converter_step(readings: NDArray[np.generic]) -> Floats:
     if readings.dtype.kind in "iu":
         return np.ones(2)
     flat = readings.reshape(-1, 2)
-    if len(flat) > _SAMPLE:  # runs from all over the record; a stride could hit one phase alone
+    if len(flat) > _SAMPLE:  # runs from all over the record; a stride could sample one phase only
         starts = np.linspace(0, len(flat) - _SAMPLE // _RUNS, _RUNS).astype(np.intp)
         flat = np.concatenate([flat[k : k + _SAMPLE // _RUNS] for k in starts])
     flat = flat.astype(np.float64)
@@ -228,7 +229,7 @@ def converter_step(readings: NDArray[np.generic]) -> Floats:
 
 
 def dithered_error(amplitude: Floats, noise: Floats) -> Floats:
-    r"""Error of a sine's amplitude that a converter's steps leave, rms over the level.
+    r"""Error of a sine's amplitude due to a converter's steps, rms over the level.
 
     $\sum_k \frac{2}{\pi k} J_1(2\pi k A)\, e^{-2\pi^2 k^2 \sigma^2}\cos 2\pi k L$ in steps.
 
@@ -236,7 +237,7 @@ def dithered_error(amplitude: Floats, noise: Floats) -> Floats:
         amplitude: peak, in steps.
         noise: standard deviation before the converter, in steps.
     Returns:
-        In steps.
+        Error, in steps.
     Source: B. Widrow, I. Kollar, Quantization Noise, Cambridge 2008, ch. 19 and app. G.
     """
     k = np.arange(1, 40)
@@ -247,21 +248,21 @@ def dithered_error(amplitude: Floats, noise: Floats) -> Floats:
 
 
 def rounding_error(amplitude: Floats, deviation: Floats, step: Floats) -> Floats:
-    """Error of a sine's amplitude by the converter's steps, part of the amplitude, rms.
+    """Relative rms error of a sine's amplitude due to the converter's steps.
 
     Args:
         amplitude: peak on each channel, `(2, blocks)`.
         deviation: of a reading, noise and rounding together, `(2, blocks)`.
-        step: of the converter on each channel, 0 where it does not show, `(2,)`.
+        step: step of the converter on each channel, 0 if not known, `(2,)`.
     Returns:
-        Shape `(2, blocks)`; 0 where the noise covers several steps.
+        Shape `(2, blocks)`; 0 where the noise spans several steps.
     """
     error = np.zeros_like(amplitude)
     for channel in np.flatnonzero(step > 0.0).tolist():
         total = deviation[channel] / step[channel]
         rough = total < _COARSE
         size = amplitude[channel, rough] / step[channel]
-        # Below a step the readings may alternate between two values without any noise.
+        # With less than a step, the readings may alternate between two values without any noise.
         rounding = np.where(size < _ONE_STEP, _ALTERNATING, 1.0 / 12.0)
         noise = np.sqrt(np.maximum(total[rough] ** 2 - rounding, 0.0))
         error[channel, rough] = dithered_error(size, noise) / np.maximum(size, 1e-300)

@@ -1,4 +1,4 @@
-"""Capacitance without a carrier: the charge that the current brings, over the voltage."""
+"""Capacitance without a carrier: integrated current over voltage."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ Floats = NDArray[np.float64]
 _AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8, 32
 _DISTURBED = 128
 _SHORTEST = 16  # samples of a block
-_POINTS = 256  # of a block that are kept at least, where it has them
+_POINTS = 256  # smallest number of points kept of a block that has as many
 _MOST_POINTS = 40_000_000  # of a record: 640 MB
 _MOST_COMPENSATION = 0.1  # share of the voltage's mean square that is noise
 _FEW_VALUES = 3
-_FEWEST_STEPS = 5.0  # of the converter in the voltage's rms: below, its rounding is no noise
+_FEWEST_STEPS = 5.0  # converter steps in the voltage's rms; with fewer, rounding is not noise
 _MOST_STD = 0.2  # of the capacitance
-_MOST_OF_STEPS = 0.1  # the same where it is a bias of all blocks
+_MOST_OF_STEPS = 0.1  # the same for a bias common to all blocks
 _CLEAR = 5.0  # standard deviations
 _TOO_UNCERTAIN = {
-    "noise": "drive hardly moves against the noise",
-    "offset": "offset of the current not known outside of two passes of 0 V",
+    "noise": "drive hardly changes compared with the noise",
+    "offset": "offset of the current not known outside two crossings of 0 V",
     "leakage": "leakage not separable",
-    "step": "step of the converter too coarse for the current",
-    "wander": "offset of the current wanders",
+    "step": "converter step too coarse for the current",
+    "wander": "offset of the current drifts",
 }
-_NOTABLE = 0.5  # share of the variance from which on a cause is named
+_NOTABLE = 0.5  # share of the variance above which a cause is reported
 
 
 @dataclass(frozen=True)
 class ChargeConfig:
-    """What a record without a carrier needs to be sensed.
+    """Configuration for sensing a record without a carrier.
 
     Args:
         rate_hz: samples per second and channel.
@@ -50,8 +50,9 @@ class ChargeConfig:
         ohm_per_ratio: impedance for equal readings on both channels, in ohm:
             (V per V of the amplifier output) / (A per V) of the two monitors.
         skew_s: time from a voltage sample to its current sample; less than a quarter of a block.
-        full_scale: a reading of this size has left the converter's range, unit of the readings.
-        current_limit: the same for the current monitor where the amplifier limits its current.
+        full_scale: a reading of this magnitude is out of the converter's range, unit of the
+            readings.
+        current_limit: the same for the current monitor at the amplifier's current limit.
     Raises:
         InputError: a value outside its range.
     """
@@ -70,13 +71,13 @@ class ChargeConfig:
                 raise InputError(f"{name} is {value:g}, but must be a finite number above 0.")
         if self.block_samples < _SHORTEST:
             raise InputError(
-                f"A block has {self.block_samples} samples, but sensing by charge needs "
-                f"{_SHORTEST} or more. Lengthen the block."
+                f"A block has {self.block_samples} samples, but sensing by charge requires "
+                f"at least {_SHORTEST}. Lengthen the block."
             )
         if not abs(self.skew_s) < 0.25 * self.block_s:
             raise InputError(
                 f"skew_s is {self.skew_s:g} s, but must be less than a quarter of a block, "
-                f"{0.25 * self.block_s:g} s. Correct it, or lengthen the block."
+                f"{0.25 * self.block_s:g} s. Lengthen the block."
             )
 
     @property
@@ -91,7 +92,7 @@ class ChargeConfig:
 
     @property
     def thinning(self) -> int:
-        """Samples that one point is the mean of: a divisor of the block, so that none is left."""
+        """Samples averaged per point; a divisor of the block length."""
         most = max(1, self.block_samples // _POINTS)
         return next(n for n in range(most, 0, -1) if self.block_samples % n == 0)
 
@@ -111,13 +112,13 @@ class _Record:
 
 @dataclass
 class _Rows:
-    """Results as they come, in the unit of the readings; arrays of shape `(blocks,)`."""
+    """Results under construction, in the unit of the readings; arrays of shape `(blocks,)`."""
 
     kappa: Floats
     variance: Floats
     reason: NDArray[np.uint8]
     seen: dict[int, str] = field(default_factory=dict)
-    causes: dict[int, str] = field(default_factory=dict)  # most of the deviation, of each estimate
+    causes: dict[int, str] = field(default_factory=dict)  # main cause of the std
 
     def refuse(self, block: int, reason: int, text: str) -> None:
         """Mark a block as not valid."""
@@ -131,19 +132,19 @@ class Charge:
 
     $q(t) = \int (i - i_0 - G v)\,dt,\quad C = \sum v q \big/ (\sum v^2 - N\sigma_v^2)$
 
-    The charge is zero where the voltage passes 0 V: there, at the anchors, the integral is tied
-    to zero, so that an offset $i_0$ of the current monitor drops out between two of them. C is
-    the mean of $q/v$ in a block with the weight $v^2$; it may depend on voltage and time in any
-    way. $G$ comes from the anchors where their intervals have different mean voltages, else from
-    the energy that a cycle loses: then it is taken as half of what explains all of the loss, with
-    the same as its deviation, because a hysteresis of C loses energy as well.
+    The charge is zero where the voltage passes 0 V: there, at the anchors, the integral is set
+    to zero, so that an offset $i_0$ of the current monitor cancels between two of them. C is
+    the mean of $q/v$ in a block with the weight $v^2$; it may be an arbitrary function of voltage
+    and time. $G$ comes from the anchors if their intervals have different mean voltages, otherwise
+    from the energy lost per cycle: half of the value that explains all of the loss, with
+    an equal standard deviation, because a hysteresis of C also loses energy.
 
-    The standard deviation holds the noise of both monitors, the random walk of the integral, the
+    The standard deviation includes the noise of both monitors, the random walk of the integral, the
     anchors, $i_0$ and $G$, kinks between two samples and steps of the converter. A series
     resistance is not identified; `resistance_ohm` is NaN.
 
-    A record is added in pieces of whole blocks; each block is kept as some 256 points where its
-    samples have a divisor for it.
+    A record is added in chunks of whole blocks; each block is kept as about 256 points if its
+    number of samples has a suitable divisor.
 
     Args:
         config: see `ChargeConfig`.
@@ -178,31 +179,31 @@ class Charge:
         return self.sense_channels(readings[:, :, 0].ravel(), readings[:, :, 1].ravel())
 
     def sense_channels(self, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
-        """The same from two columns, each of shape `(blocks * block_samples,)`."""
+        """Capacitance of a record from two columns of shape `(blocks * block_samples,)`."""
         self.add(v, i)
         return self.finish()
 
     def add(self, v: NDArray[Any], i: NDArray[Any]) -> None:
-        """Take the next blocks of a record.
+        """Add the next blocks of a record.
 
         Args:
             v: voltage monitor, shape `(blocks * block_samples,)`.
             i: current monitor, the same shape.
         Raises:
-            InputError: the shapes differ or are no whole blocks, or the record is too long.
+            InputError: the shapes differ or are not whole blocks, or the record is too long.
         """
         check_channels(v, i, self.config)
         part = _thinned(v, i, self.config)
         self._points += part.v.size
         if self._points > _MOST_POINTS:
             raise InputError(
-                f"The record has more than {_MOST_POINTS} points, the most that sensing by charge "
-                "keeps. Take blocks of a multiple of 256 samples, or cut the record."
+                f"The record has more than {_MOST_POINTS} points, the limit of sensing by charge. "
+                "Use blocks of a multiple of 256 samples, or cut the record."
             )
         self._parts.append(part)
 
     def finish(self) -> Sensed:
-        """Sense what was added; then a new record may begin.
+        """Sense the added blocks, and start a new record.
 
         Returns:
             Results, arrays of shape `(blocks,)`.
@@ -223,7 +224,7 @@ class Charge:
 
 
 def _thinned(v: NDArray[Any], i: NDArray[Any], config: ChargeConfig) -> _Record:
-    """Blocks as means of neighbouring samples, with what is wrong with each."""
+    """Blocks as means of neighbouring samples, with the faults of each."""
     blocks = v.size // config.block_samples
     means, most, pp = [], [], []
     used = config.points * config.thinning
@@ -244,7 +245,7 @@ def _thinned(v: NDArray[Any], i: NDArray[Any], config: ChargeConfig) -> _Record:
 
 def _steps(v: NDArray[Any], i: NDArray[Any], reason: NDArray[Any]) -> Floats:
     """Steps of the converter on both channels, shape `(2,)`; 0 where there are none."""
-    from haselab.sensing.block.tones import converter_step  # scipy: half a second at the start
+    from haselab.sensing.block.tones import converter_step  # scipy takes half a second to import
 
     length = v.size // max(1, reason.size)
     fine = np.repeat(reason & _NOT_FINITE == 0, length)
@@ -252,7 +253,7 @@ def _steps(v: NDArray[Any], i: NDArray[Any], reason: NDArray[Any]) -> Floats:
         return np.zeros(2)
     steps = converter_step(np.stack([v[fine], i[fine]], axis=1)[np.newaxis])
     if steps[0] > 0.0 and steps[1] == 0.0 and np.unique(i[fine]).size <= _FEW_VALUES:
-        steps[1] = max(steps[0], float(np.ptp(i[fine])))  # too few values to see the step from
+        steps[1] = max(steps[0], float(np.ptp(i[fine])))  # too few values to find the step
     return steps
 
 
@@ -288,7 +289,7 @@ def _sensed(record: _Record, config: ChargeConfig) -> Sensed:
 def _sense_runs(
     record: _Record, runs: list[slice], config: ChargeConfig, rows: _Rows
 ) -> tuple[float, float]:
-    """Fill the rows of all runs of blocks without a fault; leakage and its deviation."""
+    """Fill the rows of all runs of good blocks; return leakage and its standard deviation."""
     point_s = config.thinning / config.rate_hz
     noise = noise_of(record.v, record.i, runs, record.step, config.thinning, record.dither)
     most = max(float(np.abs(record.v[run]).max()) for run in runs)
@@ -315,7 +316,7 @@ def _sense_runs(
 
 
 def _name_swapped(record: _Record, runs: list[slice], config: ChargeConfig, rows: _Rows) -> None:
-    """Say so where the other order of the columns gives a capacitance in most of the blocks."""
+    """Report swapped columns if the other order gives a capacitance in most of the blocks."""
     other = replace(record, v=record.i, i=record.v, step=record.step[::-1])
     nan = np.full(rows.kappa.size, np.nan)
     trial = _Rows(nan, nan.copy(), np.zeros_like(rows.reason))
@@ -331,7 +332,7 @@ def _name_skew(
     record: _Record, runs: list[slice], offset: Offset, noise: Noise, rows: _Rows,
     config: ChargeConfig,
 ) -> None:  # fmt: skip
-    """Say in valid blocks that the charge has no leakage, but leads or lags the voltage."""
+    """Report a skew in valid blocks where the charge leads or lags the voltage."""
     valid = np.flatnonzero(rows.reason == 0)
     if not valid.size:
         return
@@ -341,7 +342,7 @@ def _name_skew(
     moved = max(float(i @ i) - i.size * noise.i_var, 1e-300)
     kappa = float(np.median(rows.kappa[valid]))
     skew_s = config.skew_s - offset.leakage * kappa * float(v @ v) / moved
-    text = f"negative leakage, as of a skew of {1e3 * skew_s:.2g} ms"
+    text = f"negative leakage, as from a skew of {1e3 * skew_s:.2g} ms"
     for block in valid.tolist():
         rows.seen[block] = "; ".join(part for part in (rows.seen.get(block, ""), text) if part)
 
@@ -358,7 +359,7 @@ def _sense_run(
 ) -> None:
     if anchors.at.size == 0:
         for block in range(run.start, run.stop):
-            rows.refuse(block, _DISTURBED, "charge unknown: the voltage does not pass 0 V")
+            rows.refuse(block, _DISTURBED, "charge unknown: the voltage does not cross 0 V")
         return
     tied = path.tied(anchors)
     stuck = np.unique(np.searchsorted(anchors.at, np.flatnonzero(flat[1])))
@@ -387,12 +388,12 @@ def _sense_block(
     energy = float(v @ v)
     idle = v.size * noise.v_var / path.smoothing
     if not max(idle / _MOST_COMPENSATION, v.size * (_FEWEST_STEPS * noise.v_step) ** 2) < energy:
-        rows.refuse(block, _AMPLITUDE_LOST, "drive hardly moves")
+        rows.refuse(block, _AMPLITUDE_LOST, "drive hardly changes")
         return
     below = energy - idle
     by_time, by_area = float(v @ time[part]), float(v @ area[part])
     if by_time != 0.0 and not np.isfinite(offset.level_var) and abs(by_time) > 1e-9 * energy:
-        rows.refuse(block, _DISTURBED, "offset not separable: fewer than two passes of 0 V")
+        rows.refuse(block, _DISTURBED, "offset not separable: fewer than two crossings of 0 V")
         return
     level, leakage = offset.level, offset.leakage
     kappa = (float(v @ charge[part]) - level * by_time - leakage * by_area) / below
@@ -414,9 +415,9 @@ def _sense_block(
 
 
 def _judge(rows: _Rows) -> None:
-    """Refuse what is too uncertain, against the record's mean.
+    """Refuse blocks that are too uncertain relative to the record's mean.
 
-    Against a block's own capacitance the noise would choose: the largest would be taken.
+    Relative to a block's own capacitance, noise would select the largest values.
     """
     blocks = np.array(sorted(rows.causes), dtype=np.intp)
     weights = 1.0 / np.maximum(rows.variance[blocks], 1e-300)

@@ -13,17 +13,17 @@ __all__ = ["flat_tops"]
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_PILED = 10  # points, and this share of all of them, at one extreme value
+_PILED = 10  # fewest points at one extreme value
 _PILED_SHARE = 2e-4
-_NOISY = 3  # different values near the extreme
-_BAND = 6.0  # standard deviations below the extreme that belong to a flat top
+_NOISY = 3  # distinct values near the extreme
+_BAND = 6.0  # standard deviations below the extreme that count as flat top
 _SHORTEST = 8  # points of a flat top
-_WINDOW = 64  # points before and after its edge, at most
+_WINDOW = 64  # largest number of points before and after its edge
 _CLEAR = 6.0  # standard deviations
-_STANDS = 0.25  # of what the voltage moved before: it stands still
-_FLOWS = 0.5  # of the current before: it still flows
-_CURVED = 0.05  # change of the voltage's slope under a current that stands still
-_NARROW = 0.1  # of the current: the band of its flat top
+_STANDS = 0.25  # of the earlier change of the voltage: less counts as constant
+_FLOWS = 0.5  # of the earlier current: more counts as flowing
+_CURVED = 0.05  # change of the voltage's slope at constant current
+_NARROW = 0.1  # of the current: width of its flat top
 _SMOOTH = 16  # points of the current that are averaged
 
 
@@ -34,18 +34,19 @@ def flat_tops(
     lsb: Floats,
     without_hum: tuple[Floats, Floats] | None = None,
 ) -> tuple[Flags, Flags]:
-    """Points at which a monitor stands still at its extreme value while the other one moves on.
+    """Find points at which a monitor stays at its extreme value while the other one changes.
 
-    A monitor that stops at one value shows that value far more often than noise reaches an
-    extreme. Where it has noise of its own, the other monitor decides: at the edge of a flat top of
-    the voltage the current would cease, and below one of the current the voltage has one slope.
+    A monitor that saturates has one value far more often than noise reaches an
+    extreme. If it has noise, the other monitor decides: at the edge of a flat top of
+    the voltage the current would stop, and during one of the current the voltage has a constant
+    slope.
 
     Args:
         v: voltage of one run, shape `(points,)`.
-        i: current less its offset, the same shape.
+        i: current minus its offset, the same shape.
         noise: of a point.
         lsb: step of the converter on each channel, 0 for none.
-        without_hum: the same two where hum was taken off them.
+        without_hum: voltage and current with hum subtracted, if any.
     Returns:
         Points of the voltage and of the current, each of shape `(points,)`.
     Example:
@@ -67,7 +68,7 @@ def flat_tops(
 
 
 def _piled(x: Floats, variance: float, lsb: float) -> Flags:
-    """Points at the largest value, where more of them are there than noise lets be."""
+    """Points at the largest value, if there are more than noise explains."""
     most, std = float(x.max()), variance**0.5
     top = x >= most - 1e-9 * float(np.ptp(x))
     count = np.count_nonzero(top)
@@ -77,7 +78,7 @@ def _piled(x: Floats, variance: float, lsb: float) -> Flags:
     beside = int(np.count_nonzero(below > most - max(1.5 * lsb, 0.25 * std)))
     values, counts = np.unique(below, return_counts=True)
     beside = max(beside, int(counts[-1]) if counts.size else 0)
-    noisy = values.size >= _NOISY  # else the record repeats itself exactly
+    noisy = values.size >= _NOISY  # otherwise the record repeats exactly
     return np.asarray(top & (noisy and count > beside), dtype=np.bool_)
 
 
@@ -88,7 +89,7 @@ def _tops(x: Floats, variance: float) -> list[slice]:
 
 
 def _flat_voltage(v: Floats, i: Floats, noise: Noise) -> Flags:
-    """Stretches at the largest voltage into which, or out of which, the current flows on."""
+    """Runs at the largest voltage at whose edges the current still flows."""
     flat = np.zeros(v.size, dtype=np.bool_)
     runs = _tops(v, noise.v_var)
     moved = np.zeros(4)  # voltage before and after the edge, charge before and after it
@@ -113,7 +114,7 @@ def _flat_voltage(v: Floats, i: Floats, noise: Noise) -> Flags:
 
 
 def _flat_current(v: Floats, i: Floats, noise: Noise) -> Flags:
-    """Stretches at the largest current over which the slope of the voltage has its peak.
+    """Runs at the largest current during which the voltage's slope has its peak.
 
     A capacitance that grows with the squared voltage can flatten a sine's current to the fourth
     order, which explains a change of the slope by 0.37 of the root of the band.
@@ -127,7 +128,7 @@ def _flat_current(v: Floats, i: Floats, noise: Noise) -> Flags:
     if not 0.0 <= band < _NARROW:
         return flat
     runs = [run for run in _tops(mean, variance) if run.stop - run.start >= 2 * _SHORTEST]
-    # A pulse of the current is no flat top, though its mean over some points is one.
+    # A current pulse is not a flat top, although its moving average looks like one.
     flowing = 0.5 * float(mean.max())
     runs = [run for run in runs if np.median(i[run.start : run.stop + _SMOOTH]) > flowing]
     inner = outer = spread = 0.0

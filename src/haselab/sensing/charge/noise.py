@@ -1,4 +1,4 @@
-"""Noise of both monitors from the record itself, steps of the converter, and hum."""
+"""Noise of both monitors from the record itself, effect of converter steps, and hum."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["Noise", "dither_of", "hum_of", "noise_of"]
 
 Floats = NDArray[np.float64]
 
-_ORDERS = (2, 4, 6, 8)  # of differences; the higher, the less is left of the drive
+_ORDERS = (2, 4, 6, 8)  # orders of differences; a higher order leaves less of the drive
 _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distribution
-_LONGEST = 1 << 17  # points that are looked at
+_LONGEST = 1 << 17  # largest number of points used
 _CLEAR_HUM = 60.0  # power of the line over its surroundings
 _HUM_BAND_HZ = 5.0
 _BESIDE = 5  # samples of a median on either side of a pair
 _FEWEST_PAIRS = 200
-_STDS = np.linspace(0.05, 0.8, 76)  # of the noise, in steps; beyond, nothing is left to correct
-_DISCRETE = 3  # levels of the current under ramps with holds
-_ALONE = 6.0  # power of the line over the next one beside it
+_STDS = np.linspace(0.05, 0.8, 76)  # of the noise, in steps; above, no correction is needed
+_DISCRETE = 3  # levels of the current for ramps with holds
+_ALONE = 6.0  # power of the line over the neighbouring one
 _FASTEST = 1e-3  # share of the drive's energy above half of the hum's frequency
 
 
@@ -32,7 +32,7 @@ class Noise:
     Args:
         v_var: variance of the voltage.
         i_var: variance of the current.
-        coarse: relative error of a charge by current steps that noise does not smear.
+        coarse: relative error of a charge by current steps that noise does not average out.
         v_step: of the converter on the voltage, 0 for none.
     """
 
@@ -55,12 +55,13 @@ def noise_of(
     Args:
         v: voltage, shape `(blocks, points)`.
         i: current, the same shape.
-        runs: blocks that count.
+        runs: runs of blocks that count.
         step: of the converter on each channel, 0 for none; shape `(2,)`.
-        thinning: samples that each point is the mean of.
+        thinning: samples averaged per point.
         dither: of the current, see `dither_of`; None: not counted.
     Returns:
-        Variances, none below $\Delta^2/12$ of the converter's step, and what the steps leave.
+        Variances, none below $\Delta^2/12$ of the converter's step, and the remaining effect of
+        the steps.
     Source: B. Widrow, I. Kollar, Quantization Noise, Cambridge 2008, ch. 5 (mean error of a
         constant under a quantiser, $\exp(-2\pi^2\sigma^2/\Delta^2)$).
     Example:
@@ -83,16 +84,16 @@ def noise_of(
 
 
 def dither_of(current: NDArray[np.generic], lsb: float) -> NDArray[np.intp]:
-    """Counts of neighbouring samples, and of those that are two steps of the converter apart.
+    """Count pairs of neighbouring samples that are two converter steps apart.
 
-    Noise of less than half a step moves a reading between two values and no further, whatever
+    Noise of less than half a step changes a reading between two values only, whatever
     its variance looks like. Places where the current itself steps do not count.
 
     Args:
         current: samples.
         lsb: step of the converter, 0 for none.
     Returns:
-        Pairs that are two steps or more apart, and pairs that were looked at.
+        Pairs that are two steps or more apart, and pairs that were examined.
     Example:
         >>> rng = np.random.default_rng(1)
         >>> dither_of(np.round(0.5 + rng.normal(0.0, 0.1, 1000)), 1.0).tolist()
@@ -110,11 +111,11 @@ def dither_of(current: NDArray[np.generic], lsb: float) -> NDArray[np.intp]:
 def _smear(far: int, pairs: int) -> float:
     r"""Variance of the noise before the converter, in steps, from pairs two steps apart.
 
-    With the level anywhere between two edges their share is
+    With the level uniform between two edges their share is
     $\mathrm E\max(0, |\delta| - 1)$, $\delta \sim N(0, 2\sigma^2)$, while that is below one half.
     """
     if pairs < _FEWEST_PAIRS:
-        return np.inf  # the current sweeps over the steps: that is a dither as well
+        return np.inf  # the current sweeps over the steps, which also acts as dither
     std = np.sqrt(2.0) * _STDS
     normal = np.exp(-0.5 / std**2) / np.sqrt(2.0 * np.pi)
     tail = np.array([erfc(1.0 / (one * np.sqrt(2.0))) for one in std.tolist()])
@@ -124,12 +125,12 @@ def _smear(far: int, pairs: int) -> float:
 
 
 def _coarse(current: Floats, lsb: float, smear: float) -> float:
-    """Relative error of a charge by the rounding of a current that hardly changes."""
+    """Relative error of a charge due to rounding of a nearly constant current."""
     low, high = np.percentile(current, (10, 90)).tolist()
     if lsb == 0.0:
         return 0.0
     if not high > low:
-        return 1.0  # nothing but one step
+        return 1.0  # one step only
     _, counts = np.unique(np.round(current / lsb), return_counts=True)
     share = float((counts.astype(np.float64) ** 2).sum()) / current.size**2
     levels = max(1.0, 1.0 / (_DISCRETE * share))  # a sweep through many steps averages over them
@@ -149,14 +150,14 @@ def _variance(channel: Floats, runs: list[slice]) -> float:
 
 
 def hum_of(v: Floats, i: Floats, point_s: float) -> float:
-    """Frequency of mains hum that the voltage does not explain.
+    """Frequency of mains hum in the current that is not caused by the voltage.
 
     Args:
         v: voltage, shape `(points,)`.
         i: current, the same shape.
-        point_s: time of a point, in s.
+        point_s: time between points, in s.
     Returns:
-        50 or 60 Hz; 0 where there is none, or where the drive itself is that fast.
+        50 or 60 Hz; 0 without hum, or if the drive itself is that fast.
     Example:
         >>> time_s = np.arange(4000) / 1e3
         >>> i = 0.01 * np.sin(2 * np.pi * 50 * time_s)
@@ -181,9 +182,9 @@ def hum_of(v: Floats, i: Floats, point_s: float) -> float:
         if not near.any() or not beside.any():
             continue
         clear = left[near].max() > _CLEAR_HUM * np.median(left[beside])
-        clear &= left[near].max() > _ALONE * left[beside].max()  # no harmonic of the drive
+        clear &= left[near].max() > _ALONE * left[beside].max()  # not a harmonic of the drive
         quick = (np.abs(spectrum[hz > 0.5 * line_hz]) ** 2).sum()
-        quiet = quick < _FASTEST * (np.abs(spectrum) ** 2).sum()
-        if clear and quiet and left[near].max() > best:
+        drive_is_slow = quick < _FASTEST * (np.abs(spectrum) ** 2).sum()
+        if clear and drive_is_slow and left[near].max() > best:
             best, at = float(left[near].max()), line_hz
     return at

@@ -1,4 +1,4 @@
-"""Offset of the current monitor and leakage, from charges that must close."""
+"""Offset of the current monitor and leakage, from charges that must return to zero."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ __all__ = ["Offset", "fit_offset"]
 
 Floats = NDArray[np.float64]
 
-_FEWEST = 4  # intervals that tell leakage from offset
+_FEWEST = 4  # fewest intervals to separate leakage from offset
 _WITH_DRIFT = 6
 _ROBUST = 8  # intervals needed to distinguish an outlier from noise
 _NORMAL = 0.6745  # median of |x| over the standard deviation of a normal distribution
 _OUTLIER = 6.0
 _ROUNDS = 3
-_WANDERS = 2.0  # misfit from which on the offset is no line in time
+_WANDERS = 2.0  # misfit above which the offset is not linear in time
 
 
 @dataclass(frozen=True)
 class Offset:
-    """What the current monitor shows beside the charging current.
+    """Offset and leakage: the part of the current that does not charge the capacitance.
 
     Args:
         level: offset at the middle of the record, in the unit of the readings.
         slope: of the offset, per s.
-        middle_s: where `level` is meant, counted over all runs.
+        middle_s: time of `level`, counted over all runs.
         level_var: its variance for a known leakage; infinite where it is not known.
         leakage: current over voltage, both as readings.
         leakage_std: its standard deviation.
-        mean_voltage: where offset and leakage are uncorrelated.
-        inflation: closing errors over what the noise explains, at least 1.
-        by_loss: the leakage comes from the energy that is lost, so it may be a hysteresis.
-        broken: of each path, the intervals whose charge does not close, `(anchors + 1,)`.
+        mean_voltage: voltage at which offset and leakage are uncorrelated.
+        inflation: closing errors relative to the noise, at least 1.
+        by_loss: whether the leakage is estimated from the energy loss, which may be hysteresis.
+        broken: for each path, the intervals whose charge does not return to zero, `(anchors + 1,)`.
     """
 
     level: float
@@ -52,7 +52,7 @@ class Offset:
 
     @property
     def wanders(self) -> bool:
-        """The closing errors are far larger than the noise explains."""
+        """Whether the closing errors are much larger than the noise."""
         return self.inflation > _WANDERS
 
 
@@ -60,7 +60,7 @@ class Offset:
 class _Closings:
     """Intervals between anchors; arrays of shape `(intervals,)`.
 
-    `loss` is the energy that the current brings, `square` the integral of the squared voltage,
+    `loss` is the energy supplied by the current, `square` the integral of the squared voltage,
     `moments` the sums of the charge's variance times 1, v and v^2, shape `(intervals, 3)`.
     """
 
@@ -74,16 +74,16 @@ class _Closings:
     moments: Floats
 
     def only(self, kept: NDArray[np.bool_]) -> _Closings:
-        """Some of the intervals."""
+        """The selected intervals."""
         return _Closings(*(getattr(self, part.name)[kept] for part in fields(self)))
 
 
 def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
-    r"""Offset and leakage of a record.
+    r"""Estimate offset and leakage of a record.
 
-    Between two anchors $\Delta q = i_0 \Delta t + G \int v\,dt$. Where the mean voltages of the
-    intervals differ, both follow by least squares. Else a cycle's energy gives G, which holds the
-    loss of a hysteresis too: half of it is taken, with the same as its deviation.
+    Between two anchors $\Delta q = i_0 \Delta t + G \int v\,dt$. If the mean voltages of the
+    intervals differ, both follow by least squares. Otherwise the energy loss per cycle gives G,
+    which includes the loss of a hysteresis: half of it is used, with an equal standard deviation.
 
     Args:
         paths: each run of blocks with its anchors.
@@ -93,7 +93,7 @@ def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
     if not far.size:
         none = tuple(np.zeros(anchors.at.size + 1, dtype=np.bool_) for _, anchors in paths)
         return Offset(0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0, False, none)
-    for _ in range(_ROUNDS):  # outliers distort the fit from which they are judged
+    for _ in range(_ROUNDS):  # outliers distort the fit by which they are detected
         closings = whole.only(~far)
         leakage, leakage_std, by_loss = _leakage(closings)
         level = _level(closings, leakage)
@@ -116,7 +116,7 @@ def fit_offset(paths: list[tuple[Path, Anchors]]) -> Offset:
 
 
 def _leakage(closings: _Closings) -> tuple[float, float, bool]:
-    """Leakage, its standard deviation, and whether it comes from the energy that is lost."""
+    """Leakage, its standard deviation, and whether it is estimated from the energy loss."""
     mean = float(closings.area.sum() / closings.time.sum())
     square = float(closings.square.sum())
     spread = square - mean * float(closings.area.sum())
@@ -156,7 +156,7 @@ def _closings(paths: list[tuple[Path, Anchors]]) -> _Closings:
 
 
 def _by_closing(closings: _Closings) -> tuple[Floats, Floats, float]:
-    """Offset, leakage and perhaps a drift by least squares; their covariance and the misfit."""
+    """Offset, leakage and possibly a drift by least squares; their covariance and the misfit."""
     unknown = np.full((2, 2), np.inf)
     count = closings.time.size
     if count < _FEWEST:
@@ -179,7 +179,7 @@ def _by_closing(closings: _Closings) -> tuple[Floats, Floats, float]:
 
 
 def _misfit(left: Floats, unknowns: int) -> float:
-    """Standardised residuals over what they should be, at least 1."""
+    """Standardised residuals relative to their expectation, at least 1."""
     if left.size >= _ROBUST:
         return max(1.0, float(np.median(np.abs(left))) / _NORMAL)
     if left.size > unknowns:
@@ -198,17 +198,17 @@ class _Level:
     inflation: float
 
     def left_of(self, closings: _Closings, leakage: float) -> Floats:
-        """Closing errors over their deviations."""
+        """Closing errors over their standard deviations."""
         offset = self.value + self.slope * (closings.middle - self.middle_s)
         error = closings.charge - leakage * closings.area - offset * closings.time
         return np.asarray(error / np.sqrt(np.maximum(closings.variance, 1e-300)))
 
 
 def _level(closings: _Closings, leakage: float) -> _Level:
-    """Offset for a known leakage, with a drift that is linear in time where that is known.
+    """Offset for a known leakage, with a linear drift if that is identifiable.
 
-    Where the closing errors exceed what the noise explains the offset wanders; then it may be off
-    by the spread of the intervals' own offsets outside of all anchors.
+    If the closing errors exceed the noise, the offset drifts irregularly; then its error outside
+    all anchors is the spread of the intervals' own offsets.
     """
     std = np.sqrt(np.maximum(closings.variance, 1e-300))
     middle_s = float(closings.middle.mean())
@@ -235,7 +235,7 @@ def _level(closings: _Closings, leakage: float) -> _Level:
 def _broken(
     paths: list[tuple[Path, Anchors]], far: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], ...]:
-    """Intervals whose charge does not close, for each path."""
+    """Intervals whose charge does not return to zero, for each path."""
     broken, first = [], 0
     for _, anchors in paths:
         count = max(anchors.at.size - 1, 0)

@@ -1,4 +1,4 @@
-"""The charge along a record, and the anchors: where the voltage passes 0 V."""
+"""The charge along a record, and its anchors: crossings of 0 V."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ __all__ = ["Anchors", "Path", "find_anchors", "runs_of"]
 
 Floats = NDArray[np.float64]
 
-_NEAR = 0.02  # of the largest voltage: taken as near 0 V
-_CALM = 0.002  # of the largest voltage: taken as 0 V
-_CLEAR_NOISE = 12.0  # deviations of the noise in what is near 0 V
+_NEAR = 0.02  # of the largest voltage: counts as near 0 V
+_CALM = 0.002  # of the largest voltage: counts as 0 V
+_CLEAR_NOISE = 12.0  # standard deviations of the noise that count as near 0 V
 _SHORT_RUN = 4  # points near 0 V
-_LOW = 0.15  # of the largest voltage: the capacitance near 0 V is taken from below
-_DISTANCES = (1 / 64, 1 / 16, 1 / 4, 1.0)  # of a block, over which it is taken
-_LOW_ERROR = 0.03  # relative error of that capacitance where it carries an anchor to 0 V
+_LOW = 0.15  # of the largest voltage: range for the capacitance near 0 V
+_DISTANCES = (1 / 64, 1 / 16, 1 / 4, 1.0)  # of a block, for the differences
+_LOW_ERROR = 0.03  # relative error of that capacitance when it extrapolates an anchor to 0 V
 _NODES = 6  # of the quadrature
-_BEYOND = ((3.0, -3.0, 1.0), (6.0, -8.0, 3.0), (10.0, -15.0, 6.0))  # parabola of three values
-_MOST_WINDOW = 10  # points on either side of an anchor
-_JUMP = (1.0 / 6.0, -5.0 / 6.0, 10.0 / 6.0)  # of a step; a quartic gives 0
+# Extrapolation by a parabola through three values.
+_BEYOND = ((3.0, -3.0, 1.0), (6.0, -8.0, 3.0), (10.0, -15.0, 6.0))
+_MOST_WINDOW = 10  # largest number of points on either side of an anchor
+_JUMP = (1.0 / 6.0, -5.0 / 6.0, 10.0 / 6.0)  # filter for a step; a quartic gives 0
 _JUMP_NOISE = 7.0  # its variance over that of a point
 _CLEAR_JUMP = 6.0
 _STEP = 0.05  # of the voltage's range between two points: too fast to integrate the current
@@ -32,15 +33,15 @@ _STEP = 0.05  # of the voltage's range between two points: too fast to integrate
 
 @dataclass(frozen=True)
 class Anchors:
-    """Where the charge is known, in order; arrays of shape `(anchors,)`.
+    """Points of known charge, in order; arrays of shape `(anchors,)`.
 
     Args:
-        at: places, in points.
-        charge: of the path there, less what the voltage there holds.
+        at: positions, in points.
+        charge: of the path there, minus the charge at the voltage there.
         time: from the path's start, in s.
         area: integral of the voltage.
-        variance: of the charge known there.
-        grown: variance of the path's charge there.
+        variance: of the known charge.
+        grown: accumulated variance of the path's charge.
     """
 
     at: Floats
@@ -57,13 +58,13 @@ class Path:
 
     Args:
         v: voltage.
-        charge: integral of the current up to the point.
+        charge: integral of the current up to each point.
         time: from the first point.
         area: integral of the voltage.
         grown: variance of `charge` from noise and unresolved kinks.
-        stepped: points after which the voltage steps faster than the record follows.
-        smoothing: points that a mean over a hum's period takes together, else 1.
-        hum_hz: of the hum taken off, or 0.
+        stepped: points after which the voltage steps faster than the record resolves.
+        smoothing: points averaged over a hum's period, else 1.
+        hum_hz: of the subtracted hum, or 0.
     """
 
     v: Floats
@@ -84,10 +85,10 @@ class Path:
         Args:
             v: voltage, shape `(points,)`.
             i: current, each point `skew_s` later than that of the voltage.
-            point_s: time of a point.
-            skew_s: from a voltage to its current.
+            point_s: time between points.
+            skew_s: delay from a voltage sample to its current sample.
             noise: of a point.
-            hum_hz: frequency of a hum to take off, or 0.
+            hum_hz: frequency of a hum to subtract, or 0.
         """
         charge = _integral(i, point_s, skew_s / point_s)
         area = _integral(v, point_s, 0.0)
@@ -106,7 +107,7 @@ class Path:
         return cls(v, charge, time, area, grown, np.flatnonzero(steep), width, hum_hz)
 
     def tied(self, anchors: Anchors) -> tuple[Floats, Floats, Floats]:
-        """Charge, time and area, each less a line from anchor to anchor, shape `(points,)`.
+        """Charge, time and area, each minus a line from anchor to anchor, shape `(points,)`.
 
         Before the first anchor and after the last one the line is level: there time and area are
         those since the anchor, between two anchors the time is 0.
@@ -122,7 +123,7 @@ class Path:
         )
 
     def without_drift(self, anchors: Anchors, slope: float, from_s: float) -> tuple[Path, Anchors]:
-        """The same less a current that grows linearly from 0 at a time, and its anchors."""
+        """The path and anchors without a current that grows linearly from 0 at a given time."""
         if slope == 0.0:
             return self, anchors
 
@@ -133,26 +134,26 @@ class Path:
         return path, replace(anchors, charge=anchors.charge - drawn(anchors.time))
 
     def fault(self, anchors: Anchors, bad: NDArray[np.bool_], part: slice) -> str:
-        """Why the charge of a block cannot be used; nothing where it can.
+        """Why the charge of a block cannot be used; empty if it can.
 
         Args:
             anchors: of the path.
-            bad: intervals whose charge does not close, shape `(anchors + 1,)`.
+            bad: intervals whose charge does not return to zero, shape `(anchors + 1,)`.
             part: points of the block.
         """
         first, last = np.searchsorted(anchors.at, (part.start, part.stop - 1))
         if bad[first : last + 1].any():
-            return "charge does not close between two passes of 0 V"
+            return "charge does not return to zero between two crossings of 0 V"
         steps = np.searchsorted(anchors.at, self.stepped)
         if ((steps >= first) & (steps <= last)).any():
-            return "voltage steps faster than the record follows"
+            return "voltage steps faster than the record resolves"
         return ""
 
     def walk_variance(self, anchors: Anchors, part: slice) -> float:
         """Variance of the sum of voltage times tied charge over a block.
 
-        Between two anchors the error of the charge is a random walk that is tied at both ends,
-        outside one that is tied at one end; the anchors add their own errors.
+        Between two anchors the error of the charge is a random walk fixed at both ends,
+        outside it is fixed at one end; the anchors add their own errors.
         """
         cuts = np.clip(np.ceil(anchors.at).astype(np.intp), part.start, part.stop)
         edges = np.unique(np.r_[part.start, cuts, part.stop])
@@ -190,7 +191,7 @@ class Path:
 
 
 def runs_of(good: NDArray[np.bool_]) -> list[slice]:
-    """Runs of neighbouring blocks that are good.
+    """Runs of consecutive good blocks.
 
     Args:
         good: shape `(blocks,)`.
@@ -203,7 +204,7 @@ def runs_of(good: NDArray[np.bool_]) -> list[slice]:
 
 
 def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
-    """Places where the voltage is near 0 V or changes its sign.
+    """Find the points where the voltage is near 0 V or changes its sign.
 
     Args:
         path: of a run.
@@ -223,7 +224,7 @@ def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
             continue
         last = at
         held = low * float(path.v[index] @ weight)
-        # Hum smoothing leaves the noise of a few points common.
+        # Hum smoothing correlates the noise of a few points.
         variance = low**2 * v_var * float(weight @ weight) + (_LOW_ERROR * held) ** 2
         rows.append(
             (at, float(path.charge[index] @ weight) - held, float(path.time[index] @ weight),
@@ -233,9 +234,9 @@ def find_anchors(path: Path, most: float, points: int, noise: Noise) -> Anchors:
 
 
 def _kernels(v: Floats, most: float, std: float, gap: int) -> list[tuple[NDArray[np.intp], Floats]]:
-    """Points and weights of each pass of 0 V, in order.
+    """Points and weights of each crossing of 0 V, in order.
 
-    They are looked for in a mean over so many points that noise breaks none of them into two.
+    They are searched in a moving average long enough that noise splits none of them.
     """
     half = int(min((_CLEAR_NOISE * std / (_NEAR * most)) ** 2, 31, gap // 4)) // 2
     smooth = np.convolve(np.pad(v, half, "edge"), np.ones(2 * half + 1), "valid") / (2 * half + 1)
@@ -261,7 +262,7 @@ def _kernels(v: Floats, most: float, std: float, gap: int) -> list[tuple[NDArray
 def _windows(
     run: slice, calm: NDArray[np.bool_], gap: int, size: int
 ) -> list[tuple[NDArray[np.intp], Floats]]:
-    """Means over a few points of a time near 0 V: one, or from end to end of a longer one."""
+    """Windows of a few points near 0 V: one, or several along a longer run."""
     still = run.start + np.flatnonzero(calm[run])
     start, stop = (int(still[0]), int(still[-1]) + 1) if still.size else (run.start, run.stop)
     half = min((stop - start) // 4, _MOST_WINDOW)
@@ -277,7 +278,7 @@ def _windows(
 
 
 def _merged(runs: list[slice], apart: int) -> list[slice]:
-    """Runs with what lies between two of them where that is short."""
+    """Merge runs that are separated by short gaps."""
     merged: list[slice] = []
     for run in runs:
         if merged and run.start - merged[-1].stop <= apart and apart > 1:
@@ -288,9 +289,9 @@ def _merged(runs: list[slice], apart: int) -> list[slice]:
 
 
 def _low_capacitance(path: Path, most: float, v_var: float, points: int) -> float:
-    """Slope of charge over voltage near 0 V; over all voltages where the drive is too fast.
+    """Slope of charge over voltage near 0 V, or over all voltages if the drive is too fast.
 
-    Of several distances between two points the one that the noise of the voltage spoils least.
+    Uses the distance between points that is least affected by the noise of the voltage.
     """
     for limit in (_LOW, np.inf):
         best, slope = 2.0, 0.0
@@ -304,10 +305,10 @@ def _low_capacitance(path: Path, most: float, v_var: float, points: int) -> floa
 
 
 def _moves(path: Path, limit: float, v_var: float, apart: int) -> tuple[float, float, float]:
-    """Squares of the moves of the voltage, their noise, and products with those of the charge.
+    """Squared changes of the voltage, their noise, and products with those of the charge.
 
-    Both are averaged over as many points as they are apart, else the limit on a noisy voltage
-    would choose among its noise.
+    Both are averaged over as many points as they are apart; otherwise the limit on a noisy voltage
+    would select by noise.
     """
     if path.v.size <= 2 * apart:
         return 0.0, 1.0, 0.0
@@ -325,7 +326,7 @@ def _moves(path: Path, limit: float, v_var: float, apart: int) -> tuple[float, f
 
 
 def _integral(x: Floats, point_s: float, late: float) -> Floats:
-    """Integral from the first point to each one; the samples of x are `late` points late."""
+    """Integral from the first point to each one; the samples of x are delayed by `late` points."""
     if x.size == 0:
         return np.empty(0)
     whole = int(np.floor(late))
@@ -342,7 +343,7 @@ def _integral(x: Floats, point_s: float, late: float) -> Floats:
 
 
 def _extended(x: Floats) -> Floats:
-    """With a few more values at both ends, by the parabola through the last three."""
+    """Extend by a few values at both ends, by the parabola through the last three."""
     if x.size < 3:
         return np.pad(x, len(_BEYOND), "edge")
     before, after = np.array(_BEYOND) @ x[:3], np.array(_BEYOND) @ x[:-4:-1]
@@ -350,7 +351,7 @@ def _extended(x: Floats) -> Floats:
 
 
 def _jumps(x: Floats, variance: float) -> Floats:
-    """Steps between neighbouring points that are clear of noise, else 0, shape `(points - 1,)`."""
+    """Steps between neighbouring points that are above the noise, else 0, shape `(points - 1,)`."""
     if x.size < 2 * len(_JUMP):
         return np.zeros(max(x.size - 1, 0))
     half = np.array(_JUMP)
@@ -362,15 +363,15 @@ def _jumps(x: Floats, variance: float) -> Floats:
 
 
 def _mean_over(width: float) -> Floats:
-    """Kernel of a mean over a width in points, applied twice so that a parabola stays as it is.
+    """Kernel of a mean over a width in points, applied twice so that a parabola is preserved.
 
-    With H the response of the mean it has 1 - (1 - H)^2: nothing of what H takes off whole.
+    With H the response of the mean, the result is 1 - (1 - H)^2; it is zero where H is zero.
     """
     whole = int(np.floor(width))
     part = width - whole
     mean = np.ones(whole) if part < 1e-6 else np.r_[part / 2.0, np.ones(whole), part / 2.0]
     mean /= mean.sum()
-    if mean.size % 2 == 0:  # an even mean is late by half a point, its square by a whole one
+    if mean.size % 2 == 0:  # an even mean delays by half a point, applied twice by a whole one
         mean = 0.5 * (np.r_[mean, 0.0] + np.r_[0.0, mean])
     kernel = -np.convolve(mean, mean)
     middle = mean.size // 2

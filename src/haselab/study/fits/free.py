@@ -167,8 +167,8 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     """
     records = [_trial(seen).moving() for seen in trials]
     fit = fit_free_response(records, creep=True)
-    hulls = (fit.hull_positive_decay_per_s, fit.hull_negative_decay_per_s)
-    if not fit.succeeded or hulls[0] is None or hulls[1] is None:
+    envelopes = (fit.envelope_positive_decay_per_s, fit.envelope_negative_decay_per_s)
+    if not fit.succeeded or envelopes[0] is None or envelopes[1] is None:
         raise ResultError(f"Free response: {fit.status}; {' '.join(fit.notes)}")
     e = fit.parameters
     printed = [
@@ -181,8 +181,8 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     return Free(
         quantities={
             "S19.omega_d": e["damped_frequency_rad_s"],
-            "S19.decay_1": hulls[0],
-            "S19.decay_2": hulls[1],
+            "S19.decay_1": envelopes[0],
+            "S19.decay_2": envelopes[1],
             "S19.omega_0": e["natural_frequency_rad_s"],
             "S19.eq6_omega_d": _repeated(np.array([p.omega_d for p in printed]), "rad/s"),
             "S19.eq6_decay": _repeated(np.array([p.decay for p in printed]), "1/s"),

@@ -1,1 +1,1 @@
-"""Properties of camera and picture: lens, light, noise, scale, rigid motion."""
+"""Properties of camera and image: lens, light, noise, scale, rigid motion."""

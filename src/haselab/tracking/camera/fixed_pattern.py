@@ -1,10 +1,10 @@
-r"""A fixed pattern of the sensor: offsets that stay with the pixels while the scene moves.
+r"""Fixed-pattern noise: offsets that stay with the pixels while the scene moves.
 
-Matching takes them for texture that does not move, and holds slow points back. In the mean
-$R = f + p$ of the frames at rest, white $p$ is all that reaches the highest spatial frequencies,
-which no lens passes; its variance there, less the camera's noise, is $\sigma_p^2$. With that known,
-the scene $f$ is what denoising leaves of $R$, and $R - f$ is taken from all frames. Whether the
-pattern is the sensor's or the finest texture of the scene shows when the points have moved.
+Matching treats them as static texture, which biases slow points. In the mean
+$R = f + p$ of the rest frames, only white $p$ contributes to the highest spatial frequencies,
+which no lens transmits; its variance there, minus the camera's noise, is $\sigma_p^2$. With it,
+the scene $f$ is the denoised $R$, and $R - f$ is subtracted from all frames. Whether the
+pattern belongs to the sensor or is fine texture of the scene is decided after the points moved.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from haselab.tracking.options import Floats, Frame
 __all__ = ["FixedPattern", "find_pattern", "stays_with_pixels"]
 
 _CORNER = 0.75  # of the highest frequency along each axis; a dot of 1 px deviation has 1e-4 there
-_MOST_SIDE = 1024  # px of a frame that are looked at
-_LEAST_SHARE = 0.25  # of the noise's variance; below, the pattern hardly adds to the deviations
+_MOST_SIDE = 1024  # px of a frame that are used
+_LEAST_SHARE = 0.25  # of the noise's variance; below, the pattern is negligible
 _LEAST_VARIANCE = 0.25  # grey levels squared; rounding of a frame without noise has 1/12
-_BLOCK, _STEP = 8, 2  # px, of the blocks that are denoised, and from one to the next
-_CUT = 2.7  # deviations below which a coefficient is noise
-_STAYS = 0.25  # of the pattern's contrast
+_BLOCK, _STEP = 8, 2  # px, side and spacing of the denoised blocks
+_CUT = 2.7  # standard deviations below which a coefficient is noise
+_STAYS = 0.25  # of the pattern's contrast: more means that it stays
 
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """A fixed pattern of the sensor.
+    """Fixed-pattern noise of a sensor.
 
     Args:
         levels: offset of each pixel. Shape `(H, W)`.
         variance: of the offsets, in grey levels squared.
-        scale: grey levels of a cleaned frame to one of the camera's.
+        scale: grey levels of a corrected frame per grey level of the camera.
     """
 
     levels: NDArray[np.float32]
@@ -44,7 +44,7 @@ class FixedPattern:
     scale: int
 
     def removed(self, frame: Frame) -> NDArray[np.uint16]:
-        """The frame without the pattern."""
+        """The frame with the pattern subtracted."""
         clean = np.float32(self.scale) * (frame - self.levels)
         most = min(self.scale * int(np.iinfo(frame.dtype).max), 65535)
         return np.asarray(np.clip(np.rint(clean), 0, most), np.uint16)
@@ -59,20 +59,20 @@ def _middle(image: Floats) -> Floats:
 
 
 def _corner_variance(image: Floats) -> float:
-    """Variance of what is white in an image, from its highest frequencies along both axes."""
+    """Variance of the white noise in an image, from its highest frequencies along both axes."""
     power = dctn(_middle(image), norm="ortho") ** 2
     first = [int(_CORNER * size) for size in power.shape]
     return float(power[first[0] :, first[1] :].mean())
 
 
 def find_pattern(rest_frames: Sequence[Frame]) -> FixedPattern | None:
-    """The fixed pattern behind frames at rest, where there is one that matters.
+    """Find the fixed pattern in rest frames, if it is relevant.
 
     Args:
-        rest_frames: two or more frames `(H, W)`, nothing moving.
+        rest_frames: two or more frames `(H, W)`, without motion.
 
     Returns:
-        The pattern; `None` where it is hidden by noise, or outweighs the scene.
+        The pattern; `None` where it is hidden by noise, or stronger than the scene.
 
     Source: Dabov et al. 2007 (hard threshold, then Wiener filter; here without matching of blocks).
     """
@@ -92,7 +92,7 @@ def find_pattern(rest_frames: Sequence[Frame]) -> FixedPattern | None:
 
 
 def _denoised(image: Floats, variance: float, guide: Floats | None) -> Floats:
-    """Means over overlapping blocks, their coefficients cut, or weighted as a guide says."""
+    """Average over overlapping blocks with thresholded, or Wiener-weighted, coefficients."""
     edge = _BLOCK + _STEP
     padded = np.pad(image, edge, mode="reflect")
     known = None if guide is None else np.pad(guide, edge, mode="reflect")
@@ -127,11 +127,11 @@ def _spectra(strip: Floats) -> Floats:
 def stays_with_pixels(
     pattern: FixedPattern, frame: Frame, rest_px: Floats, now_px: Floats, side: int
 ) -> bool:
-    """Does a frame show the pattern where the points were at rest, rather than where they are now?
+    """Whether the pattern stays at the rest positions, rather than moving with the points.
 
     Args:
-        pattern: found at rest.
-        frame: the frame, as the camera gave it.
+        pattern: pattern found at rest.
+        frame: the frame, as recorded.
         rest_px, now_px: points that have moved, in px. Shape `(P, 2)`.
         side: of the square around a point that is compared, in px.
     """

@@ -1,4 +1,4 @@
-"""Lens distortion: calibrated by OpenCV on checkerboard pictures, taken out of positions."""
+"""Lens distortion: calibration with OpenCV from checkerboard images, and correction."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Lens:
         focal_px: $f_x, f_y$, in px. Shape `(2,)`.
         centre_px: $c_x, c_y$, in px. Shape `(2,)`.
         coefficients: $k_1, k_2, p_1, p_2, k_3$. Shape `(5,)`.
-        size_px: width and height of the pictures that it holds for, in px.
-        rms_px: scatter of the corners about the calibration, in px.
+        size_px: width and height of the images that it is valid for, in px.
+        rms_px: rms residual of the corners, in px.
 
     Source: Brown 1966; the coefficients are in OpenCV's order.
     """
@@ -54,7 +54,7 @@ class Lens:
         )
 
     def distort(self, x_px: Floats, y_px: Floats) -> tuple[Floats, Floats]:
-        """Where the lens puts points of an ideal picture, in px. Any shape."""
+        """Distorted positions of points of an ideal image, in px. Any shape."""
         x, y = self._distorted(
             (x_px - self.centre_px[0]) / self.focal_px[0],
             (y_px - self.centre_px[1]) / self.focal_px[1],
@@ -65,16 +65,16 @@ class Lens:
         )
 
     def undistort(self, x_px: Floats, y_px: Floats) -> tuple[Floats, Floats]:
-        """Points as an ideal lens of the same focal length would show them.
+        """Correct positions to those of an ideal lens of the same focal length.
 
         Args:
-            x_px, y_px: positions in the picture, in px; NaN stays NaN. Any shape.
+            x_px, y_px: positions in the image, in px; NaN stays NaN. Any shape.
 
         Returns:
-            Both, corrected.
+            Both coordinates, corrected.
 
         Raises:
-            ResultError: the distortion cannot be undone at a point (too far outside).
+            ResultError: the distortion cannot be inverted at a point (too far outside).
         """
         xd = (x_px - self.centre_px[0]) / self.focal_px[0]
         yd = (y_px - self.centre_px[1]) / self.focal_px[1]
@@ -89,13 +89,13 @@ class Lens:
                 break
         if not error < 1e-7:
             raise ResultError(
-                "the lens distortion cannot be undone at a point far from the picture's middle. "
+                "The lens distortion cannot be inverted at a point far from the image centre. "
                 "Calibrate with boards that reach into the corners."
             )
         return self.focal_px[0] * x + self.centre_px[0], self.focal_px[1] * y + self.centre_px[1]
 
     def magnification(self, x_px: Floats, y_px: Floats) -> tuple[Floats, Floats]:
-        """By how much deviations along x and y grow in `undistort`. The positions' shape."""
+        """Factors of `undistort` on standard deviations along x and y. Shape of the positions."""
         step = 0.5
         right, left = (self.undistort(x_px + d, y_px)[0] for d in (step, -step))
         down, up = (self.undistort(x_px, y_px + d)[1] for d in (step, -step))
@@ -107,12 +107,12 @@ def _opencv() -> Any:
         return importlib.import_module("cv2")
     except ImportError:
         raise InputError(
-            "checkerboards need OpenCV, which is not installed. Type: pip install 'haselab[camera]'"
+            "Checkerboards need OpenCV. Install it with: pip install 'haselab[camera]'"
         ) from None
 
 
 def find_checkerboard(image: NDArray[np.generic], columns: int, rows: int) -> Floats:
-    """Inner corners of a checkerboard, to a part of a pixel, by OpenCV.
+    """Find the inner corners of a checkerboard with sub-pixel accuracy, by OpenCV.
 
     Args:
         image: grey levels. Shape `(H, W)`.
@@ -122,15 +122,16 @@ def find_checkerboard(image: NDArray[np.generic], columns: int, rows: int) -> Fl
         Corners `[x, y]`, row by row, in px. Shape `(rows, columns, 2)`.
 
     Raises:
-        InputError: OpenCV is not installed, or fewer than 3 x 3 corners asked for.
-        ResultError: no such board in the picture.
+        InputError: OpenCV is not installed, or fewer than 3 x 3 corners requested.
+        ResultError: no such board in the image.
 
     Source: OpenCV, findChessboardCornersSB (Duda and Frese 2018).
     """
     cv = _opencv()
     if min(columns, rows) < 3:
         raise InputError(
-            f"a board of {columns} x {rows} inner corners is too small; at least 3 x 3 are needed."
+            f"A board of {columns} x {rows} inner corners is too small; at least 3 x 3 are "
+            "required."
         )
     grey = np.asarray(image)
     if grey.dtype != np.uint8:
@@ -140,33 +141,34 @@ def find_checkerboard(image: NDArray[np.generic], columns: int, rows: int) -> Fl
     found, corners = cv.findChessboardCornersSB(np.ascontiguousarray(grey), (columns, rows), flags)
     if not found:
         raise ResultError(
-            f"no checkerboard with {columns} x {rows} inner corners in the picture. Count the "
-            "inner corners (one fewer than squares); show the whole board, sharp and evenly lit."
+            f"No checkerboard with {columns} x {rows} inner corners was found in the image. Count "
+            "the inner corners (one fewer than squares); show the whole board, sharp and evenly "
+            "lit."
         )
     return np.asarray(corners, float).reshape(rows, columns, 2)
 
 
 def calibrate_lens(boards_px: Sequence[Floats], size_px: tuple[int, int]) -> Lens:
-    """A lens from pictures of one checkerboard in several places and tilts, by OpenCV.
+    """Calibrate a lens from images of a checkerboard at several positions and tilts (OpenCV).
 
     Args:
-        boards_px: inner corners of each picture, each of shape `(R, C, 2)`, in px.
-        size_px: width and height of the pictures, in px.
+        boards_px: inner corners of each image, each of shape `(R, C, 2)`, in px.
+        size_px: width and height of the images, in px.
 
     Returns:
         The lens.
 
     Raises:
-        InputError: OpenCV is not installed, or fewer than three pictures.
-        ResultError: the corners do not fit a lens.
+        InputError: OpenCV is not installed, or fewer than three images.
+        ResultError: the corners do not fit the lens model.
 
-    Source: Zhang 2000, as OpenCV's calibrateCamera has it.
+    Source: Zhang 2000, as implemented in OpenCV's calibrateCamera.
     """
     cv = _opencv()
     if len(boards_px) < _FEWEST_PICTURES:
         raise InputError(
-            f"a lens needs at least {_FEWEST_PICTURES} pictures of the board, tilted differently; "
-            f"got {len(boards_px)}. Ten are better."
+            f"A lens calibration needs at least {_FEWEST_PICTURES} images of the board at "
+            f"different tilts, not {len(boards_px)}. Ten are better."
         )
     rows, columns = boards_px[0].shape[:2]
     v, u = np.mgrid[:rows, :columns].astype(np.float32)
@@ -177,8 +179,8 @@ def calibrate_lens(boards_px: Sequence[Floats], size_px: tuple[int, int]) -> Len
     )
     if not rms < _MOST_RMS_PX:
         raise ResultError(
-            f"the corners lie {rms:.2f} px about the calibrated lens, allowed are {_MOST_RMS_PX} "
-            "px. Take sharp pictures of a flat board."
+            f"The corners have an rms residual of {rms:.2f} px; it must be at most {_MOST_RMS_PX} "
+            "px. Take sharp images of a flat board."
         )
     return Lens(
         focal_px=np.array([matrix[0, 0], matrix[1, 1]]),

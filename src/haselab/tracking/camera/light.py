@@ -1,9 +1,9 @@
-r"""Uneven light: what a slope of the brightness across a subset moves, and how to take it out.
+r"""Uneven light: displacement error from a brightness slope across a subset, and correction.
 
 Light that changes by a relative slope $b$ per px adds $b\,\xi\,w$ to a subset $w$, with $\xi$ the
-distance from its centre. Gauss-Newton takes a part of that for motion: $\delta = B\,b$ with
-$B = A^{-1}\,(g \cdot \xi w)$. The other part stays in the residual and gives the slope itself. Grey
-level 0 is taken for darkness.
+distance from its centre. Gauss-Newton interprets part of that as motion: $\delta = B\,b$ with
+$B = A^{-1}\,(g \cdot \xi w)$. The other part remains in the residual and gives the slope itself.
+Grey level 0 is assumed to be darkness.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ Singles = NDArray[np.float32]
 
 __all__ = ["LightSlopes", "Unevenness", "build_slopes"]
 
-_SIGNIFICANT = 3.0  # standard deviations of the mean square of slopes that are noise
+_SIGNIFICANT = 3.0  # standard deviations of the slopes' mean square above which they are not noise
 
 
 @dataclass(frozen=True)
 class Unevenness:
-    """What uneven light did to the points of one frame.
+    """Effect of uneven light on the points of one frame.
 
     Args:
-        shift_px: what is to be added to the positions, in px. Shape `(P, 2)`.
-        variance_px2: of that, along x and y, in px². Shape `(P, 2)`.
+        shift_px: correction to add to the positions, in px. Shape `(P, 2)`.
+        variance_px2: variance of the correction along x and y, in px². Shape `(P, 2)`.
     """
 
     shift_px: Floats
@@ -38,13 +38,13 @@ class Unevenness:
 
 @dataclass(frozen=True)
 class LightSlopes:
-    """Slopes of the light from the samples of all subsets.
+    """Estimator of brightness slopes from the samples of all subsets.
 
     Args:
         subsets: templates of the points.
-        moved: displacement that a relative slope of 1 per px along x, y looks like, in px².
+        moved: apparent displacement for a relative slope of 1 per px along x, y, in px².
             Shape `(P, 2, 2)`.
-        reader: gives the slopes from a residual over the amplitude. Shape `(P, 2, N)`.
+        reader: matrix from a residual over the amplitude to the slopes. Shape `(P, 2, N)`.
         variance: of the slopes for a pixel variance of 1 and an amplitude of 1. `(P, 2, 2)`.
     """
 
@@ -56,14 +56,14 @@ class LightSlopes:
     def unevenness(
         self, samples: Singles, matrices: Floats, noise: Floats | None, used: NDArray[np.bool_]
     ) -> Unevenness | None:
-        """Empirical Bayes: slopes are believed as far as they scatter more than noise.
+        """Estimate the correction by empirical Bayes: slopes are shrunk by the share of noise.
 
         Args:
-            samples: grey levels of the subsets, any constant added. Shape `(P, S)`.
+            samples: grey levels of the subsets, up to a constant. Shape `(P, S)`.
             matrices: deformation of each subset. Shape `(P, 2, 2)`.
             noise: variance of a pixel in each subset, in grey levels squared. Shape `(P,)`. `None`
-                to take it from what the match leaves.
-            used: points that were found. Shape `(P,)`.
+                to estimate it from the residual of the match.
+            used: whether each point was found. Shape `(P,)`.
 
         Returns:
             The correction, or `None` where the slopes do not differ from noise.
@@ -91,7 +91,7 @@ class LightSlopes:
 
 
 def build_slopes(subsets: Subsets) -> LightSlopes:
-    """The linear readers of all templates.
+    """Build the estimators for all templates.
 
     Args:
         subsets: templates of the points.

@@ -46,7 +46,7 @@ def _bin_medians(grey: Floats, squares: Floats) -> tuple[Floats, Floats, Floats]
     for part in np.array_split(order, _BINS):
         values = squares[part]
         scale = values.mean()
-        for _ in range(4):  # cut at 4 sigma: pixels that moved between the two frames
+        for _ in range(4):  # cut at 4 sigma: pixels that changed between the two frames
             values = values[values <= 16.0 * scale]
             if not values.size:
                 break
@@ -59,21 +59,21 @@ def _bin_medians(grey: Floats, squares: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def measure_noise(rest_frames: Sequence[Frame]) -> NoiseLaw:
-    r"""Noise law from frames of a scene at rest.
+    r"""Measure the noise law from frames of a static scene.
 
     Half the mean square difference of consecutive frames, in bins of grey level, fitted by
-    $a + b\,g$ with weights $n / \sigma^4$. Pixels at either end of the range are left out, as are
-    differences beyond 4 standard deviations (something moved). Each frame is first brought to the
-    mean brightness of all, so that a flickering lamp is not taken for noise.
+    $a + b\,g$ with weights $n / \sigma^4$. Pixels at either end of the range are excluded, as are
+    differences beyond 4 standard deviations (motion). Each frame is first scaled to the
+    mean brightness of all, so that a flickering lamp does not count as noise.
 
     Args:
-        rest_frames: at least two frames of one shape `(H, W)`, uint8 or uint16, nothing moving.
+        rest_frames: at least two frames of one shape `(H, W)`, uint8 or uint16, without motion.
 
     Returns:
         The law; its slope and floor are never negative.
 
     Raises:
-        InputError: fewer than two frames, or hardly a pixel inside the range.
+        InputError: fewer than two frames, or too few pixels inside the range.
 
     Source: EMVA Standard 1288, the photon transfer method.
 
@@ -87,7 +87,8 @@ def measure_noise(rest_frames: Sequence[Frame]) -> NoiseLaw:
     """
     if len(rest_frames) < 2:
         raise InputError(
-            f"a noise law needs at least 2 rest frames, got {len(rest_frames)}. Record 10 or more."
+            f"The noise law needs at least 2 rest frames, not {len(rest_frames)}. Record 10 or "
+            "more."
         )
     top = float(np.iinfo(rest_frames[0].dtype).max)
     step = max(1, rest_frames[0].size * (len(rest_frames) - 1) // _MOST_SAMPLES)
@@ -96,8 +97,8 @@ def measure_noise(rest_frames: Sequence[Frame]) -> NoiseLaw:
     inside = (np.min(stack, axis=0) > 0) & (np.max(stack, axis=0) < top)
     if inside.sum() < 10 * _BINS:
         raise InputError(
-            f"only {int(inside.sum())} sampled pixels lie inside the camera's range; at least "
-            f"{10 * _BINS} are needed. Correct the exposure."
+            f"Only {int(inside.sum())} sampled pixels are inside the camera's range; at least "
+            f"{10 * _BINS} are required. Change the exposure."
         )
     whole = float(mean[inside].mean())
     steady = [frame[inside] * (whole / frame[inside].mean()) for frame in stack]

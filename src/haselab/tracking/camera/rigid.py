@@ -1,4 +1,4 @@
-"""Rigid motion of the camera or the stand, told by points that should stand still, taken away."""
+"""Correction for rigid motion of camera or stand, measured by fixed points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["RigidMotion", "fit_rigid_motion"]
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rotation about a centre, then shift, in each of F frames.
+    """Rotation about a centre, then translation, in each of F frames.
 
     Args:
         centre_px: centre of the fixed points at rest `[x, y]`, in px. Shape `(2,)`.
@@ -33,17 +33,17 @@ class RigidMotion:
     def undo(
         self, x_px: Floats, y_px: Floats, std_x_px: Floats, std_y_px: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Positions as if nothing had moved, and their deviations with the fit's own share.
+        """Remove the rigid motion from positions, and add its uncertainty to their std.
 
-        The share is counted in full for the fixed points too, whose own noise the fit has partly
-        taken up: for them it is an upper bound.
+        The uncertainty is added in full for the fixed points too, whose own noise the fit has
+        partly absorbed; for them it is an upper bound.
 
         Args:
             x_px, y_px: positions, in px. Shape `(F, P)`.
             std_x_px, std_y_px: their standard deviations, in px.
 
         Returns:
-            The four, corrected.
+            All four, corrected.
         """
         c, s = np.cos(self.angle_rad)[:, None], np.sin(self.angle_rad)[:, None]
         dx = x_px - self.centre_px[0] - self.shift_px[:, :1]
@@ -65,7 +65,7 @@ def _check(rest: Floats, x: Floats, y: Floats) -> None:
         raise InputError(f"rest_px has shape {rest.shape}, expected (K, 2) with K >= 1.")
     if x.ndim != 2 or x.shape != y.shape or x.shape[1] != len(rest):
         raise InputError(
-            f"the positions have shapes {x.shape} and {y.shape}, expected (F, {len(rest)}): one "
+            f"The positions have shapes {x.shape} and {y.shape}, expected (F, {len(rest)}): one "
             "column for each fixed point."
         )
 
@@ -73,23 +73,23 @@ def _check(rest: Floats, x: Floats, y: Floats) -> None:
 def fit_rigid_motion(
     rest_px: Floats, x_px: Floats, y_px: Floats, std_x_px: Floats, std_y_px: Floats
 ) -> RigidMotion:
-    r"""Rotation and shift that carry the fixed points from rest to where they are.
+    r"""Fit the rotation and translation of the fixed points from their rest positions.
 
     Least squares with the weight $w_k = 2/(\sigma_{x,k}^2 + \sigma_{y,k}^2)$ of each point:
     $\tan\theta = \sum w\,(a \times b) / \sum w\,(a \cdot b)$ of the centred positions at rest and
-    now, $\sigma_\theta^2 = 1/\sum w\,|a|^2$. One point gives the shift alone. A frame in which
-    none is found has no motion to take away: NaN.
+    in the frame, $\sigma_\theta^2 = 1/\sum w\,|a|^2$. One point gives the shift alone. A frame in
+    which no point is found gives NaN.
 
     Args:
         rest_px: fixed points at rest `[x, y]`, in px. Shape `(K, 2)`.
-        x_px, y_px: where they are, in px; NaN where lost. Shape `(F, K)`.
+        x_px, y_px: positions, in px; NaN where lost. Shape `(F, K)`.
         std_x_px, std_y_px: their standard deviations, in px. Shape `(F, K)`.
 
     Returns:
         The motion of each frame.
 
     Raises:
-        InputError: shapes that do not fit together.
+        InputError: inconsistent shapes.
 
     Source: Schönemann 1966 (orthogonal Procrustes), in the plane.
 
@@ -109,16 +109,16 @@ def fit_rigid_motion(
     total = weight.sum(axis=1)
     share = weight / np.where(total > 0.0, total, np.nan)[:, None]
     x, y = np.where(found, x, 0.0), np.where(found, y, 0.0)
-    place = share @ rest  # of the found points' centre at rest
+    place = share @ rest  # rest position of the found points' centre
     now = np.stack([(share * x).sum(axis=1), (share * y).sum(axis=1)], axis=1)
     ax, ay = rest[:, 0] - place[:, :1], rest[:, 1] - place[:, 1:]
     bx, by = x - now[:, :1], y - now[:, 1:]
     across = (weight * (ax * by - ay * bx)).sum(axis=1)
     along = (weight * (ax * bx + ay * by)).sum(axis=1)
     power = (weight * (ax**2 + ay**2)).sum(axis=1)
-    tells = (found.sum(axis=1) > 1) & (power > 0.0)
-    angle = np.where(tells, np.arctan2(across, along), 0.0)
-    angle_std = np.where(tells, 1.0 / np.sqrt(np.where(tells, power, 1.0)), 0.0)
+    has_angle = (found.sum(axis=1) > 1) & (power > 0.0)
+    angle = np.where(has_angle, np.arctan2(across, along), 0.0)
+    angle_std = np.where(has_angle, 1.0 / np.sqrt(np.where(has_angle, power, 1.0)), 0.0)
     centre = rest.mean(axis=0)
     lever = centre - place
     c, s = np.cos(angle), np.sin(angle)

@@ -1,4 +1,4 @@
-"""Metres per pixel, each with its uncertainty: from two points, a ruler, a checkerboard."""
+"""Metres per pixel with uncertainty, from two points, a ruler or a checkerboard."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from haselab.tracking.options import Floats
 
 __all__ = ["scale_from_checkerboard", "scale_from_points", "scale_from_ruler"]
 
-_CLICK_STD_PX = 12.0**-0.5  # a place told to the whole pixel
-_ACROSS = 5  # lines beside each other that are averaged over a ruler
+_CLICK_STD_PX = 12.0**-0.5  # a position given to the whole pixel
+_ACROSS = 5  # parallel lines averaged over a ruler
 _FEWEST_TICKS = 4
-_LEAST_SHARE = 0.2  # of the profile's power that the ticks and their harmonics must hold
-_CORNER_PX = 0.03  # error that the corners of one board share, found on drawn boards
+_LEAST_SHARE = 0.2  # of the profile's power required of the ticks and their harmonics
+_CORNER_PX = 0.03  # common error of the corners of one board, found with synthetic boards
 _UNIT = "m/px"
 
 
@@ -26,11 +26,11 @@ def _estimate(value: float, std: float) -> Estimate:
 def _distance_px(a_px: Floats, b_px: Floats) -> float:
     a, b = np.asarray(a_px, float), np.asarray(b_px, float)
     if a.shape != (2,) or b.shape != (2,) or not np.isfinite([a, b]).all():
-        raise InputError(f"two points [x, y] are needed, got {a.tolist()} and {b.tolist()}.")
+        raise InputError(f"Two points [x, y] are required, not {a.tolist()} and {b.tolist()}.")
     distance = float(np.hypot(*(b - a)))
     if distance < 1.0:
         raise InputError(
-            f"the two points are {distance:g} px apart; a scale needs at least 1 px, better "
+            f"The two points are {distance:g} px apart; a scale needs at least 1 px, better "
             "hundreds. Choose points far from each other."
         )
     return distance
@@ -39,20 +39,20 @@ def _distance_px(a_px: Floats, b_px: Floats) -> float:
 def _check_length(name: str, length_m: float) -> None:
     if not (np.isfinite(length_m) and length_m > 0.0):
         raise InputError(
-            f"{name} = {length_m:g} m is not a positive length. Give what was measured."
+            f"{name} = {length_m:g} m is not a positive length. Give the measured length."
         )
 
 
 def scale_from_points(
     a_px: Floats, b_px: Floats, length_m: float, *, point_std_px: float = _CLICK_STD_PX
 ) -> Estimate:
-    r"""Scale from two points a known length apart: $s = L/d$, $\sigma_s = s\,\sqrt2\,\sigma_p/d$.
+    r"""Scale from two points at a known distance: $s = L/d$, $\sigma_s = s\,\sqrt2\,\sigma_p/d$.
 
     Args:
         a_px, b_px: the points `[x, y]`, in px. Shape `(2,)`.
-        length_m: between them, in m.
+        length_m: distance between them, in m.
         point_std_px: standard deviation of a point along each axis, in px; by default that of a
-            place told to the whole pixel.
+            position given to the whole pixel.
 
     Returns:
         Metres per pixel.
@@ -71,14 +71,14 @@ def scale_from_points(
 
 
 def _profile(image: NDArray[np.generic], a: Floats, b: Floats) -> tuple[Floats, float]:
-    """Grey levels along a line, averaged over five beside each other, and their spacing in px."""
+    """Grey levels along a line, averaged over five parallel lines, and their spacing in px."""
     distance = _distance_px(a, b)
     height, width = image.shape
     ends = np.stack([a, b])
     if (ends < 0).any() or (ends > np.array([width - 1, height - 1])).any():
         raise InputError(
-            f"the ruler from {a.tolist()} to {b.tolist()} px leaves the {width} x {height} px "
-            "picture. Give two points on it."
+            f"The ruler from {a.tolist()} to {b.tolist()} px is not inside the {width} x {height} "
+            "px image. Give two points inside it."
         )
     count = int(np.ceil(2.0 * distance)) + 1
     along = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
@@ -90,7 +90,7 @@ def _profile(image: NDArray[np.generic], a: Floats, b: Floats) -> tuple[Floats, 
 
 
 def _harmonic_power(profile: Floats, place_px: Floats, period_px: float, harmonics: int) -> float:
-    """Power of the profile in a period and its harmonics."""
+    """Power of the profile at a period and its harmonics."""
     phase = 2.0 * np.pi * np.outer(np.arange(1, harmonics + 1), place_px) / period_px
     rows = np.concatenate([np.cos(phase), np.sin(phase)])
     return float(np.sum((rows @ profile) ** 2))
@@ -99,9 +99,9 @@ def _harmonic_power(profile: Floats, place_px: Floats, period_px: float, harmoni
 def scale_from_ruler(
     image: NDArray[np.generic], a_px: Floats, b_px: Floats, tick_m: float
 ) -> Estimate:
-    r"""Scale from the ticks of a ruler along a line: their period, fitted to all of them at once.
+    r"""Scale from the ticks of a ruler along a line: their period, fitted to all ticks.
 
-    The period that holds the most power together with its second and third harmonic; the
+    The period with the most power, including its second and third harmonic; the standard
     deviation is the Cramér-Rao bound of a frequency in white noise of the fit's residual,
     $\sigma_f^2 = 6\,\sigma^2 / (\pi^2 N L^2 \sum_k k^2 A_k^2)$.
 
@@ -114,7 +114,7 @@ def scale_from_ruler(
         Metres per pixel.
 
     Raises:
-        InputError: the line leaves the picture, or is shorter than 1 px.
+        InputError: the line leaves the image, or is shorter than 1 px.
         ResultError: no regular ticks.
 
     Source: Rife and Boorstyn 1974 (single-tone parameter estimation), eq. 18.
@@ -134,16 +134,16 @@ def scale_from_ruler(
     slope = np.polynomial.Polynomial.fit(place, profile, 2)
     profile = profile - slope(place)
     window = np.hanning(profile.size)
-    lowest, highest = _FEWEST_TICKS / length, 1.0 / 3.0  # ticks of 3 px at least
+    lowest, highest = _FEWEST_TICKS / length, 1.0 / 3.0  # ticks of at least 3 px
     trial = np.arange(lowest, highest, 0.1 / length)
     if not trial.size:
         raise ResultError(
-            f"the line of {length:.0f} px is too short for {_FEWEST_TICKS} ticks. Take a longer "
+            f"The line of {length:.0f} px is too short for {_FEWEST_TICKS} ticks. Use a longer "
             "part of the ruler."
         )
     weighted = profile * window
-    # Half the frequency of a comb holds its power too, in its second harmonic: the fundamental
-    # must carry its share, so it is counted twice.
+    # Half the frequency of a comb also contains its power, in its second harmonic; the fundamental
+    # must contribute, so it is counted twice.
     score = [
         _harmonic_power(weighted, place, 1 / f, 3) + _harmonic_power(weighted, place, 1 / f, 1)
         for f in trial
@@ -165,25 +165,25 @@ def _ruler_estimate(profile: Floats, place: Floats, frequency: float, tick_m: fl
     explained = 1.0 - float(residual @ residual) / max(float(profile @ profile), 1e-12)
     if explained < _LEAST_SHARE:
         raise ResultError(
-            f"no regular ticks along the line: the best period explains {100 * explained:.0f} % "
-            f"of its grey levels, {100 * _LEAST_SHARE:.0f} % are needed. Lay the line across the "
-            "ticks, or give two points with --scale-points."
+            f"No regular ticks along the line: the best period explains {100 * explained:.0f} % "
+            f"of its grey levels, {100 * _LEAST_SHARE:.0f} % are required. Place the line across "
+            "the ticks, or give two points with --scale-points."
         )
     amplitude2 = fit[:3] ** 2 + fit[3:6] ** 2
     length = place[-1]
     noise = float(residual @ residual) / (place.size - 7)
-    bent = float(np.sum(order**2 * amplitude2))
-    std = np.sqrt(6.0 * noise / (np.pi**2 * place.size * length**2 * bent))
-    # neighbours half a pixel apart share their noise: two for one
+    curvature = float(np.sum(order**2 * amplitude2))
+    std = np.sqrt(6.0 * noise / (np.pi**2 * place.size * length**2 * curvature))
+    # neighbours half a pixel apart have correlated noise, so two count as one
     std *= np.sqrt(2.0)
     return _estimate(tick_m * frequency, tick_m * float(std))
 
 
 def scale_from_checkerboard(corners_px: Floats, square_m: float) -> Estimate:
-    """Scale from the inner corners of a checkerboard that faces the camera.
+    """Scale from the inner corners of a checkerboard facing the camera.
 
     The mean side over both directions, by least squares over all corners; the scatter of the
-    corners about the even grid gives the deviation, and 0.03 px that the corners share.
+    corners about the regular grid gives the standard deviation, plus a common 0.03 px.
 
     Args:
         corners_px: inner corners `[x, y]`, row by row, in px. Shape `(R, C, 2)`.
@@ -194,7 +194,7 @@ def scale_from_checkerboard(corners_px: Floats, square_m: float) -> Estimate:
 
     Raises:
         InputError: fewer than 2 x 2 corners, or a side that is not positive.
-        ResultError: the board is tilted: its sides differ by more than 2 %.
+        ResultError: the board is tilted, so its sides differ by more than 2 %.
 
     Example:
         >>> board = np.stack(np.meshgrid(np.arange(7) * 20.0, np.arange(5) * 20.0), axis=-1)
@@ -215,7 +215,7 @@ def scale_from_checkerboard(corners_px: Floats, square_m: float) -> Estimate:
     sides = np.hypot(*fit[:2].T)
     if abs(sides[0] / sides[1] - 1.0) > 0.02:
         raise ResultError(
-            f"the board's sides are {sides[0]:.2f} and {sides[1]:.2f} px long, so it is tilted. "
+            f"The board's sides are {sides[0]:.2f} and {sides[1]:.2f} px long, so it is tilted. "
             "Hold it in the plane of the motion, facing the camera."
         )
     residual = flat - design @ fit

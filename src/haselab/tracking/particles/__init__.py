@@ -1,1 +1,1 @@
-"""Particles: detection, linking, following."""
+"""Particles: detection, linking and tracking."""

@@ -1,4 +1,4 @@
-"""Finding what can be tracked: small particles, large fiducial dots."""
+"""Detection of trackable points: small particles and large fiducial dots."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ __all__ = [
 Polarity = Literal["dark", "bright"]
 
 _PARTICLE_SIGMAS_PX = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
-_STRONGEST = 50  # dots that choose the scale
+_STRONGEST = 50  # strongest dots, used to choose the scale
 _NOISE_FACTOR = 6.0
-_AT_ONCE = 4096  # points whose surroundings are compared, for the memory
+_AT_ONCE = 4096  # points compared at once, to limit memory
 _ROUNDING = 12.0**-0.5
-_FAINTEST = 0.25  # of the strong dots' median response
+_FAINTEST = 0.25  # of the strong dots' median response: faintest dot
 _LEAST_ROUND = 0.5  # ratio of the two curvatures of a dot at its own scale
-_LEAST_COMPACT = 0.3  # the same of a particle, which may touch another; an edge has 0.1
+_LEAST_COMPACT = 0.3  # the same for a particle, which may touch another; an edge has 0.1
 _SAME_SIZE = 0.6
-_EVEN = 0.2  # most unevenness around a fiducial, part of its depth
+_EVEN = 0.2  # largest unevenness around a fiducial, relative to its depth
 
 
 def _check_image(image: NDArray[np.generic], polarity: str) -> Floats:
     if image.ndim != 2 or min(image.shape) < 16:
         raise InputError(
-            f"the image has shape {image.shape}, expected (H, W) of at least 16 x 16 pixels."
+            f"The image has shape {image.shape}, expected (H, W) of at least 16 x 16 pixels."
         )
     if polarity not in ("dark", "bright"):
         raise InputError(f"polarity = {polarity!r} is unknown. Choose dark or bright.")
@@ -51,7 +51,7 @@ def _check_image(image: NDArray[np.generic], polarity: str) -> Floats:
 
 
 def _response(image: Floats, sigma_px: float, polarity: str) -> Floats:
-    """Laplacian of Gaussian times sigma²: a dot of that sigma answers with half its depth."""
+    """Laplacian of Gaussian times sigma²: the response to a dot of that sigma is half its depth."""
     sign = 1.0 if polarity == "dark" else -1.0
     return np.asarray(sign * sigma_px**2 * gaussian_laplace(image, sigma_px, mode="nearest"))
 
@@ -67,12 +67,12 @@ def _peaks(
 ) -> NDArray[np.intp]:
     """Local maxima `[y, x]` above the noise, strongest first. Shape `(N, 2)`.
 
-    White noise of 1 grey answers with a deviation of 1 / (sqrt(2 pi) sigma).
+    The response to white noise of 1 grey level has the standard deviation 1 / (sqrt(2 pi) sigma).
     """
     least = _NOISE_FACTOR * noise / (np.sqrt(2.0 * np.pi) * sigma_px)
     edge = max(1, margin_px)
     found = np.argwhere(response[edge:-edge, edge:-edge] > least) + edge
-    for radius in (1, max(1, round(radius_px))):  # few pass the first, which costs little
+    for radius in (1, max(1, round(radius_px))):  # few pass the first, cheap test
         around = sliding_window_view(
             np.pad(response, radius, constant_values=-np.inf), (2 * radius + 1,) * 2
         )
@@ -86,7 +86,7 @@ def _peaks(
 
 
 def _paraboloids(response: Floats, peaks: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-    """Through 3 x 3 pixels each: shift and curvature along `[x, y]`, and roundness 0 to 1."""
+    """Paraboloids through 3 x 3 pixels: shift and curvature along `[x, y]`, roundness 0 to 1."""
     y, x = peaks.T
     here = response[y, x]
     gx = 0.5 * (response[y, x + 1] - response[y, x - 1])
@@ -111,7 +111,7 @@ def _paraboloids(response: Floats, peaks: NDArray[np.intp]) -> tuple[Floats, Flo
 
 @dataclass(frozen=True)
 class DotProfile:
-    """What the dots of an image look like.
+    """Profile of the dots of an image.
 
     Args:
         sigma_px: standard deviation of the Gaussian nearest to a dot's profile, in px.
@@ -123,11 +123,11 @@ class DotProfile:
 
 
 def find_profile(image: NDArray[np.generic], polarity: Polarity | None = None) -> DotProfile:
-    """The scale and the sign at which the strongest dots of an image answer most.
+    """Find the scale and sign with the largest response to the strongest dots of an image.
 
     Args:
         image: grey levels. Shape `(H, W)`.
-        polarity: if known.
+        polarity: polarity of the dots, if known.
 
     Returns:
         The profile.
@@ -152,7 +152,7 @@ def find_profile(image: NDArray[np.generic], polarity: Polarity | None = None) -
             peaks = _peaks(response, sigma, noise, sigma, round(3 * sigma))[:_STRONGEST]
             compact = _paraboloids(response, peaks)[2] > _LEAST_COMPACT
             strength = response[peaks[:, 0], peaks[:, 1]][compact]
-            # squares: the faint ring around each dot answers with the other sign
+            # squares: the faint ring around each dot has a response of opposite sign
             scores[DotProfile(sigma, sign)] = float(np.sum(strength**2))
     return max(scores, key=lambda profile: scores[profile])
 
@@ -164,7 +164,7 @@ class Particles:
     Args:
         points_px: centres `[x, y]`, in px. Shape `(N, 2)`.
         std_px: standard deviations of the centres from the pixel noise, in px. Shape `(N, 2)`.
-        strength: response, half a dot's depth in grey levels. Shape `(N,)`.
+        strength: response: half a dot's depth in grey levels. Shape `(N,)`.
     """
 
     points_px: Floats
@@ -173,7 +173,7 @@ class Particles:
 
 
 def spread_out(points: Floats, strength: Floats, count: int) -> NDArray[np.intp]:
-    """Indices of `count` points, strong and far from each other.
+    """Select `count` points, strong and well separated; return their indices.
 
     Each point's radius reaches to the nearest point at least as strong as itself by 10 %; the
     largest radii win (adaptive non-maximal suppression, Brown, Szeliski and Winder 2005).
@@ -196,25 +196,26 @@ def spread_out(points: Floats, strength: Floats, count: int) -> NDArray[np.intp]
 def locate_particles(
     image: NDArray[np.generic], profile: DotProfile, *, margin_px: int = 12
 ) -> Particles:
-    r"""All dots of a known profile.
+    r"""Locate all dots of a known profile.
 
     The centre is the vertex of a paraboloid through the Laplacian's peak. White noise of
     variance $s^2$ gives the slope there the variance
     $s^2\,[2 - e^{-u}(2 - 4u + u^2)]\,u / 8\pi$ with $u = \sigma^{-2}$ (half the difference of
-    the filtered noise's autocorrelation at 0 and 2 px); over the curvature it is the shift.
+    the filtered noise's autocorrelation at 0 and 2 px); divided by the curvature, this gives the
+    shift.
 
     Args:
         image: grey levels. Shape `(H, W)`.
         profile: scale and sign of the dots.
-        margin_px: distance from the edges, in px, that is left out.
+        margin_px: width of the excluded margin, in px.
 
     Returns:
-        Dots from the strongest to the faintest; none, where none stands out of the noise.
+        Dots from the strongest to the faintest; empty if none is above the noise.
 
     Raises:
         InputError: not an image, or an unknown polarity.
 
-    Source: Lindeberg 1998; the deviation by propagation of white noise.
+    Source: Lindeberg 1998; the standard deviation by propagation of white noise.
 
     Example:
         >>> locate_particles(np.full((40, 40), 7.0), DotProfile(2.0, "dark")).points_px.shape
@@ -246,22 +247,22 @@ def detect_particles(
     sigma_px: float | None = None,
     margin_px: int = 12,
 ) -> Floats:
-    """Sub-pixel centres of small dots.
+    """Detect small dots with sub-pixel accuracy.
 
     Args:
         image: grey levels. Shape `(H, W)`.
-        polarity: `"dark"` dots on a bright ground or `"bright"` dots on a dark one; `None` to
-            take those that stand out more.
-        count: at most so many, strong and well spread over the image; `None` for all.
+        polarity: `"dark"` dots on a bright background or `"bright"` dots on a dark one; `None` to
+            choose the stronger ones.
+        count: largest number, strong and well spread over the image; `None` for all.
         sigma_px: standard deviation of a dot's profile, in px; `None` to find it.
-        margin_px: distance from the edges, in px, that is left out.
+        margin_px: width of the excluded margin, in px.
 
     Returns:
         Centres `[x, y]`, in px, from the top down. Shape `(N, 2)`.
 
     Raises:
         InputError: not an image, or an unknown polarity.
-        ResultError: no dot stands out of the noise.
+        ResultError: no dot is above the noise.
 
     Source: Lindeberg 1998 (scale selection by the normalised Laplacian).
 
@@ -278,8 +279,8 @@ def detect_particles(
     points = found.points_px
     if not len(points):
         raise ResultError(
-            f"no {profile.polarity} dot stands out of the noise by {_NOISE_FACTOR:g} deviations. "
-            "Try the other polarity, or give the points by hand."
+            f"No {profile.polarity} dot exceeds the noise by {_NOISE_FACTOR:g} standard "
+            "deviations. Try the other polarity, or give the points manually."
         )
     if count is not None and count < len(points):
         points = points[spread_out(points, found.strength, count)]
@@ -287,7 +288,7 @@ def detect_particles(
 
 
 def _scale_space(image: Floats, polarity: str) -> list[tuple[float, Floats]]:
-    """Responses from sigma 2 px to a sixteenth of the shorter side, eight octave parts."""
+    """Responses from sigma 2 px to a sixteenth of the shorter side, in eighths of an octave."""
     largest = max(3.0, min(image.shape) / 16.0)
     steps = int(np.ceil(4 * np.log2(largest / 2.0))) + 1
     sign = 1.0 if polarity == "dark" else -1.0
@@ -304,7 +305,7 @@ def _scale_space(image: Floats, polarity: str) -> list[tuple[float, Floats]]:
 
 
 def _candidates(image: Floats, polarity: str) -> tuple[Floats, Floats, Floats]:
-    """Round dots at their own scale: centres, sigmas, responses, the overlapping ones merged."""
+    """Round dots at their own scale: centres, sigmas, responses, with overlapping ones merged."""
     space, noise = _scale_space(image, polarity), _pixel_noise(image)
     points, sigmas, strengths = [], [], []
     for level, (sigma, response) in enumerate(space):
@@ -322,10 +323,10 @@ def _candidates(image: Floats, polarity: str) -> tuple[Floats, Floats, Floats]:
     return np.concatenate(points), np.concatenate(sigmas), np.concatenate(strengths)
 
 
-def _stands_alone(
+def _is_isolated(
     image: Floats, points: Floats, sigmas: Floats, strengths: Floats
 ) -> NDArray[np.bool_]:
-    """Whether the ring around a dot, 3.5 to 4.5 sigma away, is even: no clump of particles is."""
+    """Whether the ring around a dot, 3.5 to 4.5 sigma away, is uniform, unlike for a clump."""
     angle = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
     ring = np.concatenate(
         [r * np.stack([np.cos(angle), np.sin(angle)]) for r in (3.5, 4.5)], axis=1
@@ -338,7 +339,7 @@ def _stands_alone(
 
 
 def _in_rows(points: Floats, rows: int) -> Floats:
-    """Equal rows from the top down, each from left to right."""
+    """Sort into equal rows from the top down, each from left to right."""
     down = points[np.argsort(points[:, 1], kind="stable")]
     return np.concatenate([row[np.argsort(row[:, 0])] for row in np.array_split(down, rows)])
 
@@ -350,15 +351,15 @@ def detect_fiducials(
     rows: int = 2,
     polarity: Polarity = "dark",
 ) -> Floats:
-    """Sub-pixel centres of the large round dots, such as the clamps carry.
+    """Detect the large round fiducial dots, for example on the clamps, with sub-pixel accuracy.
 
-    Of all dots that stand out at their own scale, the `count` largest of like size; small
-    particles of the same contrast do not disturb.
+    Selects the `count` largest dots of similar size that are significant at their own scale; small
+    particles of the same contrast are ignored.
 
     Args:
         image: grey levels. Shape `(H, W)`.
         count: number of dots to find.
-        rows: rows they stand in.
+        rows: number of rows of dots.
         polarity: `"dark"` or `"bright"` dots.
 
     Returns:
@@ -367,7 +368,7 @@ def detect_fiducials(
 
     Raises:
         InputError: not an image, an unknown polarity, or `count` is not a multiple of `rows`.
-        ResultError: fewer than `count` dots of like size.
+        ResultError: fewer than `count` dots of similar size.
 
     Source: Lindeberg 1998 (scale selection by the normalised Laplacian).
 
@@ -381,9 +382,9 @@ def detect_fiducials(
     """
     grey = _check_image(image, polarity)
     if count < 1 or rows < 1 or count % rows:
-        raise InputError(f"count = {count} dots cannot stand in {rows} equal rows.")
+        raise InputError(f"count = {count} dots do not form {rows} equal rows.")
     points, sigmas, strengths = _candidates(grey, polarity)
-    alone = _stands_alone(grey, points, sigmas, strengths)
+    alone = _is_isolated(grey, points, sigmas, strengths)
     points, sigmas, strengths = points[alone], sigmas[alone], strengths[alone]
     strong = strengths > 0.35 * np.max(strengths, initial=0.0)
     points, sigmas, strengths = points[strong], sigmas[strong], strengths[strong]
@@ -395,6 +396,6 @@ def detect_fiducials(
         if alike and even:
             return _in_rows(points[chosen], rows)
     raise ResultError(
-        f"found {len(order)} {polarity} dots that stand out, but not {count} of like size and "
-        "contrast. Give the points by hand, or check focus and light."
+        f"Found {len(order)} significant {polarity} dots, but not {count} of similar size and "
+        "contrast. Give the points manually, or check focus and light."
     )

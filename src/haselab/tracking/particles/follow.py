@@ -1,4 +1,4 @@
-"""Particles that move each for itself, followed by name as long as their names are certain."""
+"""Tracking of independently moving particles while their identity is certain."""
 
 from __future__ import annotations
 
@@ -18,34 +18,35 @@ from haselab.tracking.tracks import FrameTracks, LossReason, TrackState
 
 __all__ = ["ParticleState", "ParticleTracker", "lone_subset_px"]
 
-_MOST_DOUBT = 1e-3  # probability that a particle was taken for another
-_REACH_STEPS = 6.0  # of the root mean square step, how far a particle may go
+_MOST_DOUBT = 1e-3  # probability that a particle was confused with another
+_REACH_STEPS = 6.0  # of the root mean square step: largest step of a particle
 _LEAST_REACH_PX = 3.0
-_RIVALS = 4  # nearest particles that a point may be taken for
-_MEMORY = 3  # frames that a particle may stay unseen
+_CANDIDATES = 4  # nearest particles that a point may be confused with
+_MEMORY = 3  # frames that a particle may be missing
 _LEAST_STEP_PX = 0.1
-_SAME_PX = 2.0  # a point lies on a particle
-_STEADY = 0.5  # of the steps' size; particles whose steps change by less go on as they went
-_OVERLAP_SIGMAS = 3.5  # deviations of a dot within which another one moves its picture
-_PULL = 0.4  # a subset of that many deviations sees 0.6 of it; rms along an axis
+_SAME_PX = 2.0  # distance within which a point is on a particle
+_STEADY = 0.5  # of the steps' size; with smaller changes of step, velocities are assumed constant
+_OVERLAP_SIGMAS = 3.5  # standard deviations of a dot within which another one shifts its image
+_PULL = 0.4  # shift by a neighbour at that distance; a subset sees 0.6 of it; rms along an axis
 _FAR_SIGMAS = 10.0
-_LONE_SIGMAS = 4.5  # of a dot, the side of a subset that leaves others out
+_LONE_SIGMAS = 4.5  # of a dot: side of a subset that excludes others
 _SMALLEST_SUBSET_PX = 7
-_REFINED_PX = 1.5  # farther from the detection, a match shows something else
+_REFINED_PX = 1.5  # a match farther from the detection is something else
 
 
 @dataclass(frozen=True)
 class ParticleState:
-    """What is carried from frame to frame.
+    """State of the tracker between frames.
 
     Args:
-        inner: of the matching of the points.
-        others_px: particles that are not followed but could be taken for one. Shape `(Q, 2)`.
-        place_px: where the points were seen last. Shape `(P, 2)`.
-        unseen: frames since then. Shape `(P,)`.
-        certain: whether a point's name is. Shape `(P,)`.
+        inner: state of the subset matching of the points.
+        others_px: particles that are not tracked but could be confused with a tracked one. Shape
+            `(Q, 2)`.
+        place_px: last known positions of the points. Shape `(P, 2)`.
+        unseen: frames since the last detection. Shape `(P,)`.
+        certain: whether a point's identity is certain. Shape `(P,)`.
         step_px: root mean square step of a particle along one axis; 0 before it is known.
-        drift_px: the same of a step's change since the frame before.
+        drift_px: the same for a step's change since the previous frame.
         moved_px: last step of the points, then of the others. Shape `(P + Q, 2)`.
     """
 
@@ -60,23 +61,23 @@ class ParticleState:
 
     @property
     def noise(self) -> NoiseLaw | None:
-        """The camera's noise law, where the rest frames told it."""
+        """The camera's noise law, if the rest frames determined it."""
         return self.inner.noise
 
 
 class ParticleTracker:
-    """Follows particles that have no common motion.
+    """Tracks particles that have no common motion.
 
-    All particles of each frame are found and paired with those of the frame before, so that the
-    sum of squared steps is least. A point's name is certain as long as the probability that two
-    particles were exchanged, by the steps that all make, stays below one in a thousand.
+    All particles of each frame are detected and paired with those of the previous frame so that the
+    sum of squared steps is minimal. A point's identity is certain as long as the probability that
+    two particles were exchanged, given the typical steps, is below one in a thousand.
 
     Args:
         points_px: points `[x, y]` in the first frame, in px. Shape `(P, 2)`.
-        options: how to track.
+        options: tracker options.
 
     Raises:
-        InputError: as `PointTracker`.
+        InputError: as for `PointTracker`.
 
     Source: Crocker and Grier 1996 (the likelihood of an exchange under diffusion).
     """
@@ -89,7 +90,7 @@ class ParticleTracker:
         self._profile = DotProfile(2.0, "dark")
 
     def init(self, rest_frames: Sequence[Frame]) -> ParticleState:
-        """The state at rest; see `PointTracker.init`."""
+        """Create the state at rest; see `PointTracker.init`."""
         inner = self._tracker.init(rest_frames)
         self._profile = find_profile(inner.reference.picture)
         seen = self._seen(inner.reference.picture)
@@ -110,7 +111,7 @@ class ParticleTracker:
         return locate_particles(frame, self._profile, margin_px=4).points_px
 
     def step(self, state: ParticleState, frame: Frame) -> tuple[ParticleState, FrameTracks]:
-        """Finds all points in the next frame; see `PointTracker.step`."""
+        """Find all points in the next frame; see `PointTracker.step`."""
         seen = self._seen(state.inner.cleaned(frame))
         last = np.concatenate([state.place_px, state.others_px])
         count = len(self._points)
@@ -123,7 +124,7 @@ class ParticleTracker:
         paired = partner >= 0
         moved = np.where(steady, state.moved_px, 0.0)
         moved[paired] = seen[partner[paired]] - last[paired]
-        away = np.full(len(before), reach)  # at least, where none was found
+        away = np.full(len(before), reach)  # lower bound where none was found
         away[paired] = np.linalg.norm(seen[partner[paired]] - before[paired], axis=1)
         doubt = _doubt(before, seen, partner, _smoothed(change_px, away))[:count]
         went = np.where(paired, np.linalg.norm(moved, axis=1), reach)
@@ -135,7 +136,7 @@ class ParticleTracker:
         certain = state.certain & (unseen <= _MEMORY) & (doubt <= _MOST_DOUBT)
         place = before[:count].copy()
         place[found] = seen[partner[:count][found]]
-        if steady:  # two that show as one go on as they went
+        if steady:  # two that merge are assumed to keep their velocities
             through = self._nearest_px(before[:count], before[count:]) <= self._overlap_px
             place[through], unseen[through] = before[:count][through], state.unseen[through]
             moved[:count][through] = state.moved_px[:count][through]
@@ -144,8 +145,8 @@ class ParticleTracker:
         used[partner[:count][found]] = True
         others_px = np.concatenate([seen[~used], before[count:][~paired[count:]]])
         near_px = self._nearest_px(place, others_px)
-        if not steady:  # two that show as one may have changed places
-            known_px = self._nearest_px(place, before[count:])  # what is new may be the point
+        if not steady:  # two that merge may have been exchanged
+            known_px = self._nearest_px(place, before[count:])  # a new particle may be the point
             merged = ~found & (known_px <= self._overlap_px)
             near = cKDTree(place).query_ball_point(place[merged], self._overlap_px)
             certain[sorted({index for group in near for index in group})] = False
@@ -178,7 +179,7 @@ class ParticleTracker:
         return np.asarray(cKDTree(every).query(place, 2)[0][:, 1])
 
     def _pulled_px(self, near_px: Floats) -> Floats:
-        """What a particle at that distance moves a point by, at most, along one axis."""
+        """Largest shift of a point by a particle at that distance, along one axis."""
         far = np.minimum(near_px / self._profile.sigma_px, _FAR_SIGMAS)
         return np.asarray(_PULL * self._profile.sigma_px * far * np.exp(-0.25 * far**2))
 
@@ -197,7 +198,7 @@ class ParticleTracker:
         certain: NDArray[np.bool_],
         near_px: Floats,
     ) -> tuple[TrackState, FrameTracks]:
-        """The points refined by their subsets from where the particles were found."""
+        """Refine the points by subset matching, starting from the detected particles."""
         start = self._tracker.placed(state.inner, place)
         inner, made = self._tracker.step(start, frame)
         away = np.hypot(made.x_px - place[:, 0], made.y_px - place[:, 1])
@@ -214,42 +215,42 @@ class ParticleTracker:
 
 
 def lone_subset_px(frame: Frame, most_px: int) -> int:
-    """Side of a subset, in px, that shows a dot of this frame and as little as can be of others.
+    """Side of a subset, in px, that contains a dot of this frame and little of others.
 
-    Dots that move apart from their neighbours must not have these in their subsets: 4.5 deviations
-    of a dot hold 95 % of what its slopes tell.
+    Subsets of independently moving dots must not contain other dots: 4.5 standard deviations
+    of a dot contain 95 % of the information in its gradients.
     """
     wide = int(_LONE_SIGMAS * find_profile(frame).sigma_px) | 1
     return min(max(wide, _SMALLEST_SUBSET_PX), most_px)
 
 
 def _smoothed(step_px: float, away: Floats) -> float:
-    """The deviation of steps along one axis, from those so far and those of this frame."""
-    # over the median, so that pairs of the wrong particles count little
+    """Standard deviation of steps along one axis, updated with those of this frame."""
+    # from the median, so that wrong pairs have little effect
     now = float(np.median(away) / np.sqrt(2.0 * np.log(2.0)))
     return max(0.8 * step_px + 0.2 * now, now, _LEAST_STEP_PX)
 
 
 def _doubt(before: Floats, seen: Floats, partner: NDArray[np.intp], step_px: float) -> Floats:
-    """Probability that each particle was taken for another one. Shape `(N,)`.
+    """Probability that each particle was confused with another one. Shape `(N,)`.
 
-    Of two particles whose partners change places, the squared steps grow by some amount D; under
-    diffusion the exchange is exp(-D / 2 step²) times as likely. The same for a partner that belongs
-    to none.
+    If the partners of two particles are exchanged, the squared steps grow by an amount D; under
+    diffusion the exchange is exp(-D / 2 step²) times as likely. The same holds for a partner that
+    belongs to no particle.
     """
     doubt = np.zeros(len(before))
     if len(seen) < 2:
         return doubt
     owner = np.full(len(seen), -1)
     owner[partner[partner >= 0]] = np.flatnonzero(partner >= 0)
-    near = cKDTree(seen).query(before, min(_RIVALS, len(seen)))[1]
+    near = cKDTree(seen).query(before, min(_CANDIDATES, len(seen)))[1]
     for other in near.T:
         i = np.flatnonzero((partner >= 0) & (other != partner))
         mine, theirs = seen[partner[i]], seen[other[i]]
         growth = ((theirs - before[i]) ** 2 - (mine - before[i]) ** 2).sum(axis=1)
-        rival = owner[other[i]]
-        held = rival >= 0
-        back = before[rival[held]]
+        other_owner = owner[other[i]]
+        held = other_owner >= 0
+        back = before[other_owner[held]]
         growth[held] += ((mine[held] - back) ** 2 - (theirs[held] - back) ** 2).sum(axis=1)
         doubt[i] = np.maximum(doubt[i], np.exp(-np.maximum(growth, 0.0) / (2.0 * step_px**2)))
     return doubt

@@ -1,4 +1,4 @@
-"""Moving particles: detection in every frame, linked to trajectories."""
+"""Linking of particle detections to trajectories."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["Trajectories", "link_particles", "nearest_pairs"]
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Linked detections, one row each, in the order of frames.
+    """Linked detections, one row each, in order of frames.
 
     Args:
         frame: frame of the detection. Shape `(N,)`.
-        particle: number of its trajectory, from 0. Shape `(N,)`.
+        particle: index of its trajectory, from 0. Shape `(N,)`.
         x_px, y_px: position, in px. Shape `(N,)`.
     """
 
@@ -36,7 +36,7 @@ class Trajectories:
 
 @dataclass
 class _Live:
-    """Trajectories that may still go on."""
+    """Trajectories that may continue."""
 
     place: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     velocity: Floats = field(default_factory=lambda: np.zeros((0, 2)))
@@ -45,10 +45,10 @@ class _Live:
 
 
 def nearest_pairs(expected: Floats, found: Floats, reach_px: float) -> NDArray[np.intp]:
-    """Index of the detection of each expected place, -1 for none: least total squared distance.
+    """Assign detections to expected positions by least total squared distance; -1 for none.
 
-    A pair costs its squared distance, a place left alone `reach_px`²; clusters of places that
-    share a detection are solved exactly, one by one.
+    A pair costs its squared distance, an unassigned position `reach_px`²; clusters of positions
+    that share a detection are solved exactly.
     """
     partner = np.full(len(expected), -1, np.intp)
     if not len(expected) or not len(found):
@@ -82,7 +82,7 @@ def _breaks(sorted_labels: NDArray[np.intp]) -> NDArray[np.intp]:
 def _advance(
     live: _Live, found: Floats, partner: NDArray[np.intp], memory: int, first_free: int
 ) -> tuple[_Live, NDArray[np.intp], int]:
-    """Live trajectories after a frame, the particle number of each detection, the next number."""
+    """Update the live trajectories; return them, each detection's particle, and the next index."""
     numbers = np.full(len(found), -1, np.intp)
     hit = partner >= 0
     numbers[partner[hit]] = live.number[hit]
@@ -110,19 +110,19 @@ def _advance(
 def link_particles(
     detections: Iterable[Floats], *, reach_px: float, memory: int = 3, persistence: float = 0.0
 ) -> Trajectories:
-    """Links detections to trajectories, frame by frame.
+    """Link detections to trajectories, frame by frame.
 
-    Each live trajectory expects its particle at its last place plus `persistence` times its last
-    velocity; pairs are made so that the sum of squared distances is least.
+    Each live trajectory expects its particle at its last position plus `persistence` times its last
+    velocity; pairs minimise the sum of squared distances.
 
     Args:
         detections: centres `[x, y]` of each frame in turn, in px. Shape `(N, 2)` each.
-        reach_px: farthest that a particle may be from where it is expected, in px.
-        memory: frames that a particle may stay unseen.
+        reach_px: largest distance of a particle from its expected position, in px.
+        memory: frames that a particle may be missing.
         persistence: 0 for diffusing particles, 1 for particles of constant velocity.
 
     Returns:
-        The trajectories, single detections among them.
+        The trajectories, including single detections.
 
     Raises:
         InputError: `reach_px` is not positive, `memory` is negative, or `persistence` is not
@@ -137,8 +137,8 @@ def link_particles(
     """
     if not reach_px > 0.0 or memory < 0 or not 0.0 <= persistence <= 1.0:
         raise InputError(
-            f"reach_px = {reach_px:g}, memory = {memory}, persistence = {persistence:g}; allowed "
-            "are a positive reach, a memory of 0 or more, a persistence in [0, 1]."
+            f"reach_px = {reach_px:g}, memory = {memory}, persistence = {persistence:g}; reach_px "
+            "must be above 0, memory 0 or more, and persistence in [0, 1]."
         )
     live, free = _Live(), 0
     frames, particles, places = [], [], []

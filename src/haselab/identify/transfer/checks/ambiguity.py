@@ -17,23 +17,25 @@ from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
 from haselab.identify.transfer.problem import Found, TransferProblem
 
-__all__ = ["Rival", "ambiguity", "rivals_of", "stands_alone", "whitened_energy"]
+__all__ = ["OtherMinimum", "ambiguity", "find_other_minima", "has_unique_delay", "whitened_energy"]
 
 Floats = NDArray[np.float64]
-_ALIKE = 0.9  # correlation of the modelled output with itself, later
-_APART = 5.0  # standard deviations between two solutions that are different
+_ALIKE = 0.9  # correlation of the modelled output with itself at a later time
+_APART = 5.0  # standard deviations between two solutions that count as different
 _LIKELY = 16.0  # twice the difference of logarithmic likelihoods below which both are possible
 _LISTED = 60.0
 _MOST = 5
-_LEFT = 6.0  # standard deviations of the correlation of white residuals with anything
+_LEFT = 6.0  # standard deviations of the correlation of white residuals with any signal
 
 
-def stands_alone(layout: Layout, residuals: Sequence[Floats], records: Sequence[Record]) -> bool:
-    """Whether no other delay can give nearly the modelled output, and nothing of it is left.
+def has_unique_delay(
+    layout: Layout, residuals: Sequence[Floats], records: Sequence[Record]
+) -> bool:
+    """Whether no other delay explains the output and the residuals contain nothing of it.
 
-    A rival minimum at another delay has to repeat the modelled output, shifted and with other
+    Another minimum at another delay has to reproduce the modelled output, shifted and with other
     poles, up to the noise. Where the output's correlation with itself beyond its first zero stays
-    below 0.9, no rival comes near that; and residuals that hold a shifted part of the output
+    below 0.9, no other delay comes close; and residuals that contain a shifted part of the output
     are correlated with it.
     """
     if not math.isnan(float(layout.template[-1])):
@@ -58,12 +60,12 @@ def stands_alone(layout: Layout, residuals: Sequence[Floats], records: Sequence[
 
 
 @dataclass(frozen=True)
-class Rival:
+class OtherMinimum:
     """Another minimum of the same structure.
 
     Args:
         numbers: its numbers, by name.
-        log_likelihood_below: how far its logarithmic likelihood is below that of the best.
+        log_likelihood_below: how far its logarithmic likelihood is below that of the best fit.
         differs: which identifiable numbers are more than 5 standard deviations from the best's.
     """
 
@@ -73,36 +75,36 @@ class Rival:
 
     @property
     def possible(self) -> bool:
-        """Whether the data leave it open which of the two is right.
+        """Whether the data cannot decide which of the two is right.
 
-        Where the truth is twice as far above the rival in logarithmic likelihood as this limit,
-        noise turns the order round with a probability of 3e-5 (a normal deviate of 4).
+        Where the truth is twice as far above the other minimum in logarithmic likelihood as this
+        limit, noise reverses the order with a probability of 3e-5 (a normal deviate of 4).
         """
         return 2.0 * self.log_likelihood_below < _LIKELY
 
 
-def rivals_of(
+def find_other_minima(
     layout: Layout,
     problem: TransferProblem,
     residuals: Sequence[Floats],
     others: Sequence[Found],
     estimates: dict[str, Estimate],
-) -> tuple[Rival, ...]:
-    """Other minima that differ from the estimates, the likelier ones first.
+) -> tuple[OtherMinimum, ...]:
+    """Other minima that differ from the estimates, the most likely first.
 
-    The likelihoods are those of the noise model of the best residuals, the same for all.
+    All likelihoods use the noise model of the best fit's residuals.
 
     Args:
-        layout: order of the numbers.
+        layout: order of the parameters.
         problem: least squares over the records.
         residuals: of the best solution.
         others: other solutions.
-        estimates: numbers of the best solution.
+        estimates: parameters of the best solution.
     """
     polynomial = autoregression(residuals)[0]
     count = sum(e.size for e in residuals)
     least = whitened_energy(residuals, polynomial)
-    found: list[Rival] = []
+    found: list[OtherMinimum] = []
     for other in others:
         columns = problem.columns(other)
         energy = max(whitened_energy(columns.residuals, polynomial), 1e-300)
@@ -113,23 +115,23 @@ def rivals_of(
             for name, value in numbers.items()
             if name in estimates and _apart(estimates[name], value, name)
         )
-        known = any(numbers == rival.numbers for rival in found)
+        known = any(numbers == minimum.numbers for minimum in found)
         if differs and not known and below < _LISTED:
-            found.append(Rival(numbers, below, differs))
-    return tuple(sorted(found, key=lambda rival: rival.log_likelihood_below)[:_MOST])
+            found.append(OtherMinimum(numbers, below, differs))
+    return tuple(sorted(found, key=lambda minimum: minimum.log_likelihood_below)[:_MOST])
 
 
-def ambiguity(rivals: Sequence[Rival], estimates: dict[str, Estimate]) -> str | None:
-    """What another minimum says that explains the records as well, as a status; None: none does."""
-    possible = [rival for rival in rivals if rival.possible]
+def ambiguity(minima: Sequence[OtherMinimum], estimates: dict[str, Estimate]) -> str | None:
+    """Status naming another minimum that explains the records as well, or None."""
+    possible = [minimum for minimum in minima if minimum.possible]
     if not possible:
         return None
-    rival = possible[0]
+    minimum = possible[0]
     shown = ", ".join(
-        f"{name} {estimates[name].value:.4g} or {rival.numbers[name]:.4g}"
-        for name in rival.differs[:3]
+        f"{name} {estimates[name].value:.4g} or {minimum.numbers[name]:.4g}"
+        for name in minimum.differs[:3]
     )
-    ratio = math.exp(-max(rival.log_likelihood_below, 0.0))
+    ratio = math.exp(-max(minimum.log_likelihood_below, 0.0))
     return (
         f"ambiguous: two models explain the records, {shown} (likelihood ratio {ratio:.2g}); "
         "add a record that excites more frequencies, or give the delay"
@@ -143,7 +145,7 @@ def whitened_energy(residuals: Sequence[Floats], polynomial: Floats) -> float:
 
 
 def _numbers(layout: Layout, found: Found) -> dict[str, float]:
-    """Numbers of a solution by name."""
+    """Parameters of a solution by name."""
     inner = layout.full(found.search)
     numbers = {
         name: float(value) if name == "delay_s" else math.exp(value)

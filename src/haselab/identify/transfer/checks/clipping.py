@@ -1,4 +1,4 @@
-"""Clipped outputs and inputs as rival explanations of what a transfer function leaves."""
+"""Clipped outputs and inputs as causes of the residuals of a transfer function."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ __all__ = ["clipped_input", "kept", "richer_fits", "without_clipped"]
 
 Floats = NDArray[np.float64]
 _BETTER = 50.0  # twice the gain of logarithmic likelihood that names a cause
-_SHARE = 0.7  # of the residuals' energy that must remain less than
-_LEVELS = (0.999, 0.99, 0.97, 0.93, 0.88, 0.8, 0.7)  # quantiles at which a clipping is looked for
+_SHARE = 0.7  # of the residuals' energy that may remain at most
+_LEVELS = (0.999, 0.99, 0.97, 0.93, 0.88, 0.8, 0.7)  # quantiles at which clipping is looked for
 _INPUT_LEVELS = (0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3)
 _CLEAR = 4.0  # standard deviations below a rail where an output counts as free of it
-_MOSTLY = 0.7  # of the inputs beyond a limit: noise on them looks the same
+_MOSTLY = 0.7  # of the inputs beyond a limit: noise on the input looks the same
 _FOLLOWS = 0.2  # slope of the outputs beyond a rail over the model; 0 where they are clipped
 _SLOPES = (0.25, 0.5)  # of an input beyond its limit that still gets through
-_CURVES = (-0.45, -0.3, -0.15, 0.15, 0.3, 0.45)  # of the square, on an input from -1 to 1
+_CURVES = (-0.45, -0.3, -0.15, 0.15, 0.3, 0.45)  # of the square, for an input from -1 to 1
 _CUBES = (-0.3, -0.2, -0.1, 0.1, 0.2, 0.3)  # all of them monotone
 _MOST_POLES = 6
 _MOST_SLOW = 3
@@ -39,14 +39,14 @@ _TAUS = 4
 _ROUNDS = 2
 _AROUND = 0.1
 _LEAST_VISITS = 2
-_STEPS = 16  # of the search for one limit
+_STEPS = 16  # steps of the search for one limit
 
 
 def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]:
-    """The fit to outputs that a limit did not reach; None where no limit explains the records.
+    """The fit to the unclipped outputs; None where clipping does not explain the records.
 
-    A limit is named where the outputs beyond it no longer follow the model, and where neither
-    another pole nor a slow branch explains the records as well.
+    A limit is reported where the outputs beyond it no longer follow the model, and where neither
+    another pole nor a slow branch explains the records equally well.
     """
     records = best.records
     count = sum(r.y.size for r in records)
@@ -74,7 +74,7 @@ def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]
     residuals = [r.y - np.clip(m, low, high) for r, m in zip(records, modelled_parts, strict=True)]
     if not _beats(residuals, _richer(layout, best)):
         return None, []
-    for _ in range(2):  # free of the rail by the model, not by the noise of the output
+    for _ in range(2):  # by the modelled output, not by the noisy one
         modelled = np.concatenate(whole.predict(found.found))
         std = math.sqrt(found.found.cost / sum(r.y.size for r in found.records))
         lowest, highest = low + _CLEAR * std, high - _CLEAR * std
@@ -90,7 +90,7 @@ def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]
 
 
 def kept(record: Record, keep: NDArray[np.bool_]) -> Record:
-    """A record of the marked outputs only.
+    """The record with the marked outputs only.
 
     Raises:
         InputError: too few are left for a record.
@@ -103,7 +103,7 @@ def _refit(layout: Layout, records: Sequence[Record], start: Best) -> Best | Non
 
 
 def _follows(y: Floats, modelled: Floats, beyond: NDArray[np.bool_]) -> bool:
-    """Whether outputs beyond a limit still rise with the model, as unclipped ones do."""
+    """Whether outputs beyond a limit still rise with the model, as unclipped outputs do."""
     if beyond.sum() < 3:
         return False
     along = modelled[beyond] - modelled[beyond].mean()
@@ -112,8 +112,8 @@ def _follows(y: Floats, modelled: Floats, beyond: NDArray[np.bool_]) -> bool:
 
 
 def _visits(modelled: Floats, bounds: tuple[float, float]) -> int:
-    """How often the model goes beyond a rail. Once is no evidence: what creeps towards an end
-    after its only step looks like that."""
+    """How often the model goes beyond a rail. Once is no evidence: an output that creeps towards
+    a limit after its only step looks the same."""
     beyond = (modelled > bounds[1]) | (modelled < bounds[0])
     return int(np.count_nonzero(np.diff(beyond.astype(np.int8), prepend=0) == 1))
 
@@ -124,7 +124,7 @@ def _shown(low: float, high: float) -> str:
 
 
 def _rails(y: Floats) -> Iterator[tuple[float, float]]:
-    """Ranges of the output that a clipping may have left free."""
+    """Candidate ranges of the output between clipping limits."""
     for share in _LEVELS:
         high, low = float(np.quantile(y, share)), float(np.quantile(y, 1.0 - share))
         yield -math.inf, high
@@ -144,7 +144,7 @@ def _settled_rails(y: Floats, modelled: Floats, low: float, high: float) -> tupl
 
 
 def _fit_between(layout: Layout, best: Best, keep: NDArray[np.bool_]) -> Best | None:
-    """The fit to the outputs that are kept; None where the rest is no record."""
+    """The fit to the outputs that are kept; None where too few are left for a record."""
     ends = np.cumsum([r.y.size for r in best.records])[:-1]
     try:
         records = [
@@ -156,11 +156,11 @@ def _fit_between(layout: Layout, best: Best, keep: NDArray[np.bool_]) -> Best | 
 
 
 def clipped_input(layout: Layout, best: Best) -> tuple[str, Best] | None:
-    """A status with its fit, where an input that was limited unrecorded explains the records.
+    """Status and fit where an unrecorded limit of the input explains the records.
 
-    A limit is named where it explains them better than all of these do: another pole, a slow
+    A limit is reported where it explains them better than each of these: another pole, a slow
     branch, an input that passes its limit with a smaller slope, and a smooth curve of the input.
-    A limit also makes up for a part of a drift or of a nonlinearity.
+    A limit also compensates part of a drift or of a nonlinearity.
     """
     inputs = _Inputs(layout, best)
     chosen = min(
@@ -206,7 +206,7 @@ class _Inputs:
         return 0.5 * float(u.max() + u.min()), 0.5 * float(np.ptp(u))
 
     def limits(self) -> Iterator[tuple[float, float]]:
-        """Limits that the input crosses."""
+        """Candidate limits that the input crosses."""
         for level in _INPUT_LEVELS:
             yield -level, level
             yield -math.inf, level
@@ -218,7 +218,7 @@ class _Inputs:
         return middle + half * limits[0], middle + half * limits[1]
 
     def fitted(self, curve: Callable[[Floats], Floats]) -> Best | None:
-        """The fit to a curve of the input; None where it leaves an input without change."""
+        """The fit to a curve of the input; None where an input becomes constant."""
         middle, half = self._scale
         if not half > 0.0:
             return None
@@ -238,7 +238,7 @@ class _Inputs:
         return _refit(self.layout, records, self.best)
 
     def settled(self, limits: tuple[float, float], fit: Best) -> tuple[tuple[float, float], Best]:
-        """Limits and fit, each limit searched between those of the grid."""
+        """Limits and fit, each limit refined between grid points."""
         for side in (0, 1) * _ROUNDS:
             if not math.isfinite(limits[side]):
                 continue
@@ -265,7 +265,7 @@ class _Inputs:
         return self.fitted(lambda x: np.clip(x, limits[0], limits[1]))
 
     def curved(self) -> Iterator[Best]:
-        """Fits to an input that bends without being clipped."""
+        """Fits to a smooth curve of the input."""
         curves: list[Callable[[Floats], Floats]] = []
         for q in _CURVES:
             curves.append(partial(_squared, part=q))
@@ -292,13 +292,13 @@ def _soft(x: Floats, limits: tuple[float, float], slope: float) -> Floats:
     return np.asarray((1.0 - slope) * np.clip(x, *limits) + slope * x)
 
 
-def _beats(residuals: Sequence[Floats], rivals: Iterator[Best]) -> bool:
-    """Whether residuals are clearly likelier than those of all rivals, by their noise model."""
+def _beats(residuals: Sequence[Floats], others: Iterator[Best]) -> bool:
+    """Whether residuals are clearly more likely than those of all other fits."""
     polynomial = autoregression(residuals)[0]
     count = sum(e.size for e in residuals)
     least = max(whitened_energy(residuals, polynomial), 1e-300)
-    for rival in rivals:
-        energy = whitened_energy(rival.columns.residuals, polynomial)
+    for other in others:
+        energy = whitened_energy(other.columns.residuals, polynomial)
         if count * math.log(max(energy, 1e-300) / least) < _BETTER:
             return False
     return True
@@ -309,7 +309,7 @@ def _richer(layout: Layout, best: Best) -> Iterator[Best]:
 
 
 def richer_fits(layout: Layout, best: Best) -> Iterator[tuple[TransferStructure, Best]]:
-    """Fits of linear models with one more branch or pole, no worse than the fit."""
+    """Fits of linear models with one more branch or pole, each at least as good as the fit."""
     structure, records = layout.structure, best.records
     if structure.slow_modes < _MOST_SLOW:
         richer = layout_of(replace(structure, slow_modes=structure.slow_modes + 1))

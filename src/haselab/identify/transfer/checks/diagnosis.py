@@ -1,4 +1,4 @@
-"""Spikes, clipping and wrong times as rival explanations of what a transfer function leaves."""
+"""Spikes, clipping and wrong times as causes of the residuals of a transfer function."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ Floats = NDArray[np.float64]
 _FALSE_ALARM = 1e-3  # probability that white noise alone has a spike
 _MOST_SPIKES = 0.05  # of the outputs
 _ISOLATED = 3  # outputs in a row that a spike may take
-_QUIET = 0.6  # of the spike: its neighbours are below
+_SMALL = 0.6  # of the spike: its neighbours are smaller
 _AROUND = 4  # outputs either side of a spike, three quarters of which
-_CALM = 0.45  # are below this part of it; a resonance that is left over swings on
+_CALM = 0.45  # are below this part of it; an unmodelled resonance rings longer
 _ROUNDS = 4
-_LARGE = 0.3  # of the largest change of the input: one that counts
-_FEW = 4  # spikes, below which nothing is said of when they come
+_LARGE = 0.3  # of the largest change of the input: larger changes count
+_FEW = 4  # spikes, below which their times are not tested
 _BY_CHANCE = 1e-3  # probability that spikes come so soon after changes of the input
-_COLOURED = 1e-3  # whiteness below which clipping is tried
+_COLOURED = 1e-3  # whiteness below which clipping is tested
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found in the records besides the plant.
+    """Defects found in the records, with the fit that accounts for them.
 
     Args:
-        best: the solution for what is left of them.
-        notes: sentences about what was left out.
-        fault: what makes the numbers unusable, as a status; None: nothing.
+        best: the solution for the remaining outputs.
+        notes: one sentence for each exclusion.
+        fault: why the parameters are not usable, as a status; None: they are.
     """
 
     best: Best
@@ -49,10 +49,10 @@ class Diagnosis:
 
 
 def diagnosed(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
-    """The solution without spikes and clipped outputs, where these explain the records better.
+    """The fit without spikes and clipped outputs, where these explain the records better.
 
     Args:
-        layout: order of the numbers.
+        layout: order of the parameters.
         best: solution for all outputs.
         applied: whether the inputs are known to have been applied as recorded, by the same clock.
     """
@@ -69,7 +69,7 @@ def diagnosed(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
 
 
 def _named(layout: Layout, best: Best, notes: list[str]) -> Diagnosis:
-    """What else explains the records: times, a slew limit or a clipped input."""
+    """Check timing faults, a slew limit and a clipped input as the cause."""
     clipped = clipped_input(layout, best)
     cause = timing_cause(layout, best)
     if clipped is not None and cause is not None:
@@ -92,12 +92,12 @@ def _mean_square(best: Best) -> float:
 
 
 def _spread(residuals: Sequence[Floats]) -> float:
-    """Standard deviation by the median, which a few outliers do not move."""
+    """Standard deviation estimated by the median, so a few outliers do not affect it."""
     return 1.4826 * float(np.median(np.abs(np.concatenate(residuals))))
 
 
 def _spikes(residuals: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
-    """Which outputs are spikes: far off, alone among quiet neighbours; None: none or too many."""
+    """Mark isolated outliers among small residuals; None when there are none or too many."""
     count = sum(e.size for e in residuals)
     std = _spread(residuals)
     limit = -float(ndtri(0.5 * _FALSE_ALARM / count)) * std
@@ -113,9 +113,9 @@ def _spikes(residuals: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
             around = np.r_[size[max(first - _AROUND, 0) : first], size[last : last + _AROUND]]
             beside = np.r_[size[max(first - 1, 0) : first], size[last : last + 1]]
             largest = size[first:last].max()
-            quiet = beside.max(initial=0.0) < _QUIET * largest
+            small = beside.max(initial=0.0) < _SMALL * largest
             calm = np.quantile(around, 0.75) < _CALM * largest
-            mark[first:last] = last - first <= _ISOLATED and quiet and calm
+            mark[first:last] = last - first <= _ISOLATED and small and calm
         marks.append(mark)
     found = sum(int(mark.sum()) for mark in marks)
     return marks if 0 < found <= _MOST_SPIKES * count else None
@@ -133,7 +133,7 @@ def _since_change(record: Record) -> Floats:
 
 
 def _follow_input(records: Sequence[Record], marks: Sequence[NDArray[np.bool_]]) -> bool:
-    """Whether outputs far off come soon after changes of the input: model error, not spikes."""
+    """Whether outliers follow changes of the input; they are then model error, not spikes."""
     since_s = np.concatenate([_since_change(record) for record in records])
     mark = np.concatenate(list(marks))
     if mark.sum() < _FEW:
@@ -142,7 +142,7 @@ def _follow_input(records: Sequence[Record], marks: Sequence[NDArray[np.bool_]])
 
 
 def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
-    """The fit without spikes; a fit that spikes have misled is searched anew."""
+    """The fit without spikes; a fit misled by spikes is searched again."""
     left_out, limit = 0, 0.0
     for _ in range(_ROUNDS):
         marks = _spikes(best.columns.residuals)
@@ -150,8 +150,8 @@ def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
             break
         if _follow_input(best.records, marks):
             return best, [
-                "Outputs soon after changes of the input are far off: the model misses how the "
-                "motion begins. A further mode may explain them."
+                "Outputs soon after changes of the input are far off: the model does not describe "
+                "how the motion begins. An additional mode may explain them."
             ]
         try:
             records = [kept(r, ~mark) for r, mark in zip(best.records, marks, strict=True)]

@@ -1,4 +1,4 @@
-"""Clocks that drift, lost outputs or rows, and a slew limit, as rivals of what a fit leaves."""
+"""Clock drift, lost outputs or rows and a slew limit as explanations of the residuals of a fit."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ from haselab.identify.transfer.start import delay_grid, delay_margin_s
 __all__ = ["Cause", "timing_cause"]
 
 Floats = NDArray[np.float64]
-_BETTER = 50.0  # twice the gain of logarithmic likelihood that names a cause, beside the search
-_MOST_NUMBERS = 4  # searched: three poles and a delay; more would take minutes
+# Twice the gain of logarithmic likelihood that identifies a cause, besides the search's own gain.
+_BETTER = 50.0
+_MOST_NUMBERS = 4  # searched parameters: three poles and a delay; more would take minutes
 _WHITE = 1e-3
 _UNRELATED = 0.01
-_MOST_LEFT = 0.3  # of the residuals' energy, where what is left is not white
+_MOST_LEFT = 0.3  # of the residuals' energy, where they are not white
 _DRIFT = 0.01  # largest difference of two clocks
 _MOST_DRIFTS = 15  # either side
 _SLEWS = 12
-_LONGEST = 0.2  # of a record: the longest time that the usual step of the input may take
-_FINER = 4  # points a sample of a slew-limited input
+_LONGEST = 0.2  # of a record: the longest time that a typical step of the input may take
+_FINER = 4  # points per sample of a slew-limited input
 _STEPS = 18  # of the search for one number
 _PART = 0.4  # of a record, from either end, to which a model is fitted
 _MOST_LOST = 0.1  # of a record
@@ -42,18 +43,18 @@ _NEAR = 12  # outputs about a place where rows may be missing
 _KEPT = 3
 _ELSEWHERE = 0.1
 _ROUNDS = 3
-_EDGE = 16  # outputs at either end, where a loss cannot be told
+_EDGE = 16  # outputs at either end, where a loss cannot be detected
 
 
 @dataclass(frozen=True)
 class Cause:
-    """An explanation of what the fit leaves.
+    """An explanation of the residuals of a fit.
 
     Args:
         best: the fit with it.
-        sentence: what was seen.
-        places: of the search for it.
-        fault: whether the numbers are of no use; else they are those of `best`.
+        sentence: description for the user.
+        places: number of places that were searched.
+        fault: whether the result is unusable; else `best` is the result.
     """
 
     best: Best
@@ -63,11 +64,11 @@ class Cause:
 
 
 def timing_cause(layout: Layout, best: Best) -> Cause | None:
-    """The likeliest of the three, where it explains the records; None: none does.
+    """The most likely of these causes, or None when none explains the records.
 
-    It has to be likelier than the fit and than linear models with another pole or slow branch, by
-    50 in twice the logarithmic likelihood and by what a search at so many places gains from noise,
-    and to leave white residuals, or a third of them without relation to the input.
+    It has to be more likely than the fit and than linear models with another pole or slow branch,
+    by 50 in twice the logarithmic likelihood and by what the search over many places gains from
+    noise alone, and to leave white residuals, or a third of them uncorrelated with the input.
     """
     if layout.free.size > _MOST_NUMBERS:
         return None
@@ -78,8 +79,8 @@ def timing_cause(layout: Layout, best: Best) -> Cause | None:
     chosen = min(causes, key=lambda cause: _mean_square(cause.best))
     polynomial = autoregression(chosen.best.columns.residuals)[0]
     own = _log_energy(chosen.best, polynomial)
-    for _, rival in richer_fits(layout, best):
-        if count * (_log_energy(rival, polynomial) - own) < _BETTER:
+    for _, richer in richer_fits(layout, best):
+        if count * (_log_energy(richer, polynomial) - own) < _BETTER:
             return None
     return chosen
 
@@ -89,7 +90,7 @@ def _causes(layout: Layout, best: Best) -> Iterator[Cause]:
     first = best.records[0]
     part = _part_fit(layout, first, np.arange(first.y.size) < _PART * first.y.size, starts)
     if part is not None and np.abs(part.found.search - starts[0]).max(initial=0.0) > _ELSEWHERE:
-        starts.append(part.found.search)  # what the whole record hides may be clear in a part
+        starts.append(part.found.search)  # a part may show clearly what the whole record hides
     for search in (_drift, _slew, _lost_outputs, _lost_rows):
         cause = search(layout, best, starts)
         if cause is not None:
@@ -125,7 +126,7 @@ def _refit(layout: Layout, records: Sequence[Record], starts: Sequence[Floats]) 
 def _least(
     fitted: Callable[[float], Best | None], places: Sequence[float], reach: float
 ) -> tuple[float, Best] | None:
-    """The best of some places, then searched about it."""
+    """The best of some values, refined by a local search."""
     found = [(at, fit) for at in places if (fit := fitted(at)) is not None]
     if not found:
         return None
@@ -154,7 +155,7 @@ def _motion_s(layout: Layout, records: Sequence[Record]) -> float:
 
 
 def _free_delay(layout: Layout) -> Layout:
-    """The layout with a delay that is searched."""
+    """The layout with a free delay."""
     template = layout.template.copy()
     template[-1] = math.nan
     return replace(layout, template=template)
@@ -211,7 +212,7 @@ def _slew(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None:
     logarithm, fit = found
     return Cause(
         fit,
-        f"the applied input seems to be limited to a rate of {math.exp(logarithm):.4g} a second "
+        f"the applied input seems to be limited to a rate of {math.exp(logarithm):.4g} per second "
         "(slew limit), but the recorded input is faster; record the applied input, or stay below "
         "the limit",
         _SLEWS + _STEPS,
@@ -220,7 +221,7 @@ def _slew(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None:
 
 
 def _limited(record: Record, rate: float) -> Record:
-    """The record with an input that changes at most so much a second."""
+    """The record with its input limited to a rate."""
     period_s = 1.0 / (record.input_rate_hz * _FINER)
     most = rate * period_s
     fine = np.repeat(record.u, _FINER)
@@ -238,7 +239,7 @@ def _limited(record: Record, rate: float) -> Record:
 
 
 def _lost_outputs(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None:
-    """From some output on, all belong to later times than the record says, or to earlier ones."""
+    """From some output on, all times are wrong by a whole number of samples."""
     chosen: Cause | None = None
     for i, record in enumerate(best.records):
         for at, shift, start in _shifts(layout, record, starts):
@@ -251,7 +252,7 @@ def _lost_outputs(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause
                 f"{shift} outputs before {from_s:.4g} s seem to be lost: the later ones follow the "
                 "input too early; their times are corrected."
                 if shift > 0
-                else f"from {from_s:.4g} s on the outputs come {-shift} samples late (repeated "
+                else f"from {from_s:.4g} s on the outputs are {-shift} samples late (repeated "
                 "outputs, or lost inputs); their times are corrected."
             )
             chosen = Cause(fit, sentence, record.y.size * _MOST_SHIFTS, fault=False)
@@ -261,7 +262,7 @@ def _lost_outputs(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause
 def _moved(
     layout: Layout, best: Best, i: int, place: tuple[int, int], starts: Sequence[Floats]
 ) -> tuple[Best, tuple[int, int]] | None:
-    """The fit with later outputs shifted, and the place that this fit makes likeliest."""
+    """The fit with later outputs shifted, and the place that is most likely by this fit."""
     record, fit = best.records[i], None
     for _ in range(_ROUNDS):
         at, shift = place
@@ -289,16 +290,16 @@ def _most_lost(record: Record) -> int:
 def _shifts(
     layout: Layout, record: Record, starts: Sequence[Floats]
 ) -> list[tuple[int, int, Floats]]:
-    """Likely places and sizes of a loss, by models of the first and the last part of a record.
+    """Likely places and sizes of a loss, from models of the first and last part of a record.
 
-    With the numbers of that model, for the times that the loss corrects.
+    Each comes with the parameters of that model, for the corrected times.
     """
     count = record.y.size
     found: list[tuple[float, int, int, Floats]] = []
     for early in (True, False):
         keep = np.arange(count) < _PART * count
         keep = keep if early else keep[::-1]
-        # After a loss the output may come before its input: a known delay makes up for it.
+        # After a loss the output may come before its input: a known delay accounts for it.
         free = math.isnan(float(layout.template[-1]))
         pad_s = 0.0 if early or not free else _most_lost(record) * record.output_step_s
         later = [np.append(start[:-1], start[-1] + pad_s) for start in starts] if pad_s else starts
@@ -317,7 +318,7 @@ def _shifts(
 def _part_fit(
     layout: Layout, record: Record, keep: NDArray[np.bool_], starts: Sequence[Floats]
 ) -> Best | None:
-    """The fit to some outputs; all delays are searched where the starts leave something."""
+    """The fit to some outputs; all delays are searched where the residuals are not white."""
     try:
         part = [kept(record, keep)]
     except InputError:
@@ -333,7 +334,7 @@ def _part_fit(
 def _places(
     layout: Layout, record: Record, fit: Best, keep: NDArray[np.bool_], *, early: bool
 ) -> list[tuple[float, int, int]]:
-    """Sum of squares, place and size of a loss for each size, the likeliest first.
+    """Sum of squares, place and size of a loss for each size, the most likely first.
 
     The model belongs to the early or the late outputs; the others are shifted against it.
     """
@@ -362,7 +363,7 @@ def _places(
 
 
 def _lost_rows(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None:
-    """Rows of input and output are missing: after them the plant starts anew."""
+    """Rows of input and output are missing; the plant has a new initial state after them."""
     chosen: Cause | None = None
     for i, record in enumerate(best.records):
         e = best.columns.residuals[i] ** 2
@@ -392,7 +393,7 @@ def _lost_rows(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | 
 
 
 def _parted(layout: Layout, best: Best, record: Record, at: int) -> list[Record] | None:
-    """The record before and after an output; without the outputs that missing inputs may reach."""
+    """The record before and after an output; without outputs that missing inputs may affect."""
     if not _EDGE <= at < record.y.size - _EDGE:
         return None
     cut_s = float(record.output_time_s[at])

@@ -1,0 +1,1 @@
+"""Measurements of the published figures, compared with other libraries: `make bench`."""

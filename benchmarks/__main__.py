@@ -1,0 +1,95 @@
+"""Measure the published figures and compare them with other libraries: `make bench`.
+
+    python -m benchmarks [--full] [SECTION ...]
+
+The default takes a representative part of each section: fewer seeds, records and sizes. `--full`
+(`make bench-full`) takes all of them. Speeds are medians of several rounds of wall time, in which
+haselab and the other libraries take turns, so that another program slows down both. Trust the
+ratios. At the end every goal is listed, the missed ones last.
+"""
+
+import argparse
+import time
+
+from benchmarks.measurement import Measurement
+from benchmarks.rows import Row, summary
+
+__all__ = ["SECTIONS"]
+
+SECTIONS: dict[str, tuple[Measurement, ...]] = {
+    "twin": (Measurement("rig.twin"),),
+    "sensing": (
+        Measurement("sensing.accuracy", quick={"blocks": 300}),
+        Measurement("sensing.speed"),
+        Measurement("sensing.calibration"),
+        Measurement("control.pid_step"),
+    ),
+    "identify": (
+        Measurement("identification.static_laws"),
+        Measurement(
+            "identification.transfer", quick={"runs": 300, "structures": 1, "libraries": False}
+        ),
+        Measurement("control.many_loops"),
+        Measurement("identification.frequency_response", quick={"runs": 10}),
+        Measurement("identification.model_comparison", quick={"count": 1}),
+        Measurement("identification.hysteresis", quick={"runs": 8}),
+    ),
+    "identify-board": (
+        Measurement("identification.random_plants", quick={"plants": 300}),
+        Measurement("control.margins", quick={"loops": 200}),
+    ),
+    "recording": (
+        Measurement("rig.recording", quick={"seconds": 20.0, "live": 10.0, "kills": 3}),
+        Measurement("rig.wire", quick={"seconds": 5.0}),
+    ),
+    "board": (Measurement("sensing.disturbances", quick={"blocks": 200, "seeds": 1}),),
+    "stream": (
+        Measurement("sensing.stream", quick={"size_gb": 0.2, "rounds": 1}),
+        Measurement(
+            "tracking.stream", quick={"frames": 200, "kinds": ("tiff", "ffv1"), "rounds": 1}
+        ),
+    ),
+    "tracking": (
+        Measurement("tracking.points", quick={"quick": True, "only": ("bias",)}),
+        Measurement("tracking.difficult", quick={"every": 4}),
+    ),
+    "firmware": (
+        Measurement(
+            "rig.firmware",
+            quick={"flips": 20, "tries": 2, "seeds": 1},
+            full={"flips": 200, "tries": 20, "seeds": 3},
+        ),
+    ),
+    "safety": (Measurement("rig.safety", quick={"twin": 50, "wire": 10, "trials": 1}),),
+    "command": (Measurement("command"),),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("sections", nargs="*", help=f"of {', '.join(SECTIONS)}; default: all")
+    parser.add_argument("--full", action="store_true", help="measure all seeds, records and sizes")
+    options = parser.parse_args()
+    names = options.sections or list(SECTIONS)
+    unknown = [name for name in names if name not in SECTIONS]
+    if unknown:
+        parser.error(f"no section {', '.join(unknown)}. Choose from {', '.join(SECTIONS)}.")
+    measured: list[tuple[str, list[Row]]] = []
+    begun = time.perf_counter()
+    for name in names:
+        for measurement in SECTIONS[name]:
+            start = time.perf_counter()
+            rows, cpu_s = measurement.run(options.full)
+            measured.append((name, rows))
+            wall_s = time.perf_counter() - start
+            print(f"-- {name}, {measurement.module}: {cpu_s:.1f} s of CPU, {wall_s:.1f} s\n")
+    print(summary(measured))
+    print(f"Measured in {time.perf_counter() - begun:.0f} s.")
+
+
+if __name__ == "__main__":
+    main()

@@ -17,6 +17,7 @@ from haselab.rig.chip.build import simavr_header
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import TwinBench, describe
+from haselab.study.definition import load_study
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "your-actuator.md"
 TEXT = PAGE.read_text(encoding="utf-8")
@@ -173,8 +174,9 @@ def test_files_of_another_program_give_the_same_actuator(
 def test_what_the_page_types_is_enough_for_a_design(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    section = TEXT.partition("## Type values by hand")[2]
-    (typed,) = re.findall(r"^```toml\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
+    study, typed = re.findall(r"^```toml\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)
+    (tmp_path / "steps.toml").write_text(study, encoding="utf-8")
+    assert load_study(tmp_path / "steps.toml").steps.own_trials == 3
     path = tmp_path / "typed.toml"
     path.write_text(typed, encoding="utf-8")
     run(capsys, f"haselab design {path}")

@@ -40,7 +40,7 @@ def answer(
     data = DATA if reading == "hz" else DATA / "rad"
     with pytest.raises(SystemExit) as stop:
         main(["firmware", "simulate", str(data), "--reading", reading, "--before-s", "6",
-              "--after-s", "6", "--picture", str(folder / "step.png"), "--out",
+              "--after-s", "6", "--plot", str(folder / "step.png"), "--out",
               str(folder / "step.json")])  # fmt: skip
     assert stop.value.code == 0
     assert (folder / "step.png").stat().st_size > 10_000

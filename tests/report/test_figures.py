@@ -196,8 +196,12 @@ def test_each_further_trial_has_its_title_and_every_line_its_name(run):
 def test_residuals_are_what_the_models_leave_over(run):
     axes, _ = drawn_axes(run, "residualsA")
     labels = [line.get_label() for line in axes[0].lines]
-    # The second model is the truth: camera noise of 4e-4 in 4000 samples, rms 0.04 %.
-    assert "second order plus slow branch: rms 0.04 %" in labels
+    # The second model is the truth: camera noise of 4e-4 in 4000 samples, rms 0.04 %. The noise's
+    # variance is known to 4 %, so that less than a fifth of 0.04 % is left as misfit.
+    (true,) = [each for each in labels if each.startswith("second order plus slow branch:")]
+    misfit, noise = (float(word) for word in re.findall(r"([\d.]+) %", true))
+    assert noise == pytest.approx(0.04, abs=0.005) and misfit < 0.2 * noise
+    assert "second order: misfit 0.11 %, noise 0.04 % rms" in labels
     (worse,) = [line for line in axes[0].lines if line.get_label().startswith("second order:")]
     strain = np.array(run.analysis["chirp"]["strain"])
     fitted = np.array(run.analysis["chirp"]["fits"]["second order"]["strain"])

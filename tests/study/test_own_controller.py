@@ -90,13 +90,13 @@ def test_a_recording_is_read_without_the_package_that_played_it():
     assert tomllib.loads(f"x = {again.control.parameters['gain']}") == {"x": 2.0}
 
 
-def test_each_result_has_its_row_and_the_note_says_what_is_not_computed():
+def test_each_result_has_its_row_and_the_note_says_where_margins_come_from():
     value = Estimate.normal(1.0, 0.1, "")
     assert set(own_quantities(value, value, value)) <= set(quantities())
     note = own_note(Control(kind="mine", parameters={"gain": 2.0}))
     assert note == (
-        "controller 'mine' (gain = 2); margins and predicted step metrics are computed for a PID "
-        "only"
+        "controller 'mine' (gain = 2); its margins, if its feedback is linear, come from haselab "
+        "margins with --controller"
     )
 
 

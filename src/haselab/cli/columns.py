@@ -128,8 +128,19 @@ def check_unit(column: str, unit: Unit | None, quantity: Quantity, file: Path) -
     )
 
 
+def note_seconds(name: str, file: Path) -> None:
+    """Say on stderr that a column of times is taken as seconds."""
+    click.echo(
+        f"haselab: column {name} states no unit: its values are taken as times in seconds. State "
+        f"another one with --unit {name}=ms. {file}",
+        err=True,
+    )
+
+
 def note_units(table: Table, file: Path) -> None:
-    """Report on stderr which columns were converted."""
+    """Report on stderr which columns were converted, and times whose unit nobody states."""
+    if table.assumed_seconds:
+        note_seconds(str(table.time_name), file)
     for name, unit in table.units.items():
         if unit is not None and unit.factor != 1.0:
             to = "a pure number" if unit.si == "1" else unit.si

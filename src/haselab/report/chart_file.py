@@ -24,7 +24,7 @@ from haselab.report.style import (
 )
 from haselab.store.folder import drafted, write_text
 
-__all__ = ["CHART_ENDINGS", "ChartFigure", "draw_chart", "write_chart"]
+__all__ = ["CHART_ENDINGS", "ChartFigure", "draw_chart", "write_chart", "write_figure"]
 
 CHART_ENDINGS = (".svg", ".png", ".html")
 _MOST_SAMPLES = 5000
@@ -114,24 +114,36 @@ def write_chart(chart: Chart, path: Path) -> None:
     Raises:
         InputError: another ending.
     """
+    with figure_style():
+        write_figure(draw_chart(chart), chart.title, path)
+
+
+def write_figure(figure: Figure, title: str, path: Path) -> None:
+    """Write a figure as a file, inside `figure_style`.
+
+    Args:
+        figure: as it was drawn.
+        title: what it shows.
+        path: ends with .svg, .png or .html.
+    Raises:
+        InputError: another ending.
+    """
     kind = path.suffix.lower()
     if kind not in CHART_ENDINGS:
         raise InputError(
             f"A figure cannot be written as '{kind}'. Use {', '.join(CHART_ENDINGS)}: {path}"
         )
-    with figure_style():
-        figure = draw_chart(chart)
-        if kind == ".png":
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format="png")
-            with drafted(path) as draft:
-                draft.write_bytes(buffer.getvalue())
-            return
-        document = to_svg(figure, "chart", chart.title)
+    if kind == ".png":
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png")
+        with drafted(path) as draft:
+            draft.write_bytes(buffer.getvalue())
+        return
+    document = to_svg(figure, "chart", title)
     if kind == ".html":
-        title = html.escape(chart.title)
+        escaped = html.escape(title)
         document = (
-            f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}</title>\n'
+            f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{escaped}</title>\n'
             f"<body>\n{document}\n</body>\n</html>\n"
         )
     write_text(path, document)

@@ -20,6 +20,7 @@ __all__ = [
     "changed_files",
     "check_recorded",
     "read_manifest",
+    "recorded_when",
     "seal",
     "sha256_of",
 ]
@@ -93,6 +94,25 @@ def seal(
     data |= {"state": state, "closed": clock().isoformat(), "files": _recorded(folder)}
     write_json(path, data)
     return data
+
+
+def recorded_when(manifest: Mapping[str, Any]) -> dict[str, object]:
+    """When a recording was made, and how long it took.
+
+    Args:
+        manifest: of its folder.
+    Returns:
+        `date` of its beginning and `duration_s`, each where the manifest says it.
+    """
+    found: dict[str, object] = {}
+    try:
+        opened = datetime.fromisoformat(str(manifest["opened"]))
+        found["date"] = opened.isoformat(timespec="seconds")
+        closed = datetime.fromisoformat(str(manifest["closed"]))
+        found["duration_s"] = round((closed - opened).total_seconds(), 1)
+    except (KeyError, ValueError, TypeError):
+        pass  # an older recording, or one that was cut off
+    return found
 
 
 def changed_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:

@@ -69,7 +69,9 @@ def results_of(
         "verdict_rule": VERDICT_RULE,
         "sensing_error": None if trials is None else trials.sensing_error,
         "provenance": {
-            key: header[key] for key in ("versions", "seed", "study_sha256", "study", "rig_config")
+            key: header[key]
+            for key in ("recorded", "versions", "seed", "study_sha256", "study", "rig_config")
+            if key in header
         },
     }
     return marked_unverified(results, doubt)

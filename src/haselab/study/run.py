@@ -31,6 +31,7 @@ from haselab.safety.watchdog.settings import WatchdogSettings
 from haselab.store.manifest import Manifest
 from haselab.store.session.reader import session_file
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
+from haselab.store.source_commit import source_commit
 from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study, checked_study
@@ -91,6 +92,7 @@ def session_header(
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES}
         | {
             "haselab": __version__,
+            "commit": source_commit() or "not from a checkout",
             "python": platform.python_version(),
             "machine": platform.machine(),
         },

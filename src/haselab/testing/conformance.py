@@ -23,18 +23,27 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
+import numpy as np
 import pytest
 
 from haselab.base import DeviceError, InputError, LimitError
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.cameras.opened import OpenedCamera
 from haselab.rig.instruments.devices import GeneratorDevice, SupplyDevice
-from haselab.rig.instruments.instrument import Instrument, OpenContext, OutputInstrument
+from haselab.rig.instruments.instrument import (
+    CameraContext,
+    Instrument,
+    OpenContext,
+    OutputInstrument,
+)
 from haselab.rig.instruments.registry import instrument_of
 from haselab.rig.rig_file import load_rig
 from haselab.testing.bench_conformance import BenchConformance
 
 __all__ = [
     "BenchConformance",
+    "BlockTimer",
+    "CameraConformance",
     "GeneratorConformance",
     "InstrumentConformance",
     "SupplyConformance",
@@ -239,3 +248,99 @@ class GeneratorConformance(_OffConformance):
         self.energise(device)
         device.sine(1000.0, 0.0)
         assert device.is_off()
+
+
+class CameraConformance(InstrumentConformance):
+    """Of a camera: its frames are grey pictures in the order of their times.
+
+    `rate_hz` is one that the camera takes; override it where 50 frames/s are too many.
+    """
+
+    section = "camera"
+    rate_hz: ClassVar[float] = 50.0
+    blocks_s: ClassVar[float] = 0.01  # between two looks at the camera
+
+    @pytest.fixture
+    def now(self) -> BlockTimer:
+        """The acquisition's clock."""
+        return BlockTimer(self.blocks_s)
+
+    @pytest.fixture
+    def opened(self, instrument: Instrument[Any], config: Any, now: BlockTimer) -> Iterator[Any]:
+        """The camera, opened; it is closed after the test."""
+        opened = cast(Any, instrument).open(config, CameraContext(clock=now))
+        try:
+            yield opened
+        finally:
+            opened.close()
+
+    def test_it_takes_no_frames_before_it_is_started(self, opened: OpenedCamera) -> None:
+        """Opening alone leaves the camera as it is."""
+        assert opened.camera.take() is None
+
+    def test_its_frames_are_grey_pictures_in_the_order_of_their_times(
+        self, opened: OpenedCamera, now: BlockTimer
+    ) -> None:
+        """Of one size, in 8 bit, each with its time on the acquisition's clock."""
+        images, time_s = self.taken(opened, now)
+        assert len(images) == len(time_s) >= 5
+        assert images.dtype == np.uint8 and images.ndim == 3
+        assert (np.diff(time_s) > 0.0).all()
+        period_s = float(np.median(np.diff(time_s)))
+        assert abs(period_s * self.rate_hz - 1.0) < 0.1
+        assert opened.uncertainty_s() >= 0.0 and opened.dropped() >= 0
+
+    def test_it_starts_again_after_a_stop(self, opened: OpenedCamera, now: BlockTimer) -> None:
+        """Every experiment starts and stops the camera; no frame of before comes later."""
+        _, first_s = self.taken(opened, now)
+        _, second_s = self.taken(opened, now)
+        assert second_s[0] >= first_s[-1]
+
+    @pytest.mark.parametrize("rate_hz", [0.0, -1.0, math.nan, math.inf, 1e9])
+    def test_a_rate_that_it_does_not_have_is_refused(
+        self, opened: OpenedCamera, rate_hz: float
+    ) -> None:
+        """Neither clipped nor ignored."""
+        with pytest.raises(LimitError, match=r"."):
+            opened.camera.start(rate_hz)
+
+    def test_closing_may_be_repeated(self, opened: OpenedCamera) -> None:
+        """`close` never raises."""
+        opened.close()
+        opened.close()
+
+    def taken(self, opened: OpenedCamera, now: BlockTimer) -> tuple[Any, Any]:
+        """Half a second of frames: pictures and times."""
+        opened.camera.start(self.rate_hz)
+        parts = []
+        for _ in range(round(0.5 / self.blocks_s)):
+            now.pass_block()
+            found = opened.camera.take()
+            if found is not None:
+                parts.append(found)
+        opened.camera.stop()
+        assert parts, "no frame in half a second"
+        images = np.concatenate([part.images for part in parts])
+        return images, np.concatenate([part.time_s for part in parts])
+
+
+class BlockTimer:
+    """The clock of an acquisition whose blocks end as time passes on the wall.
+
+    Args:
+        block_s: length of a block, in s.
+    """
+
+    def __init__(self, block_s: float) -> None:
+        self._block_s, self._blocks = block_s, 0
+        self._start_s = self._seen_s = time.monotonic()
+
+    def pass_block(self) -> None:
+        """Wait until the next block has ended."""
+        self._blocks += 1
+        time.sleep(max(0.0, self._start_s + self._blocks * self._block_s - time.monotonic()))
+        self._seen_s = time.monotonic()
+
+    def __call__(self) -> tuple[float, float]:
+        """See `BlockClock`."""
+        return self._blocks * self._block_s, self._seen_s

@@ -110,3 +110,26 @@ def test_an_analysis_does_not_write_through_linked_folders(folder, tmp_path, cap
     (folder / "firmware").symlink_to(tmp_path / "others")
     code, _, line = typed(capsys, "analyse", folder)
     assert code == 2 and "This path is a link to" in line
+
+
+def test_the_drive_is_imported_block_by_block_and_times_without_a_unit_are_named(
+    tmp_path, capsys
+) -> None:
+    """Blocks of 20 samples, whose drive changes with each of them."""
+    time_s = np.arange(100) / 1000.0
+    drive_v = np.repeat([0.0, 0.5, 1.0, 1.5, 2.0], 20)
+    wave = np.sin(2.0 * np.pi * 200.0 * time_s)
+    rows = np.column_stack([time_s, wave, 0.5 * wave, drive_v])
+    np.savetxt(tmp_path / "m.csv", rows, "%.6g", ",", header="t,u,i,out", comments="")
+    with pytest.raises(SystemExit) as stop:
+        main(["session", "import", str(tmp_path / "m.csv"), "--v", "u", "--i", "i", "--drive",
+              "out", "--block-samples", "20", "--out", str(tmp_path / "o")])  # fmt: skip
+    err = capsys.readouterr().err
+    assert stop.value.code == 0, err
+    assert err == (
+        "haselab: column t states no unit: its values are taken as times in seconds. State "
+        f"another one with --unit t=ms. {tmp_path / 'm.csv'}\n"
+    )
+    with SessionReader(tmp_path / "o" / "session.h5") as session:
+        record = session.experiment("imported")
+    assert record.drive_v.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]

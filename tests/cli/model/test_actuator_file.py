@@ -216,3 +216,11 @@ def test_the_highest_field_lowers_the_limits_of_a_design(known, capsys):
     assert run(capsys, "design", actuator)[0] == 0
     limits = tomllib.loads(actuator.read_text())["controller"]["limits"]
     assert limits["high"] == pytest.approx(0.0692, abs=2e-4)
+
+
+def test_compare_draws_the_prediction_with_its_band(known, capsys, tmp_path):
+    actuator, _, second = known
+    figure = tmp_path / "prediction.svg"
+    assert run(capsys, "compare", actuator, second, "--plot", figure)[0] == 0
+    text = figure.read_text()
+    assert "predicted, 95 % band" in text and "Measured less predicted" in text

@@ -249,3 +249,13 @@ def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study()
         f"{asked['peak current']:.1f} of 12 mA, {asked['time of an update']:.2f} of 5 ms and "
         f"{asked['field']:.1f} of 36 MV/m"
     ) in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.long
+def test_the_figure_shows_the_requested_values_over_their_limits(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text('kind = "twin"\n')
+    figure = tmp_path / "feasible.svg"
+    arguments = [str(STUDY), "--rig", str(tmp_path / "rig.toml"), "--plot", str(figure)]
+    CliRunner().invoke(command, arguments, catch_exceptions=False)
+    text = figure.read_text()
+    assert "Requested over limit" in text and "stretch" in text

@@ -100,7 +100,7 @@ def test_without_the_file_such_a_study_says_what_is_missing(
 ) -> None:
     code = run("run", known / "steps.toml", "--rig", known / "rig.toml", "--out", tmp_path / "o")
     assert code == 2
-    assert "Give operating_point.baseline_v" in capsys.readouterr().err
+    assert "Add operating_point.baseline_v" in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from haselab.base import InputError
-from haselab.cli.columns import advice_on_columns, column_options
+from haselab.cli.columns import advice_on_columns, column_options, note_seconds
 from haselab.cli.common import Real, answer_options, emit, unverified_option, warn_unverified
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
@@ -87,6 +87,11 @@ def _export(
 @click.argument("file", type=click.Path(path_type=Path))
 @shared_option("--v", "v_column", default="v_monitor_v", show_default=True)
 @shared_option("--i", "i_column", default="i_monitor_v", show_default=True)
+@click.option(
+    "--drive", metavar="COLUMN",
+    help="Name the column of the drive voltage before the amplifier, in V; the median of each "
+    "block is kept. Default: none.",
+)  # fmt: skip
 @shared_option("--experiment", default="imported", show_default=True)
 @shared_option("--rate-hz", type=Real(1e-3, 1e8), detail="Default: the rate in the file.")
 @click.option(
@@ -117,6 +122,7 @@ def _import(
     file: Path,
     v_column: str,
     i_column: str,
+    drive: str | None,
     experiment: str,
     rate_hz: float | None,
     volt_per_code: float | None,
@@ -136,8 +142,10 @@ def _import(
     plan = ImportPlan(
         experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code, columns,
         scales["volt_per_monitor_volt"], scales["ampere_per_monitor_volt"], scales["carrier_hz"],
-        scales["skew_s"] or 0.0,
+        scales["skew_s"] or 0.0, drive,
     )  # fmt: skip
-    with advice_on_columns(["--v", "--i"]):
+    with advice_on_columns(["--v", "--i", "--drive"] if drive else ["--v", "--i"]):
         answer = asdict(import_session(file, out, plan))
+    if assumed := answer.pop("assumed_seconds"):
+        note_seconds(assumed, file)
     emit(answer, as_json=as_json, out=None)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base.chart import Chart, Curve, Panel
+from haselab.base.estimate import Z95
 from haselab.control import LinearController, LoopSetting, PidGains, simulate_loop
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plants.general_loops import trace_general
 from haselab.control.stability.margins import loop_response
+from haselab.identify.fit import Prediction
 from haselab.models import Plant
 
-__all__ = ["design_chart", "loop_chart"]
+__all__ = ["design_chart", "loop_chart", "prediction_chart"]
 
 _POINTS = 600
+Floats = NDArray[np.float64]
 
 
 def loop_chart(
@@ -74,4 +78,24 @@ def design_chart(
         Panel("Time (s)", "Output", (Curve(time_s, measured, "measured by the loop"),
                                      Curve(time_s, reference, "reference"))),
         Panel("Time (s)", "Controller", (Curve(time_s, u, "", "steps"),)),
+    ))  # fmt: skip
+
+
+def prediction_chart(found: Prediction, time_s: Floats, title: str) -> Chart:
+    """Measured and predicted output of records, one after the other, and what is left.
+
+    Args:
+        found: the prediction.
+        time_s: of its samples; records follow each other. Shape `(M,)`.
+        title: of the figure.
+    Returns:
+        The chart.
+    """
+    std = found.half_band / Z95 if found.half_band.size else None
+    label = "predicted" if std is None else "predicted, 95 % band"
+    return Chart(title, (
+        Panel("Time (s)", "Output", (Curve(time_s, found.measured, "measured", "points"),
+                                     Curve(time_s, found.predicted, label, std=std))),
+        Panel("Time (s)", "Measured less predicted",
+              (Curve(time_s, found.measured - found.predicted),)),
     ))  # fmt: skip

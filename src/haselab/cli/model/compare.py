@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import ResultError, table_at
 from haselab.cli.columns import column_options
 from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
+from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_posterior
 from haselab.cli.options import shared_option
+from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import predict
+from haselab.identify.record import Record
 from haselab.store.actuator_file import read_actuator
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.manifest import sha256_of
@@ -37,7 +41,7 @@ _NO_BAND = "no uncertainty: the model has no covariance"
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
 @shared_option("--seed", type=SEED, default=1, show_default=True, detail="For the 95 % band.")
 @column_options
-@answer_options()
+@answer_options(plot=True)
 def command(
     model: Path,
     files: tuple[Path, ...],
@@ -52,6 +56,7 @@ def command(
     *,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
     """Predict records in FILES that were not used for the fit of MODEL.
 
@@ -78,8 +83,20 @@ def command(
     used = [file for file in files if sha256_of(file) in _used(model)]
     answer = _answer(found_prediction, posterior is not None, used)
     emit(answer, as_json=as_json, out=out)
+    names = ", ".join(file.name for file in files)
+    title = f"Prediction of {names}: {found_prediction.fit_percent:.1f} %"
+    save_plot(plot, lambda: prediction_chart(found_prediction, _times(records), title))
     if used:
         raise ResultError(f"{_KNOWN}. {used[0]}")
+
+
+def _times(records: Sequence[Record]) -> NDArray[np.float64]:
+    """Times of the outputs of records that follow each other."""
+    parts, start_s = [], 0.0
+    for record in records:
+        parts.append(start_s + record.output_time_s)
+        start_s = float(parts[-1][-1]) + 1.0 / record.input_rate_hz
+    return np.concatenate(parts)
 
 
 def _model_table(model: Path) -> Mapping[str, object]:

@@ -19,6 +19,7 @@ from haselab.control import PidGains
 from haselab.firmware import FrontEnd
 from haselab.report import write_report
 from haselab.report.analysis import Section
+from haselab.report.chart_file import write_figure
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import figure_style
 from haselab.rig.chip import (
@@ -149,15 +150,14 @@ def build(
     help="Set the highest drive that the actuator has had before, in V; 0: a new actuator.",
 )
 @shared_option("--seed", type=SEED, default=1, show_default=True)
-@click.option("--picture", type=click.Path(path_type=Path), metavar="FILE.svg|png",
-              help="Write the figure of the step responses. Default: none.")  # fmt: skip
-@answer_options(OutputRule(options=("picture",)))
+@answer_options(plot=True)
 def simulate(
     run: Path,
     structure: str | None,
     source: Path | None,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
     **options: Any,
 ) -> None:
     """Simulate the firmware in a step experiment.
@@ -193,8 +193,9 @@ def simulate(
         "loops": [loop_row(loop, gains, plant) for loop in runs],
     }
     section = to_plain(section_of(runs, answer["loops"]))
-    if options["picture"] is not None:
-        _draw(section).savefig(options["picture"])
+    if plot is not None:
+        with figure_style():
+            write_figure(_draw(section), "Step by the chip and by the computer", plot)
     if (run / "results.json").is_file():
         write_json(run / "firmware" / "simulation.json", section)
         write_report(run)
@@ -203,9 +204,8 @@ def simulate(
 
 def _draw(section: Mapping[str, Any]) -> Figure:
     """Draw the responses of `section_of` in one figure."""
-    with figure_style():
-        figure = Figure(figsize=(7.0, 3.6), layout="constrained")
-        draw_loops(figure, Section("chip", section))
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    draw_loops(figure, Section("chip", section))
     return figure
 
 

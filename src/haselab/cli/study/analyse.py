@@ -13,7 +13,7 @@ from haselab.cli.common import answer_options, unverified_option, warn_unverifie
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import analyse_on_chip
 from haselab.cli.study.recommended_mass import with_mass_limit
-from haselab.cli.study.study_run import mark_found, print_results
+from haselab.cli.study.study_run import mark_found, print_results, with_date
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json
 from haselab.store.session.reader import session_file
@@ -89,6 +89,7 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
         found = with_chip_rows(found, folder)
     found = with_mass_limit(found, study, table_at(header, "rig_config"))
     noise_free = None if folder is None else _earlier_noise_free(folder)
+    header = with_date(header, path.parent)
     results = write_findings(target, found, study, header, noise_free, doubt)
     mark_found(target, found, path.parent, simulated=bool(results["simulated"]))
     print_results(results, target, as_json)

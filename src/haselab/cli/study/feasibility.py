@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from dataclasses import asdict
 from pathlib import Path
 
 import click
+import numpy as np
 
 from haselab.base import InputError, to_plain
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import answer_options
 from haselab.cli.options import shared_option
+from haselab.cli.plot import save_plot
+from haselab.cli.study.run import planned
 from haselab.rig.rig_file import load_rig
 from haselab.safety.feasibility import Feasibility
 from haselab.store.folder import write_json
@@ -36,15 +41,28 @@ def _page(found: Feasibility) -> str:
 @click.argument("study", type=click.Path(path_type=Path))
 @shared_option("--rig", required=True, type=click.Path(path_type=Path))
 @shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
-@answer_options()
-def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None) -> None:
+@shared_option(
+    "--actuator",
+    type=click.Path(path_type=Path),
+    detail="Its voltage of zero strain and its controller are used as by haselab run.",
+)
+@answer_options(plot=True)
+def command(
+    study: Path,
+    rig: Path,
+    quick: bool,
+    actuator: Path | None,
+    as_json: bool,
+    out: Path | None,
+    plot: Path | None,
+) -> None:
     """Check whether a bench can play STUDY.
 
     The command compares current, slew rate, bandwidth, electric field and stretch with the limits
     of the bench. It does not connect to any instrument and applies no voltage. The exit code is 2
     if the bench cannot play the study. STUDY is a TOML file.
     """
-    plan = load_study(study, quick=quick)
+    plan = planned(load_study(study, quick=quick), actuator)
     file = load_rig(rig)
     rated = rated_rig(file, plan, rig)
     if rated is None:
@@ -61,4 +79,17 @@ def command(study: Path, rig: Path, quick: bool, as_json: bool, out: Path | None
     if out is not None:
         write_json(out, answer)
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else _page(found))
+    save_plot(plot, lambda: _chart(found))
     found.require()
+
+
+def _chart(found: Feasibility) -> Chart:
+    """Draw each requested value as a fraction of its limit."""
+    shown = [c for c in found.checks if c.allowed > 0.0 and math.isfinite(c.requested)]
+    at = np.arange(len(shown), dtype=np.float64)
+    share = np.array([check.requested / check.allowed for check in shown])
+    names = [textwrap.fill(check.name, 12) for check in shown]
+    bars = Curve(at, share, "requested", "bars")
+    limit = Curve(np.array([-0.5, len(shown) - 0.5]), np.ones(2), "limit")
+    panel = Panel("", "Requested over limit", (bars, limit), ticks=names)
+    return Chart("Feasibility: requested value over limit", (panel,))

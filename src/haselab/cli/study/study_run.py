@@ -24,7 +24,7 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.store.actuator_file import ACTUATOR
-from haselab.store.manifest import read_manifest
+from haselab.store.manifest import read_manifest, recorded_when
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.definition import Study
 from haselab.study.experiment import Outcome
@@ -45,6 +45,7 @@ __all__ = [
     "mark_found",
     "print_results",
     "twin_rig",
+    "with_date",
 ]
 
 RUN_FOLDER = "A new folder for the recording and the results.  [required]"
@@ -174,10 +175,26 @@ def _execute(
     if study.is_reference:
         found = with_chip_rows(found, folder)
     found = with_mass_limit(found, study, options.rig_config)
-    header = session_header(study, rig.description, options)
+    header = with_date(session_header(study, rig.description, options), folder)
     results = write_findings(folder, found, study, header, noise_free)
     mark_found(folder, found, folder, simulated=bool(results["simulated"]))
     print_results(results, folder, as_json)
+
+
+def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> dict[str, Any]:
+    """A session's header with the date and the duration of the recording, for the provenance.
+
+    Args:
+        header: of the session.
+        recorded_in: folder of the session; None, or one without a manifest: nothing is added.
+    Returns:
+        The header.
+    """
+    try:
+        found = {} if recorded_in is None else recorded_when(read_manifest(recorded_in))
+    except InputError:
+        found = {}
+    return {**header, **({"recorded": found} if found else {})}
 
 
 def mark_found(folder: Path, found: Findings, recorded_in: Path | None, *, simulated: bool) -> None:

@@ -13,6 +13,7 @@ from haselab.report.style import BLUE, GREEN, GREY, RED, SKY, scale_by, thinned
 __all__ = ["PLAN"]
 
 _FRAMES_DRAWN = 300
+_MARGIN = 0.15  # shown beside the paths, as a part of their extent
 
 
 def _tracks(host: FigureBase, run: RunFolder) -> None:
@@ -21,12 +22,20 @@ def _tracks(host: FigureBase, run: RunFolder) -> None:
     y_px = section.rows("y_px", length=x_px.shape[1])
     if x_px.shape != y_px.shape:
         raise LeftOutError("'tracks.x_px' and 'tracks.y_px' in analysis.json differ in length.")
+    picked_x = section.array("picked_x_px")
+    picked_y = section.array("picked_y_px", like=picked_x)
     axes = host.subplots()
     axes.grid(False)
     frame_name = run.analysis["tracks"].get("frame_png")
     frame = run.picture(str(frame_name)) if frame_name else None
     if frame is not None:
-        axes.imshow(frame, cmap="gray", vmin=0.0, vmax=1.0, interpolation="none")
+        columns = _shown(np.append(x_px.ravel(), picked_x), frame.shape[1])
+        rows = _shown(np.append(y_px.ravel(), picked_y), frame.shape[0])
+        edges = (columns.start - 0.5, columns.stop - 0.5, rows.stop - 0.5, rows.start - 0.5)
+        axes.imshow(
+            frame[rows, columns], cmap="gray", vmin=0.0, vmax=1.0, interpolation="none",
+            extent=edges,
+        )  # fmt: skip
     else:
         axes.invert_yaxis()
         axes.set_facecolor("#777777")
@@ -34,10 +43,9 @@ def _tracks(host: FigureBase, run: RunFolder) -> None:
     step = thinned(x_px.shape[0], _FRAMES_DRAWN)
     axes.plot(x_px[step], y_px[step], color=SKY, linewidth=0.7, rasterized=True)
     axes.axvline(section.number("midline_px"), color="white", linewidth=1.2)
-    picked_x = section.array("picked_x_px")
     axes.plot(
         picked_x,
-        section.array("picked_y_px", like=picked_x),
+        picked_y,
         "o",
         markerfacecolor="none",
         markeredgecolor=GREEN,
@@ -50,6 +58,13 @@ def _tracks(host: FigureBase, run: RunFolder) -> None:
         scale = section.number("scale_mm_per_px")
         right = axes.secondary_yaxis("right", functions=scale_by(scale))
         right.set_ylabel("y (mm)")
+
+
+def _shown(places_px: Array, size_px: int) -> slice:
+    """The part of a picture that shows these places, with a margin."""
+    low, high = float(np.nanmin(places_px)), float(np.nanmax(places_px))
+    margin = _MARGIN * (high - low) + 1.0
+    return slice(max(int(low - margin), 0), min(int(high + margin) + 2, size_px))
 
 
 def _along(host: FigureBase, run: RunFolder) -> None:
@@ -105,8 +120,8 @@ PLAN = FigurePlan(
     "homogeneous stretch. C: lateral motion of each particle (positive: to the right) against "
     "its distance from the mid-line; the free sides move most.",
     (
-        Panel("A", "Particle paths", _tracks, height_in=3.3),
+        Panel("A", "Particle paths", _tracks, wide=True, height_in=2.6),
         Panel("B", "Strain along the length", _along, height_in=3.3),
-        Panel("C", "Lateral motion", _lateral, wide=True, height_in=2.6),
+        Panel("C", "Lateral motion", _lateral, height_in=3.3),
     ),
 )

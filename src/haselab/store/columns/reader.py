@@ -16,6 +16,7 @@ from haselab.store.columns.archive import Archive
 from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
     ColumnOptions,
+    assumed_seconds,
     stated_unit,
     time_column,
 )
@@ -187,6 +188,7 @@ class ColumnStream(Closing):
         self._names = archive.locate_all(names)
         self.units = [stated_unit(archive, name, options) for name in self._names]
         self._times: str | None = None
+        self.assumed_seconds = ""  # column of times whose unit nobody states
         self._time_factor = 1.0
         self.rows_read = 0
         try:
@@ -220,6 +222,8 @@ class ColumnStream(Closing):
         self._time_factor = 1.0 if unit is None else unit.factor
         self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
+        if self._times and assumed_seconds(self._archive, full, self._options):
+            self.assumed_seconds = full
 
     def _empty(self) -> InputError:
         return InputError(f"Column {self._names[0]} is empty. Record again: {self._archive.file}")

@@ -9,7 +9,13 @@ from haselab.base import InputError
 from haselab.store.columns.archive import Archive
 from haselab.store.columns.units import Unit, parse_unit
 
-__all__ = ["AS_THE_FILE_STATES", "ColumnOptions", "stated_unit", "time_column"]
+__all__ = [
+    "AS_THE_FILE_STATES",
+    "ColumnOptions",
+    "assumed_seconds",
+    "stated_unit",
+    "time_column",
+]
 
 _TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiempo", "tempo")
 
@@ -88,6 +94,20 @@ def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = 
         if len(found) == 1 and _is_time(archive, found[0], options):
             return found[0]
     return None
+
+
+def assumed_seconds(archive: Archive, full: str, options: ColumnOptions) -> bool:
+    """Whether a column of times is taken as seconds though nobody says so.
+
+    Args:
+        archive: the file.
+        full: name of the column of times.
+        options: of the user.
+    Returns:
+        True for a column such as `t` without a unit; `time_s` states its own.
+    """
+    name = archive.plain_name(full).casefold()
+    return not name.endswith("_s") and stated_unit(archive, full, options) is None
 
 
 def _is_time(archive: Archive, full: str, options: ColumnOptions) -> bool:

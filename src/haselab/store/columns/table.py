@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.store.columns.archive import Archive
 from haselab.store.columns.reader import ColumnStream, open_archive, rate_of_times
-from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions, time_column
+from haselab.store.columns.selection import (
+    AS_THE_FILE_STATES,
+    ColumnOptions,
+    assumed_seconds,
+    time_column,
+)
 from haselab.store.columns.units import Unit
 from haselab.store.optional import library
 
@@ -40,6 +45,7 @@ class Table:
         left_out: rows that a column `valid` marks with 0.
         units: unit that each column states, by the same names; None where it states none.
         time_name: column of the times, if there is one.
+        assumed_seconds: no unit of these times is stated anywhere: they are taken as seconds.
         time_s: its values. Shape `(N,)`.
     """
 
@@ -49,6 +55,7 @@ class Table:
     units: Mapping[str, Unit | None] = field(default_factory=dict)
     time_name: str | None = None
     time_s: Floats | None = None
+    assumed_seconds: bool = False
 
     def __getitem__(self, name: str) -> Floats:
         return self.columns[name]
@@ -159,7 +166,8 @@ def read_table(
             time_name, time_s = _times(archive, kept, options)
             rate_hz = None if time_s is None else rate_of_times(time_s)
         units = dict(zip(wanted, stream.units, strict=True))
-    return Table(values, rate_hz, left_out, units, time_name, time_s)
+        assumed = time_name is not None and assumed_seconds(archive, time_name, options)
+    return Table(values, rate_hz, left_out, units, time_name, time_s, assumed)
 
 
 def _valid_rows(archive: Archive, wanted: Sequence[str], rows: int) -> NDArray[np.bool_]:

@@ -38,6 +38,7 @@ class ImportPlan:
         ampere_per_monitor_volt: scale of the current monitor, in A/V; None: 0.002.
         carrier_hz: of the sensing signal, if known.
         skew_s: from a voltage sample to its current sample.
+        drive: column of the drive voltage ahead of the amplifier, in V; None: there is none.
     """
 
     experiment: str = "imported"
@@ -50,6 +51,12 @@ class ImportPlan:
     ampere_per_monitor_volt: float | None = None
     carrier_hz: float | None = None
     skew_s: float = 0.0
+    drive: str | None = None
+
+    @property
+    def all_columns(self) -> tuple[str, ...]:
+        """The monitors, and the drive where there is one."""
+        return self.columns if self.drive is None else (*self.columns, self.drive)
 
 
 @dataclass(frozen=True)
@@ -79,6 +86,7 @@ class Imported:
         largest_rounding_v: largest rounding error of the codes, in V.
         volt_per_monitor_volt: scale of the voltage monitor in the session.
         ampere_per_monitor_volt: scale of the current monitor in the session, in A/V.
+        assumed_seconds: column of times that states no unit and was taken as seconds; empty: none.
     """
 
     blocks: int
@@ -88,6 +96,7 @@ class Imported:
     largest_rounding_v: float
     volt_per_monitor_volt: float
     ampere_per_monitor_volt: float
+    assumed_seconds: str = ""
 
 
 def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
@@ -104,7 +113,7 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
             block.
     """
     with _open(file, plan) as stream:
-        rate_hz = plan.rate_hz or stream.rate_hz
+        rate_hz, assumed = plan.rate_hz or stream.rate_hz, stream.assumed_seconds
     if not rate_hz:
         raise InputError(
             "The file states no sampling rate. Add --rate-hz, or name the column of the times with "
@@ -120,7 +129,7 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
     }  # fmt: skip
     if plan.carrier_hz is not None:
         header["sensing"] = {"carrier_hz": plan.carrier_hz}
-    plans = [ExperimentPlan(plan.experiment, "imported", 1, {"columns": list(plan.columns)})]
+    plans = [ExperimentPlan(plan.experiment, "imported", 1, {"columns": list(plan.all_columns)})]
     path = folder / "session.h5"
     with (
         Manifest(folder, header),
@@ -134,19 +143,22 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
             f"--block-samples, or record for longer. {file}"
         )
     return Imported(
-        blocks, left, rate_hz, scale.volt_per_code, worst_v, volt_per_unit, ampere_per_unit
+        blocks, left, rate_hz, scale.volt_per_code, worst_v, volt_per_unit, ampere_per_unit, assumed
     )
 
 
 def _open(file: Path, plan: ImportPlan) -> ColumnStream:
-    return open_columns(file, plan.columns, use_times=plan.rate_hz is None, options=plan.options)
+    return open_columns(
+        file, plan.all_columns, use_times=plan.rate_hz is None, options=plan.options
+    )
 
 
 def _scale(file: Path, plan: ImportPlan) -> _Scale:
     """Scales of the codes; columns in kV or A are values at the actuator and get a monitor each."""
     with _open(file, plan) as stream:
-        v, i = stream.units
-    for unit, good, what in ((v, ("V",), "voltage"), (i, ("V", "A"), "current")):
+        v, i, *rest = stream.units
+    wanted = [(v, ("V",), "voltage"), (i, ("V", "A"), "current")]
+    for unit, good, what in (*wanted, *((unit, ("V",), "drive") for unit in rest)):
         if unit is not None and unit.si not in good:
             raise InputError(
                 f"The column of the {what} is in {unit.symbol}, but must be in "
@@ -176,7 +188,7 @@ def _peaks(file: Path, plan: ImportPlan) -> tuple[float, float]:
     peaks = [0.0, 0.0]
     with _open(file, plan) as stream:
         for chunk in stream.chunks(_CHUNK_BLOCKS * plan.block_samples):
-            for k, column in enumerate(chunk):
+            for k, column in enumerate(chunk[:2]):
                 if np.issubdtype(column.dtype, np.integer):
                     raise InputError(
                         f"The columns contain integers, codes of a converter. Add --volt-per-code. "
@@ -215,15 +227,21 @@ def _copy(
     file: Path,
 ) -> tuple[int, int, float]:
     samples, count, worst_v = plan.block_samples, 0, 0.0
-    rest = np.empty((0, 2), np.int16)
+    rest, rest_v = np.empty((0, 2), np.int16), np.empty(0)
     for chunk in stream.chunks(_CHUNK_BLOCKS * samples):
-        codes, lost_v = _codes(chunk, scale, stream.rows_read - len(chunk[0]), file)
+        codes, lost_v = _codes(chunk[:2], scale, stream.rows_read - len(chunk[0]), file)
         worst_v = max(worst_v, lost_v)
         codes = np.concatenate([rest, codes])
+        drive_v = chunk[2].astype(np.float64) if plan.drive else np.full(len(chunk[0]), np.nan)
+        drive_v = np.concatenate([rest_v, drive_v])
         whole = len(codes) // samples
-        for block in codes[: whole * samples].reshape(whole, samples, 2):
+        shape = (whole, samples)
+        levels_v = np.median(drive_v[: whole * samples].reshape(shape), axis=1)  # one a block
+        for block, level_v in zip(
+            codes[: whole * samples].reshape(*shape, 2), levels_v, strict=True
+        ):
             start_s = count * samples / rate_hz
-            session.append_block(plan.experiment, block, start_s, float("nan"), float("nan"))
+            session.append_block(plan.experiment, block, start_s, float(level_v), float("nan"))
             count += 1
-        rest = codes[whole * samples :]
+        rest, rest_v = codes[whole * samples :], drive_v[whole * samples :]
     return count, len(rest), worst_v

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from haselab.base import Estimate
 from haselab.rig import RigDescription
 from haselab.safety.feasibility import Drive
 from haselab.signals import constant, linear_chirp
@@ -13,7 +14,12 @@ from haselab.study.analysis import Analysis
 from haselab.study.experiment import Experiment, Outcome
 from haselab.study.experiments.operating_point import baseline_v, possible_baselines_v
 from haselab.study.experiments.steps import open_names
-from haselab.study.fits.dynamics import Dynamics, fit_chirp, fit_chirp_and_steps
+from haselab.study.fits.dynamics import (
+    Dynamics,
+    fit_chirp,
+    fit_chirp_and_steps,
+    fit_chirp_of_voltage,
+)
 from haselab.study.fits.maps import Maps
 from haselab.study.paper.quantity_table import paper_rows
 from haselab.study.player import UPDATE_HZ, Player
@@ -22,6 +28,8 @@ from haselab.study.tables import Chirp
 
 __all__ = ["ChirpTest"]
 
+_PER_VOLT = {"S20.gain_per_volt": Quantity("plant, gain from the drive voltage", "1/V")}
+_ABOUT = "strain for a volt before the amplifier, about the baseline; no voltage map is known"
 _LEAD_S = 1.0  # recorded at the baseline before the chirp
 
 
@@ -59,17 +67,31 @@ class ChirpTest(Experiment[Chirp]):
         player.play(self.table, drive_v, self.settings.frame_rate_hz)
 
     def fit(self, analysis: Analysis) -> Outcome:
-        """See `Experiment`; without steps, only the paper's second-order model."""
-        maps, seen = analysis.need(Maps), analysis.observe(self.table)
+        """See `Experiment`; without steps or maps, only the second-order model."""
+        maps, seen = analysis.find(Maps), analysis.observe(self.table)
+        stop_hz = self.settings.stop_hz
+        if maps is None:
+            found = fit_chirp_of_voltage(seen, analysis.rig, _LEAD_S, stop_hz)
+            return self._alone(*found, "needs the voltage map of [triangle], or of --actuator")
         if not self.study.has("steps"):
-            quantities = fit_chirp(seen, maps, analysis.rig)
-            reason = "needs the open-loop trials of [steps], which is not in this study"
-            missing = {key: reason for key in self.rows() if key not in quantities}
-            return Outcome(quantities, missing=missing)
+            found = fit_chirp(seen, maps, analysis.rig, stop_hz)
+            return self._alone(*found, "needs the open-loop trials of [steps]")
         opened = [analysis.observe(name) for name in open_names(self.study)]
-        found = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig)
-        return Outcome(found.quantities, figures=found.figures, values=(found,))
+        both = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig)
+        return Outcome(both.quantities, figures=both.figures, values=(both,))
+
+    def _alone(
+        self, quantities: Mapping[str, Estimate], figures: Mapping[str, object], needs: str
+    ) -> Outcome:
+        """The second order alone; why the other results are missing."""
+        reason = f"{needs}; this study has none"
+        missing = {key: reason for key in self.rows() if key not in quantities}
+        if "S20.gain_per_volt" in missing:
+            missing["S20.gain_per_volt"] = "the voltage map is known, see S20.eq8_gain"
+        note = {"S20.gain_per_volt": _ABOUT} if "S20.gain_per_volt" in quantities else {}
+        return Outcome(quantities, note, figures=figures, missing=missing)
 
     def rows(self) -> Mapping[str, Quantity]:
-        """See `Experiment`."""
-        return paper_rows("S20.")
+        """See `Experiment`; without a triangle, the gain from the drive voltage too."""
+        rows = paper_rows("S20.")
+        return rows if self.study.has("triangle") else {**rows, **_PER_VOLT}

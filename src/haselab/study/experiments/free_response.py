@@ -54,12 +54,14 @@ class FreeResponseTest(Experiment[FreeResponse]):
     def fit(self, analysis: Analysis) -> Outcome:
         """See `Experiment`."""
         found = fit_free([analysis.observe(name) for name in self.recordings()])
-        quantities, missing = found.quantities, {}
+        quantities, missing, notes = found.quantities, {}, found.notes
         try:
-            quantities = {**quantities, **_against_chirp(found, analysis.need(Dynamics))}
+            dynamics = analysis.need(Dynamics)
+            quantities = {**quantities, **_against_chirp(found, dynamics)}
+            notes = {**notes, _DIFFERENCE: _discussed(quantities, dynamics)}
         except NotPlayedError as reason:
             missing = {_DIFFERENCE: str(reason)}
-        return Outcome(quantities, found.notes, figures=found.figures, missing=missing)
+        return Outcome(quantities, notes, figures=found.figures, missing=missing)
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""
@@ -72,3 +74,21 @@ def _against_chirp(free: Free, dynamics: Dynamics) -> dict[str, Estimate]:
     ratio = swing.value / sweep.value
     std = ratio * float(np.hypot(swing.std / swing.value, sweep.std / sweep.value))
     return {_DIFFERENCE: Estimate.normal(ratio - 1.0, std, "")}
+
+
+def _discussed(quantities: Mapping[str, Estimate], dynamics: Dynamics) -> str:
+    """The two frequencies, whether noise explains their difference, and what else differs."""
+    swing, sweep = quantities["S19.omega_0"], dynamics.quantities["S20.omega_n"]
+    difference = quantities[_DIFFERENCE]
+    low, high = difference.ci95
+    told = (
+        f"{swing.value:.4g} rad/s from the free response, {sweep.value:.4g} rad/s from the chirp: "
+        f"{100.0 * difference.value:+.2g} %"
+    )
+    if low <= 0.0 <= high:
+        return f"{told}, which the intervals of the two explain"
+    return (
+        f"{told}, more than the intervals of the two explain ({100.0 * low:.2g} to "
+        f"{100.0 * high:.2g} %). The experiments differ in amplitude and in what came before; a "
+        "spring that is not linear, or creep, gives such a difference"
+    )

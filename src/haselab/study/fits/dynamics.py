@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.frequency.response import estimate_frequency_response
@@ -19,8 +20,9 @@ from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
 
-__all__ = ["Dynamics", "fit_chirp", "fit_chirp_and_steps"]
+__all__ = ["Dynamics", "fit_chirp", "fit_chirp_and_steps", "fit_chirp_of_voltage"]
 
+Floats = NDArray[np.float64]
 _UPDATE_HZ = 100.0  # one new output per block, row S5
 _BEFORE_STEP_S = 4.0  # of a step trial, to estimate its initial state
 
@@ -49,11 +51,15 @@ class Dynamics:
 def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
     """Record of corrected strain (input) and strain (output), from a time on."""
     first = round(from_s / rig.block_s)
-    u = maps.voltage_map.strain(seen.drive_v)[first:]
+    return _held(seen, maps.voltage_map.strain(seen.drive_v), maps.length_m, rig, first)
+
+
+def _held(seen: Observation, u: Floats, length_m: float, rig: RigDescription, first: int) -> Record:
+    """An input that each block holds, and the strain from its first update on."""
     zero_s = seen.block_start_s[first] + rig.switch_sample / rig.rate_hz
     after = seen.frame_time_s >= zero_s
-    strain = seen.length_m[after] / maps.length_m - 1.0
-    return Record(u, _UPDATE_HZ, strain, seen.frame_time_s[after] - zero_s, None)
+    strain = seen.length_m[after] / length_m - 1.0
+    return Record(u[first:], _UPDATE_HZ, strain, seen.frame_time_s[after] - zero_s, None)
 
 
 def fit_chirp_and_steps(
@@ -128,19 +134,53 @@ def fit_chirp_and_steps(
     )
 
 
-def fit_chirp(chirp: Observation, maps: Maps, rig: RigDescription) -> dict[str, Estimate]:
+def fit_chirp(
+    chirp: Observation, maps: Maps, rig: RigDescription, stop_hz: float
+) -> tuple[dict[str, Estimate], dict[str, Any]]:
     """Fit the paper's second-order model to the chirp.
 
     Args:
         chirp: the chirp.
         maps: zero strain and the voltage map.
         rig: for the output's delay.
+        stop_hz: highest frequency of the chirp.
     Returns:
-        Results S20 of eq. 8 without a slow branch.
+        Results S20 of eq. 8 without a slow branch, and the section of analysis.json.
     Raises:
         ResultError: the fit has no result.
     """
-    return _second_order_results(_second_order(_record(chirp, maps, rig, 0.0)))
+    sweep = _record(chirp, maps, rig, 0.0)
+    printed = _second_order(sweep)
+    return _second_order_results(printed), {"chirp": _chirp_figure(sweep, printed, None, stop_hz)}
+
+
+def fit_chirp_of_voltage(
+    chirp: Observation, rig: RigDescription, lead_s: float, stop_hz: float
+) -> tuple[dict[str, Estimate], dict[str, Any]]:
+    """The second order from the drive voltage itself, where no voltage map is known.
+
+    Args:
+        chirp: the chirp; its strain counts from the length before it.
+        rig: for the output's delay.
+        lead_s: recorded before the chirp begins, in s.
+        stop_hz: highest frequency of the chirp.
+    Returns:
+        Gain in 1/V, natural frequency, damping ratio; and the section of analysis.json.
+    Raises:
+        ResultError: the fit has no result, or there is no frame before the chirp.
+    """
+    before = chirp.frame_time_s < chirp.frame_time_s[0] + lead_s
+    length_m = float(np.mean(chirp.length_m[before]))
+    sweep = _held(chirp, chirp.drive_v - chirp.drive_v[0], length_m, rig, 0)
+    found = _second_order(sweep)
+    gain, omega, zeta = _second_order_results(found).values()
+    figure = _chirp_figure(sweep, found, None, stop_hz)
+    del figure["u"]  # in V: the figure's axis is strain
+    gain_per_v = Estimate(gain.value, gain.std, gain.ci95, "1/V")
+    results = {
+        "S20.gain_per_volt": gain_per_v, "S20.eq8_omega_n": omega, "S20.eq8_zeta": zeta
+    }  # fmt: skip
+    return results, {"chirp": figure}
 
 
 def _second_order(sweep: Record) -> TransferFit:
@@ -178,7 +218,7 @@ def _checked(fit: TransferFit, what: str) -> TransferFit:
 
 
 def _chirp_figure(
-    sweep: Record, printed: TransferFit, both: TransferFit, stop_hz: float
+    sweep: Record, printed: TransferFit, both: TransferFit | None, stop_hz: float
 ) -> dict[str, Any]:
     index = (sweep.output_time_s * _UPDATE_HZ).astype(int)
     u = sweep.u[np.minimum(index, sweep.u.size - 1)]
@@ -189,7 +229,9 @@ def _chirp_figure(
     lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key not in words}
     omega_rad_s = 2.0 * np.pi * lines["frequency_hz"]
     thin = slice(None, None, max(1, sweep.y.size // 2000))
-    models = {"second order": printed, "second order plus slow branch": both}
+    models = {"second order": printed}
+    if both is not None:
+        models["second order plus slow branch"] = both
     curves = {name: fit.plant.frequency_response(omega_rad_s) for name, fit in models.items()}
     return {
         "time_s": sweep.output_time_s[thin],

@@ -191,10 +191,10 @@ def fit_free(trials: Sequence[Observation]) -> Free:
             "S19.eq6_rms": _repeated(np.array([p.rms_m for p in printed]), "m"),
         },
         notes={
-            "S19.omega_0": "eq. 6 with an exponential creep term; the creep is "
+            "S19.omega_0": "decaying oscillation with exponential creep; the creep is "
             f"{1e3 * _creep_m(fit):.2g} mm over the record, the rms residual is "
             f"{1e3 * float(np.sqrt(np.mean(left_m**2))):.2g} mm",
-            "S19.eq6_omega_0": "eq. 6 as printed, without a creep term" + _missing(printed),
+            "S19.eq6_omega_0": "decaying oscillation without a creep term" + _missing(printed),
         },
         figures={"free_response": _figure(trials, records, fit, printed)},
     )

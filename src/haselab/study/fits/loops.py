@@ -305,8 +305,8 @@ def _notes(
     scaled, pi, delayed_pi = gains
     setting, late = settings
     scaling = (
-        f"printed gains times {study.control.plant_gain:g} / {plant.gain:.4g}, the ratio of the "
-        "printed and the identified plant's gain (D8)"
+        f"kp and ki of [control] times {study.control.plant_gain:g} / {plant.gain:.4g}, the ratio "
+        "of the gain of the plant that they were chosen for and the identified plant's gain"
     )
     lowered = _lowered(scaled, pi, setting, plant)
     late_lowered = _lowered(scaled, delayed_pi, late, plant)

@@ -270,7 +270,8 @@ def line(
 def rows(runs: int = RUNS, structures: int = STRUCTURES, libraries: bool = True) -> list[Row]:
     """Return the goals; print the table of the other libraries."""
     found = [*time_rows(), *at_rest_rows(runs), *nuisance_rows(runs), *colour_rows(runs)]
-    found += structure_rows(structures)
+    if structures:  # each takes more than a minute
+        found += structure_rows(structures)
     for text in library_table() if libraries else ():
         print(text, flush=True)
     return found

@@ -181,7 +181,7 @@ def _execute(
     print_results(results, folder, as_json)
 
 
-def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> dict[str, Any]:
+def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> JsonObject:
     """A session's header with the date and the duration of the recording, for the provenance.
 
     Args:

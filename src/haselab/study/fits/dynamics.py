@@ -136,7 +136,7 @@ def fit_chirp_and_steps(
 
 def fit_chirp(
     chirp: Observation, maps: Maps, rig: RigDescription, stop_hz: float
-) -> tuple[dict[str, Estimate], dict[str, Any]]:
+) -> tuple[dict[str, Estimate], JsonObject]:
     """Fit the paper's second-order model to the chirp.
 
     Args:
@@ -156,7 +156,7 @@ def fit_chirp(
 
 def fit_chirp_of_voltage(
     chirp: Observation, rig: RigDescription, lead_s: float, stop_hz: float
-) -> tuple[dict[str, Estimate], dict[str, Any]]:
+) -> tuple[dict[str, Estimate], JsonObject]:
     """The second order from the drive voltage itself, where no voltage map is known.
 
     Args:

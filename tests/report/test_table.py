@@ -37,7 +37,7 @@ def test_columns_about_a_paper_stand_only_where_a_row_is_compared_with_one():
     head = results_table({"quantities": [row]}).splitlines()[0]
     assert head.split() == ["id", "unit", "measured", "95", "%", "interval"]
     compared = results_table({"quantities": [row, {**row, "id": "S16.mu", "paper": 1.0}]})
-    assert {"paper", "recomputed", "verdict"} <= set(compared.splitlines()[0].split())
+    assert {"paper", "recomputed", "agreement"} <= set(compared.splitlines()[0].split())
 
 
 def test_a_value_without_noise_outside_the_interval_is_said():

@@ -53,7 +53,7 @@ def test_the_trials_are_planned_and_counted(tmp_path):
     (step_test,) = (one for one in experiments_of(study) if one.table == "steps")
     played = step_test.recordings().items()
     planned = [(name, kind) for name, kind in played if name.startswith("own")]
-    assert planned == [(f"own-{k}", "step by open-loop") for k in (1, 2, 3)]
+    assert planned == [(f"own-{k}", "step with open-loop") for k in (1, 2, 3)]
     steps = study.steps
     (without,) = (one for one in experiments_of(builtin_study()) if one.table == "steps")
     bench = describe(twin_of_reading("hz"))

@@ -24,6 +24,7 @@ __all__ = [
     "check_unit",
     "column_option",
     "column_options",
+    "note_seconds",
     "note_units",
 ]
 

@@ -59,7 +59,7 @@ def test_the_command_prints_every_number_and_refuses_a_thin_dielectric(tmp_path:
     assert answer["feasible"] and all(check["ok"] for check in answer["checks"])
     (tmp_path / "twin.toml").write_text("[dielectric]\nbreakdown_v_per_m = 20e6\n")
     (tmp_path / "rig.toml").write_text('kind = "twin"\ntwin = "twin.toml"\n')
-    words = r"field is \d.* MV/m in step trials by the paper's sensing chain \(limit 18 MV/m"
+    words = r"field is \d.* MV/m in step trials with the paper's sensing chain \(limit 18 MV/m"
     with pytest.raises(LimitError, match=words):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 
@@ -67,7 +67,9 @@ def test_the_command_prints_every_number_and_refuses_a_thin_dielectric(tmp_path:
 def test_a_recorded_session_is_not_judged_and_not_read_back(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text('kind = "replay"\nsession = "s.h5"\n')
-    with pytest.raises(InputError, match=r"No table \[rating\] for a rig of kind 'replay'"):
+    with pytest.raises(
+        InputError, match=r"The rig file, of kind 'replay', has no table \[rating\]"
+    ):
         CliRunner().invoke(command, [str(STUDY), "--rig", str(path)], catch_exceptions=False)
     settings = safety_of(load_rig(path), {}, path)
     assert not settings.read_back and not settings.real_time
@@ -173,7 +175,7 @@ def test_a_fault_names_the_section_of_a_limit_that_two_sections_have(
     path = tmp_path / "rig.toml"
     path.write_text('kind = "twin"\n')
     file = load_rig(path)
-    with pytest.raises(InputError, match=rf"1 fault\(s\): {section}\.current_limit_a: "):
+    with pytest.raises(InputError, match=rf"1 error\(s\): {section}\.current_limit_a: "):
         if section == "safety":
             safety_of(file, {"current_limit_a": 0.0}, path)
         else:
@@ -192,7 +194,7 @@ def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> No
     plain = rig_of(TwinBench(config, 1), config)
     with (
         pytest.raises(
-            LimitError, match=r"current of 8\.198 mA in step trials by the paper's sensing chain"
+            LimitError, match=r"current is 8\.198 mA in step trials with the paper's sensing chain"
         ),
         armed_rig(plain, load_rig(path), path, builtin_study(), tmp_path),
     ):
@@ -210,7 +212,7 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
         found = judge_study(loud, describe(config), rating)
         bad = {check.name: check.where for check in found.checks if not check.ok}
         named = dict.fromkeys(
-            ("peak current", "time of an update"), "step trials by the paper's sensing chain"
+            ("peak current", "time of an update"), "step trials with the paper's sensing chain"
         )
         assert bad == (named if trials else {})
 

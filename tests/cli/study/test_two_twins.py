@@ -64,7 +64,7 @@ def test_a_twin_that_is_too_heavy_is_refused_with_every_advice(twin: Path, tmp_p
         )
     printed = str(refused.value)
     assert "inf" not in printed
-    assert "in step trials by the paper's sensing chain" in printed
+    assert "in step trials with the paper's sensing chain" in printed
     assert "The carrier alone needs all of the amplifier's current." in printed
     assert "Lower the voltage or the hung mass of 0.35 kg." in printed
 

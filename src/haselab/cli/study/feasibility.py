@@ -13,7 +13,7 @@ import numpy as np
 
 from haselab.base import InputError, to_plain
 from haselab.base.chart import Chart, Curve, Panel
-from haselab.cli.common import answer_options
+from haselab.cli.common import actuator_option, answer_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.cli.study.run import planned
@@ -41,11 +41,7 @@ def _page(found: Feasibility) -> str:
 @click.argument("study", type=click.Path(path_type=Path))
 @shared_option("--rig", required=True, type=click.Path(path_type=Path))
 @shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
-@shared_option(
-    "--actuator",
-    type=click.Path(path_type=Path),
-    detail="Its voltage of zero strain and its controller are used as by haselab run.",
-)
+@actuator_option("Uses its voltage of zero strain and its controller, as haselab run does.")
 @answer_options(plot=True)
 def command(
     study: Path,

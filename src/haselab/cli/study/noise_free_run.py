@@ -24,7 +24,7 @@ from haselab.study.definition import Study
 from haselab.study.experiment import Outcome
 from haselab.study.run import noise_free_results
 
-__all__ = ["NoiseFreeRun", "main"]
+__all__ = ["NoiseFreeRun", "SentValues", "main"]
 
 _END_S = 10.0
 

@@ -90,6 +90,8 @@ def loop_response(
         rate_hz: sampling rate of the loop, in Hz; None for a continuous loop.
     Returns:
         Complex response of the same shape.
+    Raises:
+        LimitError: `rate_hz` is None and the controller exists only sampled.
     Example:
         >>> from haselab.models import Plant
         >>> plant, gains = Plant(1.0, 20.0, 0.5), PidGains(0.0, 2.0)
@@ -100,7 +102,9 @@ def loop_response(
     omega = np.asarray(omega_rad_s, dtype=float)
     if rate_hz is None:
         if isinstance(gains, LinearController):
-            raise LimitError("rate = none; a sampled controller needs its own. Give the rate.")
+            raise LimitError(
+                "rate_hz is None, but this controller is only known at its own rate. Give rate_hz."
+            )
         delay = np.exp(-1j * omega * loop_delay_s)
         return np.asarray(gains.frequency_response(omega) * plant.frequency_response(omega) * delay)
     sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s)

@@ -102,9 +102,7 @@ def loop_response(
     omega = np.asarray(omega_rad_s, dtype=float)
     if rate_hz is None:
         if isinstance(gains, LinearController):
-            raise LimitError(
-                "rate_hz is None, but this controller is only known at its own rate. Give rate_hz."
-            )
+            raise LimitError("rate_hz is None, but this controller is sampled. Give its rate_hz.")
         delay = np.exp(-1j * omega * loop_delay_s)
         return np.asarray(gains.frequency_response(omega) * plant.frequency_response(omega) * delay)
     sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s)

@@ -104,10 +104,7 @@ def test_a_verdict_is_worded_and_coloured(page):
 
 def test_the_summary_counts_verdicts_and_values_without_noise(page):
     lead = re.search(r'<p class="lead">(.*?)</p>', page, re.DOTALL)[1]
-    assert (
-        "The natural frequency of the fast mode is 5.130 rad/s (95 % interval [5.090, 5.171], paper 5.11"
-        in lead
-    )
+    assert "natural frequency of the fast mode is 5.130 rad/s (95 % interval [5.090, 5.171]" in lead
     assert "9 results can be compared with the paper: 8 agree, 1 disagrees." in lead
     assert "10 of 10 intervals contain the noise-free value." in lead
 

@@ -177,7 +177,7 @@ def test_unknown_kinds_names_and_values_are_refused_with_what_to_do():
         actuator_law("dea-stack", {"layer": 3.0})
     with pytest.raises(InputError, match=r"actuator.layers = 0 is outside \[1, 100000\]"):
         actuator_law("dea-stack", {"layers": 0.0})
-    with pytest.raises(InputError, match=r"actuator.branch_share = 0.1 is not a list of numbers"):
+    with pytest.raises(InputError, match=r"branch_share is 0.1, but it must be a list of numbers"):
         actuator_law("dea-stack", {"branch_share": 0.1})
     with pytest.raises(InputError, match=r"actuator.layers = \(1.0,\) is not a number"):
         actuator_law("dea-stack", {"layers": (1.0,)})

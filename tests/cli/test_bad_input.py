@@ -218,7 +218,7 @@ def test_a_twin_that_cannot_be_is_one_line_that_names_every_fault(
         (["reproduce", "--out", "{out}", "--seed", "-1"], "-1 is not in the range"),
         (["reproduce", "--out", "{out}", "--seed", "99999999999999999999"], "not in the range"),
         (["reproduce", "--out", "{out}", "--reading", "khz"], "'khz' is not one of"),
-        (["reproduce", "--out", "{file}"], "--out names a file, not a folder. Name another one."),
+        (["reproduce", "--out", "{file}"], "--out names a file, not a folder. Name a new folder."),
         (["run", "{file}"], "Missing option '--rig'"),
         (["analyse"], "Missing argument"),
         (["design", "{file}", "--out", "{file}/controller.toml"], ""),

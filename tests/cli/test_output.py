@@ -208,7 +208,7 @@ def test_of_two_commands_that_write_one_name_the_second_is_refused(tmp_path, cap
             timeout=120, check=False,
         )  # fmt: skip
         assert done.returncode == 2
-        assert "--out" in done.stderr or "Another program writes to this" in done.stderr
+        assert "--out" in done.stderr or "Another program is writing to this" in done.stderr
         (out if kind == "file" else out / "results.json").write_text("of the first")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -256,8 +256,8 @@ def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
         first.send_signal(signal.SIGSTOP)  # it holds its lock, and does not end before the others
         os.waitid(os.P_PID, first.pid, os.WSTOPPED | os.WNOWAIT)
         before = bytes_of(out)
-        assert "Another program writes to this folder" in second()
-        assert "Another program writes to this folder" in second("--force")
+        assert "Another program is writing to this folder" in second()
+        assert "Another program is writing to this folder" in second("--force")
         assert bytes_of(out) == before
         first.send_signal(signal.SIGCONT)
         first.send_signal(signal.SIGINT)

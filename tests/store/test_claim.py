@@ -42,9 +42,9 @@ def other_process(folder: Path) -> str:
 def test_a_folder_belongs_to_one_process_until_its_context_ends(tmp_path):
     folder = tmp_path / "deep" / "run"
     with claimed_folder(folder):
-        assert "Another program writes to this folder" in other_process(folder)
+        assert "Another program is writing to this folder" in other_process(folder)
         (folder / "session.h5").write_text("x")
-        assert "Another program writes to this folder" in other_process(folder)
+        assert "Another program is writing to this folder" in other_process(folder)
         assert (folder / "session.h5").read_text() == "x"
     assert "claimed" in other_process(folder)
     assert (tmp_path / "deep" / "run.previous-1" / "session.h5").read_text() == "x"
@@ -118,7 +118,7 @@ def test_a_folder_that_is_written_to_is_not_moved_aside_nor_one_that_holds_it(tm
     with claimed_folder(live):
         (live / "session.h5").write_bytes(b"being recorded")
         for path in (live, tmp_path / "runs"):
-            with pytest.raises(InputError, match="Another program writes to this folder"):
+            with pytest.raises(InputError, match="Another program is writing to this folder"):
                 move_aside(path)
     assert (live / "session.h5").read_bytes() == b"being recorded"
     assert move_aside(tmp_path / "runs").name == "runs.previous-1"
@@ -157,7 +157,7 @@ def test_the_name_of_a_file_belongs_to_one_command_while_it_runs(tmp_path):
 def test_a_file_that_is_being_written_is_not_moved_aside(tmp_path):
     path = tmp_path / "a.csv"
     with claimed_file(path):
-        with pytest.raises(InputError, match="Another program writes to this file"):
+        with pytest.raises(InputError, match="Another program is writing to this file"):
             move_aside(path)
         path.write_text("result")
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]

@@ -110,7 +110,7 @@ def test_each_experiment_alone_declares_its_drives(table: str) -> None:
 
 
 def test_a_drive_about_an_unknown_baseline_is_refused_before_anything_moves() -> None:
-    with pytest.raises(InputError, match=r"no \[triangle\].*Give operating_point.baseline_v"):
+    with pytest.raises(InputError, match=r"no \[triangle\].*Add operating_point.baseline_v"):
         study_drives(part("chirp"), describe(TwinConfig()))
 
 

@@ -141,7 +141,7 @@ def test_only_a_bench_decides_the_reading(config: dict[str, object], word: str) 
     names = {"S20.omega_n": 32.1, "S19.omega_0": 32.0, "S19.decay_1": 3.6, "S19.decay_2": 4.2}
     found = axis_interpretation({k: Estimate.normal(v, 0.1, "") for k, v in names.items()}, config)
     assert found["verdict"].startswith(word)
-    assert "reading Hz" in found["verdict"]
+    assert "the data support Hz" in found["verdict"]
 
 
 def test_the_decay_under_each_reading_has_the_printed_damping() -> None:

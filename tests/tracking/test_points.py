@@ -446,7 +446,7 @@ def test_options_out_of_range_are_refused(choice, match):
 def test_frames_that_do_not_fit_are_refused():
     tracker = PointTracker(np.array([[45.0, 45.0]]))
     state = tracker.init([TEXTURE])
-    with pytest.raises(InputError, match=r"shape \(90, 80\), but but the reference \(90, 90\)"):
+    with pytest.raises(InputError, match=r"shape \(90, 80\), but the reference \(90, 90\)"):
         tracker.step(state, TEXTURE[:, :80])
     with pytest.raises(InputError, match=r"float64 of shape.*expected uint8 or uint16"):
         tracker.step(state, TEXTURE.astype(float))

@@ -101,7 +101,7 @@ def test_swapped_references_are_refused(rig_file, monkeypatch, capsys):
     values = iter([2.2e-9, 0.47e-9, None])
     monkeypatch.setattr(click, "confirm", lambda *a, **k: bench.connect(next(values)))
     assert run(["--rig", "twin", "--capacitor", "0.47e-9", "--capacitor", "2.2e-9"]) == 3
-    assert "turned by -178 deg" in capsys.readouterr().err
+    assert "phase error of -178 deg" in capsys.readouterr().err
 
 
 def test_a_rig_file_that_is_not_there_is_refused(tmp_path, capsys):

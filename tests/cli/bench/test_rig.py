@@ -66,8 +66,9 @@ def test_a_fault_is_named_with_what_to_do_and_the_protocol_holds_it(tmp_path, ca
         code, out, err = call(capsys, "rig", "check", path, "--live", "--yes", "--save", save)
     assert code == 4
     assert err.splitlines()[-1].endswith(
-        "the voltage monitor has the wrong sign. Switch amplifier and supply off and discharge the "
-        "electrodes first. Swap the two wires of the voltage monitor at the board. Then run "
+        "the voltage monitor has the wrong sign. First switch the amplifier and the "
+        "supply off and discharge the electrodes. Swap the two wires of the voltage monitor at "
+        "the board. Then run "
         f"'haselab rig check' again. {path}"
     )
     assert "recommended for the rig file" not in out  # the file has what was measured
@@ -88,7 +89,7 @@ def test_a_bench_that_cannot_be_opened_has_not_passed(tmp_path, capsys) -> None:
     printed = json.loads(save.read_text())
     assert code == 4 and "its meter shows 80" in err
     assert printed["passed"] is False
-    assert "Pull its power jack" in printed["checks"][-1]["found"]
+    assert "Pull the power jack of" in printed["checks"][-1]["found"]
 
 
 def test_the_doctor_says_that_a_supply_is_on_and_leaves_it(tmp_path, capsys) -> None:
@@ -212,7 +213,7 @@ def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
 
 def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
     code, out, err = call(capsys, "rig", "safe", rig)
-    assert code == 0 and "0 V set" in out and out.count("off, by the instrument's own report") == 2
+    assert code == 0 and "0 V set" in out and out.count("off, as reported by the instrument") == 2
     assert err.startswith("Permission revoked.")
     assert "Revoking the permission and commanding 0 V. If this does not end," in err
 

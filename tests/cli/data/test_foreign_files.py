@@ -366,9 +366,9 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
     "case decides": (
         "u (mpa);y\n1;2\n2;3\n",
         (),
-        "states the unit 'mpa', which is not known",
+        "states the unit 'mpa', which is unknown",
     ),
-    "two marks": ("u;y\n0,5;1.234\n0,6;1.235\n", (), "Column y has decimal points, but other col"),
+    "two marks": ("u;y\n0,5;1.234\n0,6;1.235\n", (), "Column y has points, but other col"),
     "thousands": ("u;y\n0,5;1.234,5\n0,6;0,1\n", (), "Column y has '1.234,5' in line 2"),
     "empty cell": ("u;y\n0,5;1,5\n0,6;\n0,7;1,7\n", (), "Column y has no value in line 3"),
     "no header": (

@@ -337,7 +337,7 @@ def test_a_session_states_everything_that_its_codes_need(tmp_path, monkeypatch):
     [
         ({}, [], "a session with the experiments play. Name one with --experiment"),
         ({}, ["--experiment", "never"], "no experiment 'never' with blocks, only play."),
-        ({}, ["--experiment", "play", "--block-s", "0.02"], "blocks have 0.01 s"),
+        ({}, ["--experiment", "play", "--block-s", "0.02"], "with one output each, have 0.01 s"),
         ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),
         ({"study": {}}, ["--experiment", "play"], "lacks study.sensing"),
     ],

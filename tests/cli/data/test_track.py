@@ -128,7 +128,7 @@ def test_linking_real_colloids_warns_that_the_file_is_lossy(shared_data, tmp_pat
 @pytest.mark.parametrize(
     ("table", "match"),
     [
-        ("x_px,y_px\n1,2\n", "needed are point, x_px, y_px"),
+        ("x_px,y_px\n1,2\n", "but must have point, x_px, y_px"),
         ("point,x_px,y_px\na,1,two\n", "not a number"),
         ("point,x_px,y_px\na,50,50\na,60,60\n", "same name"),
         ("point,x_px,y_px\na,2,50\n", "too close to the edge"),
@@ -268,7 +268,7 @@ def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, ca
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        (("--scale-mm-per-px", "0"), "--scale-mm-per-px 0 is not a positive number"),
+        (("--scale-mm-per-px", "0"), "--scale-mm-per-px is 0. Use a positive number"),
         (("--scale-mm-per-px", "nan"), "is not a finite number"),
         (("--scale-points", "1,2,3,4"), "not of the form X1,Y1,X2,Y2,MM"),
         (("--scale-points", "1,2,3,4,0"), "not a positive length"),
@@ -298,7 +298,7 @@ def test_points_outside_the_picture_are_named(clip, tmp_path, capsys):
     points = table(tmp_path / "p.csv", ["a,50,40", "b,221,40", "c,10,-3"])
     assert call(clip, "--points", points, "--out", tmp_path / "t.csv") == 2
     error = capsys.readouterr().err
-    assert "2 of 3 points lie outside the picture, the first is 'b' at (221, 40) px" in error
+    assert "2 of 3 points are outside the frame, the first is 'b' at (221, 40) px" in error
     assert "x from 0 to 219" in error
 
 
@@ -315,7 +315,7 @@ def test_a_truncated_video_keeps_what_was_read_and_ends_with_code_2(tmp_path, ca
     assert 10 < kept < 30
     assert len(read(out)) == 6 * kept
     assert len(read(tmp_path / "t-strain.csv")) == kept
-    assert "copy it again" in summary["incomplete"]
+    assert "Copy it again" in summary["incomplete"]
     assert f"Only {kept} frames were tracked; their rows are kept" in captured.err
     assert captured.err.count("\n") == 1
 

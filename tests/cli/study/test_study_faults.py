@@ -84,7 +84,7 @@ def test_an_interrupt_in_mid_run_keeps_what_was_recorded(tmp_path: Path, number:
     assert run.returncode == 130
     assert len(printed) == 1
     assert printed[0].startswith("haselab: Interrupted. Output at 0 V; ")
-    assert printed[0].endswith(f"What was recorded is kept in {tmp_path}.")
+    assert printed[0].endswith(f"The data recorded so far are kept in {tmp_path}.")
     with SessionReader(path) as session:
         assert len(session.experiment("triangle").codes) >= 100
         assert any("output at 0 V" in what for _, what in session.events())

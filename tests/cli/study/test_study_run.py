@@ -137,7 +137,8 @@ def refused_by_analyse(folder: Path) -> str:
 
 
 INTERRUPTED = (  # and the folder
-    r"haselab: Interrupted\. Output at 0 V; \S+ V read back\. What was recorded is kept in \S+\.$"
+    r"haselab: Interrupted\. Output at 0 V; \S+ V read back\. "
+    r"The data recorded so far are kept in \S+\.$"
 )
 
 

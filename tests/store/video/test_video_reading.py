@@ -199,7 +199,7 @@ def test_a_truncated_stack_gives_its_whole_pages_and_then_says_so(tmp_path):
     (tmp_path / "s.tif").write_bytes(whole[: len(whole) - 2 * 2000 - 1000])
     seen = []
     with (
-        pytest.raises(InputError, match=r"Page 3 of 6 cannot be read.*copy it again"),
+        pytest.raises(InputError, match=r"Page 3 of 6 cannot be read.*Copy it again"),
         open_video(tmp_path / "s.tif") as video,
     ):
         for frame in video:
@@ -216,7 +216,7 @@ def test_a_stack_whose_chain_of_pages_is_cut_gives_the_pages_before_and_says_so(
     (tmp_path / "s.tif").write_bytes(whole[: len(whole) // 2])
     seen = []
     with (
-        pytest.raises(InputError, match=r"(breaks off after|Page) .*copy it again"),
+        pytest.raises(InputError, match=r"(breaks off after|Page) .*Copy it again"),
         open_video(tmp_path / "s.tif") as video,
     ):
         for frame in video:

@@ -13,7 +13,7 @@ from haselab.base import InputError, LimitError
 __all__ = ["StrainMap"]
 
 Floats = NDArray[np.float64]
-_BEYOND = 0.25  # of the width of the fitted range, on either side
+_BEYOND = 1.0  # of the width of the fitted range, on either side
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class StrainMap:
 
         Creep, overshoot and another load take an actuator a little beyond the record that was
         fitted: there the strain is extrapolated, beyond its band but still a strain to control.
-        Further out than a quarter of the fitted range, a cubic may bend anywhere.
+        Further out than the width of the fitted range, the map is not used.
         """
         if self.range_f is None:
             return -math.inf, math.inf

@@ -83,7 +83,7 @@ def _layout(file: BinaryIO, path: Path) -> _Layout:
         raise broken(
             f"The .cine file ends at byte {size}, but its header extends to byte "
             f"{offsets + 8 * count}",
-            "It is truncated; copy it again.",
+            "It is truncated. Copy it again.",
             path,
         )
     depth = depth if 0 < depth <= bits else bits
@@ -157,7 +157,7 @@ class CineReader(VideoReader):
             if len(raw) < pixels * kind.itemsize:
                 raise broken(
                     f"The .cine file ends within frame {index} of {layout.count}",
-                    "It is truncated; copy it again.",
+                    "It is truncated. Copy it again.",
                     self.path,
                 )
             image = np.frombuffer(raw, kind).reshape(abs(layout.height), layout.width)

@@ -43,7 +43,7 @@ def _read_cihx(path: Path) -> _Header:
     match = re.search(rb"<cih>.*</cih>", _bytes(path), re.DOTALL)
     if match is None:
         raise broken(
-            "The header contains no <cih> section", "It is truncated; copy it again.", path
+            "The header contains no <cih> section", "It is truncated. Copy it again.", path
         )
     root = ElementTree.fromstring(match.group().decode("utf-8", errors="replace"))
     depth = int(root.findtext("imageDataInfo/effectiveBit/depth", "0"))
@@ -155,7 +155,7 @@ class MrawReader(VideoReader):
         return broken(
             f"The file has {got} bytes, {header.count} frames of {header.width} x {header.height} "
             f"px at {header.bits} bits need {header.count * self._frame_bytes}",
-            "It is truncated; copy it again.",
+            "It is truncated. Copy it again.",
             self.path,
         )
 

@@ -1,7 +1,8 @@
 """Options that exclude each other, and files that say too little, are refused in one line."""
 
-from __future__ import re
+from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest

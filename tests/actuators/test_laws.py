@@ -179,7 +179,7 @@ def test_unknown_kinds_names_and_values_are_refused_with_what_to_do():
         actuator_law("dea-stack", {"layers": 0.0})
     with pytest.raises(InputError, match=r"branch_share is 0.1, but it must be a list of numbers"):
         actuator_law("dea-stack", {"branch_share": 0.1})
-    with pytest.raises(InputError, match=r"actuator.layers = \(1.0,\) is not a number"):
+    with pytest.raises(InputError, match=r"layers is \(1.0,\), but it must be a number"):
         actuator_law("dea-stack", {"layers": (1.0,)})
 
 

@@ -36,7 +36,7 @@ def test_the_table_shows_choice_and_question(tmp_path, capsys):
     rows = [line for line in page.splitlines() if "<-" in line]
     assert [row.split()[0] for row in rows if "chosen" in row] == [f"{chosen:g}"]
     assert [row.split()[0] for row in rows if "given" in row] == ["1500"]
-    assert "Against 1500 Hz" in page
+    assert "Disadvantages of 1500 Hz" in page
     assert json.loads(out.read_text())["request"]["mains_hz"] == 60.0
 
 

@@ -358,7 +358,7 @@ def test_times_of_a_table_stand_as_they_are_and_must_reach_to_the_end(clip, tmp_
     assert found == pytest.approx(7 + 0.01 * np.arange(6), abs=1e-9)
     times.write_text("frame,time_s\n0,7\n1,8\n")
     assert call(clip, "--points", points, "--times", times, "--out", out, "--force") == 2
-    assert "The table of times has 2 frames, the video has more" in capsys.readouterr().err
+    assert "The table of times has 2 frames, but the video has more" in capsys.readouterr().err
 
 
 def test_a_lossy_file_is_named_as_such(tmp_path, capsys):

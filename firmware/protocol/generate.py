@@ -237,12 +237,14 @@ def module(table: Row) -> str:
 
 def page(table: Row) -> str:
     lines = [
-        "# The firmware's protocol",
+        "# Protocol between computer and microcontroller",
         "",
         f"Version {table['version']}. Generated from `firmware/protocol/protocol.toml`.",
         "",
         "This page lists all messages between the computer and the [microcontroller](firmware.md).",
-        "See the [glossary](../glossary.md#bench-and-safety) for terms such as arm and trip.",
+        "See the [glossary](../glossary.md#bench-and-safety) for terms such as arm and trip. An",
+        "*update* is one step of the controller, a *code* an integer of a converter, and the",
+        "*level* the high voltage as the voltage monitor shows it.",
         "",
         "A frame is COBS(code u8, sequence u16, fields, CRC-16/CCITT-FALSE u16), then one byte 0,",
         "in both directions. Numbers are little endian; the link has 500,000 baud, 8 bits, no",
@@ -259,7 +261,7 @@ def page(table: Row) -> str:
                 lines += ["| field | type | what |", "|---|---|---|"]
                 lines += [f"| {f['name']} | {f['type']} | {f['help']} |" for f in message["fields"]]
                 lines.append("")
-    lines += ["## Lists", ""]
+    lines += ["## Values of states, faults and other fields", ""]
     for group in table["list"]:
         lines += [f"**{group['name']}**: {group['help']}", "", "| code | name | what |",
                   "|---|---|---|"]  # fmt: skip

@@ -53,7 +53,7 @@ def design(
         controller: "pi" or "pid".
         limits: lowest and highest output of the controller, in the unit of the model's input.
         rate_hz: updates of the loop a second, in Hz.
-        delay_s: age of a measurement when the controller uses it, in s.
+        delay_s: age of a measurement when the output computed from it takes effect, in s.
         probability: share of the plausible plants that has to keep the margins; a fit only.
         seed: of the search.
     Returns:

@@ -27,7 +27,10 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--controller": ("KIND", "Choose the controller."),
     "--controller-source": ("FILE.c", "Compile this C file in place of the PID controller."),
     "--current-limit-a": (None, "Set the current limit of the amplifier in A."),
-    "--delay-s": (None, "Set the age of a measurement when the controller uses it, in s."),
+    "--delay-s": (
+        None,
+        "Set the age of a measurement when the output computed from it takes effect, in s.",
+    ),
     "--duration-s": (None, "Set the duration in s."),
     "--experiment": ("NAME", "Name the experiment in the session."),
     "--held-at-hz": (None, "State the update rate of the output converter in Hz."),

@@ -25,8 +25,8 @@ class LoopSetting:
 
     Args:
         rate_hz: sampling rate, in Hz.
-        measurement_delay_s: age of a measurement when the controller uses it, in s (half the
-            averaged block, and input/output), without the hold.
+        measurement_delay_s: age of a measurement when the output computed from it takes effect, in
+            s (half the averaged block, and input/output), without the hold.
         saturation: limits of the controller's output.
         initial_u: constant drive strain before the first sample, at which the plant is in steady
             state.

@@ -161,7 +161,7 @@ def _carrier(
     """Choose the sensing frequency with the smallest error.
 
     The error includes the monitors' noise (Cramer-Rao bound), the steps of the output, mains
-    harmonics, and harmonics of the carrier that the converter folds back.
+    harmonics, and aliased harmonics of the carrier.
     """
     request = CarrierRequest(update_s=None if update_unknown else update_s, **options)
     given = judge_carrier(request, carrier_hz)

@@ -36,7 +36,7 @@ _TICK_S = 0.2  # Python handles signals between waits
 
 @click.group("twin")
 def command() -> None:
-    """Describe a simulated bench, or serve it on loopback."""
+    """Describe a simulated bench, or serve it to the drivers."""
 
 
 command.add_command(new)
@@ -108,10 +108,11 @@ def serve(
     as_json: bool,
     out: Path | None,
 ) -> None:
-    """Serve the twin of RIG as instruments on loopback.
+    """Serve the twin of RIG as instruments on this computer.
 
-    RIG is a rig file of kind "twin". The command prints a rig file that connects to the served
-    instruments, or writes it to --out, once they all answer. It ends on SIGINT (Ctrl-C) or SIGTERM.
+    RIG is a rig file of kind "twin". The servers listen on 127.0.0.1 only. The command prints a
+    rig file that connects to the served instruments, or writes it to --out, once they all answer.
+    It ends on SIGINT (Ctrl-C) or SIGTERM.
     """
     config, seed = rig_file(rig)
     ended = threading.Event()

@@ -307,8 +307,8 @@ def _request(options: dict[str, Any]) -> _Request:
 )  # fmt: skip
 @click.option(
     "--fixed", metavar="NAMES|P.csv",
-    help="Subtract the rigid motion of these fixed points, which moves camera and stand. Default: "
-    "none.",
+    help="Subtract the rigid motion of these points, which only move if the camera or its stand "
+    "moves. Default: none.",
 )  # fmt: skip
 @shared_option("--rate-hz", type=POSITIVE, detail="Default: the frame rate in the file.")
 @click.option(

@@ -188,15 +188,15 @@ def _examine() -> list[Finding]:
 @click.command("doctor")
 @shared_option(
     "--rig", type=click.Path(path_type=Path),
-    detail="Its instruments are identified, too. Default: none.",
+    detail="Its instruments are identified too. Default: none.",
 )  # fmt: skip
 @answer_options()
 def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
     """Report what is installed and which devices answer.
 
-    For everything else the command says how to fix it. It also examines serial ports, cameras, the
-    network and the process priorities of the operating system. With --rig it identifies every
-    instrument of that bench; outputs are not changed.
+    If something is missing or does not answer, the command says how to fix it. It also examines
+    serial ports, cameras, the network and the process priorities of the operating system. With
+    --rig it identifies every instrument of that bench; outputs are not changed.
     """
     findings = _examine()
     file = None if rig is None else load_rig(rig)

@@ -88,7 +88,7 @@ def _between(
 )  # fmt: skip
 @click.option(
     "--electrode-natural", type=REAL,
-    help="Fit electrodes too, which are free of stress at this stretch. Default: no electrodes.",
+    help="Fit electrodes too; they have no stress at this stretch. Default: no electrodes.",
 )  # fmt: skip
 @click.option(
     "--electrode-stiffening", is_flag=True, help="Fit a cubic term of the electrodes too."

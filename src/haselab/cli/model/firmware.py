@@ -100,8 +100,8 @@ def build(
 ) -> None:
     """Compile the firmware with the gains in RUN.
 
-    RUN is an actuator file or the folder of a run. The firmware gets its maps, limits and gains.
-    `haselab firmware simulate` measures its use of stack and processor time.
+    RUN is an actuator file or the folder of a run, with the maps, limits and gains to compile in.
+    `haselab firmware simulate` measures how much stack and processor time the firmware uses.
     """
     load_run(run)  # warns of misspelled keys
     file = None if rig is None else _chip_file(rig, board)

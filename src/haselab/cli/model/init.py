@@ -50,7 +50,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
 # natural_frequency_rad_s = 32.0
 # damping_ratio = 0.12
 # rate_hz = 100.0  # of the loop
-# loop_delay_s = 0.0075  # age of a measurement when the controller uses it
+# loop_delay_s = 0.0075  # age of a measurement when the output computed from it takes effect
 
 [controller]
 # haselab design writes the controller with its margins.

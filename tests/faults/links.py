@@ -159,7 +159,7 @@ class SharedNumber:
 
     def __init__(self, path: Path) -> None:
         with path.open("a+b") as file:
-            if file.execute() < 8:
+            if file.tell() < 8:
                 file.truncate(8)
             self._map = mmap.mmap(file.fileno(), 8)
 

@@ -153,11 +153,11 @@ def test_a_drive_or_a_strain_that_the_chip_does_not_take_is_refused_before_it_is
     chip: CoSim, bench: ChipBench, settings: ChipSettings
 ) -> None:
     rig = armed(bench, settings)
-    with pytest.raises(LimitError, match=r"closes its own loop accepts only 0 V\. Ask it"):
+    with pytest.raises(LimitError, match=r"accepts only 0 V\. Request a strain"):
         rig.source.write(0.5)
     with pytest.raises(LimitError, match=r"desired strain = 0\.5 is outside"):
         follow(rig, 0.5, 1)
-    with pytest.raises(LimitError, match=r"carrier of the chip = 2000 Hz is outside"):
+    with pytest.raises(LimitError, match=r"carrier of the microcontroller = 2000 Hz is outside"):
         rig.generator.sine(2000.0, 0.02)
     assert not any(out.enable for out in chip.outputs)
 
@@ -212,7 +212,7 @@ def test_a_chip_that_sees_no_carrier_says_so_when_it_is_armed(
 def test_one_bad_update_at_the_moment_of_running_is_no_fault(
     chip: CoSim, bench: ChipBench, settings: ChipSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig, asked, plain = armed(bench, settings), [], chip.ask
+    rig, asked, plain = armed(bench, settings), [], chip.query
 
     def once_blind(message: object, wait_s: float | None = None) -> object:
         asked.append(message)
@@ -221,7 +221,7 @@ def test_one_bad_update_at_the_moment_of_running_is_no_fault(
             return Ack(Run.CODE, 0, Result.NOT_READY, 0)
         return plain(message, wait_s)
 
-    monkeypatch.setattr(chip, "ask", once_blind)
+    monkeypatch.setattr(chip, "query", once_blind)
     follow(rig, 0.02, 50)
     assert chip.outputs[-1].on
 
@@ -456,7 +456,7 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
     code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "twin.toml", "--out",
                    tmp_path / "out")  # fmt: skip
     assert code == 2
-    assert 'which only a rig with kind = "mega" plays' in capsys.readouterr().err
+    assert 'which needs a rig with kind = "mega"' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

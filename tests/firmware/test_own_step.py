@@ -176,7 +176,7 @@ def test_the_name_of_the_c_file_is_the_kind_where_none_is_given(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("alternative", "kind", "source", "said"),
     [
-        ("", "own", None, r"no controller of kind 'own'; it holds pid, pi"),
+        ("", "own", None, r"no controller of kind 'own', only pid, pi"),
         ('kind = "open-loop"', "open-loop", None, "'open-loop' has no C step"),
         ('kind = "lqr"', "lqr", None, "No controller of kind 'lqr' is registered"),
         ('kind = "lqr"\nparameters = {gain = "much"}', "lqr", C_FILE, "number"),

@@ -91,7 +91,7 @@ def test_a_capacitance_far_outside_the_strain_map_has_no_strain_and_trips(
     built = build_firmware(replace(settings, usable_f=usable_f), tmp_path)
     with CoSim(cosim_program, built.elf, twin) as chip:
         close_loop(chip, 0.0, 0.3)
-        chip.tell(SetReference(0.05))
+        chip.execute(SetReference(0.05))
         chip.run(0.5)
         assert status(chip).fault == Fault.SENSING
         assert not chip.outputs[-1].on

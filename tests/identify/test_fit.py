@@ -302,7 +302,7 @@ def test_a_fit_without_a_result_says_why_and_does_nothing_else():
     fit = fit_map(np.tile([0.0, 1.0], 10), np.random.default_rng(1).normal(size=20))
     assert "no result" in fit.summary() and "no result" in fit._repr_html_()
     for use in (lambda: fit.simulate([1.0]), lambda: fit.compare([1.0], [1.0]), fit.plot):
-        with pytest.raises(ResultError, match="no result: x takes 2 values"):
+        with pytest.raises(ResultError, match="no result: x has only 2 distinct values"):
             use()
 
 

@@ -123,7 +123,7 @@ def test_noise_alone_gives_no_result_and_bad_trials_are_refused():
         fit_free_response([])
     with pytest.raises(InputError, match="throughout"):
         FreeTrial(np.ones(20), np.arange(20.0))
-    with pytest.raises(InputError, match="rising times"):
+    with pytest.raises(InputError, match="the times must rise"):
         FreeTrial(np.arange(20.0), np.zeros(20))
 
 

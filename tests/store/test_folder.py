@@ -45,7 +45,7 @@ def test_a_disk_that_fills_up_keeps_the_old_file_whole(tmp_path, monkeypatch, st
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, step, full)
-    with pytest.raises(DeviceError, match=r"Cannot write \(No space left on device\); free .*txt$"):
+    with pytest.raises(DeviceError, match=r"\(No space left on device\)\. Free .*txt$"):
         write_text(path, "new")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]

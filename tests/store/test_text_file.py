@@ -113,7 +113,7 @@ def test_zero_is_a_moderate_number() -> None:
 
 def test_a_message_stays_short_whatever_is_in_the_file() -> None:
     many = {f"key{k}": "x" * 1000 for k in range(1000)}
-    with pytest.raises(InputError, match="1001 fault") as caught:
+    with pytest.raises(InputError, match="1001 error") as caught:
         validated(_Table, {"length_m": "y" * 10_000, **many}, "a.toml")
     assert str(caught.value).startswith("1001 error(s): length_m: ")
     assert "and 993 more" in str(caught.value)

@@ -180,7 +180,7 @@ class Fit(ABC):
     def _require(self) -> None:
         """Refuse to use a fit that has no result."""
         if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
 
 
 def _row(name: str, value: str, interval: str, unit: str) -> str:

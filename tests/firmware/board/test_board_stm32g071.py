@@ -398,7 +398,7 @@ def test_the_command_builds_for_a_board(
     built: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        main(["firmware", "build", str(HERE.parent / "data"), "--board", NAME, "--out",
+        main(["firmware", "build", str(HERE.parent / "data"), "--board", NAME, "--build-dir",
               str(tmp_path), "--json"])  # fmt: skip
     assert stop.value.code == 0
     assert json.loads(capsys.readouterr().out)["flash_bytes"] == built.flash_bytes

@@ -144,7 +144,7 @@ def test_one_step_from_rest_is_fitted_and_the_assumption_is_reported():
     y = PAPER.simulate(np.ones(1), 100.0, TIME_S) + 0.005 * rng.normal(size=4000)
     fit = fit_transfer([Record(np.ones(1), 100.0, y, TIME_S)])
     assert abs(fit.parameters["gain"].value - 0.5) <= 4 * fit.parameters["gain"].std
-    assert any("rest before the step" in note for note in fit.notes)
+    assert any("time before the step" in note for note in fit.notes)
 
 
 def test_bad_records_and_structures_are_refused():

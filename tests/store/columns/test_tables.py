@@ -73,7 +73,7 @@ def test_the_rate_of_a_csv_comes_from_even_times_only(tmp_path):
     [
         ("", "The file is empty. Export a header"),
         ("u,y\n", "Column u is empty"),
-        ("u,y\n1,2\n1,nan\n", r"Column y holds nan in row 2 \(1 such rows\)"),
+        ("u,y\n1,2\n1,nan\n", r"Column y has nan in row 2 \(1 such rows\)"),
         ("u,y\n1,2\n1,bad\n", "Column y has 'bad' in line 3"),
         ("u,y\n1,2\n1\n", "Column y has no value in line 3"),
         ("u,y\n1,2\n1,\n", "Column y has no value in line 3"),
@@ -110,7 +110,7 @@ def test_other_bad_files_are_refused(tmp_path):
 def test_a_name_that_is_there_twice_needs_its_group(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["one/u"], file["two/u"] = U, Y
-    with pytest.raises(InputError, match=r"there 2 times \(one/u, two/u\)"):
+    with pytest.raises(InputError, match=r"has 2 columns u \(one/u, two/u\)"):
         read_table(tmp_path / "a.h5", ["u"])
     assert read_table(tmp_path / "a.h5", ["two/u"])["two/u"].tolist() == Y.tolist()
 

@@ -269,7 +269,7 @@ def test_a_full_disk_stops_the_recording_while_the_file_can_still_be_finished(
     path = tmp_path / "s.h5"
     free = 20_000_000
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - free, free))
-    full = pytest.raises(DeviceError, match=r"The disk is full: 5 MB left, 8 MB .*s\.h5$")
+    full = pytest.raises(DeviceError, match=r"The disk is full: 5 MB are left, 8 MB .*s\.h5$")
     with full, SessionWriter(path, PLANS, SAMPLES, HEADER) as session:
         for k, block in enumerate(blocks_of(45)):
             session.append_block("a", block, 0.01 * k, 0.0, 0.0)
@@ -292,7 +292,7 @@ def test_the_reserve_takes_the_note_of_how_it_ended(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_reported_before_the_first_block(tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(1, 1, 0))
-    with pytest.raises(DeviceError, match="The disk is full: 0 MB left"):
+    with pytest.raises(DeviceError, match="The disk is full: 0 MB are left"):
         SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER)
 
 
@@ -333,7 +333,7 @@ def test_a_place_that_cannot_hold_a_session_is_a_device_error(tmp_path):
 def test_the_limit_of_a_process_on_file_sizes_counts_as_a_full_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_size_limit", lambda: 9_000_000)
     session = SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER)
-    with pytest.raises(DeviceError, match="The disk is full: 8 MB left"):
+    with pytest.raises(DeviceError, match="The disk is full: 8 MB are left"):
         for k in range(2000):
             session.append_block("a", blocks_of(1, k)[0], 0.01 * k, 0.0, 0.0)
     session.close()

@@ -121,7 +121,7 @@ def test_an_export_comes_back_as_a_session_bit_for_bit(session, tmp_path, form):
     # The code -32768 has no counterpart: a converter's lowest reading is as good as clipped.
     if form == "tdms":
         plan = ImportPlan("back", columns, SAMPLES, None, VOLT)
-    with pytest.raises(InputError, match=r"Row 1 reads \[-10.*Raise --volt-per-code.*"):
+    with pytest.raises(InputError, match=r"Row 1 has \[-10.*Raise --volt-per-code.*"):
         import_session(out / file, tmp_path / "refused", plan)
     finer = ImportPlan("back", columns, SAMPLES, plan.rate_hz, 1.5 * VOLT)
     made = import_session(out / file, tmp_path / "again", finer)
@@ -142,7 +142,7 @@ def test_columns_that_cannot_be_a_session_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"50 samples, but a block has 2000.*a\.csv$"):
         import_session(path, tmp_path / "x", ImportPlan(rate_hz=1e3))
     np.savez(tmp_path / "c.npz", v=np.zeros(50, np.int16), i=np.zeros(50, np.int16), rate_hz=1e3)
-    with pytest.raises(InputError, match=r"hold integers.*Give --volt-per-code\. .*c\.npz$"):
+    with pytest.raises(InputError, match=r"contain integers.*Add --volt-per-code\. .*c\.npz$"):
         import_session(tmp_path / "c.npz", tmp_path / "y", ImportPlan(columns=("v", "i")))
 
 

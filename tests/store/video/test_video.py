@@ -175,7 +175,7 @@ def truncated(source: Path, target: Path, keep: float) -> Path:
     ("name", "keep", "match"),
     [
         ("readers/cine_781.cine", 0.7, "ends within frame 10 of 15.*truncated"),
-        ("readers/cine_781.cine", 0.001, "header reaches to byte.*truncated"),
+        ("readers/cine_781.cine", 0.001, "header extends to byte.*truncated"),
         ("readers/beam.mraw", 0.5, "has 327680 bytes, 4 frames.*need 655360.*truncated"),
         ("bulk-water.mov", 0.5, "cannot open the video.*copy is complete"),
         ("dic-challenge-14/L1.tif", 0.5, "cannot be read.*truncated or damaged"),

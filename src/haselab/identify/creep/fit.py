@@ -161,7 +161,7 @@ class CreepFit(RecordFit[Record]):
             ResultError: the fit has no result.
         """
         if self.fitted is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
@@ -193,7 +193,7 @@ class CreepFit(RecordFit[Record]):
             InputError: a time that is not above 0 s.
         """
         if not self.candidates:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         if not 0.0 < later_s < math.inf:
             raise InputError(f"later_s = {later_s:g} s; must be above 0 s.")
         entries = [_forecast(self.setting, candidate, later_s) for candidate in self.candidates]

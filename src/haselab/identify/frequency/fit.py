@@ -81,7 +81,7 @@ class ResponseFit(RecordFit[Record]):
                 zeros.
         """
         if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
@@ -116,7 +116,7 @@ class ResponseFit(RecordFit[Record]):
         """See `Fit`; magnitude and phase over frequency."""
         del names
         if not self.residuals:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         measured = self.modelled + self.residuals[0] + 1j * self.residuals[1]
         return lines_chart("Frequency response and fit", self.frequency_hz, measured, self.modelled)
 

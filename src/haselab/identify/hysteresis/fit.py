@@ -110,7 +110,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
             ResultError: the fit has no result.
         """
         if self.fitted is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:

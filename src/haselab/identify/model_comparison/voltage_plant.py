@@ -170,7 +170,7 @@ class VoltagePlantFit(RecordFit[Record]):
 
     def _fitted(self) -> VoltagePlant:
         if self.plant is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.plant
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:

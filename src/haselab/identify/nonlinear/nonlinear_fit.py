@@ -107,7 +107,7 @@ class NonlinearFit(TransferFit):
             ResultError: the fit has no result, or the slope of the curve is not different from 0.
         """
         if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         gain = self.parameters["gain"]
         if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
             raise ResultError(
@@ -141,7 +141,7 @@ class NonlinearFit(TransferFit):
 
     def _usable(self) -> Nonlinear:
         if self.model is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.model
 
     @property

@@ -92,7 +92,7 @@ class ArxFit(RecordFit[Record]):
 
     def _fitted(self) -> ArxModel:
         if self.model is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.model
 
     @property

@@ -64,7 +64,7 @@ class SubspaceFit(RecordFit[Record]):
             ResultError: the fit has no result.
         """
         if self.model is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.model
 
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
@@ -85,7 +85,7 @@ class SubspaceFit(RecordFit[Record]):
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
         if not self.residuals:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return sampled_chart("Subspace model", self.record, self.residuals[0], names)
 
     def answer(self) -> JsonObject:

@@ -66,7 +66,7 @@ class MapFit(CurveFit):
             ResultError: the fit has no result.
         """
         if self.curve is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.curve
 
     def value_std(self, x: ArrayLike) -> Floats:

@@ -79,7 +79,7 @@ class VoltageMapFit(CurveFit):
 
     def _fitted(self) -> _Curve:
         if self.curve is None:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return self.curve
 
     def simulate(self, x: ArrayLike) -> Floats:

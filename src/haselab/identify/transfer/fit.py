@@ -138,7 +138,7 @@ class TransferFit(RecordFit[Record]):
                 one resonance without zeros.
         """
         if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
@@ -167,7 +167,7 @@ class TransferFit(RecordFit[Record]):
             ResultError: the fit has no result, or a gain, pole or zero is not identifiable.
         """
         if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         gain, delay_s = (self.parameters[name].value for name in ("gain", "delay_s"))
         if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
             raise ResultError(
@@ -187,7 +187,7 @@ class TransferFit(RecordFit[Record]):
             ResultError: the fit has no result.
         """
         if not self.succeeded:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         return PlantPosterior.from_dict(covariance_table(self.parameters, self.covariance))
 
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
@@ -218,7 +218,7 @@ class TransferFit(RecordFit[Record]):
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
         if not self.records:
-            raise ResultError(f"The fit has no result: {self.status}")
+            raise ResultError(f"The fit gives no model: {self.status}")
         title = f"Transfer function, fit {self.fit_percent:.1f} %"
         return records_chart(title, self.records, self.residuals, (names or ("", "Output"))[1])
 

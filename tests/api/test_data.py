@@ -89,3 +89,8 @@ def test_records_pass_through():
     records = hl.records(SOURCES["dictionary"])
     assert hl.records(records) == records
     assert hl.records(records[0]) == records
+
+
+def test_one_row_with_a_time_is_too_short():
+    with pytest.raises(InputError, match="time_s has 1 times"):
+        hl.records({"time_s": [0.0], "u": [1.0], "y": [2.0]})

@@ -56,8 +56,10 @@ def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
     Returns:
         The clock of these times.
     Raises:
-        InputError: the times do not increase, or are too uneven for one rate.
+        InputError: fewer than two times, times that do not increase, or too uneven for one rate.
     """
+    if time_s.size < 2:
+        raise InputError(f"Column {name} has {time_s.size} times. Record longer: {file}")
     steps = np.diff(time_s)
     usual_s = float(np.median(steps))
     if not (steps > 0.0).all():

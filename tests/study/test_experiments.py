@@ -129,7 +129,7 @@ def test_what_an_experiment_needs_and_does_not_find_is_named() -> None:
     with pytest.raises(NotPlayedError, match=r"needs \[triangle\], which is not in this study"):
         analysis_of(part("chirp")).need(Maps)
     assert analysis_of(part("chirp")).find(Static) is None
-    with pytest.raises(NotPlayedError, match="an experiment that gives a int"):
+    with pytest.raises(NotPlayedError, match="an experiment that finds a int"):
         analysis_of(part("chirp")).need(int)
 
 
@@ -200,7 +200,7 @@ def test_the_code_of_another_package_that_fails_is_named(monkeypatch: pytest.Mon
 
 
 def test_a_result_without_a_row_is_refused() -> None:
-    with pytest.raises(ResultError, match=r"\[own\] gives own.result.*'rows' does not name"):
+    with pytest.raises(ResultError, match=r"\[own\] returns own.result.*'rows' does not list"):
         analysis_of(REFERENCE).outcome(_Unnamed(REFERENCE, _Settings()))
 
 
@@ -227,8 +227,8 @@ def test_packages_that_cannot_be_loaded_or_take_a_name_are_named(
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ('name = "x"\n[tringle]\nlow_v = 0\n', r"\[tringle\] that no installed experiment reads"),
-        ('name = "x"\n', "holds no experiment"),
+        ('name = "x"\n[tringle]\nlow_v = 0\n', r"\[tringle\], but no installed experiment"),
+        ('name = "x"\n', "has no experiment"),
         (
             'name = "x"\n' + TRIANGLE.replace("2.0", "200.0"),
             "triangle.high_v: .*less than or equal",

@@ -69,13 +69,14 @@ def test_a_fit_that_refuses_recorded_data_is_a_missing_result(
     for name in FITS:
         stand_in = _stand_in(GIVEN[name]) if name in GIVEN else _Anything()
         monkeypatch.setattr(where + name, lambda *_, value=stand_in, **__: value)
-    for name, value in (("design.measured_latency", 0.0), ("free_response._against_chirp", {})):
+    fixed = {"design.measured_latency": 0.0, "free_response._against_chirp": {}}
+    for name, value in (fixed | {"free_response._discussed": ""}).items():
         monkeypatch.setattr(where + name, lambda *_, value=value: value)
     monkeypatch.setattr(where + "steps.further_trials", lambda *_: ({}, {}, {}))
     for name in ("triangle", "operating_point"):
         monkeypatch.setattr(f"{where}{name}.Cycles.of", lambda *_: _Anything())
     monkeypatch.setattr(where + failing, _refuse)
-    with pytest.raises(ResultError, match=rf"{FITS[failing]}.*y has 3 samples.*is kept"):
+    with pytest.raises(ResultError, match=rf"{FITS[failing]}.*y has 3 samples.*are kept"):
         pipeline.investigate(lambda name: _Anything(), builtin_study(quick=True), _Anything())
 
 

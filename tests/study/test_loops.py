@@ -49,7 +49,7 @@ def test_outputs_that_wait_lower_the_gain_until_the_loop_holds(delay_s: float) -
 
 def test_where_no_gain_holds_it_says_what_to_change() -> None:
     still = Plant(1.0, 32.58, 1e-4)
-    with pytest.raises(ResultError, match=r"No PI holds 6 dB .* 500 ms\. Let fewer outputs wait"):
+    with pytest.raises(ResultError, match=r"No PI reaches .* 6 dB .* 500 ms\. Queue fewer outputs"):
         playable(still, PidGains(0.4, 500.0), setting(0.5))
 
 
@@ -65,7 +65,7 @@ def test_the_delay_that_a_note_states_is_the_one_that_its_margin_has() -> None:
     )
     assert _delay_text(loop, PLANT) == "a delay of 20.6 ms"
     alone = margins(replace(slow, delay_s=0.0), PRINTED, loop_delay_s=15.6e-3, rate_hz=100.0)
-    assert f"with the loop's alone {alone.gain_margin_db:.3g} dB" in _margin_note(
+    assert f"with the loop's delay only {alone.gain_margin_db:.3g} dB" in _margin_note(
         PRINTED, slow, loop
     )
 

@@ -112,7 +112,7 @@ def test_a_stretch_that_falls_with_the_voltage_is_no_result() -> None:
     study = builtin_study()
     turned = holds(study)
     turned[1] = replace(turned[1], length_m=1.1 * turned[1].length_m)
-    with pytest.raises(ResultError, match="must rise with the voltage"):
+    with pytest.raises(ResultError, match="must increase with the voltage"):
         find_point(turned, triangle(study), static(1.2, 1.6), study, RIG)
 
 

@@ -69,7 +69,7 @@ def rows_of(config: dict[str, object]) -> dict[str, dict[str, object]]:
 
 def test_rows_of_the_default_twin_say_what_was_set_in_it() -> None:
     rows = rows_of(HZ)
-    assert rows["S20.omega_n"]["set_in_twin"] == "frequency of the reading"
+    assert rows["S20.omega_n"]["set_in_twin"] == "frequency of the interpretation"
     assert "set_in_twin" not in rows["S24.error_open"]
     assert rows["S20.omega_n"]["noise_free"] == 1.05
     assert rows["S16.mu"]["truth"] == 15.6e3
@@ -136,12 +136,12 @@ def test_a_bench_is_neither_simulated_nor_set() -> None:
     assert not {"truth", "set_in_twin"} & set(row)
 
 
-@pytest.mark.parametrize(("config", "word"), [(HZ, "No verdict"), (BENCH, "The data support")])
+@pytest.mark.parametrize(("config", "word"), [(HZ, "No conclusion"), (BENCH, "The data support")])
 def test_only_a_bench_decides_the_reading(config: dict[str, object], word: str) -> None:
     names = {"S20.omega_n": 32.1, "S19.omega_0": 32.0, "S19.decay_1": 3.6, "S19.decay_2": 4.2}
     found = axis_interpretation({k: Estimate.normal(v, 0.1, "") for k, v in names.items()}, config)
     assert found["verdict"].startswith(word)
-    assert "the data support Hz" in found["verdict"]
+    assert "he data support Hz" in found["verdict"]
 
 
 def test_the_decay_under_each_reading_has_the_printed_damping() -> None:

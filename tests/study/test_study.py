@@ -147,7 +147,7 @@ def test_run_on_a_rig_file_plays_what_reproduce_plays(
     """The same study, twin and seed go into the same function: `analyse` shows what comes out."""
     played: list[tuple[Any, ...]] = []
 
-    def execute(study: Any, rig: Any, config: Any, seed: int, *others: Any) -> None:
+    def execute(study: Any, rig: Any, config: Any, seed: int, *others: Any, **_: Any) -> None:
         played.append((study, rig.description, config, seed))
 
     (tmp_path / "rig.toml").write_text('kind = "twin"\nreading = "hz"\nseed = 11\n')

@@ -50,7 +50,7 @@ def test_a_number_that_is_missing_has_no_deviation() -> None:
 
 
 def test_a_few_trials_say_whose_scatter_they_have() -> None:
-    assert _scatter_note(1, 4) == "one trial, with the scatter of the 4 PI trials"
-    assert _scatter_note(2, 4) == "2 trials, with the scatter of the 4 PI trials"
+    assert _scatter_note(1, 4) == "one trial; scatter taken from the 4 PI trials"
+    assert _scatter_note(2, 4) == "2 trials; scatter taken from the 4 PI trials"
     assert _scatter_note(1, 1) == ONE_TRIAL
     assert isinstance(STEPS, Steps)

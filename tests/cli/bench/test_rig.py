@@ -215,7 +215,7 @@ def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
     code, out, err = call(capsys, "rig", "safe", rig)
     assert code == 0 and "0 V set" in out and out.count("off, as reported by the instrument") == 2
     assert err.startswith("Permission revoked.")
-    assert "Revoking the permission and commanding 0 V. If this does not end," in err
+    assert "Revoking the permission and commanding 0 V. If this does not finish," in err
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def accepted(mass_kg: float) -> bool:
 def test_a_mass_that_would_be_refused_is_said_with_the_largest_one_that_is_not() -> None:
     """Before, "hang about 0.35 kg" led to a refusal."""
     printed = note(0.35, HZ.model_dump(mode="json"))
-    assert "with that mass the study would be refused (field of " in printed
+    assert "with that mass the study would be refused (field is " in printed
     best_kg = float(printed.rpartition("accepted is ")[2].removesuffix(" kg"))
     assert accepted(best_kg) and not accepted(best_kg + 0.01)
 

@@ -69,7 +69,7 @@ def test_the_gains_hold_their_margins_with_the_delay_of_the_serial_line(
 
 
 def test_a_supply_that_holds_no_step_is_refused() -> None:
-    with pytest.raises(ResultError, match=r"A supply of 1500 V .* leaves no step"):
+    with pytest.raises(ResultError, match=r"a supply of 1500 V.* leaves no room for a step"):
         design_miniature(RUN, SupplyModel(highest_v=1500.0), GAIN)
 
 

@@ -71,7 +71,7 @@ def test_changed_counts_a_fixed_baseline_and_another_twin_are_named() -> None:
     load = twin_of_reading("hz").load.model_copy(update={"mass_kg": 0.27})
     printed = changes_text(header(study, twin_of_reading("hz").model_copy(update={"load": load})))
     assert "another study, which changes rows S18, S10, S21 to S25" in printed
-    assert "operating_point.baseline_v 1.2 instead of left to the data" in printed
+    assert "operating_point.baseline_v 1.2 instead of found" in printed
     assert "steps.open_trials 1 instead of 6" in printed
     assert "load.mass_kg 0.27 instead of 0.25" in printed
 

@@ -94,3 +94,11 @@ def test_records_pass_through():
 def test_one_row_with_a_time_is_too_short():
     with pytest.raises(InputError, match="time_s has 1 times"):
         hl.records({"time_s": [0.0], "u": [1.0], "y": [2.0]})
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES))
+def test_a_rate_that_contradicts_the_times_is_refused(name):
+    (kept,) = hl.records(SOURCES[name], rate_hz=50.0)
+    assert kept.input_rate_hz == 50.0
+    with pytest.raises(InputError, match=r"rate_hz is 25, but the data have 50 rows per second"):
+        hl.records(SOURCES[name], rate_hz=25.0)

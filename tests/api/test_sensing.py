@@ -72,3 +72,27 @@ def test_points_follow_a_moving_pattern():
 def test_a_video_without_frames_is_refused():
     with pytest.raises(InputError, match="no frame"):
         hl.track([], np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize(
+    ("headers", "factors"),
+    [
+        (("v (mV)", "i (V)"), (1e3, 1.0)),
+        (("v (V)", "i (mA)"), (1.0, 2e-3 * 1e3)),
+        (("v (kV)", "i (V)"), (5000.0 * 1e-3, 1.0)),
+    ],
+)
+def test_units_of_a_file_give_the_scales(tmp_path, headers, factors):
+    rows = monitors().to_numpy() * factors
+    path = tmp_path / "a.csv"
+    np.savetxt(path, rows, "%.10g", ",", header=",".join(headers), comments="")
+    sensed = hl.sense(path, carrier_hz=CARRIER_HZ, rate_hz=RATE_HZ, v="v", i="i")
+    assert sensed["valid"].all()
+    assert sensed["capacitance_f"] == pytest.approx(CAPACITANCE_F, rel=0.01)
+
+
+def test_a_column_of_another_quantity_is_refused(tmp_path):
+    path = tmp_path / "a.csv"
+    np.savetxt(path, monitors().to_numpy(), "%.10g", ",", header="v (V),i (pF)", comments="")
+    with pytest.raises(InputError, match=r"column of --i is in pF, but must be in V or A"):
+        hl.sense(path, carrier_hz=CARRIER_HZ, rate_hz=RATE_HZ, v="v", i="i")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-__all__ = ["Data", "Session", "example", "load", "records", "table"]
+__all__ = ["Data", "Session", "checked_rate", "example", "load", "records", "table"]
 
 Floats = NDArray[np.float64]
 Data: TypeAlias = "Table | Mapping[str, ArrayLike] | pandas.DataFrame | xarray.Dataset | str | Path"
@@ -118,13 +118,40 @@ def table(data: Data, *, rate_hz: float | None = None) -> Table:
         raise InputError(
             f"The data have columns of the lengths {sorted(lengths)}. Give columns of one length."
         )
-    stated = getattr(data, "attrs", {}).get("rate_hz") if rate_hz is None else rate_hz
+    stated = getattr(data, "attrs", {}).get("rate_hz")
     time_name = next((name for name in _TIMES if name in columns), None)
     time_s = None if time_name is None else columns[time_name]
     if stated is None and time_s is not None:
         stated = rate_of_times(time_s)
-    rate = None if stated is None else float(stated)
+    rate = checked_rate(None if stated is None else float(stated), rate_hz, lengths.pop())
     return Table(columns, rate, time_name=time_name, time_s=time_s)
+
+
+def checked_rate(stated_hz: float | None, given_hz: float | None, rows: int) -> float | None:
+    """The rate that the caller gives, else that of the data.
+
+    Args:
+        stated_hz: by the data or their times; None: not at all.
+        given_hz: by the caller; None: not given.
+        rows: of the data: times with few digits state a rate only to 1.5 rows in all.
+    Returns:
+        The rate in Hz; None where nobody states one.
+    Raises:
+        InputError: the two contradict each other.
+    """
+    if given_hz is None or stated_hz is None:
+        return stated_hz if given_hz is None else float(given_hz)
+    if abs(stated_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
+        raise InputError(
+            f"rate_hz is {given_hz:g}, but the data have {stated_hz:.6g} rows per second. Leave "
+            "out rate_hz, or change the data."
+        )
+    return float(given_hz)
+
+
+def _median_hz(time_s: Floats) -> float | None:
+    step_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else 0.0
+    return 1.0 / step_s if step_s > 0.0 else None
 
 
 def _columns(data: Any) -> dict[str, Floats]:
@@ -174,14 +201,16 @@ def records(
         return [data]
     if isinstance(data, Sequence) and not isinstance(data, str):
         return list(data)
-    found = table(data, rate_hz=rate_hz)
+    found = table(data)
     for name in (input, output):
         if name not in found.columns:
             raise InputError(
                 f"There is no column {name!r}; the data have {', '.join(found)}. Name input and "
                 "output."
             )
-    rate = found.rate_hz if rate_hz is None else rate_hz
+    if rate_hz is not None and found.rate_hz is None and found.time_s is not None:
+        checked_rate(_median_hz(found.time_s), rate_hz, found[input].size)
+    rate = checked_rate(found.rate_hz, rate_hz, found[input].size)
     if rate is not None:
         return [Record.sampled(found[input], found[output], rate, hold=hold)]
     if found.time_s is None or found.time_name is None:

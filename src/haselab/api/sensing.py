@@ -11,10 +11,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.api.data import Data, table
+from haselab.api.data import Data, checked_rate, table
 from haselab.base import InputError
 from haselab.pipelines.sensing.series import DEFAULT_REQUEST
-from haselab.pipelines.sensing.source import lockin_config
+from haselab.pipelines.sensing.source import at_the_actuator, lockin_config
 from haselab.pipelines.sensing.table import columns_of
 from haselab.pipelines.tracking.points import find_points
 from haselab.sensing import Lockin
@@ -46,8 +46,8 @@ def sense(
         data: both monitors: a file, a DataFrame, a Dataset, a table or a dictionary.
         carrier_hz: frequency of the sensing signal, in Hz.
         rate_hz: samples a second, in Hz. None: as the data state it.
-        v: column of the voltage monitor, in V.
-        i: column of the current monitor, in V.
+        v: column of the voltage monitor, in V; or of the voltage itself, if its unit is kV.
+        i: column of the current monitor, in V; or of the current itself, if its unit is A.
         block_s: length of a block, in s.
         volt_per_monitor_volt: scale of the voltage monitor. None: 5000.
         ampere_per_monitor_volt: scale of the current monitor. None: 0.002.
@@ -57,16 +57,13 @@ def sense(
     Raises:
         InputError: a column that is missing, no rate, or fewer samples than one block.
     """
-    if isinstance(data, (str, Path)):
-        found = read_table(data, [v, i])
-    else:
-        found = table(data, rate_hz=rate_hz)
+    found = read_table(data, [v, i]) if isinstance(data, (str, Path)) else table(data)
     missing = [name for name in (v, i) if name not in found.columns]
     if missing:
         raise InputError(
             f"There is no column {missing[0]!r}; the data have {', '.join(found)}. Name v and i."
         )
-    rate = found.rate_hz if rate_hz is None else rate_hz
+    rate = checked_rate(found.rate_hz, rate_hz, found[v].size)
     if rate is None:
         raise InputError("The data state no sampling rate. Give rate_hz, or a column time_s.")
     request = replace(
@@ -75,6 +72,8 @@ def sense(
         volt_per_monitor_volt=volt_per_monitor_volt,
         ampere_per_monitor_volt=ampere_per_monitor_volt,
     )
+    units = found.units.get(v), found.units.get(i)
+    request = at_the_actuator(units, request, data if isinstance(data, (str, Path)) else "")
     samples = round(block_s * rate)
     blocks = found[v].size // samples if samples else 0
     if blocks == 0:

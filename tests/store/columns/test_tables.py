@@ -6,6 +6,7 @@ import pytest
 from scipy.io import savemat
 
 from haselab.base import InputError
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import read_table
 
 U = np.array([0.0, 1.5, -2.25e-9, 3.0])
@@ -119,3 +120,32 @@ def test_a_structure_of_an_old_mat_file_is_opened(tmp_path):
     savemat(tmp_path / "a.mat", {"run": {"u": U, "fs": 400.0}})
     table = read_table(tmp_path / "a.mat", ["u"])
     assert (table["u"].tolist(), table.rate_hz) == (U.tolist(), 400.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time_s,u,y\n0,1,2\n0.100000,1,0.000284,0.001784\n0.2,1,2\n", r"Line 3 has 4 cells"),
+        ("time_s,u,y\n0,1,2\n0.01,1,0e-2,7\n0.02,1,2\n", r"decimal comma"),
+        ("# rate_hz = 50\ntime_s,u,y\n0,1,2\n0.01,2,2\n0.02,3,2\n0.03,4,1\n", r"50 Hz.*100 rows"),
+        ("u (mV),y\nV,V\n1,2\n2,3\n", r"unit mV in its header, but V in the row below"),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused(tmp_path, text, words):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_table(path, ["u", "y"])
+
+
+@pytest.mark.parametrize("end", ["", ",", ",,", " , "])
+def test_empty_cells_at_the_end_of_a_row_are_no_surplus(tmp_path, end):
+    path = tmp_path / "a.csv"
+    path.write_text(f"u,y\n1,2\n2,3{end}\n4,5\n")
+    assert read_table(path, ["y"])["y"].tolist() == [2.0, 3.0, 5.0]
+
+
+def test_a_unit_for_a_column_that_is_not_there_is_refused(tmp_path):
+    as_csv(tmp_path / "a.csv")
+    with pytest.raises(InputError, match=r"--unit nope=V names no column of the file, .* u, y"):
+        read_table(tmp_path / "a.csv", ["u"], ColumnOptions(units={"nope": "V"}))

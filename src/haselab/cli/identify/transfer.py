@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,8 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
         name, _, value = pair.partition("=")
         try:
             fixed[name.strip()] = float(value)
+            if not math.isfinite(fixed[name.strip()]):
+                raise ValueError
         except ValueError as error:
             raise InputError(
                 f"--fix is {pair}. Use NAME=NUMBER, for example damping_ratio=0.09."

@@ -15,6 +15,7 @@ from haselab.base import InputError
 from haselab.sensing import ChargeConfig, LockinConfig
 from haselab.store.columns.reader import ColumnStream, check_rate, head_of_times, open_columns
 from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions
+from haselab.store.columns.units import Unit
 from haselab.store.session.reader import SessionReader, session_file
 
 if TYPE_CHECKING:
@@ -23,7 +24,15 @@ if TYPE_CHECKING:
 # Modules for sessions and calibrations are imported where these are opened: importing HDF5 and the
 # rig takes longer than sensing a gigabyte.
 
-__all__ = ["Request", "Source", "lockin_config", "open_source", "session_config", "too_short"]
+__all__ = [
+    "Request",
+    "Source",
+    "at_the_actuator",
+    "lockin_config",
+    "open_source",
+    "session_config",
+    "too_short",
+]
 
 _MOST_SAMPLES = 2_000_000  # of a block
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
@@ -188,7 +197,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
             use_times=request.rate_hz is None, options=request.columns,
         )
     )  # fmt: skip
-    request = _at_the_actuator(stream, request, path)
+    request = at_the_actuator((stream.units[0], stream.units[1]), request, path)
     rate_hz = _rate_hz(stream, request, path)
     charge = request.method == "charge"
     if request.carrier_hz is None and not charge:
@@ -222,14 +231,26 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     return Source(stream, config, 1.0, in_monitor_volts=unscaled)
 
 
-def _at_the_actuator(stream: ColumnStream, request: Request, path: Path) -> Request:
-    """Derive scales from stated units: kV and A are actuator values, V may be a monitor voltage."""
-    v, i = stream.units
+def at_the_actuator(
+    units: tuple[Unit | None, Unit | None], request: Request, source: Path | str
+) -> Request:
+    """Derive scales from stated units: kV and A are actuator values, V may be a monitor voltage.
+
+    Args:
+        units: of the columns of voltage and current; None where none is stated.
+        request: scales that it states are kept.
+        source: of the columns, for messages.
+    Returns:
+        The request with the scales.
+    Raises:
+        InputError: a unit of another quantity.
+    """
+    v, i = units
     for option, unit, good in (("--v", v, ("V",)), ("--i", i, ("V", "A"))):
         if unit is not None and unit.si not in good:
             raise InputError(
                 f"The column of {option} is in {unit.symbol}, but must be in {' or '.join(good)}. "
-                f"Name another column, or state its unit with --unit. {path}"
+                f"Name another column, or state its unit with --unit. {source}"
             )
     if v is not None and v.factor > 1.0 and request.volt_per_monitor_volt is None:
         request = replace(

@@ -22,7 +22,7 @@ from haselab.store.columns.text_layout import (
     layout_of,
     split_cells,
 )
-from haselab.store.columns.units import split_header
+from haselab.store.columns.units import parse_unit, split_header
 
 __all__ = ["CsvArchive"]
 
@@ -107,9 +107,14 @@ class CsvArchive(Archive):
         """From the row of units below the header, else from the header."""
         place = self._names.index(full)
         units = self._layout.units
-        if place < len(units) and units[place]:
-            return units[place].strip("[]() ")
-        return super().unit_text(full)
+        header = super().unit_text(full)
+        below = units[place].strip("[]() ") if place < len(units) else ""
+        if header and below and parse_unit(header, full) != parse_unit(below, full):
+            raise InputError(
+                f"Column '{full}' has the unit {header} in its header, but {below} in the row "
+                f"below. State the true one with --unit '{self.plain_name(full)}=UNIT': {self.file}"
+            )
+        return below or header
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
         """From a line like `# rate_hz = 400` above the header."""
@@ -210,7 +215,8 @@ class _Rows:
         if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
             return np.empty((0, len(self._names)))
         try:
-            return self._load(self._plain(lines))
+            if self._has_equal_rows(lines):
+                return self._load(self._plain(lines))
         except ValueError:
             pass
         rows = []  # quotes, separators after the last row, a cell that is no number
@@ -232,6 +238,14 @@ class _Rows:
             raise ValueError  # quoted cells
         return "\n".join(lines).replace(",", ".").split("\n")
 
+    def _has_equal_rows(self, lines: Sequence[str]) -> bool:
+        """Whether no row can have more cells than the table: those are read one by one."""
+        mark = self._layout.delimiter
+        if mark is None:
+            return True
+        between = sum(line.count(mark) for line in lines)
+        return between == sum(map(bool, map(str.strip, lines))) * (self._layout.cells - 1)
+
     def _load(self, lines: Sequence[str]) -> NDArray[np.float64]:
         return np.loadtxt(
             lines, delimiter=self._layout.delimiter, usecols=self._places, ndmin=2, comments="#"
@@ -239,6 +253,12 @@ class _Rows:
 
     def _row(self, line: str, number: int) -> list[float]:
         cells = split_cells(line.rstrip("\r").partition("#")[0], self._layout.delimiter)
+        width = self._layout.cells  # 0: no row of numbers was found
+        if width and any(cell.strip() for cell in cells[width:]):
+            raise InputError(
+                f"Line {number} has {len(cells)} cells, but the table has {width} "
+                f"columns. Is a comma in it a decimal comma? Change or remove it: {self._file}"
+            )
         row = []
         for name, place in zip(self._names, self._places, strict=True):
             cell = cells[place] if place < len(cells) else ""

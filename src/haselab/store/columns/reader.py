@@ -186,6 +186,12 @@ class ColumnStream(Closing):
     ) -> None:
         self._archive, self._options = archive, options
         self._names = archive.locate_all(names)
+        for name in options.units:
+            if archive.locate(name) is None:
+                raise InputError(
+                    f"--unit {name}={options.units[name]} names no column of the file, which has "
+                    f"{', '.join(archive.names)}: {archive.file}"
+                )
         self.units = [stated_unit(archive, name, options) for name in self._names]
         self._times: str | None = None
         self.assumed_seconds = ""  # column of times whose unit nobody states
@@ -195,6 +201,8 @@ class ColumnStream(Closing):
             self.rate_hz = archive.rate_hz(self._names)
             if self.rate_hz is None and use_times:
                 self._use_times()
+            elif self.rate_hz is not None:
+                self._check_stated_rate(self.rate_hz)
             self.rows = archive.rows(self._all_names)
         except InputError:
             raise
@@ -224,6 +232,23 @@ class ColumnStream(Closing):
         self._times = full if self.rate_hz is not None else None
         if self._times and assumed_seconds(self._archive, full, self._options):
             self.assumed_seconds = full
+
+    def _check_stated_rate(self, stated_hz: float) -> None:
+        """Compare a rate that the file states with its times."""
+        full = time_column(self._archive, self._options, self._names)
+        if full is None or full in self._names:
+            return
+        try:
+            (head,) = self._archive.start([full])(_HEAD_ROWS)
+        except InputError:
+            return  # a column that is only called like one of times
+        unit = stated_unit(self._archive, full, self._options)
+        found_hz = rate_of_times(head * (1.0 if unit is None else unit.factor))
+        if found_hz and abs(found_hz / stated_hz - 1.0) > max(1.5 / head.size, 1e-3):
+            raise InputError(
+                f"The file states a rate of {stated_hz:g} Hz, but column {full} has {found_hz:.6g} "
+                f"rows per second. Remove the wrong one: {self._archive.file}"
+            )
 
     def _empty(self) -> InputError:
         return InputError(f"Column {self._names[0]} is empty. Record again: {self._archive.file}")

@@ -311,3 +311,10 @@ def test_rescaling_keeps_correlations_and_marks_what_is_not_identifiable():
     found = rescaled(covariance, np.array([4.0, 3.0, np.inf]))
     assert found[:2, :2] == pytest.approx(np.array([[16.0, 6.0], [6.0, 9.0]]))
     assert np.isinf(found[2]).all() and np.isinf(found[:, 2]).all()
+
+
+@pytest.mark.parametrize("wrong", [None, "u.csv", 3.0, {"u": [1.0], "y": [1.0]}, [[1.0, 2.0]]])
+@pytest.mark.parametrize("fit", [fit_transfer, fit_arx, fit_hysteresis])
+def test_what_is_no_record_is_refused_with_how_to_make_one(fit, wrong):
+    with pytest.raises(InputError, match=r"is no record\. Make records .* haselab\.records"):
+        fit(wrong)

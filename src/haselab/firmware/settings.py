@@ -195,8 +195,9 @@ class ChipSettings:
         if not (np.diff(table) > 0.0).all() or table[0] < 0.0 or table[-1] > self.drive_high_v:
             raise InputError(
                 f"The voltage map goes from {table[0]:g} V to {table[-1]:g} V over the saturation, "
-                f"but it must rise within [0, {self.drive_high_v:g}] V. Narrow the saturation, or "
-                "raise drive_high_v."
+                f"but it must rise within [0, {self.drive_high_v:g}] V. Set [drive] high_v = "
+                f"{self.drive_high_v:g} in the actuator file, or give narrower --limits, and run "
+                "'haselab design' again."
             )
 
     @property

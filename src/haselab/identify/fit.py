@@ -6,7 +6,7 @@ import html
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
@@ -43,9 +43,9 @@ class Prediction:
     fit_percent: float
     rms_error: float
     inside_band: float
-    predicted: Floats
-    half_band: Floats
-    measured: Floats
+    predicted: Floats = field(repr=False)
+    half_band: Floats = field(repr=False)
+    measured: Floats = field(repr=False)
 
     @classmethod
     def of(
@@ -272,9 +272,15 @@ def several(records: Recorded | Sequence[Recorded]) -> list[Recorded]:
     Returns:
         At least one record.
     Raises:
-        InputError: an empty sequence.
+        InputError: an empty sequence, or something else than records.
     """
     found = list(records) if isinstance(records, Sequence) else [records]
+    for each in found:
+        if not (is_dataclass(each) and hasattr(each, "y")):
+            raise InputError(
+                f"{type(each).__name__} is no record. Make records of columns with "
+                "haselab.records(data, input, output)."
+            )
     if not found:
         raise InputError("records is empty. Give one record or more.")
     return found

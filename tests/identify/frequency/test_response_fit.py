@@ -154,7 +154,7 @@ def test_noise_alone_gives_no_result():
         noise = rng.normal(size=50) + 1j * rng.normal(size=50)
         fit = fit_response(AT_HZ, noise, np.full(50, np.sqrt(2.0)))
         assert fit.status.startswith("no result"), fit.parameters
-        with pytest.raises(ResultError, match="has no result"):
+        with pytest.raises(ResultError, match="gives no model"):
             _ = fit.plant
 
 

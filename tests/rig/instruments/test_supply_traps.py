@@ -423,7 +423,8 @@ def test_it_is_switched_off_from_outside_whatever_is_wrong_with_it(faults: dict[
         assert b.wire.rail_v > 0.0
         switch_supply_off(b.config)
         assert b.wire.rail_v == 0.0
-        assert b.server.converter_v <= 50.0
+        step_v = b.server.firmware.reach_v / 1023  # the meter has ten bits and shows whole steps
+        assert b.server.converter_v <= 50.0 + step_v
 
 
 def test_another_supply_is_switched_off_and_reported() -> None:

@@ -149,3 +149,12 @@ def test_a_unit_for_a_column_that_is_not_there_is_refused(tmp_path):
     as_csv(tmp_path / "a.csv")
     with pytest.raises(InputError, match=r"--unit nope=V names no column of the file, .* u, y"):
         read_table(tmp_path / "a.csv", ["u"], ColumnOptions(units={"nope": "V"}))
+
+
+def test_the_times_of_another_table_do_not_contradict_the_rate(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, u=np.arange(40.0), rate_hz=400.0, time_s=np.arange(5) / 100.0)
+    assert read_table(path, ["u"]).rate_hz == 400.0
+    np.savez(path, u=np.arange(40.0), rate_hz=400.0, time_s=np.arange(40) / 100.0)
+    with pytest.raises(InputError, match=r"rate of 400 Hz, but column time_s has 100 rows"):
+        read_table(path, ["u"])

@@ -239,6 +239,7 @@ class ColumnStream(Closing):
         if full is None or full in self._names:
             return
         try:
+            self._archive.rows([*self._names, full])  # refuses times of a table of another length
             (head,) = self._archive.start([full])(_HEAD_ROWS)
         except InputError:
             return  # a column that is only called like one of times

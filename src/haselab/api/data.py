@@ -15,7 +15,7 @@ from haselab.identify.record import Record
 from haselab.pipelines.examples.data_sets import find_data_set, write_data_set
 from haselab.pipelines.sensing.series import derived_series
 from haselab.pipelines.time_axis import records_of, time_axis
-from haselab.store.columns.reader import rate_of_times
+from haselab.store.columns.reader import rate_of_times, rates_agree
 from haselab.store.columns.table import Table, read_every_column
 from haselab.store.export.frames import session_dataset, session_tables
 from haselab.store.session.reader import SessionReader, session_file
@@ -133,7 +133,7 @@ def checked_rate(stated_hz: float | None, given_hz: float | None, rows: int) -> 
     Args:
         stated_hz: by the data or their times; None: not at all.
         given_hz: by the caller; None: not given.
-        rows: of the data: times with few digits state a rate only to 1.5 rows in all.
+        rows: of the data.
     Returns:
         The rate in Hz; None where nobody states one.
     Raises:
@@ -141,7 +141,7 @@ def checked_rate(stated_hz: float | None, given_hz: float | None, rows: int) -> 
     """
     if given_hz is None or stated_hz is None:
         return stated_hz if given_hz is None else float(given_hz)
-    if abs(stated_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
+    if not rates_agree(stated_hz, given_hz, rows):
         raise InputError(
             f"rate_hz is {given_hz:g}, but the data have {stated_hz:.6g} rows per second. Leave "
             "out rate_hz, or change the data."

@@ -76,7 +76,7 @@ class Controller(Protocol):
 
 @runtime_checkable
 class LinearisableController(Protocol):
-    """A controller whose feedback is linear, or is told as if it were: margins need it."""
+    """A controller that states a linear feedback, exact or linearised: margins need it."""
 
     def linear_feedback(self, period_s: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Transfer function in z from the measured strain, sign reversed, to the drive.

@@ -145,7 +145,7 @@ class ChipExperiments:
         for process in self._processes.values():
             assert process.stdin is not None
             with contextlib.suppress(OSError):
-                process.stdin.close()  # tells it to end
+                process.stdin.close()  # at the end of its input, it ends
             try:
                 process.wait(_END_S)
             except subprocess.TimeoutExpired:

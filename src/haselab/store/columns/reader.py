@@ -30,6 +30,7 @@ __all__ = [
     "open_columns",
     "pairs_of",
     "rate_of_times",
+    "rates_agree",
 ]
 
 _HEAD_ROWS = 4096
@@ -119,6 +120,22 @@ def rate_of_times(time_s: NDArray[Any]) -> float | None:
     return 1.0 / mean if even else None
 
 
+def rates_agree(one_hz: float, other_hz: float, rows: int) -> bool:
+    """Whether two rates of a record differ by at most 0.1 %, or 1.5 rows in total.
+
+    Args:
+        one_hz: a rate.
+        other_hz: another.
+        rows: of the record; times with few digits state its rate only to 1.5 rows.
+    Returns:
+        True if both can be meant.
+    Example:
+        >>> rates_agree(1000.5, 1000.0, 4096), rates_agree(1010.0, 1000.0, 4096)
+        (True, False)
+    """
+    return abs(one_hz / other_hz - 1.0) <= max(1.5 / rows, 1e-3)
+
+
 def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
     """Refuse a rate that differs from the file's by more than 0.1 % and 1.5 rows in total.
 
@@ -133,7 +150,7 @@ def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Pa
     Example:
         >>> check_rate(1000.0, 1000.5, 4096, "column time_s", Path("a.csv"))
     """
-    if abs(found_hz / given_hz - 1.0) > max(1.5 / rows, 1e-3):
+    if not rates_agree(found_hz, given_hz, rows):
         raise InputError(
             f"--rate-hz is {given_hz:g}, but {where} has {found_hz:.6g} rows per second. Leave out "
             f"--rate-hz, or change the file: {file}"
@@ -245,7 +262,7 @@ class ColumnStream(Closing):
             return  # a column that is only called like one of times
         unit = stated_unit(self._archive, full, self._options)
         found_hz = rate_of_times(head * (1.0 if unit is None else unit.factor))
-        if found_hz and abs(found_hz / stated_hz - 1.0) > max(1.5 / head.size, 1e-3):
+        if found_hz and not rates_agree(found_hz, stated_hz, head.size):
             raise InputError(
                 f"The file states a rate of {stated_hz:g} Hz, but column {full} has {found_hz:.6g} "
                 f"rows per second. Remove the wrong one: {self._archive.file}"

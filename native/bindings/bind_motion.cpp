@@ -3,10 +3,10 @@
 #include <nanobind/ndarray.h>
 
 #include <cstdint>
-#include <cstring>
 #include <stdexcept>
 #include <vector>
 
+#include "bindings/law.h"
 #include "bindings/records.h"
 
 extern "C" {
@@ -14,8 +14,6 @@ extern "C" {
 }
 
 namespace nb = nanobind;
-using Values = nb::ndarray<nb::numpy, const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Rows = nb::ndarray<nb::numpy, const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<nb::numpy, const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Kinds = nb::ndarray<nb::numpy, const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using OutRow = nb::ndarray<nb::numpy, double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
@@ -35,23 +33,7 @@ class Law {
     Law(double low_m, double step_m, double step_v, Values elastic_n, Values gap_m,
         Rows capacitance_f, Rows pull_n_v2)
     {
-        const size_t n = elastic_n.size(), rows = capacitance_f.shape(0);
-        need(n >= 4 && n <= MOTION_LENGTHS && gap_m.size() == n && capacitance_f.shape(1) == n &&
-                 pull_n_v2.shape(1) == n && pull_n_v2.shape(0) == rows &&
-                 rows <= MOTION_VOLTAGES && (rows == 1 || rows >= 4) && step_m > 0.0 &&
-                 step_v > 0.0,
-             "4 to 1024 lengths, 1 or 4 to 9 voltages, one grid");
-        law.lengths = static_cast<int32_t>(n);
-        law.voltages = static_cast<int32_t>(rows);
-        law.low_m = low_m;
-        law.step_m = step_m;
-        law.step_v = step_v;
-        std::memcpy(law.elastic_n, elastic_n.data(), n * sizeof(double));
-        std::memcpy(law.gap_m, gap_m.data(), n * sizeof(double));
-        for (size_t k = 0; k < rows; ++k) {
-            std::memcpy(law.capacitance_f[k], capacitance_f.data() + k * n, n * sizeof(double));
-            std::memcpy(law.pull_n_v2[k], pull_n_v2.data() + k * n, n * sizeof(double));
-        }
+        fill_law(law, low_m, step_m, step_v, elastic_n, gap_m, capacitance_f, pull_n_v2);
     }
     motion_law law{};
 };
@@ -91,7 +73,7 @@ void play(const Law &law, nb::handle parameters, nb::handle state, Values edge_s
     need(p.size() == 1 && s.size() == 1 && n > 0 && edge_s.size() == n + 1 &&
              mass_kg.size() == n && sensed.size() == n && mean_f.size() == n &&
              length_m.size() == time_s.size() && speed_m_s.size() == time_s.size() &&
-             p.data()->step_s > 0.0,
+             p.data()->step_s > 0.0 && p.data()->phase > 0.0,
          "one input, mass and mean for each interval; one length for each time");
     const motion_record record = {static_cast<int32_t>(n), edge_s.data(), in.data(),
                                   mass_kg.data(), sensed.data(),
@@ -134,6 +116,7 @@ NB_MODULE(_motion, m)
         FIELD(motion_parameters, charge_share),
         FIELD(motion_parameters, charge_s),
         FIELD(motion_parameters, step_s),
+        FIELD(motion_parameters, phase),
     });
     m.attr("STATE") = dtype_of<motion_state>({
         FIELD(motion_state, length_m),

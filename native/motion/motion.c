@@ -426,11 +426,30 @@ void motion_step(const motion_law *law, const motion_parameters *p, motion_state
     smooth_step(law, p, s, tangent, in, dt);
 }
 
+int32_t motion_steps(const motion_law *law, const motion_parameters *p, const motion_state *s,
+                     double duration_s)
+{
+    const cubic c = at_length(law, s->length_m);
+    double taut = 1.0 + p->softening_share, stiffness, fastest, step_s = p->step_s, wanted;
+    int k;
+    fastest = p->damping_n_s_m / p->inertia_kg;
+    for (k = 0; k < MOTION_BRANCHES; ++k) {
+        if (p->branch_share[k] > 0.0) {
+            taut += p->branch_share[k];
+            fastest = fastest > 1.0 / p->branch_s[k] ? fastest : 1.0 / p->branch_s[k];
+        }
+    }
+    stiffness = fabs(dot4(c.slope, law->elastic_n + c.first)) / law->step_m * taut;
+    fastest = fmax(fastest, sqrt(stiffness / p->inertia_kg));
+    step_s = fmin(step_s, p->phase / fastest);
+    wanted = ceil(duration_s / step_s - 1e-9);
+    return wanted > 1.0 ? (int32_t)fmin(wanted, 1e9) : 1;
+}
+
 void motion_advance(const motion_law *law, const motion_parameters *p, motion_state *s,
                     motion_tangent *tangent, const motion_input *in, double duration_s)
 {
-    const double wanted = ceil(duration_s / p->step_s - 1e-9);
-    const int32_t steps = wanted > 1.0 ? (int32_t)wanted : 1;
+    const int32_t steps = motion_steps(law, p, s, duration_s);
     int32_t k;
     for (k = 0; k < steps; ++k) {
         motion_step(law, p, s, tangent, in, duration_s / (double)steps);

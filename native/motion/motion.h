@@ -35,7 +35,8 @@ typedef struct {
     double branch_share[MOTION_BRANCHES], branch_s[MOTION_BRANCHES]; /* share 0: none */
     double damping_n_s_m, inertia_kg;
     double charge_share, charge_s; /* of the voltage that acts late; share 0: none */
-    double step_s;                 /* longest step of motion_advance */
+    double step_s;                 /* longest step */
+    double phase;                  /* of the fastest motion in a step, at most; rad */
 } motion_parameters;
 
 typedef struct {
@@ -101,7 +102,11 @@ void motion_rest(const motion_law *law, const motion_parameters *p, motion_state
 void motion_step(const motion_law *law, const motion_parameters *p, motion_state *s,
                  motion_tangent *tangent, const motion_input *input, double dt);
 
-/* A duration in equal steps of at most p->step_s. */
+/* Number of equal steps that a duration needs from this state on. */
+int32_t motion_steps(const motion_law *law, const motion_parameters *p, const motion_state *s,
+                     double duration_s);
+
+/* A duration in that many steps. */
 void motion_advance(const motion_law *law, const motion_parameters *p, motion_state *s,
                     motion_tangent *tangent, const motion_input *input, double duration_s);
 

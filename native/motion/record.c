@@ -96,11 +96,11 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
     int32_t k, next = 0;
     for (k = 0; k < record->intervals; ++k) {
         const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
-        const double wanted = ceil((to_s - from_s) / p->step_s - 1e-9);
-        const int32_t steps = wanted > 1.0 ? (int32_t)wanted : 1;
-        const double dt = (to_s - from_s) / (double)steps;
-        int32_t i;
+        int32_t steps, i;
+        double dt;
         moving.inertia_kg = p->inertia_kg + record->mass_kg[k];
+        steps = motion_steps(law, &moving, s, to_s - from_s);
+        dt = (to_s - from_s) / (double)steps;
         output->mean_f[k] = 0.0;
         if (tangent != NULL) {
             memset(output->mean_by + (int64_t)k * tangent->columns, 0,

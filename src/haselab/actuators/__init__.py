@@ -3,11 +3,12 @@
 from haselab.actuators.dea_stack import DeaStack
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, Parameter, parameter
 from haselab.actuators.losses import Circuit, Losses
-from haselab.actuators.motion import ActuatorState, advance, rates, simulate
+from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
 from haselab.actuators.planar_hasel import PlanarHasel
 from haselab.actuators.registry import actuator_kind, actuator_kinds, actuator_law
-from haselab.actuators.table import LawTable, law_table, motion_substeps
+from haselab.actuators.response import Drive, Response, motion_parameters
+from haselab.actuators.table import LawTable, law_table
 
 __all__ = [
     "VACUUM_F_PER_M",
@@ -15,20 +16,20 @@ __all__ = [
     "ActuatorState",
     "Circuit",
     "DeaStack",
+    "Drive",
     "LawTable",
     "Losses",
     "OperatingPoint",
     "Parameter",
     "PlanarHasel",
+    "Response",
     "actuator_kind",
     "actuator_kinds",
     "actuator_law",
-    "advance",
     "equilibrium_m",
     "law_table",
     "linearise",
-    "motion_substeps",
+    "motion_parameters",
     "parameter",
     "rates",
-    "simulate",
 ]

@@ -1,8 +1,7 @@
-"""Sample a law on a grid, which the compiled twin interpolates."""
+"""Sample a law on a grid, which the compiled motion interpolates."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +10,13 @@ from numpy.typing import NDArray
 from haselab.actuators.law import ActuatorLaw
 from haselab.base import InputError
 
-__all__ = ["LawTable", "law_table", "motion_substeps"]
+__all__ = ["LawTable", "law_table"]
 
 Floats = NDArray[np.float64]
-LENGTHS = 1024  # TWIN_LENGTHS of native/twin/twin.h
-VOLTAGES = 9  # TWIN_VOLTAGES
+LENGTHS = 1024  # MOTION_LENGTHS of native/motion/motion.h
+VOLTAGES = 9  # MOTION_VOLTAGES
 _SAME = 1e-9  # relative difference below which the voltage has no effect
 _INTERPOLATED = 1e-6  # largest error between the knots, of the largest value
-_PHASE = 0.1  # of the fastest motion in a substep, rad
-_MOST_SUBSTEPS = 100
 
 
 @dataclass(frozen=True)
@@ -43,6 +40,18 @@ class LawTable:
     gap_m: Floats
     capacitance_f: Floats
     pull_n_v2: Floats
+
+    def arrays(self) -> tuple[float, float, float, Floats, Floats, Floats, Floats]:
+        """All values, in the order that the compiled code takes them."""
+        return (
+            self.low_m,
+            self.step_m,
+            self.step_v,
+            self.elastic_n,
+            self.gap_m,
+            self.capacitance_f,
+            self.pull_n_v2,
+        )
 
 
 def _rows(law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats) -> tuple[Floats, Floats]:
@@ -128,30 +137,3 @@ def _check_smooth(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
                 f"lengths has a relative error of {error:.2g}, and at most {_INTERPOLATED:g} is "
                 "accepted. Remove steps and kinks from the law, or narrow length_limits_m."
             )
-
-
-def motion_substeps(law: ActuatorLaw, table: LawTable, step_s: float, mass_kg: float) -> int:
-    """Compute the number of substeps needed to resolve the fastest motion.
-
-    Args:
-        law: of the actuator.
-        table: of it.
-        step_s: one mechanical step.
-        mass_kg: smallest mass that will move, without the actuator's own.
-    Returns:
-        Number of substeps, at least 1.
-    Raises:
-        InputError: The actuator is too stiff for its mass.
-    """
-    losses = law.losses
-    taut = (1.0 + sum(losses.branch_share)) * (1.0 + losses.softening_share)
-    stiffness = float(np.abs(np.gradient(table.elastic_n, table.step_m)).max()) * taut
-    omega = math.sqrt(stiffness / (mass_kg + law.moving_mass_kg))
-    wanted = math.ceil(omega * step_s / _PHASE)
-    if wanted > _MOST_SUBSTEPS:
-        raise InputError(
-            f"The {law.kind} moves with up to {omega:.3g} rad/s at {mass_kg:g} kg, and the twin "
-            f"follows at most {_PHASE * _MOST_SUBSTEPS / step_s:.3g} rad/s. Give it more moving "
-            "mass or narrower length limits, or raise acquisition.rate_hz."
-        )
-    return max(1, wanted)

@@ -14,6 +14,7 @@ extern "C" {
 }
 
 namespace nb = nanobind;
+using Tables = nb::ndarray<nb::numpy, const double, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<nb::numpy, const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Kinds = nb::ndarray<nb::numpy, const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using OutRow = nb::ndarray<nb::numpy, double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
@@ -40,14 +41,17 @@ class Law {
 
 // Derivatives by `kind.size()` columns; the tables have one row for each parameter of the law.
 struct Tangent {
-    Tangent(const Law &law, Kinds kind, Rows elastic, Rows pull, Rows capacitance, Values free_m)
+    Tangent(const Law &law, Kinds kind, Rows elastic, Tables pull, Tables capacitance,
+            Values free_m)
         : work(static_cast<size_t>(MOTION_WORK) * kind.size()),
           kept(static_cast<size_t>(MOTION_ROWS) * 2 * kind.size())
     {
         const size_t laws = free_m.size(), n = static_cast<size_t>(law.law.lengths);
+        const auto volts = static_cast<size_t>(law.law.voltages);
         need(elastic.shape(0) == laws && pull.shape(0) == laws && capacitance.shape(0) == laws &&
-                 elastic.shape(1) == n && pull.shape(1) == n && capacitance.shape(1) == n,
-             "one row of derivatives for each parameter of the law");
+                 pull.shape(1) == volts && capacitance.shape(1) == volts &&
+                 elastic.shape(1) == n && pull.shape(2) == n && capacitance.shape(2) == n,
+             "one table of derivatives for each parameter of the law");
         c.columns = static_cast<int32_t>(kind.size());
         c.laws = static_cast<int32_t>(laws);
         c.kind = kind.data();
@@ -63,7 +67,7 @@ struct Tangent {
 
 void play(const Law &law, nb::handle parameters, nb::handle state, Values edge_s, nb::handle input,
           Values mass_kg, Flags sensed, Values time_s, OutRow length_m, OutRow speed_m_s,
-          OutRow mean_f, Kinds kind, Rows elastic, Rows pull, Rows capacitance, Values free_m,
+          OutRow mean_f, Kinds kind, Rows elastic, Tables pull, Tables capacitance, Values free_m,
           OutRows rows, OutRows length_by, OutRows mean_by)
 {
     const Records<const motion_parameters> p(parameters);

@@ -51,30 +51,58 @@ static cubic at_length(const motion_law *law, double length_m)
     return cubic_at((length_m - law->low_m) / law->step_m, law->lengths);
 }
 
-/* Value of a table at a length and a voltage, and its slopes. */
+/* Where a length and a voltage lie in the tables. */
+typedef struct {
+    cubic along, across; /* across: unused where nothing depends on the voltage */
+} place;
+
+static place place_at(const motion_law *law, double length_m, double voltage_v)
+{
+    place at = {at_length(law, length_m), {0, {0.0}, {0.0}}};
+    if (law->voltages > 1) {
+        at.across = cubic_at(fabs(voltage_v) / law->step_v, law->voltages);
+    }
+    return at;
+}
+
+/* Value of rows of `stride` knots each. */
+static double value_at(const motion_law *law, const double *rows, int64_t stride, const place *at)
+{
+    const double *first = rows + at->along.first;
+    double sum = 0.0;
+    int k;
+    if (law->voltages == 1) {
+        return dot4(at->along.weight, first);
+    }
+    for (k = 0; k < 4; ++k) {
+        sum += at->across.weight[k] * dot4(at->along.weight, first + (at->across.first + k) * stride);
+    }
+    return sum;
+}
+
+/* Value of a table of the law, and its slopes. */
 typedef struct {
     double value, per_m, per_v;
 } surface;
 
 static surface surface_at(const motion_law *law, const double rows[][MOTION_LENGTHS],
-                          const cubic *c, double voltage_v)
+                          const place *at, double voltage_v)
 {
     surface s = {0.0, 0.0, 0.0};
+    int k;
     if (law->voltages == 1) {
-        s.value = dot4(c->weight, rows[0] + c->first);
-        s.per_m = dot4(c->slope, rows[0] + c->first) / law->step_m;
-    } else {
-        const cubic row = cubic_at(fabs(voltage_v) / law->step_v, law->voltages);
-        int k;
-        for (k = 0; k < 4; ++k) {
-            const double *values = rows[row.first + k] + c->first;
-            const double along = dot4(c->weight, values);
-            s.value += row.weight[k] * along;
-            s.per_m += row.weight[k] * dot4(c->slope, values) / law->step_m;
-            s.per_v += row.slope[k] * along / law->step_v;
-        }
-        s.per_v = voltage_v < 0.0 ? -s.per_v : s.per_v;
+        s.value = dot4(at->along.weight, rows[0] + at->along.first);
+        s.per_m = dot4(at->along.slope, rows[0] + at->along.first) / law->step_m;
+        return s;
     }
+    for (k = 0; k < 4; ++k) {
+        const double *values = rows[at->across.first + k] + at->along.first;
+        const double along = dot4(at->along.weight, values);
+        s.value += at->across.weight[k] * along;
+        s.per_m += at->across.weight[k] * dot4(at->along.slope, values) / law->step_m;
+        s.per_v += at->across.slope[k] * along / law->step_v;
+    }
+    s.per_v = voltage_v < 0.0 ? -s.per_v : s.per_v;
     return s;
 }
 
@@ -92,22 +120,22 @@ double motion_gap(const motion_law *law, double length_m)
 
 double motion_capacitance(const motion_law *law, double length_m, double voltage_v)
 {
-    const cubic c = at_length(law, length_m);
-    return surface_at(law, law->capacitance_f, &c, voltage_v).value;
+    const place at = place_at(law, length_m, voltage_v);
+    return value_at(law, law->capacitance_f[0], MOTION_LENGTHS, &at);
 }
 
 motion_capacitance_slopes motion_capacitance_by(const motion_law *law, const motion_tangent *t,
                                                 double length_m, double voltage_v, double *by,
                                                 double share)
 {
-    const cubic c = at_length(law, length_m);
-    const surface found = surface_at(law, law->capacitance_f, &c, voltage_v);
+    const place at = place_at(law, length_m, voltage_v);
+    const surface found = surface_at(law, law->capacitance_f, &at, voltage_v);
     const motion_capacitance_slopes slopes = {found.per_m, found.per_v};
     int32_t j;
     for (j = 0; j < t->columns; ++j) {
         if (t->kind[j] < t->laws) {
-            const int64_t knot = (int64_t)t->kind[j] * law->lengths + c.first;
-            by[j] += share * dot4(c.weight, t->capacitance + knot);
+            const int64_t table = (int64_t)t->kind[j] * law->voltages * law->lengths;
+            by[j] += share * value_at(law, t->capacitance + table, law->lengths, &at);
         }
     }
     return slopes;
@@ -140,7 +168,7 @@ void motion_rest(const motion_law *law, const motion_parameters *p, motion_state
 /* Rates of the state, and what their derivatives need. */
 typedef struct {
     double speed, acceleration, relaxed[MOTION_BRANCHES], charge;
-    cubic at;
+    place at;
     double elastic, softening;      /* their product is the elastic force */
     double elastic_per_m;
     surface pull;
@@ -155,12 +183,12 @@ static rates rates_of(const motion_law *law, const motion_parameters *p, const m
     double force, held = 1.0;
     rates r;
     int k;
-    r.at = at_length(law, s->length_m);
-    r.elastic = dot4(r.at.weight, law->elastic_n + r.at.first);
-    r.elastic_per_m = dot4(r.at.slope, law->elastic_n + r.at.first) / law->step_m;
     r.softening = s->length_m > s->longest_m ? motion_softening(p, longest) : softening;
     r.acting_v = (1.0 - p->charge_share) * in->volt + p->charge_share * s->charge_v;
     r.square = r.acting_v * r.acting_v + in->ripple_v2;
+    r.at = place_at(law, s->length_m, sqrt(r.square));
+    r.elastic = dot4(r.at.along.weight, law->elastic_n + r.at.along.first);
+    r.elastic_per_m = dot4(r.at.along.slope, law->elastic_n + r.at.along.first) / law->step_m;
     r.pull = surface_at(law, law->pull_n_v2, &r.at, sqrt(r.square));
     force = r.elastic * r.softening;
     r.acceleration = in->load_n + r.square * r.pull.value - p->damping_n_s_m * s->speed_m_s;
@@ -271,9 +299,10 @@ static void direct_rates(const motion_law *law, const motion_parameters *p, cons
     double elastic = 0.0, softening = 0.0, force = 0.0, acting = 0.0, dforce;
     int k;
     if (kind < tangent->laws) {
-        const int64_t knot = (int64_t)kind * law->lengths + r->at.first;
-        elastic = dot4(r->at.weight, tangent->elastic + knot);
-        force = r->square * dot4(r->at.weight, tangent->pull + knot);
+        const double *elastic_n = tangent->elastic + (int64_t)kind * law->lengths;
+        const int64_t table = (int64_t)kind * law->voltages * law->lengths;
+        elastic = dot4(r->at.along.weight, elastic_n + r->at.along.first);
+        force = r->square * value_at(law, tangent->pull + table, law->lengths, &r->at);
         softening = -d->reached * d->longest_m * tangent->free_length[kind] /
                     (p->free_length_m * p->free_length_m);
     } else if (kind == MOTION_DAMPING) {

@@ -54,7 +54,7 @@ typedef struct {
 /* Derivatives by `columns` numbers. `kind` states the number a column is for: index of a parameter
  * of the law (below `laws`) or one of enum motion_column. `rows` holds MOTION_ROWS rows of the
  * state's derivatives, each `columns` wide; `work` MOTION_WORK rows. The tables of the law's
- * derivatives have `lengths` knots each, at voltage 0. */
+ * derivatives have the law's knots, without gaps between the rows. */
 enum motion_column {
     MOTION_START = 1000, /* a start value: derivatives enter through `rows` alone */
     MOTION_DAMPING,
@@ -73,7 +73,8 @@ enum { MOTION_ROWS = 4 + MOTION_BRANCHES, MOTION_WORK = 3 * MOTION_ROWS };
 typedef struct {
     int32_t columns, laws;
     const int32_t *kind;
-    const double *elastic, *pull, *capacitance; /* [laws][lengths] */
+    const double *elastic;            /* [laws][lengths] */
+    const double *pull, *capacitance; /* [laws][voltages][lengths] */
     const double *free_length;                  /* [laws]: derivative of the free length */
     double *rows;
     double *work;

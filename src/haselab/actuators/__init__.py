@@ -7,7 +7,13 @@ from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
 from haselab.actuators.planar_hasel import PlanarHasel
 from haselab.actuators.registry import actuator_kind, actuator_kinds, actuator_law
-from haselab.actuators.response import Drive, Response, motion_parameters
+from haselab.actuators.response import (
+    Drive,
+    Response,
+    SampledLaw,
+    motion_parameters,
+    with_parameters,
+)
 from haselab.actuators.table import LawTable, law_table
 
 __all__ = [
@@ -23,6 +29,7 @@ __all__ = [
     "Parameter",
     "PlanarHasel",
     "Response",
+    "SampledLaw",
     "actuator_kind",
     "actuator_kinds",
     "actuator_law",
@@ -32,4 +39,5 @@ __all__ = [
     "motion_parameters",
     "parameter",
     "rates",
+    "with_parameters",
 ]

@@ -1,10 +1,19 @@
-"""Lengths and capacitances of an actuator under given voltages and loads, with derivatives."""
+r"""Lengths and capacitances of an actuator under given voltages and loads, with derivatives.
+
+The compiled motion steps any law by a table of its forces. Derivatives by the law's parameters
+$\theta$ go through what the motion uses of it, its tables $T$ and losses $l$:
+
+$\frac{dy}{d\theta} = \frac{\partial y}{\partial T}\frac{dT}{d\theta}
++ \frac{\partial y}{\partial l}\frac{dl}{d\theta}$
+
+The first factors are exact derivatives of the steps computed; the second are differences of the
+law, which is evaluated a few hundred times for that.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +21,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab import _motion
 from haselab.actuators.law import ActuatorLaw
-from haselab.actuators.motion import ActuatorState
-from haselab.actuators.table import LawTable, law_table
-from haselab.base import InputError
+from haselab.actuators.table import law_table, law_values
+from haselab.base import InputError, LimitError
 
-__all__ = ["Drive", "Response", "motion_parameters"]
+__all__ = [
+    "Drive",
+    "Response",
+    "SampledLaw",
+    "motion_parameters",
+    "with_parameters",
+]
 
 Floats = NDArray[np.float64]
 _LONGEST_STEP_S = 2.5e-3
@@ -90,18 +104,204 @@ class Drive:
 
 @dataclass(frozen=True)
 class Response:
-    """Simulated motion of an actuator.
+    """Simulated motion of an actuator, and its derivatives by P parameters.
 
     Args:
         length_m: at the wanted times. Shape `(T,)`.
         speed_m_s: at the wanted times. Shape `(T,)`.
         capacitance_f: mean over each interval; 0 where not wanted. Shape `(N,)`.
-        end: state after the last interval.
+        end: after the last interval, a record of `haselab._motion.STATE`. Shape `(1,)`.
+        length_by: derivatives of the lengths. Shape `(T, P)`.
+        capacitance_by: derivatives of the capacitances. Shape `(N, P)`.
+        end_by: derivatives of the state at the end, in the rows of the compiled motion.
+            Shape `(ROWS, P)`.
     """
 
     length_m: Floats
     speed_m_s: Floats
     capacitance_f: Floats
-    end: ActuatorState
+    end: NDArray[np.void]
+    length_by: Floats
+    capacitance_by: Floats
+    end_by: Floats
 
 
+def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLaw:
+    """Replace parameters of a law.
+
+    Args:
+        law: to start from.
+        values: by the names of `ActuatorLaw.parameters`; one of several values by its index, such
+            as `viscosity.share[0]`.
+    Returns:
+        The changed law.
+    Raises:
+        InputError: A name is unknown.
+        LimitError: A value is outside its limits.
+    Example:
+        >>> from haselab.actuators import DeaStack
+        >>> with_parameters(DeaStack(), {"actuator.branch_share[1]": 0.2}).losses.branch_share
+        (0.05, 0.2)
+    """
+    names = {about.key: about.name for about in law.described()}
+    changed: dict[str, float | tuple[float, ...]] = {}
+    for key, value in values.items():
+        name, _, index = key.partition("[")
+        if name not in names:
+            raise InputError(
+                f"{key} is not a parameter of the law {law.kind}. Its parameters are "
+                f"{', '.join(names)}."
+            )
+        field = names[name]
+        if index:
+            old = changed.get(field, getattr(law, field))
+            parts = list(old) if isinstance(old, tuple) else []
+            if not index[:-1].isdigit() or int(index[:-1]) >= len(parts):
+                raise InputError(f"{key} does not exist: {name} has {len(parts)} values.")
+            parts[int(index[:-1])] = float(value)
+            changed[field] = tuple(parts)
+        else:
+            changed[field] = float(value)
+    return dataclasses.replace(law, **changed)  # type: ignore[arg-type]
+
+
+_LOSSES = (
+    ("damping_n_s_m", 0, _motion.DAMPING),
+    ("inertia_kg", 0, _motion.INERTIA),
+    ("softening_share", 0, _motion.SOFTENING_SHARE),
+    ("softening_stretch", 0, _motion.SOFTENING_STRETCH),
+    ("softening_width", 0, _motion.SOFTENING_WIDTH),
+    ("charge_share", 0, _motion.CHARGE_SHARE),
+    ("charge_s", 0, _motion.CHARGE_S),
+    *(("branch_share", k, _motion.BRANCH_SHARE + k) for k in range(_motion.BRANCHES)),
+    *(("branch_s", k, _motion.BRANCH_S + k) for k in range(_motion.BRANCHES)),
+)
+_CHARGE_ROW, _LONGEST_ROW, _RELAXED_ROW = 2, 3, 4  # of the compiled motion's derivatives
+
+
+def _values(law: ActuatorLaw) -> dict[str, float]:
+    """All parameters of a law; of several values, each by its index."""
+    found: dict[str, float] = {}
+    for key, value in law.parameters().items():
+        if isinstance(value, tuple):
+            found |= {f"{key}[{k}]": part for k, part in enumerate(value)}
+        else:
+            found[key] = value
+    return found
+
+
+def _beside(law: ActuatorLaw, name: str) -> tuple[ActuatorLaw, ActuatorLaw, float]:
+    """The law with a parameter a little lower and higher, and the distance; within its limits."""
+    value = _values(law).get(name, 0.0)
+    ends, step = [], _STEP * (abs(value) or 1.0)
+    for wanted in (value - step, value + step):
+        try:
+            ends.append((with_parameters(law, {name: wanted}), wanted))
+        except LimitError:
+            ends.append((law, value))
+    return ends[0][0], ends[1][0], ends[1][1] - ends[0][1]
+
+
+def _losses_of(parameters: NDArray[np.void]) -> Floats:
+    return np.array([parameters[name].reshape(-1)[k] for name, k, _ in _LOSSES])
+
+
+class SampledLaw:
+    """A law as the compiled motion takes it, with derivatives by some of its parameters.
+
+    Args:
+        law: to sample.
+        highest_v: largest voltage that will act.
+        by: names of the parameters, see `with_parameters`.
+    Raises:
+        InputError: A name is unknown, or the law is not smooth.
+        LimitError: A parameter is at its limit.
+    """
+
+    def __init__(self, law: ActuatorLaw, highest_v: float, by: Sequence[str] = ()) -> None:
+        self.law, self.by = law, tuple(by)
+        self.table = law_table(law, highest_v)
+        self.parameters = motion_parameters(law)
+        self._native = _motion.Law(*self.table.arrays())
+        lengths_m = self.table.low_m + self.table.step_m * np.arange(self.table.elastic_n.size)
+        rows = self.table.capacitance_f.shape[0]
+        voltages_v = self.table.step_v * np.arange(rows)
+        elastic, pull, capacitance, free, losses = [], [], [], [], []
+        for name in self.by:
+            low, high, width = _beside(law, name)
+            from_n, from_f, from_v2 = law_values(low, lengths_m, voltages_v)
+            to_n, to_f, to_v2 = law_values(high, lengths_m, voltages_v)
+            elastic.append((to_n - from_n) / width)
+            capacitance.append((to_f - from_f) / width)
+            pull.append((to_v2 - from_v2) / width)
+            free.append((high.free_length_m - low.free_length_m) / width)
+            changed = _losses_of(motion_parameters(high)) - _losses_of(motion_parameters(low))
+            losses.append(changed / width)
+        count, knots = len(self.by), lengths_m.size
+        self._elastic = np.reshape(elastic, (count, knots))
+        self._pull = np.reshape(pull, (count, rows, knots))
+        self._capacitance = np.reshape(capacitance, (count, rows, knots))
+        self.free_by = np.reshape(free, count).astype(np.float64)
+        losses_by = np.reshape(losses, (count, len(_LOSSES)))
+        used = np.flatnonzero((losses_by != 0.0).any(axis=0))
+        self._kinds = np.array([*range(count), *(_LOSSES[k][2] for k in used)], dtype=np.int32)
+        # derivatives by the columns of the motion, to those by the parameters
+        self._joined = np.vstack([np.eye(count), losses_by[:, used].T])
+
+    def respond(
+        self,
+        drive: Drive,
+        times_s: ArrayLike,
+        start: NDArray[np.void],
+        *,
+        sensed: ArrayLike | None = None,
+        start_by: Floats | None = None,
+    ) -> Response:
+        """Simulate the motion under a drive.
+
+        Args:
+            drive: what acts.
+            times_s: of the wanted lengths, rising, within the drive. Shape `(T,)`.
+            start: state at the first edge, see `at_rest`. Shape `(1,)`.
+            sensed: which intervals' mean capacitance is wanted; None: all. Shape `(N,)`.
+            start_by: derivatives of that state, see `rest_by`, followed by any number of columns
+                for start values that are parameters themselves. Shape `(ROWS, P + S)`.
+        Returns:
+            Lengths and capacitances, with derivatives by the parameters and start values if
+            there are any.
+        Raises:
+            InputError: A time is outside the drive.
+        """
+        times = np.ascontiguousarray(times_s, dtype=np.float64)
+        if times.size and not (drive.edge_s[0] <= times[0] and times[-1] <= drive.edge_s[-1]):
+            raise InputError(
+                f"Lengths are wanted from {times[0]:g} to {times[-1]:g} s, but the drive lasts "
+                f"from {drive.edge_s[0]:g} to {drive.edge_s[-1]:g} s. Extend the drive."
+            )
+        count, intervals = len(self.by), drive.voltage_v.size
+        acts = np.zeros(intervals, _motion.INPUT)
+        acts["volt"], acts["ripple_v2"] = drive.voltage_v, drive.ripple_v2
+        acts["load_n"] = drive.load_n
+        given = np.zeros((_motion.ROWS, count)) if start_by is None else start_by
+        extra = given.shape[1] - count
+        own = self._kinds.size - count
+        kinds = np.concatenate([self._kinds, np.full(extra, _motion.START, dtype=np.int32)])
+        rows = np.ascontiguousarray(
+            np.hstack([given[:, :count], np.zeros((_motion.ROWS, own)), given[:, count:]])
+        )
+        state, columns = start.copy(), kinds.size
+        wanted = np.ones(intervals, np.uint8) if sensed is None else np.asarray(sensed, np.uint8)
+        length, speed, mean = np.empty(times.size), np.empty(times.size), np.empty(intervals)
+        length_by, mean_by = np.empty((times.size, columns)), np.empty((intervals, columns))
+        _motion.play(
+            self._native, self.parameters, state, drive.edge_s, acts, drive.mass_kg, wanted, times,
+            length, speed, mean, kinds, self._elastic, self._pull, self._capacitance, self.free_by,
+            rows, length_by, mean_by,
+        )  # fmt: skip
+        joined = np.block([
+            [self._joined, np.zeros((self._joined.shape[0], extra))],
+            [np.zeros((extra, count)), np.eye(extra)],
+        ])  # fmt: skip
+        return Response(
+            length, speed, mean, state, length_by @ joined, mean_by @ joined, rows @ joined
+        )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from haselab.actuators.law import ActuatorLaw
 from haselab.base import InputError
 
-__all__ = ["LawTable", "law_table"]
+__all__ = ["LawTable", "law_table", "law_values"]
 
 Floats = NDArray[np.float64]
 LENGTHS = 1024  # MOTION_LENGTHS of native/motion/motion.h
@@ -60,6 +60,21 @@ def _rows(law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats) -> tuple[Floa
     acting_v = np.maximum(voltages_v, 1.0)
     pull = np.stack([law.electric_force_n(lengths_m, v) / v**2 for v in acting_v])
     return capacitance, pull
+
+
+def law_values(
+    law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Elastic force, differential capacitance, and electric force over the voltage squared.
+
+    Args:
+        law: to evaluate.
+        lengths_m: Shape `(L,)`.
+        voltages_v: Shape `(V,)`.
+    Returns:
+        Shapes `(L,)`, `(V, L)` and `(V, L)`.
+    """
+    return law.elastic_force_n(lengths_m), *_rows(law, lengths_m, voltages_v)
 
 
 def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:

@@ -67,7 +67,7 @@ struct Tangent {
 
 void play(const Law &law, nb::handle parameters, nb::handle state, Values edge_s, nb::handle input,
           Values mass_kg, Flags sensed, Values time_s, OutRow length_m, OutRow speed_m_s,
-          OutRow mean_f, Kinds kind, Rows elastic, Tables pull, Tables capacitance, Values free_m,
+          OutRow mean_f, OutRow drift_f_s, Kinds kind, Rows elastic, Tables pull, Tables capacitance, Values free_m,
           OutRows rows, OutRows length_by, OutRows mean_by)
 {
     const Records<const motion_parameters> p(parameters);
@@ -76,14 +76,15 @@ void play(const Law &law, nb::handle parameters, nb::handle state, Values edge_s
     const size_t n = in.size(), columns = kind.size();
     need(p.size() == 1 && s.size() == 1 && n > 0 && edge_s.size() == n + 1 &&
              mass_kg.size() == n && sensed.size() == n && mean_f.size() == n &&
+             drift_f_s.size() == n &&
              length_m.size() == time_s.size() && speed_m_s.size() == time_s.size() &&
              p.data()->step_s > 0.0 && p.data()->phase > 0.0,
          "one input, mass and mean for each interval; one length for each time");
     const motion_record record = {static_cast<int32_t>(n), edge_s.data(), in.data(),
                                   mass_kg.data(), sensed.data(),
                                   static_cast<int32_t>(time_s.size()), time_s.data()};
-    motion_output output = {length_m.data(), speed_m_s.data(), mean_f.data(), nullptr, nullptr,
-                            nullptr};
+    motion_output output = {length_m.data(), speed_m_s.data(), mean_f.data(), drift_f_s.data(),
+                            nullptr, nullptr, nullptr};
     if (columns == 0) {
         nb::gil_scoped_release free_gil;
         motion_play(&law.law, p.data(), s.data(), nullptr, &record, &output);

@@ -5,6 +5,12 @@
 #include <stddef.h>
 #include <string.h>
 
+/* Where nobody looks and nothing swings any more, only slow creep is left: long steps follow it. A
+ * swing of that speed decays by the same number of steps, without growing. */
+#define SLOW_M_S 1e-4
+#define LONG_PHASE 0.6
+#define LONG_STEP_S 0.05
+
 /* Weights of Hermite's cubic at a share of a step of dt: lengths and speeds of both ends. */
 typedef struct {
     double from_m, from_m_s, to_m, to_m_s;
@@ -96,32 +102,40 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
     int32_t k, next = 0;
     for (k = 0; k < record->intervals; ++k) {
         const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
-        int32_t steps, i;
-        double dt;
+        const double volt = record->input[k].volt;
+        double before_f, at_s = from_s;
+        int32_t j;
         moving.inertia_kg = p->inertia_kg + record->mass_kg[k];
-        steps = motion_steps(law, &moving, s, to_s - from_s);
-        dt = (to_s - from_s) / (double)steps;
-        output->mean_f[k] = 0.0;
+        output->mean_f[k] = output->drift_f_s[k] = 0.0;
+        before_f = motion_capacitance(law, s->length_m, volt);
         if (tangent != NULL) {
             memset(output->mean_by + (int64_t)k * tangent->columns, 0,
                    (size_t)tangent->columns * sizeof(double));
         }
-        for (i = 0; i < steps; ++i) {
+        while (at_s < to_s) {
+            const int unseen = !record->sensed[k] &&
+                               (next >= record->times || record->time_s[next] > to_s);
             const motion_state start = *s;
-            const step now = {&start, s, from_s + dt * i, dt};
-            const double until_s = i + 1 < steps ? from_s + dt * (i + 1) : to_s;
+            step now = {&start, s, at_s, 0.0};
+            double until_s;
+            moving.phase = unseen && fabs(s->speed_m_s) < SLOW_M_S ? LONG_PHASE : p->phase;
+            moving.step_s = moving.phase > p->phase ? LONG_STEP_S : p->step_s;
+            now.dt = (to_s - at_s) / (double)motion_steps(law, &moving, s, to_s - at_s);
+            until_s = to_s - at_s - now.dt > 1e-9 * now.dt ? at_s + now.dt : to_s;
             if (tangent != NULL) {
                 const size_t n = (size_t)tangent->columns;
                 memcpy(output->kept, tangent->rows, 2 * n * sizeof(double));
             }
-            motion_step(law, &moving, s, tangent, &record->input[k], dt);
+            motion_step(law, &moving, s, tangent, &record->input[k], now.dt);
             next = sample(&now, tangent, record, output, next, until_s);
             if (record->sensed[k]) {
-                integrate(law, &now, tangent, record->input[k].volt, output, k);
+                integrate(law, &now, tangent, volt, output, k);
             }
+            at_s = until_s;
         }
         if (record->sensed[k]) {
-            int32_t j;
+            const double after_f = motion_capacitance(law, s->length_m, volt);
+            output->drift_f_s[k] = (after_f - before_f) / (to_s - from_s);
             output->mean_f[k] /= to_s - from_s;
             for (j = 0; tangent != NULL && j < tangent->columns; ++j) {
                 output->mean_by[(int64_t)k * tangent->columns + j] /= to_s - from_s;

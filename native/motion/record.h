@@ -1,5 +1,6 @@
 /* A record: an actuator under voltages and loads that are constant between edges, its lengths at
- * given times, and its mean capacitance between edges. With a tangent, their derivatives too. */
+ * given times, and its mean capacitance between edges. With a tangent, their derivatives too. Where
+ * neither is wanted and only creep is left, the steps are longer. */
 #ifndef MOTION_RECORD_H
 #define MOTION_RECORD_H
 
@@ -15,11 +16,12 @@ typedef struct {
     const double *time_s;                        /* rising, from the first edge to the last */
 } motion_record;
 
-/* lengths, speeds: [times]; means: [intervals], 0 where not sensed. The derivatives have
+/* lengths, speeds: [times]; means and drifts (change of the capacitance from an interval's start to
+ * its end, over its duration): [intervals], 0 where not sensed. The derivatives have
  * [times][columns] and [intervals][columns] values and may be NULL without a tangent, whose rows
  * and 2 * MOTION_ROWS * columns values of `kept` the caller gives. */
 typedef struct {
-    double *length_m, *speed_m_s, *mean_f;
+    double *length_m, *speed_m_s, *mean_f, *drift_f_s;
     double *length_by, *mean_by;
     double *kept;
 } motion_output;

@@ -42,6 +42,7 @@ def play(
     length_m: NDArray[np.float64],
     speed_m_s: NDArray[np.float64],
     mean_f: NDArray[np.float64],
+    drift_f_s: NDArray[np.float64],
     kind: NDArray[np.int32],
     elastic: NDArray[np.float64],
     pull: NDArray[np.float64],

@@ -176,3 +176,34 @@ def test_edges_that_do_not_rise_are_refused():
         Drive(np.array([0.0, 1.0, 1.0]), one, one, one, one)
     with pytest.raises(InputError, match=r"^A drive has 3 edges and 3 voltages"):
         Drive(np.array([0.0, 1.0, 2.0]), np.ones(3), one, one, one)
+
+
+@pytest.mark.parametrize("longest", [0.0, 0.06], ids=["new", "softened before"])
+def test_the_state_at_rest_stays_and_has_the_derivatives_of_its_equilibrium(longest):
+    law, by = LAWS["planar"], BY["planar"]
+    sampled = SampledLaw(law, 15e3, by)
+    state, rows = sampled.at_rest(4e3, 5e3, LOAD_N, longest_m=longest)
+    held = Drive(
+        np.array([0.0, 30.0]), np.array([4e3]), np.array([LOAD_N]), np.array([MASS_KG]),
+        np.array([5e3]),
+    )  # fmt: skip
+    found = sampled.respond(held, [30.0], state, start_by=rows)
+    assert found.length_m[0] == pytest.approx(float(state["length_m"][0]), abs=2e-9)
+    # where everything rests, so do the derivatives
+    np.testing.assert_allclose(
+        found.length_by[0], rows[0], rtol=0.0, atol=1e-4 * np.abs(rows[0]).max()
+    )
+    for column, name in enumerate(by):
+        field, _, index = name.partition("[")
+        value = law.parameters()[field]
+        value = value[int(index[:-1])] if index else value
+        lengths = [
+            equilibrium_m(
+                with_parameters(law, {name: value * factor}),
+                np.hypot(4e3, np.sqrt(5e3)), LOAD_N, longest_m=longest or None,
+            )
+            for factor in (0.999, 1.001)
+        ]  # fmt: skip
+        expected = (lengths[1] - lengths[0]) / (0.002 * value)
+        scale = max(abs(expected), 1e-5 / value)
+        assert rows[0, column] == pytest.approx(expected, abs=1e-3 * scale), name

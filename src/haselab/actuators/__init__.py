@@ -8,6 +8,7 @@ from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, lin
 from haselab.actuators.planar_hasel import PlanarHasel
 from haselab.actuators.registry import actuator_kind, actuator_kinds, actuator_law
 from haselab.actuators.response import (
+    ADDED_INERTIA,
     Drive,
     Response,
     SampledLaw,
@@ -17,6 +18,7 @@ from haselab.actuators.response import (
 from haselab.actuators.table import LawTable, law_table
 
 __all__ = [
+    "ADDED_INERTIA",
     "VACUUM_F_PER_M",
     "ActuatorLaw",
     "ActuatorState",

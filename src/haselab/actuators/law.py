@@ -46,6 +46,7 @@ class Parameter:
         low: smallest permitted value.
         high: largest permitted value.
         description: short text for people.
+        fitted: whether `identify actuator` estimates it; False: measured otherwise.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Parameter:
     low: float
     high: float
     description: str
+    fitted: bool = True
 
 
 def parameter(
@@ -64,6 +66,7 @@ def parameter(
     high: float,
     description: str,
     key: str = "",
+    fitted: bool = True,
 ) -> AnyValue:
     """A field of a law with its unit and limits.
 
@@ -74,10 +77,19 @@ def parameter(
         high: largest permitted value.
         description: short text for people.
         key: in TWIN.toml; empty: the name of the field in the table `actuator`.
+        fitted: whether `identify actuator` estimates it; False: measured otherwise, such as a
+            width, or without effect on motion and capacitance.
     Returns:
         The dataclass field.
     """
-    about = {"key": key, "unit": unit, "low": low, "high": high, "description": description}
+    about = {
+        "key": key,
+        "unit": unit,
+        "low": low,
+        "high": high,
+        "description": description,
+        "fitted": fitted,
+    }
     field: AnyValue = dataclasses.field(default=default, metadata={_KEY: about})
     return field
 

@@ -13,7 +13,9 @@ law, which is evaluated a few hundred times for that.
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +23,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab import _motion
 from haselab.actuators.law import ActuatorLaw
+from haselab.actuators.operating_point import equilibrium_m
 from haselab.actuators.table import law_table, law_values
 from haselab.base import InputError, LimitError
 
 __all__ = [
+    "ADDED_INERTIA",
     "Drive",
     "Response",
     "SampledLaw",
@@ -33,7 +37,10 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
+ADDED_INERTIA = "load.added_inertia_kg"
 _LONGEST_STEP_S = 2.5e-3
+_CORES = os.cpu_count() or 1
+_COLUMNS_EACH = 8  # for fewer columns another thread does not pay
 _PHASE = 0.1  # of the fastest motion in a step, rad
 _SHORTEST_STEP_S = 1e-6
 _STEP = 1e-4  # of a parameter, for the derivatives of the law's table
@@ -110,6 +117,7 @@ class Response:
         length_m: at the wanted times. Shape `(T,)`.
         speed_m_s: at the wanted times. Shape `(T,)`.
         capacitance_f: mean over each interval; 0 where not wanted. Shape `(N,)`.
+        drift_f_s: change of the capacitance over each interval, over its duration. Shape `(N,)`.
         end: after the last interval, a record of `haselab._motion.STATE`. Shape `(1,)`.
         length_by: derivatives of the lengths. Shape `(T, P)`.
         capacitance_by: derivatives of the capacitances. Shape `(N, P)`.
@@ -120,6 +128,7 @@ class Response:
     length_m: Floats
     speed_m_s: Floats
     capacitance_f: Floats
+    drift_f_s: Floats
     end: NDArray[np.void]
     length_by: Floats
     capacitance_by: Floats
@@ -134,7 +143,7 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
         values: by the names of `ActuatorLaw.parameters`; one of several values by its index, such
             as `viscosity.share[0]`.
     Returns:
-        The changed law.
+        The changed law; `ADDED_INERTIA` is none of its parameters and changes nothing.
     Raises:
         InputError: A name is unknown.
         LimitError: A value is outside its limits.
@@ -147,6 +156,8 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
     changed: dict[str, float | tuple[float, ...]] = {}
     for key, value in values.items():
         name, _, index = key.partition("[")
+        if key == ADDED_INERTIA:
+            continue
         if name not in names:
             raise InputError(
                 f"{key} is not a parameter of the law {law.kind}. Its parameters are "
@@ -176,7 +187,13 @@ _LOSSES = (
     *(("branch_share", k, _motion.BRANCH_SHARE + k) for k in range(_motion.BRANCHES)),
     *(("branch_s", k, _motion.BRANCH_S + k) for k in range(_motion.BRANCHES)),
 )
-_CHARGE_ROW, _LONGEST_ROW, _RELAXED_ROW = 2, 3, 4  # of the compiled motion's derivatives
+_INERTIA = 1  # of _LOSSES
+_LENGTH_ROW, _CHARGE_ROW, _LONGEST_ROW, _RELAXED_ROW = (
+    0,
+    2,
+    3,
+    4,
+)  # of the compiled motion's derivatives
 
 
 def _values(law: ActuatorLaw) -> dict[str, float]:
@@ -202,6 +219,18 @@ def _beside(law: ActuatorLaw, name: str) -> tuple[ActuatorLaw, ActuatorLaw, floa
     return ends[0][0], ends[1][0], ends[1][1] - ends[0][1]
 
 
+def _difference(
+    laws: Sequence[ActuatorLaw], lengths_m: Sequence[float], voltage_v: float, longest_m: float
+) -> float:
+    """Change of the electric minus the elastic force between two laws or lengths."""
+    net = []
+    for law, length_m in zip(laws, lengths_m, strict=True):
+        reached = max(length_m, longest_m) / law.free_length_m
+        elastic = law.elastic_force_n(length_m) * law.losses.softening(reached)
+        net.append(float(law.electric_force_n(length_m, voltage_v) - elastic))
+    return net[1] - net[0]
+
+
 def _losses_of(parameters: NDArray[np.void]) -> Floats:
     return np.array([parameters[name].reshape(-1)[k] for name, k, _ in _LOSSES])
 
@@ -212,16 +241,25 @@ class SampledLaw:
     Args:
         law: to sample.
         highest_v: largest voltage that will act.
-        by: names of the parameters, see `with_parameters`.
+        by: names of the parameters, see `with_parameters`; `ADDED_INERTIA` is one too.
+        added_inertia_kg: inertia without weight: clamp, oil, linkage.
     Raises:
         InputError: A name is unknown, or the law is not smooth.
         LimitError: A parameter is at its limit.
     """
 
-    def __init__(self, law: ActuatorLaw, highest_v: float, by: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        law: ActuatorLaw,
+        highest_v: float,
+        by: Sequence[str] = (),
+        *,
+        added_inertia_kg: float = 0.0,
+    ) -> None:
         self.law, self.by = law, tuple(by)
         self.table = law_table(law, highest_v)
         self.parameters = motion_parameters(law)
+        self.parameters["inertia_kg"] += added_inertia_kg
         self._native = _motion.Law(*self.table.arrays())
         lengths_m = self.table.low_m + self.table.step_m * np.arange(self.table.elastic_n.size)
         rows = self.table.capacitance_f.shape[0]
@@ -236,6 +274,7 @@ class SampledLaw:
             pull.append((to_v2 - from_v2) / width)
             free.append((high.free_length_m - low.free_length_m) / width)
             changed = _losses_of(motion_parameters(high)) - _losses_of(motion_parameters(low))
+            changed[_INERTIA] += width if name == ADDED_INERTIA else 0.0
             losses.append(changed / width)
         count, knots = len(self.by), lengths_m.size
         self._elastic = np.reshape(elastic, (count, knots))
@@ -247,6 +286,48 @@ class SampledLaw:
         self._kinds = np.array([*range(count), *(_LOSSES[k][2] for k in used)], dtype=np.int32)
         # derivatives by the columns of the motion, to those by the parameters
         self._joined = np.vstack([np.eye(count), losses_by[:, used].T])
+
+    def at_rest(
+        self, voltage_v: float, ripple_v2: float, load_n: float, *, longest_m: float = 0.0
+    ) -> tuple[NDArray[np.void], Floats]:
+        """State of the relaxed actuator, and its derivatives by the parameters.
+
+        Args:
+            voltage_v: that acts.
+            ripple_v2: mean square of the carrier's voltage.
+            load_n: pulls at the moving end.
+            longest_m: largest length before, if that was longer.
+        Returns:
+            The state, shape `(1,)`, and the derivatives for `respond`, shape `(ROWS, P)`.
+        Raises:
+            LimitError: There is no equilibrium.
+        """
+        acting_v = float(np.hypot(voltage_v, np.sqrt(ripple_v2)))
+        length_m = equilibrium_m(self.law, acting_v, load_n, longest_m=longest_m or None)
+        longest = max(length_m, longest_m)
+        branches = len(self.law.losses.branch_share)
+        state = np.zeros(1, _motion.STATE)
+        state["length_m"], state["longest_m"], state["charge_v"] = length_m, longest, voltage_v
+        state["relaxed_n"][0, :branches] = load_n + float(
+            self.law.electric_force_n(length_m, acting_v)
+        )
+        step_m = _STEP * length_m
+        ends = [self.law] * 2
+        slope = _difference(ends, [length_m - step_m, length_m + step_m], acting_v, longest_m)
+        pull = np.diff([self.law.electric_force_n(length_m + s * step_m, acting_v)
+                        for s in (-1.0, 1.0)])[0] / (2.0 * step_m)  # fmt: skip
+        rows = np.zeros((_motion.ROWS, len(self.by)))
+        for column, name in enumerate(self.by):
+            low, high, width = _beside(self.law, name)
+            force = _difference([low, high], [length_m] * 2, acting_v, longest_m) / width
+            moved = -force * 2.0 * step_m / slope
+            rows[_LENGTH_ROW, column] = moved
+            rows[_LONGEST_ROW, column] = moved if longest == length_m else 0.0
+            electric = [float(part.electric_force_n(length_m, acting_v)) for part in (low, high)]
+            rows[_RELAXED_ROW : _RELAXED_ROW + branches, column] = (
+                electric[1] - electric[0]
+            ) / width + pull * moved
+        return state, rows
 
     def respond(
         self,
@@ -289,19 +370,37 @@ class SampledLaw:
         rows = np.ascontiguousarray(
             np.hstack([given[:, :count], np.zeros((_motion.ROWS, own)), given[:, count:]])
         )
-        state, columns = start.copy(), kinds.size
+        columns = kinds.size
         wanted = np.ones(intervals, np.uint8) if sensed is None else np.asarray(sensed, np.uint8)
-        length, speed, mean = np.empty(times.size), np.empty(times.size), np.empty(intervals)
         length_by, mean_by = np.empty((times.size, columns)), np.empty((intervals, columns))
-        _motion.play(
-            self._native, self.parameters, state, drive.edge_s, acts, drive.mass_kg, wanted, times,
-            length, speed, mean, kinds, self._elastic, self._pull, self._capacitance, self.free_by,
-            rows, length_by, mean_by,
-        )  # fmt: skip
+
+        def part(chosen: NDArray[np.int64]) -> tuple[NDArray[np.void], tuple[Floats, ...]]:
+            """Some of the columns; the motion itself is the same in each part."""
+            moved, size = start.copy(), chosen.size
+            seen = tuple(np.empty(n) for n in (times.size, times.size, intervals, intervals))
+            own_rows = np.ascontiguousarray(rows[:, chosen])
+            lengths, means = np.empty((times.size, size)), np.empty((intervals, size))
+            _motion.play(
+                self._native, self.parameters, moved, drive.edge_s, acts, drive.mass_kg, wanted,
+                times, *seen, kinds[chosen], self._elastic, self._pull, self._capacitance,
+                self.free_by, own_rows, lengths, means,
+            )  # fmt: skip
+            rows[:, chosen], length_by[:, chosen], mean_by[:, chosen] = own_rows, lengths, means
+            return moved, seen
+
+        workers = min(_CORES, 1 + columns // _COLUMNS_EACH)
+        parts = np.array_split(np.arange(columns), workers)
+        if workers == 1:
+            state, seen = part(parts[0])
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                state, seen = list(pool.map(part, parts))[0]
+        length, speed, mean, drift = seen
         joined = np.block([
             [self._joined, np.zeros((self._joined.shape[0], extra))],
             [np.zeros((extra, count)), np.eye(extra)],
         ])  # fmt: skip
         return Response(
-            length, speed, mean, state, length_by @ joined, mean_by @ joined, rows @ joined
-        )
+            length, speed, mean, drift, state,
+            length_by @ joined, mean_by @ joined, rows @ joined,
+        )  # fmt: skip

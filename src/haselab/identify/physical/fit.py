@@ -1,0 +1,189 @@
+r"""Identify one physical model of an actuator jointly from all its experiments.
+
+Lengths and capacitances of all records are compared with one simulated motion. With residuals $r$
+over their standard deviations and their derivatives $J$ by the parameters, the estimate minimises
+$r^\top r$, and its covariance is
+
+$\Sigma = (J^\top J)^{-1}$
+
+where the standard deviations are those of the residuals themselves, channel by channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.actuators import ADDED_INERTIA, ActuatorLaw
+from haselab.base import Estimate, InputError, JsonObject
+from haselab.base.chart import Chart
+from haselab.identify.fit import Fit
+from haselab.identify.physical.misfit import Misfit
+from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.search import Found, search
+from haselab.identify.physical.unknowns import Unknowns
+
+__all__ = ["ActuatorFit", "fit_actuator"]
+
+Floats = NDArray[np.float64]
+_ROUNDS = 3  # of the noise's estimate
+_SAME_NOISE = 0.02
+_WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorFit(Fit):
+    """One physical model of an actuator.
+
+    Args:
+        status: "ok", or why there is no result.
+        parameters: by the names of TWIN.toml, and of the instruments.
+        covariance: of `parameters`, in their order.
+        residuals: lengths, then capacitances, over their standard deviations, of each record.
+        notes: remarks for the user, one sentence each.
+        law: with the estimated parameters.
+        kind: of the actuator.
+        not_identifiable: names of parameters that these records do not determine.
+        length_rms_m: of the residuals of the lengths.
+        capacitance_rms_f: of those of the capacitances.
+        length_noise_m: from differences of neighbours, which a slow misfit does not change.
+        capacitance_noise_f: likewise.
+        evaluations: of the model, until it was found.
+    """
+
+    law: ActuatorLaw | None = None
+    kind: str = ""
+    added_inertia_kg: float = 0.0
+    not_identifiable: tuple[str, ...] = ()
+    length_rms_m: float = float("nan")
+    capacitance_rms_f: float = float("nan")
+    length_noise_m: float = float("nan")
+    capacitance_noise_f: float = float("nan")
+    evaluations: int = 0
+    chi_squared_ratio: float = float("nan")
+    channels: Mapping[str, float] = field(default_factory=dict)
+
+    def answer(self) -> JsonObject:
+        """See `Fit`."""
+        return {
+            "kind": self.kind,
+            "parameters": self.parameters,
+            "not_identifiable": list(self.not_identifiable),
+            "residual_rms": {
+                "length_m": self.length_rms_m,
+                "capacitance_f": self.capacitance_rms_f,
+            },
+            "noise_rms": {
+                "length_m": self.length_noise_m,
+                "capacitance_f": self.capacitance_noise_f,
+            },
+            "evaluations": self.evaluations,
+            "status": self.status,
+        }
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """See `Fit`."""
+        raise NotImplementedError
+
+
+def fit_actuator(
+    law: ActuatorLaw,
+    records: Sequence[MotionRecord],
+    *,
+    mass_kg: float,
+    added_inertia_kg: float = 0.0,
+) -> ActuatorFit:
+    """Identify a physical model from records.
+
+    Args:
+        law: kind of the actuator, and where to start; what it declares as measured stays.
+        records: of one actuator.
+        mass_kg: hung mass, the scale of an added inertia.
+        added_inertia_kg: where to start with that.
+    Returns:
+        The model, with the covariance of its parameters.
+    Raises:
+        InputError: There is no record.
+    """
+    if not records:
+        raise InputError("There is no record of the actuator's motion. Give at least one.")
+    start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
+    misfit = Misfit(records)
+    found = search(misfit, start)
+    if found is None:
+        return ActuatorFit(
+            status="the start values describe no motion: the actuator has no equilibrium under the "
+            "first load and voltage",
+            kind=law.kind,
+        )
+    count = found.evaluations
+    for _ in range(_ROUNDS):
+        factors = _factors(misfit, found)
+        same = np.allclose(factors, (misfit.length_factor, misfit.capacitance_factor),
+                           rtol=_SAME_NOISE)  # fmt: skip
+        misfit = Misfit(records, *factors)
+        if same:
+            break
+        again = search(misfit, found.unknowns)
+        if again is None:
+            break
+        found, count = again, count + again.evaluations
+    return _result(misfit, found, count)
+
+
+def _split(misfit: Misfit, residuals: Floats) -> tuple[Floats, Floats]:
+    """Residuals of all lengths, and of all capacitances."""
+    lengths, capacitances, at = [], [], 0
+    for record in misfit.records:
+        lengths.append(residuals[at : at + record.length_m.size])
+        at += record.length_m.size
+        capacitances.append(residuals[at : at + record.capacitance_f.size])
+        at += record.capacitance_f.size
+    return np.concatenate(lengths), np.concatenate(capacitances)
+
+
+def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
+    """True over stated standard deviation of both channels, by the residuals."""
+    parts = _split(misfit, found.residuals)
+    share = 1.0 - found.unknowns.values.size / found.residuals.size
+    rms = [float(np.sqrt(np.mean(part**2) / share)) if part.size else 1.0 for part in parts]
+    return misfit.length_factor * rms[0], misfit.capacitance_factor * rms[1]
+
+
+def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
+    unknowns = found.unknowns
+    scale = np.sqrt((found.jacobian**2).sum(axis=0))
+    scale[scale == 0.0] = 1.0
+    normal = found.jacobian.T @ found.jacobian / np.outer(scale, scale)
+    covariance = np.linalg.pinv(normal, rcond=1e-14, hermitian=True) / np.outer(scale, scale)
+    std = np.sqrt(np.diag(covariance))
+    units = {about.key: about.unit for about in unknowns.law.described()}
+    units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
+              "sensing.latency_s": "s", "sensing.scale": ""}  # fmt: skip
+    parameters, weak = {}, []
+    for k, name in enumerate(unknowns.names):
+        unit = units[name.partition("[")[0]]
+        if unknowns.by_logarithm[k]:
+            if std[k] > _WEAK or not np.abs(found.jacobian[:, k]).any():
+                weak.append(name)
+            parameters[name] = Estimate.lognormal(unknowns.values[k], std[k], unit)
+        else:
+            parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
+    slopes = unknowns.slopes
+    lengths, capacitances = _split(misfit, found.residuals)
+    return ActuatorFit(
+        status="ok" if found.converged else "the search did not converge",
+        parameters=parameters,
+        covariance=covariance * np.outer(slopes, slopes),
+        residuals=(lengths, capacitances),
+        law=unknowns.present_law(),
+        kind=unknowns.law.kind,
+        added_inertia_kg=unknowns.value(ADDED_INERTIA),
+        not_identifiable=tuple(weak),
+        evaluations=count,
+        chi_squared_ratio=float(np.mean(found.residuals**2)),
+        channels={"length": misfit.length_factor, "capacitance": misfit.capacitance_factor},
+    )

@@ -1,0 +1,131 @@
+"""Find the parameters of a physical model, from a start that may be far off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.identify.physical.misfit import Misfit
+from haselab.identify.physical.unknowns import Unknowns
+
+__all__ = ["Found", "search"]
+
+Floats = NDArray[np.float64]
+_STAGES = 3  # before the last one; in each, the noise is assumed a tenth of that before
+_FIRST_SHARE = 0.3  # of the signals' spread: noise of the first stage
+_STEPS = 20  # of one stage
+_LAST_STEPS = 40
+_LONGEST = 0.5  # step, in what varies over its width or as a logarithm
+_ENOUGH = 1e-3  # relative decrease that ends a stage
+_DONE = 1e-2  # decrease of chi squared that ends the last one
+
+
+@dataclass(frozen=True)
+class Found:
+    """Result of a search.
+
+    Args:
+        unknowns: at the smallest misfit.
+        residuals: over their standard deviations. Shape `(N,)`.
+        jacobian: of the model over the standard deviations. Shape `(N, P)`.
+        converged: whether no better values were found nearby.
+        evaluations: of the model.
+    """
+
+    unknowns: Unknowns
+    residuals: Floats
+    jacobian: Floats
+    converged: bool
+    evaluations: int
+
+
+def search(misfit: Misfit, start: Unknowns) -> Found | None:
+    """Minimise the misfit: first smoothly near the start, then by the data alone.
+
+    A path of growing confidence in the data: in each stage the noise is assumed ten times smaller,
+    and the start counts as an observation with the widths of the unknowns. So what the data
+    determine well comes right first, while what they hardly determine stays near the start, and
+    the strongly curved valley of the last stage is entered near its floor. The last stage is
+    Levenberg-Marquardt without the start.
+
+    Args:
+        misfit: to minimise.
+        start: first values.
+    Returns:
+        What was found; None if no motion exists at the start.
+    """
+    found = misfit.linearised(start)
+    if found is None:
+        return None
+    now, count = _State(start, *found), 1
+    spread = _FIRST_SHARE * _spread(misfit)
+    noise = [max(1.0, spread * 0.1**k) for k in range(_STAGES)]
+    for level in noise:
+        now, used, _ = _descend(misfit, now, start, level, _STEPS)
+        count += used
+    now, used, converged = _descend(misfit, now, None, 1.0, _LAST_STEPS)
+    return Found(now.unknowns, now.residuals, now.jacobian, converged, count + used)
+
+
+def _spread(misfit: Misfit) -> float:
+    """Standard deviation of the signals over that of their noise."""
+    parts = []
+    for record in misfit.records:
+        parts.append(np.std(record.length_m / record.length_std_m) if record.length_m.size else 0.0)
+        if record.capacitance_f.size:
+            parts.append(np.std(record.capacitance_f / record.capacitance_std_f))
+    return float(max(parts))
+
+
+@dataclass(frozen=True)
+class _State:
+    unknowns: Unknowns
+    residuals: Floats
+    jacobian: Floats
+
+
+def _descend(
+    misfit: Misfit, now: _State, start: Unknowns | None, noise: float, most: int
+) -> tuple[_State, int, bool]:
+    """One stage: state, evaluations used, whether it converged."""
+    widths = now.unknowns.widths
+    pull = np.zeros(widths.size) if start is None else 1.0 / widths**2
+
+    def cost_of(unknowns: Unknowns, residuals: Floats) -> float:
+        away = 0.0 if start is None else float((pull * unknowns.distance(start) ** 2).sum())
+        return float(residuals @ residuals) / noise**2 + away
+
+    damping, cost, count = 1e-4, cost_of(now.unknowns, now.residuals), 0
+    for _ in range(most):
+        normal = now.jacobian.T @ now.jacobian / noise**2 + np.diag(pull)
+        slope = now.jacobian.T @ now.residuals / noise**2
+        if start is not None:
+            slope = slope - pull * now.unknowns.distance(start)
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        better: tuple[Unknowns, float] | None = None
+        while better is None and damping < 1e6:
+            damped = normal / np.outer(scale, scale) + damping * np.eye(scale.size)
+            step = np.linalg.lstsq(damped, slope / scale, rcond=1e-15)[0] / scale
+            longest = float(np.abs(np.where(now.unknowns.by_logarithm, step, step / widths)).max())
+            trial = now.unknowns.moved(step * min(1.0, _LONGEST / max(longest, 1e-300)))
+            residuals = misfit.residuals(trial)
+            count += 1
+            if residuals is not None and np.isfinite(residuals).all():
+                reached = cost_of(trial, residuals)
+                if reached < cost:
+                    better = trial, reached
+                    continue
+            damping = max(10.0 * damping, 1e-6)
+        if better is None:
+            return now, count, True
+        decrease, cost = cost - better[1], better[1]
+        found = misfit.linearised(better[0])
+        count += 1
+        if found is None:
+            return now, count, False
+        now, damping = _State(better[0], *found), max(0.1 * damping, 1e-12)
+        if decrease < (_DONE if start is None else _ENOUGH * cost):
+            return now, count, True
+    return now, count, False

@@ -173,7 +173,7 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
             changed[field] = tuple(parts)
         else:
             changed[field] = float(value)
-    return dataclasses.replace(law, **changed)  # type: ignore[arg-type]
+    return dataclasses.replace(law, **changed)
 
 
 _LOSSES = (
@@ -261,9 +261,10 @@ class SampledLaw:
         self.parameters = motion_parameters(law)
         self.parameters["inertia_kg"] += added_inertia_kg
         self._native = _motion.Law(*self.table.arrays())
-        lengths_m = self.table.low_m + self.table.step_m * np.arange(self.table.elastic_n.size)
+        knots = np.arange(self.table.elastic_n.size, dtype=np.float64)
+        lengths_m = np.asarray(self.table.low_m + self.table.step_m * knots)
         rows = self.table.capacitance_f.shape[0]
-        voltages_v = self.table.step_v * np.arange(rows)
+        voltages_v = np.asarray(self.table.step_v * np.arange(rows, dtype=np.float64))
         elastic, pull, capacitance, free, losses = [], [], [], [], []
         for name in self.by:
             low, high, width = _beside(law, name)
@@ -276,10 +277,10 @@ class SampledLaw:
             changed = _losses_of(motion_parameters(high)) - _losses_of(motion_parameters(low))
             changed[_INERTIA] += width if name == ADDED_INERTIA else 0.0
             losses.append(changed / width)
-        count, knots = len(self.by), lengths_m.size
-        self._elastic = np.reshape(elastic, (count, knots))
-        self._pull = np.reshape(pull, (count, rows, knots))
-        self._capacitance = np.reshape(capacitance, (count, rows, knots))
+        count = len(self.by)
+        self._elastic = np.reshape(elastic, (count, knots.size))
+        self._pull = np.reshape(pull, (count, rows, knots.size))
+        self._capacitance = np.reshape(capacitance, (count, rows, knots.size))
         self.free_by = np.reshape(free, count).astype(np.float64)
         losses_by = np.reshape(losses, (count, len(_LOSSES)))
         used = np.flatnonzero((losses_by != 0.0).any(axis=0))
@@ -377,7 +378,12 @@ class SampledLaw:
         def part(chosen: NDArray[np.int64]) -> tuple[NDArray[np.void], tuple[Floats, ...]]:
             """Some of the columns; the motion itself is the same in each part."""
             moved, size = start.copy(), chosen.size
-            seen = tuple(np.empty(n) for n in (times.size, times.size, intervals, intervals))
+            seen = (
+                np.empty(times.size),
+                np.empty(times.size),
+                np.empty(intervals),
+                np.empty(intervals),
+            )
             own_rows = np.ascontiguousarray(rows[:, chosen])
             lengths, means = np.empty((times.size, size)), np.empty((intervals, size))
             _motion.play(

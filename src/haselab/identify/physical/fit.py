@@ -11,8 +11,9 @@ where the standard deviations are those of the residuals themselves, channel by 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from haselab.actuators import ADDED_INERTIA, ActuatorLaw
 from haselab.base import Estimate, InputError, JsonObject
 from haselab.base.chart import Chart
 from haselab.identify.fit import Fit
+from haselab.identify.noise import coloured_covariance, whiteness_p
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.search import Found, search
@@ -29,6 +31,7 @@ from haselab.identify.physical.unknowns import Unknowns
 __all__ = ["ActuatorFit", "fit_actuator"]
 
 Floats = NDArray[np.float64]
+_LENGTH, _CAPACITANCE = "length", "capacitance"
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
@@ -64,7 +67,7 @@ class ActuatorFit(Fit):
     capacitance_noise_f: float = float("nan")
     evaluations: int = 0
     chi_squared_ratio: float = float("nan")
-    channels: Mapping[str, float] = field(default_factory=dict)
+    residual_whiteness_p: float = float("nan")
 
     def answer(self) -> JsonObject:
         """See `Fit`."""
@@ -134,31 +137,68 @@ def fit_actuator(
     return _result(misfit, found, count)
 
 
-def _split(misfit: Misfit, residuals: Floats) -> tuple[Floats, Floats]:
-    """Residuals of all lengths, and of all capacitances."""
-    lengths, capacitances, at = [], [], 0
-    for record in misfit.records:
-        lengths.append(residuals[at : at + record.length_m.size])
-        at += record.length_m.size
-        capacitances.append(residuals[at : at + record.capacitance_f.size])
-        at += record.capacitance_f.size
-    return np.concatenate(lengths), np.concatenate(capacitances)
+@dataclass(frozen=True)
+class _Segment:
+    """Residuals of one channel in one experiment, with their rows."""
+
+    experiment: str
+    channel: str
+    rows: NDArray[np.int64]
+
+
+def _segments(records: Sequence[MotionRecord]) -> list[_Segment]:
+    found, at = [], 0
+    for record in records:
+        for channel, member in (
+            (_LENGTH, record.length_experiment),
+            (_CAPACITANCE, record.capacitance_experiment),
+        ):
+            for k, name in enumerate(record.experiments):
+                rows = at + np.flatnonzero(member == k)
+                if rows.size:
+                    found.append(_Segment(name, channel, rows))
+            at += member.size
+    return found
+
+
+def _channel(segments: Sequence[_Segment], channel: str, residuals: Floats) -> list[Floats]:
+    """Residuals of one channel, experiment by experiment."""
+    return [residuals[part.rows] for part in segments if part.channel == channel]
 
 
 def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
     """True over stated standard deviation of both channels, by the residuals."""
-    parts = _split(misfit, found.residuals)
+    segments = _segments(misfit.records)
     share = 1.0 - found.unknowns.values.size / found.residuals.size
-    rms = [float(np.sqrt(np.mean(part**2) / share)) if part.size else 1.0 for part in parts]
+    rms = [_rms(_channel(segments, name, found.residuals)) / math.sqrt(share)
+           for name in (_LENGTH, _CAPACITANCE)]  # fmt: skip
     return misfit.length_factor * rms[0], misfit.capacitance_factor * rms[1]
+
+
+def _rms(parts: Sequence[Floats]) -> float:
+    return math.sqrt(float(np.mean(np.concatenate(parts) ** 2))) if parts else 1.0
+
+
+def _neighbours(parts: Sequence[Floats]) -> float:
+    """Noise by the differences of neighbours, which a slow misfit does not change."""
+    steps = [np.diff(part) for part in parts if part.size > 1]
+    return _rms(steps) / math.sqrt(2.0) if steps else math.nan
+
+
+def _typical(parts: Sequence[Floats]) -> float:
+    """Typical standard deviation of a channel; NaN where it has no values."""
+    joined = np.concatenate(list(parts))
+    return float(np.median(joined)) if joined.size else math.nan
 
 
 def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
     unknowns = found.unknowns
-    scale = np.sqrt((found.jacobian**2).sum(axis=0))
-    scale[scale == 0.0] = 1.0
-    normal = found.jacobian.T @ found.jacobian / np.outer(scale, scale)
-    covariance = np.linalg.pinv(normal, rcond=1e-14, hermitian=True) / np.outer(scale, scale)
+    segments = _segments(misfit.records)
+    covariance = coloured_covariance(
+        [found.jacobian[part.rows] for part in segments],
+        [found.residuals[part.rows] for part in segments],
+        unknowns.values.size,
+    )
     std = np.sqrt(np.diag(covariance))
     units = {about.key: about.unit for about in unknowns.law.described()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
@@ -173,17 +213,24 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
         else:
             parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
     slopes = unknowns.slopes
-    lengths, capacitances = _split(misfit, found.residuals)
+    lengths = _channel(segments, _LENGTH, found.residuals)
+    capacitances = _channel(segments, _CAPACITANCE, found.residuals)
+    std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])
+    std_f = misfit.capacitance_factor * _typical([r.capacitance_std_f for r in misfit.records])
     return ActuatorFit(
         status="ok" if found.converged else "the search did not converge",
         parameters=parameters,
         covariance=covariance * np.outer(slopes, slopes),
-        residuals=(lengths, capacitances),
+        residuals=(*lengths, *capacitances),
+        length_rms_m=std_m * _rms(lengths),
+        length_noise_m=std_m * _neighbours(lengths),
+        capacitance_rms_f=std_f * _rms(capacitances),
+        capacitance_noise_f=std_f * _neighbours(capacitances),
+        residual_whiteness_p=min(whiteness_p(lengths), whiteness_p(capacitances)),
         law=unknowns.present_law(),
         kind=unknowns.law.kind,
         added_inertia_kg=unknowns.value(ADDED_INERTIA),
         not_identifiable=tuple(weak),
         evaluations=count,
         chi_squared_ratio=float(np.mean(found.residuals**2)),
-        channels={"length": misfit.length_factor, "capacitance": misfit.capacitance_factor},
     )

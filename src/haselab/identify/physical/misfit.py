@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
 from haselab.base import HaselabError
@@ -70,7 +70,7 @@ def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = Tr
     if not derivatives:
         none = np.zeros((0, 0))
         return Modelled(length_m, scale * inside, none, none)
-    columns = {
+    columns: dict[str, tuple[ArrayLike, ArrayLike]] = {
         CAMERA_LATENCY: (-response.speed_m_s, 0.0),
         CAMERA_OFFSET: (1.0, 0.0),
         SENSING_LATENCY: (0.0, -scale * drift),
@@ -82,7 +82,8 @@ def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = Tr
     length_by[:, :count] = response.length_by
     capacitance_by[:, :count] = scale * response.capacitance_by[record.sensed]
     for k, name in enumerate(unknowns.names[count:], start=count):
-        length_by[:, k], capacitance_by[:, k] = columns[name]
+        length_by[:, k] = np.asarray(columns[name][0])
+        capacitance_by[:, k] = np.asarray(columns[name][1])
     slopes = unknowns.slopes
     return Modelled(length_m, scale * inside, length_by * slopes, capacitance_by * slopes)
 

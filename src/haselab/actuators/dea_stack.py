@@ -65,7 +65,8 @@ class DeaStack(ActuatorLaw):
     layer_thickness_m: float = parameter(
         0.7e-3, unit="m", low=1e-6, high=1e-2, description="undeformed")
     side_m: float = parameter(
-        0.025, unit="m", low=1e-3, high=0.3, description="of the square cross-section", fitted=False)
+        0.025, unit="m", low=1e-3, high=0.3, description="of the square cross-section",
+        fitted=False)
     shear_modulus_pa: float = parameter(
         15e3, unit="Pa", low=1.0, high=1e8, description="of the elastomer")
     extension_limit: float = parameter(

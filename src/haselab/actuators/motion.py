@@ -19,8 +19,8 @@ Floats = NDArray[np.float64]
 class ActuatorState:
     r"""State of an actuator. All shapes may have any number of leading axes.
 
-    A viscoelastic branch of share $g$ and time constant $\tau$ pulls with $g\,(F - y)$, where $F$ is
-    the elastic force and $y$ the force to which the branch has relaxed: $\dot y = (F - y)/\tau$.
+    A viscoelastic branch of share $g$ and time constant $\tau$ pulls with $g\,(F - y)$: $F$ is the
+    elastic force and $y$ the force to which the branch has relaxed, $\dot y = (F - y)/\tau$.
 
     Args:
         length_m: present length.

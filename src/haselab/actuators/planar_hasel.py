@@ -70,7 +70,8 @@ class PlanarHasel(ActuatorLaw):
     length_m: float = parameter(0.0624, unit="m", low=0.01, high=0.2,
         description="between clamps, unstretched", key="shell.length_m")
     shell_width_m: float = parameter(
-        0.0498, unit="m", low=0.005, high=0.3, description="unstretched", key="shell.width_m", fitted=False)
+        0.0498, unit="m", low=0.005, high=0.3, description="unstretched", key="shell.width_m",
+        fitted=False)
     shell_thickness_m: float = parameter(1.2e-3, unit="m", low=1e-4, high=1e-2,
         description="unstretched, without oil", key="shell.thickness_m", fitted=False)
     shell_lateral_stretch: float = parameter(3.0, unit="", low=1.0, high=5.0,

@@ -400,7 +400,7 @@ class SampledLaw:
             state, seen = part(parts[0])
         else:
             with ThreadPoolExecutor(workers) as pool:
-                state, seen = list(pool.map(part, parts))[0]
+                state, seen = next(iter(pool.map(part, parts)))  # the others end with the pool
         length, speed, mean, drift = seen
         joined = np.block([
             [self._joined, np.zeros((self._joined.shape[0], extra))],

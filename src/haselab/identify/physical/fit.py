@@ -25,7 +25,7 @@ from haselab.identify.fit import Fit
 from haselab.identify.noise import coloured_covariance, whiteness_p
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.search import Found, search
+from haselab.identify.physical.search import Found, refine, search
 from haselab.identify.physical.unknowns import Unknowns
 
 __all__ = ["ActuatorFit", "fit_actuator"]
@@ -130,7 +130,7 @@ def fit_actuator(
         misfit = Misfit(records, *factors)
         if same:
             break
-        again = search(misfit, found.unknowns)
+        again = refine(misfit, found)
         if again is None:
             break
         found, count = again, count + again.evaluations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,13 +11,18 @@ from numpy.typing import NDArray
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.unknowns import Unknowns
 
-__all__ = ["Found", "search"]
+__all__ = ["Found", "refine", "search"]
 
 Floats = NDArray[np.float64]
 _STAGES = 3  # before the last one; in each, the noise is assumed a tenth of that before
 _FIRST_SHARE = 0.3  # of the signals' spread: noise of the first stage
 _STEPS = 20  # of one stage
-_LAST_STEPS = 40
+_LAST_STEPS = 14
+_BEND = 3.0  # standard deviations from which a residual counts less, while the start counts
+_DRAWN = 0.7  # widths, of further starts
+_TRIALS = 24  # starts that are compared
+_TRIED = 6  # of them, followed to the end of the first stage
+_EXPLAINED = 0.1  # mean bounded square below which the first stage has explained the records
 _LONGEST = 0.5  # step, in what varies over its width or as a logarithm
 _ENOUGH = 1e-3  # relative decrease that ends a stage
 _DONE = 1e-2  # decrease of chi squared that ends the last one
@@ -47,26 +53,78 @@ def search(misfit: Misfit, start: Unknowns) -> Found | None:
     A path of growing confidence in the data: in each stage the noise is assumed ten times smaller,
     and the start counts as an observation with the widths of the unknowns. So what the data
     determine well comes right first, while what they hardly determine stays near the start, and
-    the strongly curved valley of the last stage is entered near its floor. The last stage is
-    Levenberg-Marquardt without the start.
+    the strongly curved valley of the last stage is entered near its floor. Parts of the records
+    that the model misses altogether, such as a collapse that the start predicts, count little
+    there; if much of the records remains so after the first stage, another start is drawn within
+    the widths. The last stage is Levenberg-Marquardt without the start.
 
     Args:
         misfit: to minimise.
         start: first values.
     Returns:
-        What was found; None if no motion exists at the start.
+        What was found; None if no motion exists near the start.
     """
-    found = misfit.linearised(start)
-    if found is None:
+    noise = max(1.0, _FIRST_SHARE * _spread(misfit))
+    now, count = _first_stage(misfit, start, noise)
+    if now is None:
         return None
-    now, count = _State(start, *found), 1
-    spread = _FIRST_SHARE * _spread(misfit)
-    noise = [max(1.0, spread * 0.1**k) for k in range(_STAGES)]
-    for level in noise:
-        now, used, _ = _descend(misfit, now, start, level, _STEPS)
+    for _ in range(1, _STAGES):
+        noise = max(1.0, 0.1 * noise)
+        now, used, _ = _descend(misfit, now, start, noise, _STEPS)
         count += used
     now, used, converged = _descend(misfit, now, None, 1.0, _LAST_STEPS)
     return Found(now.unknowns, now.residuals, now.jacobian, converged, count + used)
+
+
+def refine(misfit: Misfit, found: Found) -> Found | None:
+    """Minimise the misfit again after its weights have changed.
+
+    Args:
+        misfit: with the new weights.
+        found: result before.
+    Returns:
+        The new result; None if no motion exists there.
+    """
+    again = misfit.linearised(found.unknowns)
+    if again is None:
+        return None
+    now = _State(found.unknowns, *again)
+    now, used, converged = _descend(misfit, now, None, 1.0, _LAST_STEPS)
+    return Found(now.unknowns, now.residuals, now.jacobian, converged, used + 1)
+
+
+def _first_stage(misfit: Misfit, start: Unknowns, noise: float) -> tuple[_State | None, int]:
+    """The best end of the first stage, from the start and others near it; evaluations used."""
+    rng = np.random.default_rng(0)
+    trials = [start] + [
+        start.moved(_DRAWN * start.widths * rng.standard_normal(start.widths.size))
+        for _ in range(_TRIALS)
+    ]
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(misfit.residuals, trials))
+    costs = [np.inf if part is None else _bounded(part, noise) for part in found]
+    best: tuple[float, _State] | None = None
+    count = len(trials)
+    for k in np.argsort(costs)[:_TRIED]:
+        first = misfit.linearised(trials[k])
+        count += 1
+        if first is None:
+            continue
+        now, used, _ = _descend(misfit, _State(trials[k], *first), start, noise, _STEPS)
+        count += used
+        cost = _bounded(now.residuals, noise)
+        if best is None or cost < best[0]:
+            best = cost, now
+        if cost < _EXPLAINED * now.residuals.size:
+            break
+    return (None if best is None else best[1]), count
+
+
+def _bounded(residuals: Floats, noise: float) -> float:
+    """Squares over the noise, of which large ones count little."""
+    if not np.isfinite(residuals).all():
+        return np.inf
+    return float(_BEND**2 * np.log1p((residuals / (_BEND * noise)) ** 2).sum())
 
 
 def _spread(misfit: Misfit) -> float:
@@ -94,13 +152,19 @@ def _descend(
     pull = np.zeros(widths.size) if start is None else 1.0 / widths**2
 
     def cost_of(unknowns: Unknowns, residuals: Floats) -> float:
-        away = 0.0 if start is None else float((pull * unknowns.distance(start) ** 2).sum())
-        return float(residuals @ residuals) / noise**2 + away
+        if start is None:
+            return float(residuals @ residuals)
+        away = float((pull * unknowns.distance(start) ** 2).sum())
+        return _bounded(residuals, noise) + away
 
     damping, cost, count = 1e-4, cost_of(now.unknowns, now.residuals), 0
     for _ in range(most):
-        normal = now.jacobian.T @ now.jacobian / noise**2 + np.diag(pull)
-        slope = now.jacobian.T @ now.residuals / noise**2
+        weights = np.ones(now.residuals.size)
+        if start is not None:
+            weights = 1.0 / (noise**2 + (now.residuals / _BEND) ** 2)
+        weighed = now.jacobian * weights[:, None]
+        normal = weighed.T @ now.jacobian + np.diag(pull)
+        slope = weighed.T @ now.residuals
         if start is not None:
             slope = slope - pull * now.unknowns.distance(start)
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -121,6 +185,8 @@ def _descend(
         if better is None:
             return now, count, True
         decrease, cost = cost - better[1], better[1]
+        if __import__("os").environ.get("PHDEBUG"):
+            print(noise, count, cost, decrease, damping, "pred", float(slope @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[0] @ (1 / scale) if False else (slope / scale) @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[0]), flush=True)
         found = misfit.linearised(better[0])
         count += 1
         if found is None:

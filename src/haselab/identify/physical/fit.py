@@ -26,7 +26,7 @@ from haselab.identify.noise import coloured_covariance, whiteness_p
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.search import Found, refine, search
-from haselab.identify.physical.unknowns import Unknowns
+from haselab.identify.physical.unknowns import CAMERA_OFFSET, Unknowns
 
 __all__ = ["ActuatorFit", "fit_actuator"]
 
@@ -98,6 +98,7 @@ def fit_actuator(
     *,
     mass_kg: float,
     added_inertia_kg: float = 0.0,
+    camera_bias_m: float = 2e-6,
 ) -> ActuatorFit:
     """Identify a physical model from records.
 
@@ -106,6 +107,8 @@ def fit_actuator(
         records: of one actuator.
         mass_kg: hung mass, the scale of an added inertia.
         added_inertia_kg: where to start with that.
+        camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
+            is usual.
     Returns:
         The model, with the covariance of its parameters.
     Raises:
@@ -114,7 +117,8 @@ def fit_actuator(
     if not records:
         raise InputError("There is no record of the actuator's motion. Give at least one.")
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
-    misfit = Misfit(records)
+    known = {CAMERA_OFFSET: camera_bias_m}
+    misfit = Misfit(records, known=known)
     found = search(misfit, start)
     if found is None:
         return ActuatorFit(
@@ -127,7 +131,7 @@ def fit_actuator(
         factors = _factors(misfit, found)
         same = np.allclose(factors, (misfit.length_factor, misfit.capacitance_factor),
                            rtol=_SAME_NOISE)  # fmt: skip
-        misfit = Misfit(records, *factors)
+        misfit = Misfit(records, *factors, known)
         if same:
             break
         again = refine(misfit, found)
@@ -146,7 +150,7 @@ class _Segment:
     rows: NDArray[np.int64]
 
 
-def _segments(records: Sequence[MotionRecord]) -> list[_Segment]:
+def _segments(records: Sequence[MotionRecord], rows_in_all: int) -> list[_Segment]:
     found, at = [], 0
     for record in records:
         for channel, member in (
@@ -158,7 +162,8 @@ def _segments(records: Sequence[MotionRecord]) -> list[_Segment]:
                 if rows.size:
                     found.append(_Segment(name, channel, rows))
             at += member.size
-    return found
+    known = np.arange(at, rows_in_all)
+    return [*found, _Segment("", "known", known)] if known.size else found
 
 
 def _channel(segments: Sequence[_Segment], channel: str, residuals: Floats) -> list[Floats]:
@@ -168,7 +173,7 @@ def _channel(segments: Sequence[_Segment], channel: str, residuals: Floats) -> l
 
 def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
     """True over stated standard deviation of both channels, by the residuals."""
-    segments = _segments(misfit.records)
+    segments = _segments(misfit.records, found.residuals.size)
     share = 1.0 - found.unknowns.values.size / found.residuals.size
     rms = [_rms(_channel(segments, name, found.residuals)) / math.sqrt(share)
            for name in (_LENGTH, _CAPACITANCE)]  # fmt: skip
@@ -193,7 +198,7 @@ def _typical(parts: Sequence[Floats]) -> float:
 
 def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
     unknowns = found.unknowns
-    segments = _segments(misfit.records)
+    segments = _segments(misfit.records, found.residuals.size)
     covariance = coloured_covariance(
         [found.jacobian[part.rows] for part in segments],
         [found.residuals[part.rows] for part in segments],

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -114,11 +114,14 @@ class Misfit:
         records: what was seen.
         length_factor: true over stated standard deviation of the lengths.
         capacitance_factor: the same of the capacitances.
+        known: standard deviations of what is known of an instrument beforehand, by its name; each
+            is one more residual, after those of the records.
     """
 
     records: Sequence[MotionRecord]
     length_factor: float = 1.0
     capacitance_factor: float = 1.0
+    known: Mapping[str, float] = field(default_factory=dict)
 
     def residuals(self, unknowns: Unknowns) -> Floats | None:
         """Measured minus modelled over the standard deviation; None where no motion exists.
@@ -126,10 +129,10 @@ class Misfit:
         Args:
             unknowns: of the model.
         Returns:
-            All lengths, then all capacitances, of one record after the other.
+            All lengths, then all capacitances, of one record after the other; then what is known.
         """
         found = self._each(unknowns, derivatives=False)
-        return None if found is None else self._weighed(found)
+        return None if found is None else self._weighed(found, unknowns)
 
     def linearised(self, unknowns: Unknowns) -> tuple[Floats, Floats] | None:
         """Residuals and their derivatives by what varies; None where no motion exists.
@@ -148,7 +151,9 @@ class Misfit:
             by.append(part.length_by / (self.length_factor * record.length_std_m)[:, None])
             std_f = self.capacitance_factor * record.capacitance_std_f
             by.append(part.capacitance_by / std_f[:, None])
-        return self._weighed(found), np.vstack(by)
+        for name, std in self.known.items():
+            by.append(np.where(np.array(unknowns.names) == name, 1.0 / std, 0.0)[None])
+        return self._weighed(found, unknowns), np.vstack(by)
 
     def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[Modelled] | None:
         def one(record: MotionRecord) -> Modelled:
@@ -162,11 +167,12 @@ class Misfit:
         except HaselabError:
             return None
 
-    def _weighed(self, found: Sequence[Modelled]) -> Floats:
+    def _weighed(self, found: Sequence[Modelled], unknowns: Unknowns) -> Floats:
         parts = []
         for part, record in zip(found, self.records, strict=True):
             std_m = self.length_factor * record.length_std_m
             parts.append((record.length_m - part.length_m) / std_m)
             std_f = self.capacitance_factor * record.capacitance_std_f
             parts.append((record.capacitance_f - part.capacitance_f) / std_f)
-        return np.concatenate(parts)
+        known = [-unknowns.value(name) / std for name, std in self.known.items()]
+        return np.concatenate([*parts, known])

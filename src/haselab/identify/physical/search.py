@@ -186,7 +186,27 @@ def _descend(
             return now, count, True
         decrease, cost = cost - better[1], better[1]
         if __import__("os").environ.get("PHDEBUG"):
-            print(noise, count, cost, decrease, damping, "pred", float(slope @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[0] @ (1 / scale) if False else (slope / scale) @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[0]), flush=True)
+            print(
+                noise,
+                count,
+                cost,
+                decrease,
+                damping,
+                "pred",
+                float(
+                    slope
+                    @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[
+                        0
+                    ]
+                    @ (1 / scale)
+                    if False
+                    else (slope / scale)
+                    @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[
+                        0
+                    ]
+                ),
+                flush=True,
+            )
         found = misfit.linearised(better[0])
         count += 1
         if found is None:

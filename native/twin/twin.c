@@ -156,6 +156,9 @@ double twin_gap(const twin_parameters *p, double length_m)
 /* Force of the field under the mean square voltage `v2`, along the length. */
 static double electric_force(const twin_parameters *p, double length_m, double v2)
 {
+    if (v2 == 0.0) {
+        return 0.0;
+    }
     if (p->law.lengths) {
         return v2 * across(&p->law, p->law.pull_n_v2, length_m, sqrt(v2));
     }
@@ -223,7 +226,7 @@ static double pulling_square(const twin_parameters *p, twin_state *s, double mea
 
 static void watch_field(const twin_parameters *p, twin_state *s, double voltage)
 {
-    const double field = fabs(voltage) / twin_gap(p, s->length_m);
+    const double field = voltage != 0.0 ? fabs(voltage) / twin_gap(p, s->length_m) : 0.0;
     if (field > s->field_v_m) {
         s->field_v_m = field;
     }

@@ -300,7 +300,7 @@ def test_an_interrupted_run_leaves_a_video_that_can_be_read(tmp_path, keep):
     scene = Scene(tmp_path, {"advance": (3, KeyboardInterrupt())}, keep)
     with pytest.raises(KeyboardInterrupt), scene.camera_recorder, scene.runner as runner:
         play(runner)
-    path = tmp_path / "video" / "x.mkv"
+    path = tmp_path / "video" / "x.avi"
     assert path.exists() == (keep != "none")
     if keep != "none":
         frames = scene.record("x").frame_time_s

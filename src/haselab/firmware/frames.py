@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import binascii
-import functools
 import struct
 from dataclasses import astuple, fields
 from typing import Any
@@ -119,16 +118,18 @@ def decode_message(frame: bytes) -> tuple[Any, int] | None:
     return _build(kind, struct.unpack(kind.LAYOUT, data[_HEADER.size :])), sequence
 
 
-@functools.cache
 def _array_field(kind: type[Any]) -> tuple[int, int]:
-    """Index of a message's array field, behind the last field if there is none, and their number."""
+    """Index of a message's array field, past the end if there is none, and the number of fields."""
     arrays = [str(field.type).startswith("tuple") for field in fields(kind)]
     return [*arrays, True].index(True), len(arrays)
 
 
+_ARRAY_FIELDS = {kind.CODE: _array_field(kind) for kind in _KINDS.values()}
+
+
 def _build(kind: type[Any], values: tuple[Any, ...]) -> Any:
     """Assign values to fields; an array field takes those that the others leave."""
-    at, count = _array_field(kind)
+    at, count = _ARRAY_FIELDS[kind.CODE]
     if at == count:
         return kind(*values)
     end = at + 1 + len(values) - count

@@ -78,7 +78,7 @@ def _peaks(
     for down, right in _NEIGHBOURS:
         top, left = edge + down, edge + right
         highest &= inner >= response[top : top + height, left : left + width]
-    found = np.argwhere(highest) + edge
+    found: NDArray[np.intp] = np.argwhere(highest) + edge
     radius = max(1, round(radius_px))
     around = sliding_window_view(
         np.pad(response, radius, constant_values=-np.inf), (2 * radius + 1,) * 2

@@ -27,7 +27,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     "identify": (
         Measurement("identification.static_laws"),
         Measurement(
-            "identification.transfer", quick={"runs": 300, "structures": 0, "libraries": False}
+            "identification.transfer", quick={"runs": 60, "structures": 0, "libraries": False}
         ),
         Measurement("control.many_loops"),
         Measurement("identification.frequency_response", quick={"runs": 10}),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, check_fields, checked, real_array
 
 __all__ = ["HOLDS", "Record", "finite_vector"]
 
@@ -20,7 +21,7 @@ _LARGEST_SHARE = 0.05  # of the record
 
 def finite_vector(name: str, values: object, least: int) -> Floats:
     """`values` as a finite vector of at least `least` numbers, or an `InputError`."""
-    vector = np.asarray(values, dtype=np.float64)
+    vector = real_array(name, values)
     if vector.ndim != 1 or vector.size < least:
         raise InputError(
             f"{name} has shape {vector.shape}; it must be a vector of at least {least} values. "
@@ -60,8 +61,10 @@ class Record:
     output_time_s: Floats
     input_before: float | None = 0.0
     hold: str = "zero"
+    made_by: ClassVar[str] = "Make records of columns with haselab.records(data, input, output)."
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, least in (("u", 1), ("y", 8), ("output_time_s", 8)):
             object.__setattr__(self, name, finite_vector(name, getattr(self, name), least))
         if self.y.size != self.output_time_s.size:
@@ -100,10 +103,11 @@ class Record:
         return float(np.median(np.diff(self.output_time_s)))
 
     @classmethod
+    @checked
     def sampled(
         cls,
-        u: object,
-        y: object,
+        u: ArrayLike,
+        y: ArrayLike,
         rate_hz: float,
         input_before: float | None = None,
         *,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, checked
 
 __all__ = ["constant", "linear_chirp", "multisine", "prbs", "square", "triangle"]
 
@@ -34,6 +34,7 @@ def _count(duration_s: float, rate_hz: float) -> int:
     return round(count)
 
 
+@checked
 def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:
     """Create a constant signal.
 
@@ -52,6 +53,7 @@ def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.floa
     return np.full(_count(duration_s, rate_hz), float(level))
 
 
+@checked
 def triangle(
     low: float, high: float, frequency_hz: float, cycles: int, rate_hz: float
 ) -> NDArray[np.float64]:
@@ -78,6 +80,7 @@ def triangle(
     return low + (high - low) * rise
 
 
+@checked
 def linear_chirp(
     start_hz: float, stop_hz: float, duration_s: float, rate_hz: float
 ) -> NDArray[np.float64]:
@@ -109,6 +112,7 @@ def linear_chirp(
     return np.sin(2.0 * np.pi * (start_hz * time_s + 0.5 * sweep_hz_s * time_s**2))
 
 
+@checked
 def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:
     """Create a square wave of plus and minus one, plus first: signs for alternating polarity.
 
@@ -133,6 +137,7 @@ def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np
     return np.where(np.floor(halves + 1e-9) % 2 == 0, 1.0, -1.0)
 
 
+@checked
 def prbs(
     bit_s: float, duration_s: float, rate_hz: float, register_start: int = 1
 ) -> NDArray[np.float64]:
@@ -174,6 +179,7 @@ def prbs(
     return np.repeat(signs, held)[:count]
 
 
+@checked
 def multisine(
     frequencies_hz: ArrayLike,
     duration_s: float,

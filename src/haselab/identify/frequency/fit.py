@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import chdtrc
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import lines_chart
 from haselab.identify.fit import RecordFit
@@ -133,6 +133,7 @@ class ResponseFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_response(
     frequency_hz: object,
     response: object,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import loop_chart
 from haselab.identify.fit import RecordFit, rescaled, several
@@ -157,6 +157,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
         }
 
 
+@checked
 def fit_hysteresis(
     records: LoopRecord | Sequence[LoopRecord],
     model: str = "auto",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
@@ -107,6 +107,7 @@ class SubspaceFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_subspace(
     records: Record | Sequence[Record],
     order: int | None = None,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base import Estimate, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit
@@ -129,6 +129,7 @@ class MapFit(CurveFit):
         }
 
 
+@checked
 def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
     r"""Penalised least squares of a quadratic spline.
 

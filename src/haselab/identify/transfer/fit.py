@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import Prediction, RecordFit, several
@@ -244,6 +244,7 @@ class TransferFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_transfer(
     records: Record | Sequence[Record],
     structure: TransferStructure | None = None,

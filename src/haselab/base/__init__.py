@@ -1,6 +1,6 @@
 """Foundations that every package uses: estimates, limits, errors, progress."""
 
-from haselab.base.arguments import check_fields, checked, generator, real_array
+from haselab.base.arguments import check_fields, checked, generator, real_array, shown
 from haselab.base.closing import Closing
 from haselab.base.errors import (
     DeviceError,
@@ -34,6 +34,7 @@ __all__ = [
     "checked",
     "generator",
     "real_array",
+    "shown",
     "table_at",
     "to_plain",
 ]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base.errors import InputError
 
-__all__ = ["check_fields", "checked", "generator", "real_array"]
+__all__ = ["check_fields", "checked", "generator", "real_array", "shown"]
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
@@ -96,9 +96,9 @@ def real_array(name: str, values: object) -> NDArray[np.float64]:
     if array.dtype.kind in "biuf":
         return np.asarray(array, dtype=np.float64)
     if array.ndim == 0:
-        raise InputError(f"{name} is {_shown(values)}; it must be an array of real numbers.")
+        raise InputError(f"{name} is {shown(values)}; it must be an array of real numbers.")
     strange = next((each for each in array.flat if not _is_real(each)), array.dtype)
-    raise InputError(f"{name} holds {_shown(strange)}; it must hold real numbers.")
+    raise InputError(f"{name} holds {shown(strange)}; it must hold real numbers.")
 
 
 def generator(seed: object, name: str = "seed") -> np.random.Generator:
@@ -113,7 +113,7 @@ def generator(seed: object, name: str = "seed") -> np.random.Generator:
         InputError: anything else; a seed of None would give other numbers each time.
     """
     if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
-        raise InputError(f"{name} is {_shown(seed)}; it must be a whole number of 0 or more.")
+        raise InputError(f"{name} is {shown(seed)}; it must be a whole number of 0 or more.")
     return np.random.default_rng(int(seed))
 
 
@@ -138,7 +138,7 @@ def _check(name: str, value: object, kind: Any) -> None:
     words = " or ".join(dict.fromkeys(_described(option) for option in kinds))
     made_by = next(filter(None, (getattr(option, "made_by", "") for option in options)), "")
     advice = f" {made_by}" if made_by else ""
-    raise InputError(f"{name} is {_shown(value)}; it must be {words}.{advice}")
+    raise InputError(f"{name} is {shown(value)}; it must be {words}.{advice}")
 
 
 def _options(kind: Any) -> list[Any]:
@@ -152,6 +152,8 @@ def _options(kind: Any) -> list[Any]:
 def _suits(value: object, kind: Any) -> bool:
     """Whether a value is of a kind; what cannot be checked is."""
     origin, parts = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return True
     if kind is np.ndarray:
         try:
             real_array("", value)
@@ -164,6 +166,8 @@ def _suits(value: object, kind: Any) -> bool:
         return isinstance(value, Integral) and _is_real(value)
     if kind is bool:
         return isinstance(value, (bool, np.bool_))
+    if kind is str:
+        return isinstance(value, str) and "\0" not in value
     if origin is Literal:
         return isinstance(value, str) and value in parts
     if origin is tuple and parts[-1] is not Ellipsis:
@@ -211,20 +215,29 @@ def _described(kind: Any) -> str:
     if origin in (tuple, Sequence):
         return f"a sequence of {_plural(parts[0])}"
     if origin is Mapping:
-        return "a dictionary"
+        return f"a dictionary of {' or '.join(map(_plural, _options(parts[1])))}"
     name = str(getattr(kind, "__name__", kind))
     return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
 
 
 def _plural(kind: Any) -> str:
-    return _described(kind).removeprefix("a ").removeprefix("an ") + "s"
+    one = _described(kind).removeprefix("a ").removeprefix("an ")
+    return one if kind is bool else f"{one}s"
 
 
-def _shown(value: object) -> str:
+def shown(value: object) -> str:
+    """A value as an error message shows it: short, and in one line.
+
+    Args:
+        value: anything.
+    Returns:
+        Its text, or what it is where that is long.
+    """
     if isinstance(value, np.ndarray) and value.ndim:
         return f"an array of shape {value.shape} and type {value.dtype}"
     plain = value is None or isinstance(value, (Real, complex, str, bytes, list, tuple, dict))
     text = repr(value) if plain else f"an object of type {type(value).__name__}"
     if isinstance(value, np.generic):
         text = str(value)
+    text = " ".join(text.split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

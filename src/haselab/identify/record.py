@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -73,9 +74,9 @@ class Record:
                 "must be equally long. Give one time for each output."
             )
         _check_times(self.output_time_s)
-        if not self.input_rate_hz > 0.0:
+        if not 0.0 < self.input_rate_hz < math.inf:
             raise InputError(
-                f"input_rate_hz = {self.input_rate_hz:g} Hz; must be above 0 Hz. "
+                f"input_rate_hz = {self.input_rate_hz:g} Hz; must be above 0 Hz and finite. "
                 "Give the rate at which the input was updated."
             )
         if self.hold not in HOLDS:
@@ -125,9 +126,9 @@ class Record:
             held_at_hz: actual update rate of the input, a whole fraction of `rate_hz`,
                 if the command was recorded faster than the converter updates. None: `rate_hz`.
         """
-        if not rate_hz > 0.0:
+        if not 0.0 < rate_hz < math.inf:
             raise InputError(
-                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz. Give the sampling rate."
+                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz and finite. Give the sampling rate."
             )
         source, output = finite_vector("u", u, 8), finite_vector("y", y, 8)
         if source.size != output.size:

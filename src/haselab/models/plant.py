@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, JsonObject, check_fields, real_array
+from haselab.base import InputError, JsonObject, check_fields, checked, real_array
 from haselab.models.held_input import HeldInput
 
 __all__ = ["Plant", "SlowMode"]
@@ -97,6 +97,7 @@ class Plant:
         fast = -omega_rad_s * (zeta + root)
         return (omega_rad_s * omega_rad_s / fast, fast)
 
+    @checked
     def frequency_response(self, omega_rad_s: ArrayLike) -> NDArray[np.complex128]:
         """Complex gain at angular frequencies.
 
@@ -112,6 +113,7 @@ class Plant:
             total = total + mode.gain / (mode.time_constant_s * s + 1.0)
         return np.asarray(total * np.exp(-s * self.delay_s), dtype=np.complex128)
 
+    @checked
     def simulate(
         self,
         u: ArrayLike,

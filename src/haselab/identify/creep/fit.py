@@ -164,6 +164,7 @@ class CreepFit(RecordFit[Record]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
         return self.model.simulate(u, rate_hz or self.setting.span.rate_hz)

@@ -108,12 +108,14 @@ class FreeResponseFit(CurveFit):
     motion: tuple[Floats, ...] = field(repr=False)
     search: Floats = field(repr=False)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Motion of the first trial at times since its release, in s; see `CurveFit`."""
         self._require()
         time_s = np.atleast_1d(np.asarray(x, dtype=np.float64))
         return np.asarray(_shapes(self.search, time_s) @ self.motion[0])
 
+    @checked
     def compare(self, x: ArrayLike, y: ArrayLike) -> Prediction:
         """Predict another free motion with the fitted frequency and decay, and compare.
 

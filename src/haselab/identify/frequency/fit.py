@@ -102,6 +102,7 @@ class ResponseFit(RecordFit[Record]):
             tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
         )
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; lines have no rate, so `rate_hz` is needed."""
         inputs = finite_vector("u", u, 1)

@@ -113,6 +113,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the memory is that of rest at the first value of the input."""
         inputs = self._driven(finite_vector("u", u, 1))

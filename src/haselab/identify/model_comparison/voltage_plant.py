@@ -161,6 +161,7 @@ class VoltagePlantFit(RecordFit[Record]):
     parameter_count: int = 0
     modelled: tuple[Floats, ...] = field(default=(), repr=False)
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the first voltage has stood for ever."""
         plant = self._fitted()

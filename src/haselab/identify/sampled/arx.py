@@ -157,6 +157,7 @@ class ArxFit(RecordFit[Record]):
         part = self.covariance[: self.orders.na, : self.orders.na]
         return Estimate.normal(value, math.sqrt(max(float(slope @ part @ slope), 0.0)), unit)
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; rest is the operating point, and the rate that of the record."""
         model = self._fitted()

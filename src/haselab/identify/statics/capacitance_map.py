@@ -50,6 +50,7 @@ class CapacitanceMapFit(CurveFit):
         self._require()
         return LinearMap(self.parameters["slope"].value, self.parameters["offset"].value)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Strain at capacitances; see `CurveFit`."""
         return np.asarray(self.map.strain(x), dtype=np.float64)

@@ -151,6 +151,7 @@ class HyperelasticFit(CurveFit):
         self._require()
         return _law(self.best)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Nominal stress at stretches, in Pa, deformed as the first test; see `CurveFit`."""
         return self.predict(x).nominal_stress_pa

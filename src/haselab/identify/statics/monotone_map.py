@@ -100,6 +100,7 @@ class MapFit(CurveFit):
         x = self.map.inverse(y)
         return np.asarray(self.value_std(x) / np.abs(self.map.slope(x)))
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """See `CurveFit`."""
         return np.asarray(self.map.value(x), dtype=np.float64)

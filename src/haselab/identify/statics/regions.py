@@ -84,6 +84,7 @@ class RegionsFit(CurveFit):
         """Index of the longest region."""
         return 0
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Load at stretches, in N; the first and the last piece go on. See `CurveFit`."""
         self._require()

@@ -82,6 +82,7 @@ class VoltageMapFit(CurveFit):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.curve
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Voltage at strains, in V; see `CurveFit`."""
         return np.asarray(self.map.voltage_v(x), dtype=np.float64)

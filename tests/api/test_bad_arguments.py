@@ -345,7 +345,26 @@ def test_every_parameter_of_a_function_is_in_the_table(function):
 def test_every_public_function_is_in_the_table():
     public = {getattr(hl, name) for name in hl.__all__}
     functions = {each for each in public if inspect.isfunction(each)}
-    assert functions - {hl.armed} <= set(CALLS)  # `armed` belongs to a real bench
+    assert functions - {hl.armed} <= set(CALLS)  # what `armed` takes is in tests/safety
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: hl.load("."), r"The path is a folder, not a file"),
+        (lambda: hl.table({"u": U})["x"], r"no column 'x'; the table has u\. Name one"),
+        (lambda: CURVE.compare([], []), r"x has shape \(0,\) and y \(0,\)"),
+        (lambda: hl.signals.triangle(0.0, 1.0, 0.0, 1, 100.0), r"frequency_hz is 0; it must be"),
+        (lambda: hl.signals.multisine([1.0, 2.0], 1.0, 10.0, [1.0] * 3), r"power has shape \(3,\)"),
+        (lambda: hl.signals.linear_chirp("1", 2.0, 3.0, 100.0), r"start_hz is '1'; it must be"),
+        (lambda: hl.armed(None), r"rig is None; it must be a Rig"),
+        (lambda: hl.sense({**MONITORS, "v_monitor_v": np.full(4000, np.nan)}, carrier_hz=2000.0,
+                          rate_hz=2e5), r"v_monitor_v has no finite value"),
+    ],
+)  # fmt: skip
+def test_other_wrong_calls_are_refused(call, match):
+    with pytest.raises(InputError, match=match):
+        call()
 
 
 def test_a_refusal_says_the_true_reason():

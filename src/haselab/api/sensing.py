@@ -60,6 +60,9 @@ def sense(
         InputError: a column that is missing, no rate, or fewer samples than one block.
     """
     found = wanted(data, [v, i], rate_hz)
+    for name in (v, i):
+        if not np.isfinite(found[name]).any():
+            raise InputError(f"Column {name} has no finite value. Name another column.")
     rate = found.rate_hz
     if rate is None and found.time_s is not None:
         raise InputError(

@@ -259,7 +259,7 @@ class CurveFit(Fit):
         self._require()
         measured = np.asarray(y, dtype=np.float64)
         modelled = self.simulate(x)
-        if measured.shape != modelled.shape:
+        if measured.shape != modelled.shape or measured.size == 0:
             raise InputError(
                 f"x has shape {modelled.shape} and y {measured.shape}. Give one y for each x."
             )

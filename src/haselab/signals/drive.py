@@ -74,6 +74,8 @@ def triangle(
         >>> triangle(0.0, 2.0, 0.25, 1, 2.0)
         array([0. , 0.5, 1. , 1.5, 2. , 1.5, 1. , 0.5])
     """
+    if not 0.0 < frequency_hz < np.inf:
+        raise InputError(f"frequency_hz is {frequency_hz:g}; it must be above 0 Hz and finite.")
     time_s = np.arange(_count(cycles / frequency_hz, rate_hz)) / rate_hz
     phase = (time_s * frequency_hz) % 1.0
     rise: NDArray[np.float64] = 1.0 - np.abs(2.0 * phase - 1.0)
@@ -209,7 +211,13 @@ def multisine(
         (1.0, True)
     """
     lines_hz = np.atleast_1d(np.asarray(frequencies_hz, dtype=np.float64))
-    share = np.broadcast_to(np.asarray(power, dtype=np.float64), lines_hz.shape)
+    share = np.asarray(power, dtype=np.float64)
+    if share.shape not in ((), lines_hz.shape):
+        raise InputError(
+            f"power has shape {share.shape} for {lines_hz.size} lines. Give one value for each, or "
+            "one for all."
+        )
+    share = np.broadcast_to(share, lines_hz.shape)
     inside = (lines_hz > 0.0) & (lines_hz < 0.5 * rate_hz)
     if not inside.all() or not (share >= 0.0).all() or not share.sum() > 0.0:
         raise InputError(

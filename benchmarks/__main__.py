@@ -31,7 +31,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         ),
         Measurement("control.many_loops"),
         Measurement("identification.frequency_response", quick={"runs": 10}),
-        Measurement("identification.model_comparison", quick={"count": 1}),
+        Measurement("identification.model_comparison", quick={"count": 1, "readings": ("hz",)}),
         Measurement("identification.hysteresis", quick={"runs": 8}),
     ),
     "identify-board": (

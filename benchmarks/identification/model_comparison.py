@@ -12,6 +12,7 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -196,13 +197,17 @@ def _kept(task: tuple[str, str, int, Path | None]) -> dict[str, Any]:
 
 
 def runs(
-    count: int, folder: Path | None = None, processes: int = 1, first_seed: int = FIRST_SEED
+    count: int,
+    folder: Path | None = None,
+    processes: int = 1,
+    first_seed: int = FIRST_SEED,
+    readings: Sequence[str] = ("rad", "hz"),
 ) -> list[dict[str, Any]]:
-    """`count` runs of each of the four kinds of twin."""
+    """`count` runs of each of the four kinds of twin, two for each reading."""
     tasks = [
         (reading, creep, seed, folder)
         for seed in range(first_seed, first_seed + count)
-        for reading in ("rad", "hz")
+        for reading in readings
         for creep in ("mechanical", "electrical")
     ]
     if processes == 1:
@@ -239,9 +244,9 @@ def table(results: list[dict[str, Any]]) -> list[Row]:
     return made
 
 
-def rows(count: int = 2) -> list[Row]:
+def rows(count: int = 2, readings: Sequence[str] = ("rad", "hz")) -> list[Row]:
     """A few runs of each kind; `--runs 50` gives a hundred of each truth."""
-    return table(runs(count))
+    return table(runs(count, readings=readings))
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Foundations that every package uses: estimates, limits, errors, progress."""
+"""Foundations that every package uses: estimates, limits, errors, progress, registries."""
 
 from haselab.base.closing import Closing
 from haselab.base.errors import (
@@ -14,6 +14,7 @@ from haselab.base.json import Json, JsonObject, table_at
 from haselab.base.limits import Limits
 from haselab.base.plain import to_plain
 from haselab.base.progress import Progress, SilentProgress
+from haselab.base.registry import Registry
 
 __all__ = [
     "Closing",
@@ -26,6 +27,7 @@ __all__ = [
     "LimitError",
     "Limits",
     "Progress",
+    "Registry",
     "ResultError",
     "SafetyError",
     "SilentProgress",

@@ -54,8 +54,16 @@ def test_both_ends_of_a_range_are_allowed():
 @pytest.mark.parametrize("value", [-1e-12, 2.0000001, math.nan, math.inf, [1.0, 3.0]])
 def test_a_value_outside_or_none_at_all_is_refused_with_the_four_facts(value):
     limits = Limits("drive voltage", 0.0, 2.0, "V")
-    with pytest.raises(LimitError, match=r"^drive voltage = .* V is outside \[0, 2\] V\. Lower"):
+    with pytest.raises(LimitError, match=r"^drive voltage = .* V is outside \[0, 2\] V\. Ch"):
         limits.check(value)
+
+
+def test_the_file_of_the_limit_that_was_crossed_is_named():
+    limits = Limits("drive voltage", 0.0, 2.0, "V", high_source="leg.toml")
+    with pytest.raises(LimitError, match=r"widen the limit in leg\.toml\.$"):
+        limits.check(3.0)
+    with pytest.raises(LimitError, match=r"widen the limit in the rig file\.$"):
+        limits.check(-1.0)
 
 
 def test_every_error_is_one_of_ours_and_one_of_the_language():

@@ -205,6 +205,76 @@ def test_a_misspelled_key_is_warned_of_once_and_keys_of_ones_own_are_not(known, 
     assert error == line
 
 
+@pytest.mark.parametrize(
+    "command",
+    ["design {a}", "identify transfer no.csv --actuator {a}",
+     "calibrate --rig twin --capacitor 1e-9 --actuator {a}",
+     "identify capacitance-map no.csv --actuator {a}",
+     "identify voltage-map no.csv --actuator {a}"],
+)  # fmt: skip
+def test_a_read_only_file_is_refused_before_the_work(files, capsys, command):
+    actuator, *_ = files
+    text = actuator.read_text()
+    actuator.chmod(0o444)
+    code, _, error = run(capsys, *command.format(a=actuator).split())
+    assert code == 2 and error.count("\n") == 1 and "The file is read-only" in error
+    assert actuator.read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('kind = "planar-hasel"', 'kind = "unicorn"',
+         "[actuator] kind 'unicorn' is unknown; the known kinds are planar-hasel, dea-stack, "
+         "peano-hasel."),
+        ("[mine]", "[contorller]", "[contorller] has no effect; did you mean [controller]?"),
+        ("[mine]", "[Modle]", "[Modle] has no effect; did you mean [model]?"),
+    ],
+)  # fmt: skip
+def test_an_unknown_kind_and_a_misspelled_section_are_warned_of(known, capsys, old, new, said):
+    actuator, *_ = known
+    actuator.write_text(actuator.read_text().replace(old, new))
+    code, _, error = run(capsys, "design", actuator)
+    assert (code, error) == (0, f"haselab: warning: {said} {actuator}\n")
+
+
+def test_init_warns_of_an_unknown_kind_and_not_of_one_without_a_law(tmp_path, capsys):
+    code, _, error = run(capsys, "init", "a", "--kind", "unicorn", "--out", tmp_path / "a.toml")
+    assert code == 0 and error.startswith("haselab: warning: [actuator] kind 'unicorn' is unknown")
+    code, _, error = run(capsys, "init", "b", "--kind", "peano-hasel", "--out", tmp_path / "b.toml")
+    assert (code, error) == (0, "")
+
+
+_MAP = "[sensing.strain_map]\nslope_per_f = 4.9e8\noffset = -0.27\n"
+_CURVE = "[drive.voltage_map]\na1_v = 1.3\nb1 = 3.1\na2_v = -0.3\nb2 = -27.0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"{_MAP}range_f = [8e-10, 5e-10]", "range_f: Value error, [8e-10, 5e-10] must have the"),
+        (f"{_MAP}range_f = [nan, 5e-10]", "range_f.0: Input should be a finite number (got nan)"),
+        (f"{_MAP}band = [0.01, -0.01]", "band: Value error, [0.01, -0.01] must have the lower end"),
+        (f"{_MAP}hysteresis_strain = -0.1", "hysteresis_strain: Input should be greater than or"),
+        (f"{_CURVE}strain_low = 0.2\nstrain_high = 0.1", "strain_low = 0.2 must be below strain_"),
+        ("[drive]\nlow_v = 3\nhigh_v = 1", "drive: Value error, low_v = 3 must be below high_v"),
+        ("[drive]\nhighest_field_v_per_m = -1.0", "Input should be greater than 0 (got -1.0)"),
+        ("[controller]\nlimits = {low = 0.1, high = -0.05}", "low = 0.1 must be below high = -0"),
+        ('[[controller.alternatives]]\nkind = "x"\nlimits = {low = 0.1, high = 0.1}',
+         "alternatives.0.limits: Value error, low = 0.1 must be below high = 0.1"),
+        ("[controller.demands]\nphase_margin_deg = -5.0", "phase_margin_deg = -5; must be within"),
+    ],
+)  # fmt: skip
+def test_reversed_and_impossible_ranges_are_refused_when_the_file_is_read(
+    tmp_path, capsys, text, said
+):
+    actuator = tmp_path / "a.toml"
+    model = "[model]\ngain = 1.0\nnatural_frequency_rad_s = 30.0\ndamping_ratio = 0.1\n"
+    actuator.write_text(model + "rate_hz = 100.0\nloop_delay_s = 0.0075\n" + text + "\n")
+    code, _, error = run(capsys, "design", actuator)
+    assert code == 2 and said in error and error.endswith(f"{actuator}\n")
+
+
 def test_the_highest_field_lowers_the_limits_of_a_design(known, capsys):
     """1.28e7 V/m in 0.5 mm, 4000 V/V: 1.6 V, as of the test of high_v above."""
     actuator, *_ = known

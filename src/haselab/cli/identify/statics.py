@@ -252,7 +252,7 @@ def voltage_map(
     order of time.
     """
     if actuator is not None:
-        load_actuator(actuator)
+        load_actuator(actuator, to_write=True)
     strain, voltage_v = read_quantities(
         file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns
     )
@@ -292,7 +292,7 @@ def capacitance_map(
     is per F for a capacitance in F, and per unit of relative capacitance otherwise.
     """
     if actuator is not None:
-        load_actuator(actuator)
+        load_actuator(actuator, to_write=True)
     files = [file] if strain_file is None else [file, strain_file]
     pairs = read_pairs(files, capacitance_column, strain_column, columns)
     fit = fit_capacitance_map(pairs.capacitance, pairs.strain)

@@ -143,7 +143,7 @@ def transfer(
             "--actuator."
         )
     if actuator is not None:
-        load_actuator(actuator)  # before a long fit
+        load_actuator(actuator, to_write=True)  # before a long fit
     records: list[Record] = []
     notes: list[str] = []
     unit = ""

@@ -23,6 +23,7 @@ __all__ = ["CurveFit", "Fit", "Prediction", "RecordFit", "propagated", "rescaled
 
 Floats = NDArray[np.float64]
 Recorded = TypeVar("Recorded")
+Part = TypeVar("Part")
 _QUALITIES = ("fit_percent", "r_squared", "residual_whiteness_p", "chi_squared_ratio")
 _NAME_WIDTH = 28
 
@@ -178,9 +179,14 @@ class Fit(ABC):
                 yield name, value
 
     def _require(self) -> None:
-        """Refuse to use a fit that has no result."""
-        if not self.succeeded:
+        """Refuse to use a fit that has no usable result."""
+        self._present(self if self.succeeded else None)
+
+    def _present(self, part: Part | None) -> Part:
+        """A part of the result; refuse to use a fit that lacks it."""
+        if part is None:
             raise ResultError(f"The fit gives no model: {self.status}")
+        return part
 
 
 def _row(name: str, value: str, interval: str, unit: str) -> str:

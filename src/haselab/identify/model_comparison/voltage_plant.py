@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import RecordFit, rescaled
@@ -169,9 +169,7 @@ class VoltagePlantFit(RecordFit[Record]):
         return plant.simulate(inputs, rate, np.arange(inputs.size) / rate)
 
     def _fitted(self) -> VoltagePlant:
-        if self.plant is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.plant
+        return self._present(self.plant)
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:
         moved = self._fitted().simulate(record.u, record.input_rate_hz, record.output_time_s)

@@ -91,9 +91,7 @@ class ArxFit(RecordFit[Record]):
     bic: float
 
     def _fitted(self) -> ArxModel:
-        if self.model is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.model
+        return self._present(self.model)
 
     @property
     def a(self) -> tuple[Estimate, ...]:

@@ -137,8 +137,7 @@ class TransferFit(RecordFit[Record]):
             ResultError: the fit has no result, a parameter is not identifiable, or the fit is not
                 one resonance without zeros.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
@@ -166,8 +165,7 @@ class TransferFit(RecordFit[Record]):
         Raises:
             ResultError: the fit has no result, or a gain, pole or zero is not identifiable.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         gain, delay_s = (self.parameters[name].value for name in ("gain", "delay_s"))
         if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
             raise ResultError(
@@ -186,8 +184,7 @@ class TransferFit(RecordFit[Record]):
             InputError: a parameter is not identifiable.
             ResultError: the fit has no result.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         return PlantPosterior.from_dict(covariance_table(self.parameters, self.covariance))
 
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
@@ -217,8 +214,7 @@ class TransferFit(RecordFit[Record]):
 
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
-        if not self.records:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._present(self.records or None)
         title = f"Transfer function, fit {self.fit_percent:.1f} %"
         return records_chart(title, self.records, self.residuals, (names or ("", "Output"))[1])
 

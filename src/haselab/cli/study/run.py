@@ -27,7 +27,7 @@ from haselab.rig.chip import ChipFile
 from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.rig_file import TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.runner import lockin_of
+from haselab.runtime.lockin import lockin_of
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text

@@ -29,7 +29,7 @@ from haselab.rig.chip import REFERENCE, CoSim, Firmware, calibrated_firmware
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import TwinBench, describe
-from haselab.runtime.runner import BLANKING_S
+from haselab.runtime.lockin import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 
 __all__ = [

@@ -9,9 +9,11 @@ from types import SimpleNamespace
 import pytest
 
 from haselab.actuators import ACTUATORS
-from haselab.base import DeviceError, HaselabError, InputError, Registry
+from haselab.base import DeviceError, HaselabError, InputError
+from haselab.base.registry import Registry
 from haselab.controllers import CONTROLLERS
 from haselab.rig.instruments.registry import INSTRUMENTS
+from haselab.store.columns.reader import FORMATS
 from haselab.study.registry import EXPERIMENTS
 
 ROOT = Path(__file__).parents[2]
@@ -19,6 +21,7 @@ ALL: list[tuple[Registry, type[HaselabError]]] = [
     (ACTUATORS, InputError),
     (CONTROLLERS, InputError),
     (EXPERIMENTS, InputError),
+    (FORMATS, InputError),
     (INSTRUMENTS, DeviceError),
 ]
 EACH = pytest.mark.parametrize(("registry", "error"), ALL, ids=[each.what for each, _ in ALL])

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from haselab.actuators.law import ActuatorLaw
-from haselab.base import InputError, LimitError, Registry
+from haselab.base import InputError, LimitError
+from haselab.base.registry import Registry
 
 __all__ = ["ACTUATORS", "actuator_law"]
 

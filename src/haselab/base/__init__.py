@@ -1,4 +1,4 @@
-"""Foundations that every package uses: estimates, limits, errors, progress, registries."""
+"""Foundations that every package uses: estimates, limits, errors, progress."""
 
 from haselab.base.closing import Closing
 from haselab.base.errors import (
@@ -14,7 +14,6 @@ from haselab.base.json import Json, JsonObject, table_at
 from haselab.base.limits import Limits
 from haselab.base.plain import to_plain
 from haselab.base.progress import Progress, SilentProgress
-from haselab.base.registry import Registry
 
 __all__ = [
     "Closing",
@@ -27,7 +26,6 @@ __all__ = [
     "LimitError",
     "Limits",
     "Progress",
-    "Registry",
     "ResultError",
     "SafetyError",
     "SilentProgress",

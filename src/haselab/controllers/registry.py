@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from haselab.base import InputError, Registry
+from haselab.base import InputError
+from haselab.base.registry import Registry
 from haselab.controllers.kind import ChosenController, ControllerKind
 
 __all__ = ["CONTROLLERS", "chosen_controller", "parameters_of"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import ClassVar, Protocol
 
-from haselab.base import Registry
+from haselab.base.registry import Registry
 from haselab.store.toml import Section
 
 __all__ = ["EXPERIMENTS", "ExperimentClass", "table_types"]

@@ -6,18 +6,20 @@ from collections.abc import Iterator
 from typing import Any
 
 from haselab.actuators import ACTUATORS
-from haselab.base import InputError, Registry
+from haselab.base import InputError
+from haselab.base.registry import Registry
 from haselab.cli.doctor.machine import Finding
 from haselab.controllers import CONTROLLERS, ControllerKind
+from haselab.store.columns.reader import FORMATS
 from haselab.study.registry import EXPERIMENTS
 
 __all__ = ["extension_findings"]
 
-_REGISTRIES: tuple[Registry[Any], ...] = (CONTROLLERS, ACTUATORS, EXPERIMENTS)
+_REGISTRIES: tuple[Registry[Any], ...] = (CONTROLLERS, ACTUATORS, EXPERIMENTS, FORMATS)
 
 
 def extension_findings() -> Iterator[Finding]:
-    """Yield one row for each controller, actuator and experiment of another package."""
+    """Yield one row for each controller, actuator, experiment and format of another package."""
     for registry in _REGISTRIES:
         for name, package in registry.packages().items():
             if package == "haselab":

@@ -22,7 +22,8 @@ from typing import Any, cast
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
-from haselab.base import DeviceError, HaselabError, Registry
+from haselab.base import DeviceError, HaselabError
+from haselab.base.registry import Registry
 from haselab.rig.instruments.instrument import (
     CameraInstrument,
     DaqInstrument,

@@ -54,7 +54,7 @@ def test_both_ends_of_a_range_are_allowed():
 @pytest.mark.parametrize("value", [-1e-12, 2.0000001, math.nan, math.inf, [1.0, 3.0]])
 def test_a_value_outside_or_none_at_all_is_refused_with_the_four_facts(value):
     limits = Limits("drive voltage", 0.0, 2.0, "V")
-    with pytest.raises(LimitError, match=r"^drive voltage = .* V is outside \[0, 2\] V\. Ch"):
+    with pytest.raises(LimitError, match=r"^drive voltage = .* V is outside \[0, 2\] V\. Lower"):
         limits.check(value)
 
 

@@ -45,5 +45,5 @@ class Limits:
             source = self.low_source if worst < self.low else self.high_source
             raise LimitError(
                 f"{self.name} = {worst:g}{unit} is outside [{self.low:g}, {self.high:g}]{unit}. "
-                f"Change the request, or widen the limit in {source}."
+                f"Lower the request, or widen the limit in {source}."
             )

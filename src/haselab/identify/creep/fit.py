@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
 from haselab.identify.creep.laws import (
@@ -162,6 +162,7 @@ class CreepFit(RecordFit[Record]):
         """
         return self._present(self.fitted)
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
         return self.model.simulate(u, rate_hz or self.setting.span.rate_hz)
@@ -213,6 +214,7 @@ class CreepFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_creep(
     records: Record | Sequence[Record], model: str = "auto", *, leave_out_s: float = 0.0
 ) -> CreepFit:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, JsonObject
+from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, propagated
@@ -80,6 +80,7 @@ class VoltageMapFit(CurveFit):
     def _fitted(self) -> _Curve:
         return self._present(self.curve)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Voltage at strains, in V; see `CurveFit`."""
         return np.asarray(self.map.voltage_v(x), dtype=np.float64)
@@ -144,6 +145,7 @@ class _Curve:
         }, covariance
 
 
+@checked
 def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
     r"""Fit the sum of two exponentials through a loop, monotone over the range of the map.
 

@@ -164,6 +164,11 @@ class CreepFit(RecordFit[Record]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.setting.y,)
+
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
         return self.model.simulate(u, rate_hz or self.setting.span.rate_hz)

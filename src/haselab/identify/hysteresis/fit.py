@@ -113,6 +113,11 @@ class HysteresisFit(RecordFit[LoopRecord]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
+
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the memory is that of rest at the first value of the input."""
         inputs = self._driven(finite_vector("u", u, 1))

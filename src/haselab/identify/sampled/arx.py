@@ -90,6 +90,11 @@ class ArxFit(RecordFit[Record]):
     aic: float
     bic: float
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
+
     def _fitted(self) -> ArxModel:
         if self.model is None:
             raise ResultError(f"The fit gives no model: {self.status}")

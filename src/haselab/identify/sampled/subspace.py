@@ -67,6 +67,11 @@ class SubspaceFit(RecordFit[Record]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.model
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
+
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; rest is the operating point, and the rate that of the record."""
         check_same_rate(rate_hz, self.plant.rate_hz)

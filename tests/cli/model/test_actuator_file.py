@@ -347,3 +347,20 @@ def test_compare_draws_the_prediction_with_its_band(known, capsys, tmp_path):
     assert run(capsys, "compare", actuator, second, "--plot", figure)[0] == 0
     text = figure.read_text()
     assert "predicted, 95 % band" in text and "Measured less predicted" in text
+
+
+@pytest.mark.parametrize("section", ["drive.voltage_map", "sensing.strain_map"])
+@pytest.mark.parametrize(
+    ("matrix", "rows"), [("[[1.0, 0.0], [0.0]]", "[2, 1]"), ("[[1.0]]", "[1]")], ids=str
+)
+def test_a_ragged_covariance_of_a_map_is_one_line(files, tmp_path, capsys, section, matrix, rows):
+    actuator, *_ = files
+    numbers = "slope_per_f = 1e8\noffset = -0.1\n"
+    if section == "drive.voltage_map":
+        numbers = MAP.split("]\n")[1]
+    actuator.write_text(f"{actuator.read_text()}\n[{section}]\n{numbers}covariance = {matrix}\n")
+    code, _, error = run(capsys, "report", actuator, "--out", tmp_path / "page.html")
+    assert code == 2 and error == (
+        f"haselab: 1 error(s): {section}.covariance: Input should be 4 rows of 4 numbers, not rows "
+        f"of {rows}. Change these values. {actuator}\n"
+    )

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
 from haselab.models.actuator.model_tables import CovarianceTable, Number
@@ -36,6 +37,20 @@ _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
 _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
 # products of two numbers: 1/F^2 squared is large
 _Variance = Annotated[float, Field(strict=True, ge=-1e120, le=1e120, allow_inf_nan=False)]
+
+
+def _four_by_four(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+    """A covariance of the four coefficients of a map."""
+    lengths = [len(row) for row in rows]
+    if lengths != [4] * 4:
+        raise PydanticCustomError(
+            "square", "Input should be 4 rows of 4 numbers, not rows of {lengths}",
+            {"lengths": str(lengths)},
+        )  # fmt: skip
+    return rows
+
+
+_Covariance = Annotated[tuple[tuple[_Variance, ...], ...], AfterValidator(_four_by_four)]
 
 
 class _Section(BaseModel):
@@ -66,7 +81,7 @@ class StrainMapTable(_Section):
     offset: Number
     curvature_per_f2: Number = 0.0
     cubic_per_f3: Number = 0.0
-    covariance: tuple[tuple[_Variance, ...], ...] | None = None
+    covariance: _Covariance | None = None
     range_f: tuple[Number, Number] | None = None
     band: tuple[Number, Number] | None = None
     coverage: _Share = 0.95
@@ -110,7 +125,7 @@ class VoltageMapTable(_Section):
     b2: Number
     strain_low: Number = -0.1
     strain_high: Number = 0.2
-    covariance: tuple[tuple[_Variance, ...], ...] | None = None
+    covariance: _Covariance | None = None
 
     def map(self) -> VoltageMap:
         """The map with these coefficients.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import RecordFit, rescaled
@@ -166,6 +166,7 @@ class VoltagePlantFit(RecordFit[Record]):
         """See `RecordFit`."""
         return tuple(record.y for record in self.records)
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the first voltage has stood for ever."""
         plant = self._fitted()
@@ -200,6 +201,7 @@ class VoltagePlantFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_voltage_plant(
     records: Sequence[Record],
     structure: VoltageStructure | None = None,

@@ -8,6 +8,7 @@ import pytest
 
 from haselab.cli.main import main
 from haselab.control import PidGains, margins
+from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 from haselab.models.posterior import PlantPosterior
 
@@ -152,7 +153,129 @@ def test_compare_predicts_a_record_that_was_not_used(known, capsys):
     assert answer["fit_percent"] == pytest.approx(fit, abs=1e-9)
     code, text, error = run(capsys, "compare", actuator, first, "--json")
     assert code == 3 and json.loads(text)["status"].startswith("not a validation")
-    assert "Use another one" in error
+    assert "100 % of the samples were used for the fit. Use another record" in error
+    assert answer["used_for_fit"] == 0.0
+
+
+def rewritten(path, first, **how):
+    """The rows of a record in another text."""
+    rows = np.loadtxt(first, delimiter=",", skiprows=1)[how.pop("rows", slice(None))]
+    rows[:, 2] *= how.pop("factor", 1.0)
+    np.savetxt(path, rows, comments="", **how)
+    return path
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"fmt": "%.17g", "delimiter": ",", "header": "# exported\n# again\ntime_s,u,y"},
+        {"fmt": "%.12g", "delimiter": ";", "header": "time_s;u;y (%)", "factor": 100.0},
+        {"fmt": "%.9g", "delimiter": ",", "header": "time_s,u,y", "rows": slice(0, 600)},
+        {"fmt": "%.9g", "delimiter": ",", "header": "time_s,u,y", "rows": slice(333, 453)},
+    ],
+    ids=["preamble and digits", "percent", "half", "a tenth of it"],
+)
+@pytest.mark.parametrize("form", ["toml", "json"])
+def test_a_record_of_the_fit_is_known_by_its_samples(known, tmp_path, capsys, how, form):
+    model, first, _ = known
+    if form == "json":
+        model = tmp_path / "model.json"
+        assert run(capsys, "identify", "transfer", first, "--out", model)[0] == 0
+    again = rewritten(tmp_path / "again.csv", first, **how)
+    code, text, error = run(capsys, "compare", model, again, "--json")
+    answer = json.loads(text)
+    assert code == 3 and answer["used_for_fit"] == 1.0 and answer["fit_percent"] > 98.0
+    assert error.splitlines()[-1].startswith("haselab: not a validation: 100 %")
+
+
+def test_records_of_the_fit_are_known_after_an_export_and_a_design(known, tmp_path, capsys):
+    actuator, first, second = known
+    plant, other = tmp_path / "plant.json", tmp_path / "other.toml"
+    assert run(capsys, "export", actuator, "--to", "plant", "--out", plant)[0] == 0
+    assert run(capsys, "design", plant, "--out", other)[0] == 0
+    for model in (plant, other):
+        assert run(capsys, "compare", model, first)[0] == 3
+        assert run(capsys, "compare", model, second)[0] == 0
+
+
+def test_a_record_that_contains_the_one_of_the_fit_has_its_share(known, tmp_path, capsys):
+    actuator, first, second = known
+    rows = np.vstack([np.loadtxt(path, delimiter=",", skiprows=1) for path in (first, second)])
+    rows[:, 0] = np.arange(len(rows)) / RATE_HZ
+    both = tmp_path / "both.csv"
+    np.savetxt(both, rows, "%.9g", ",", header="time_s,u,y", comments="")
+    code, text, _ = run(capsys, "compare", actuator, both, "--json")
+    # 256 hashes below the limit in each half: 4 standard deviations of a binomial share
+    assert json.loads(text)["used_for_fit"] == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(512))
+    assert code == 3
+
+
+def test_a_prediction_worse_than_the_mean_is_not_ok(known, tmp_path, capsys):
+    actuator, _, second = known
+    wrong = rewritten(tmp_path / "wrong.csv", second, fmt="%.9g", delimiter=",",
+                      header="time_s,u,y", factor=-1.0)  # fmt: skip
+    code, text, error = run(capsys, "compare", actuator, wrong, "--json")
+    answer = json.loads(text)
+    assert code == 3 and answer["fit_percent"] < 0.0
+    assert answer["status"].startswith("the prediction is worse than the mean of the record")
+    assert "Check the columns, their units" in error
+
+
+EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+MAP = "\n[drive.voltage_map]\na1_v = 1.324\nb1 = 3.124\na2_v = -0.2805\nb2 = -26.92\n"
+
+
+@pytest.fixture
+def driven(files, tmp_path):
+    """An actuator file with its voltage map, and two records in mV and %."""
+    actuator, *plain = files
+    actuator.write_text(actuator.read_text() + MAP)
+    for path in plain:
+        rows = np.loadtxt(path, delimiter=",", skiprows=1)
+        rows[:, 1:] = np.c_[1e3 * EQ4.voltage_v(rows[:, 1]), 100.0 * rows[:, 2]]
+        np.savetxt(path, rows, "%.9g", ";", header="t (s);U (mV);S (%)", comments="")
+    return actuator, *plain, ("--input", "U", "--output", "S")
+
+
+def test_units_that_contradict_the_model_are_refused(driven, capsys):
+    actuator, first, second, names = driven
+    through = "--through-voltage-map"
+    assert (
+        run(capsys, "identify", "transfer", first, *names, through, "--actuator", actuator)[0] == 0
+    )
+    model = tomllib.loads(actuator.read_text())["model"]
+    assert (model["input_unit"], model["output_unit"]) == ("1", "1")
+    assert run(capsys, "compare", actuator, second, *names, through)[0] == 0
+    code, _, error = run(capsys, "compare", actuator, second, *names)
+    assert code == 2 and error.splitlines()[-1] == (
+        "haselab: The model's input is a pure number, such as a strain, but column U is in V. Add "
+        f"--through-voltage-map: {second}"
+    )
+    second.write_text(second.read_text().replace("S (%)", "S (mm)"))
+    code, _, error = run(capsys, "compare", actuator, second, *names, through)
+    assert code == 2
+    assert "model's output is a pure number, such as a strain, but column S is in m. Name" in error
+    code, _, error = run(capsys, "identify", "transfer", first, second, *names)
+    assert code == 2 and "Column S is in m, but in another file a pure number" in error
+    swapped = ("--input", "S", "--output", "U", through, "--actuator", actuator)
+    code, _, error = run(capsys, "identify", "transfer", first, *swapped)
+    assert code == 2 and "converts a voltage, but column S is a pure number" in error
+
+
+def test_a_model_from_volts_takes_no_strain_map_and_no_limits_of_strain(driven, tmp_path, capsys):
+    actuator, first, second, names = driven
+    out = tmp_path / "volts.json"
+    assert (
+        run(capsys, "identify", "transfer", first, *names, "--actuator", actuator, "--out", out)[0]
+        == 0
+    )
+    code, _, error = run(capsys, "compare", actuator, second, *names, "--through-voltage-map")
+    assert code == 2 and "model's input is in V, but --through-voltage-map gives a strain" in error
+    code, _, error = run(capsys, "design", actuator)
+    assert code == 2 and "[drive.voltage_map] expects a strain" in error
+    code, _, error = run(capsys, "design", out)
+    assert code == 2 and "Give the limits in V with --limits LOW HIGH" in error
+    assert run(capsys, "design", out, "--limits", 0, 2)[0] == 0
 
 
 def test_another_actuator_is_seen_by_the_band(known, tmp_path, capsys):
@@ -294,3 +417,20 @@ def test_compare_draws_the_prediction_with_its_band(known, capsys, tmp_path):
     assert run(capsys, "compare", actuator, second, "--plot", figure)[0] == 0
     text = figure.read_text()
     assert "predicted, 95 % band" in text and "Measured less predicted" in text
+
+
+@pytest.mark.parametrize("section", ["drive.voltage_map", "sensing.strain_map"])
+@pytest.mark.parametrize(
+    ("matrix", "rows"), [("[[1.0, 0.0], [0.0]]", "[2, 1]"), ("[[1.0]]", "[1]")], ids=str
+)
+def test_a_ragged_covariance_of_a_map_is_one_line(files, tmp_path, capsys, section, matrix, rows):
+    actuator, *_ = files
+    numbers = "slope_per_f = 1e8\noffset = -0.1\n"
+    if section == "drive.voltage_map":
+        numbers = MAP.split("]\n")[1]
+    actuator.write_text(f"{actuator.read_text()}\n[{section}]\n{numbers}covariance = {matrix}\n")
+    code, _, error = run(capsys, "report", actuator, "--out", tmp_path / "page.html")
+    assert code == 2 and error == (
+        f"haselab: 1 error(s): {section}.covariance: Input should be 4 rows of 4 numbers, not rows "
+        f"of {rows}. Change these values. {actuator}\n"
+    )

@@ -20,6 +20,7 @@ from haselab.cli.model.model_file import (
     loop_options,
     read_any_plant,
     read_loop,
+    read_origin,
     read_posterior,
 )
 from haselab.cli.model.sections import (
@@ -196,7 +197,8 @@ def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path 
     if out is not None:
         write_text(out, read_text(model) if own else "# Model and controller of haselab design\n")
         if not own:
-            table = {**read_any_plant(model).to_dict(), **_loop_and_covariance(model)}
+            origin = read_origin(model).model_dump(exclude_defaults=True)
+            table = {**origin, **read_any_plant(model).to_dict(), **_loop_and_covariance(model)}
             save_section(out, "model", table, [model], MODEL_KEYS)
     target = out or (model if own else None)
     if target is not None:

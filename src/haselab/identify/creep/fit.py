@@ -162,6 +162,11 @@ class CreepFit(RecordFit[Record]):
         """
         return self._present(self.fitted)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.setting.y,)
+
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""

@@ -111,6 +111,11 @@ class HysteresisFit(RecordFit[LoopRecord]):
         """
         return self._present(self.fitted)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
+
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the memory is that of rest at the first value of the input."""

@@ -161,6 +161,11 @@ class VoltagePlantFit(RecordFit[Record]):
     parameter_count: int = 0
     modelled: tuple[Floats, ...] = field(default=(), repr=False)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
+
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the first voltage has stood for ever."""

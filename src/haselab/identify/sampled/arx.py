@@ -91,6 +91,11 @@ class ArxFit(RecordFit[Record]):
     aic: float
     bic: float
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
+
     def _fitted(self) -> ArxModel:
         return self._present(self.model)
 

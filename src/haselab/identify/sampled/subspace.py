@@ -65,6 +65,11 @@ class SubspaceFit(RecordFit[Record]):
         """
         return self._present(self.model)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
+
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; rest is the operating point, and the rate that of the record."""

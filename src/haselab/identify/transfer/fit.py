@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
+from haselab.identify.fingerprint import fingerprint
 from haselab.identify.fit import Prediction, RecordFit, several
 from haselab.identify.frequency.steady_tone import steady_tone_hz
 from haselab.identify.noise import coloured_covariance, fit_percent
@@ -88,6 +89,11 @@ class TransferFit(RecordFit[Record]):
     def records(self) -> tuple[Record, ...]:
         """The experiments, an unknown input before them replaced by the more likely guess."""
         return () if self.best is None else tuple(self.best.records)
+
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
 
     @property
     def parameter_count(self) -> int:
@@ -202,6 +208,7 @@ class TransferFit(RecordFit[Record]):
             several(records),
             posterior=None if np.isinf(self.covariance).any() else self.posterior,
             noise_std=float(np.std(np.concatenate(self.residuals))),
+            fitted_to=fingerprint(self.fitted_outputs),
             rng=np.random.default_rng(1),
         )
 
@@ -235,6 +242,7 @@ class TransferFit(RecordFit[Record]):
             "status": self.status,
             "notes": list(self.notes),
             "covariance": covariance_table(self.parameters, self.covariance),
+            "fitted_to": fingerprint(self.fitted_outputs),
             "other_minima": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
                 for r in self.other_minima

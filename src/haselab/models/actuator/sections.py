@@ -10,6 +10,7 @@ import operator
 from typing import Annotated, ClassVar, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
 from haselab.models.actuator.model_tables import CovarianceTable, Number
@@ -46,6 +47,20 @@ def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
 
 
 _Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
+
+
+def _four_by_four(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+    """A covariance of the four coefficients of a map."""
+    lengths = [len(row) for row in rows]
+    if lengths != [4] * 4:
+        raise PydanticCustomError(
+            "square", "Input should be 4 rows of 4 numbers, not rows of {lengths}",
+            {"lengths": str(lengths)},
+        )  # fmt: skip
+    return rows
+
+
+_Covariance = Annotated[tuple[tuple[_Variance, ...], ...], AfterValidator(_four_by_four)]
 
 
 class _Section(BaseModel):
@@ -86,7 +101,7 @@ class StrainMapTable(_Section):
     offset: Number
     curvature_per_f2: Number = 0.0
     cubic_per_f3: Number = 0.0
-    covariance: tuple[tuple[_Variance, ...], ...] | None = None
+    covariance: _Covariance | None = None
     range_f: _Range | None = None
     band: _Range | None = None
     coverage: _Share = 0.95
@@ -132,7 +147,7 @@ class VoltageMapTable(_Section):
     b2: Number
     strain_low: Number = -0.1
     strain_high: Number = 0.2
-    covariance: tuple[tuple[_Variance, ...], ...] | None = None
+    covariance: _Covariance | None = None
 
     def map(self) -> VoltageMap:
         """The map with these coefficients.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.noise import fit_percent
 
@@ -208,6 +208,7 @@ class RecordFit(Fit, Generic[Recorded]):
     def _modelled(self, record: Recorded) -> tuple[Floats, Floats]:
         """Measured and modelled output of a record, initial state and constant fitted to it."""
 
+    @checked
     def compare(self, records: Recorded | Sequence[Recorded]) -> Prediction:
         """Predict records that were not used for the fit, and compare with their outputs.
 
@@ -242,6 +243,7 @@ class CurveFit(Fit):
             ResultError: the fit has no result.
         """
 
+    @checked
     def compare(self, x: ArrayLike, y: ArrayLike) -> Prediction:
         """Predict pairs that were not used for the fit, and compare.
 
@@ -257,7 +259,7 @@ class CurveFit(Fit):
         self._require()
         measured = np.asarray(y, dtype=np.float64)
         modelled = self.simulate(x)
-        if measured.shape != modelled.shape:
+        if measured.shape != modelled.shape or measured.size == 0:
             raise InputError(
                 f"x has shape {modelled.shape} and y {measured.shape}. Give one y for each x."
             )

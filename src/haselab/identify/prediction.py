@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
-from haselab.identify.fit import Prediction
+from haselab.base import checked
+from haselab.identify.fit import Prediction, several
 from haselab.identify.record import Record
 from haselab.models.plant import Plant
 from haselab.models.posterior import PlantPosterior
@@ -22,9 +22,10 @@ _HALF_WIDTH = 1.959963984540054  # standard deviations of a 95 % interval
 _SLOWEST = 10.0  # lengths of a record beyond which a free response counts as a straight line
 
 
+@checked
 def predict(
     model: Plant | RationalModel,
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     *,
     posterior: PlantPosterior | None = None,
     noise_std: float = 0.0,
@@ -40,7 +41,7 @@ def predict(
 
     Args:
         model: model under test.
-        records: records that were not used for the fit.
+        records: records that were not used for the fit, or one.
         posterior: of the model's parameters; None: no band.
         noise_std: root mean square of the residuals of the fit, in the unit of the output.
         free_start: fit initial state and constant; False: the record starts at 0 in steady state.
@@ -56,8 +57,7 @@ def predict(
         >>> round(predict(plant, [record], rng=np.random.default_rng(1)).fit_percent, 6)
         100.0
     """
-    if not records:
-        raise InputError("There is no record to predict. Give at least one.")
+    records = several(records)
     modelled = [fitted_output(model, record, free_start) for record in records]
     half = None
     if posterior is not None:

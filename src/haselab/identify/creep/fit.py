@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
 from haselab.identify.creep.laws import (
@@ -164,6 +164,7 @@ class CreepFit(RecordFit[Record]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
         return self.model.simulate(u, rate_hz or self.setting.span.rate_hz)
@@ -216,6 +217,7 @@ class CreepFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_creep(
     records: Record | Sequence[Record], model: str = "auto", *, leave_out_s: float = 0.0
 ) -> CreepFit:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import chdtrc
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import lines_chart
 from haselab.identify.fit import RecordFit
@@ -102,6 +102,7 @@ class ResponseFit(RecordFit[Record]):
             tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
         )
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; lines have no rate, so `rate_hz` is needed."""
         inputs = finite_vector("u", u, 1)
@@ -133,6 +134,7 @@ class ResponseFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_response(
     frequency_hz: object,
     response: object,

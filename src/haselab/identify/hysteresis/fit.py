@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import loop_chart
 from haselab.identify.fit import RecordFit, rescaled, several
@@ -113,6 +113,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return self.fitted
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the memory is that of rest at the first value of the input."""
         inputs = self._driven(finite_vector("u", u, 1))
@@ -157,6 +158,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
         }
 
 
+@checked
 def fit_hysteresis(
     records: LoopRecord | Sequence[LoopRecord],
     model: str = "auto",

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 from scipy.special import chdtrc, ndtri
 
-from haselab.base import Estimate, InputError, JsonObject
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.estimate import Z95
 
 __all__ = ["Agreement", "agree"]
@@ -56,6 +56,7 @@ class Agreement:
         }
 
 
+@checked
 def agree(
     estimates: Mapping[str, Estimate], *, risk: float = 0.01, matters: float = 0.2
 ) -> Agreement:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import RecordFit, rescaled
@@ -161,6 +161,7 @@ class VoltagePlantFit(RecordFit[Record]):
     parameter_count: int = 0
     modelled: tuple[Floats, ...] = field(default=(), repr=False)
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the first voltage has stood for ever."""
         plant = self._fitted()
@@ -195,6 +196,7 @@ class VoltagePlantFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_voltage_plant(
     records: Sequence[Record],
     structure: VoltageStructure | None = None,

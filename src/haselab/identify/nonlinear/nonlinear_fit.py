@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base import Estimate, JsonObject, ResultError, checked
 from haselab.identify.fit import Prediction, RecordFit
 from haselab.identify.noise import fit_percent
 from haselab.identify.record import Record, finite_vector
@@ -127,11 +127,13 @@ class NonlinearFit(TransferFit):
             fit_percent=self.fit_percent,
         )
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the nonlinearity is a part of it."""
         inputs = finite_vector("u", u, 1)
         return self._usable().simulated(inputs, self._rate_hz(rate_hz))
 
+    @checked
     def compare(self, records: Record | Sequence[Record]) -> Prediction:
         """See `RecordFit`; there is no band."""
         return RecordFit.compare(self, records)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, JsonObject, LimitError
+from haselab.base import InputError, JsonObject, LimitError, check_fields, checked
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import CurveFit
 from haselab.identify.statics.columns import paired, plausible_stretch
@@ -56,6 +56,7 @@ class SheetTest:
     deformation: Deformation = field(default_factory=Deformation)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         x, y = paired(
             "stretch", self.stretch, "nominal_stress_pa", self.nominal_stress_pa,
             least=_LEAST_SAMPLES, record="record a tensile test",
@@ -150,6 +151,7 @@ class HyperelasticFit(CurveFit):
         self._require()
         return _law(self.best)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Nominal stress at stretches, in Pa, deformed as the first test; see `CurveFit`."""
         return self.predict(x).nominal_stress_pa
@@ -234,9 +236,10 @@ class HyperelasticFit(CurveFit):
         }
 
 
+@checked
 def fit_hyperelastic(
-    stretch: object,
-    nominal_stress_pa: object,
+    stretch: ArrayLike,
+    nominal_stress_pa: ArrayLike,
     model: str = "auto",
     *,
     deformation: str = "uniaxial",
@@ -278,6 +281,7 @@ def fit_hyperelastic(
     )  # fmt: skip
 
 
+@checked
 def fit_hyperelastic_tests(
     tests: Sequence[SheetTest],
     model: str = "auto",

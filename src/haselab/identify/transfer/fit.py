@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import Prediction, RecordFit, several
@@ -190,12 +190,14 @@ class TransferFit(RecordFit[Record]):
             raise ResultError(f"The fit gives no model: {self.status}")
         return PlantPosterior.from_dict(covariance_table(self.parameters, self.covariance))
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
         inputs = finite_vector("u", u, 1)
         rate = self._rate_hz(rate_hz)
         return self.rational.simulate(inputs, rate, np.arange(inputs.size) / rate)
 
+    @checked
     def compare(self, records: Record | Sequence[Record]) -> Prediction:
         """See `RecordFit`; the band is that of the covariance and of the residuals."""
         return predict(
@@ -244,6 +246,7 @@ class TransferFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_transfer(
     records: Record | Sequence[Record],
     structure: TransferStructure | None = None,

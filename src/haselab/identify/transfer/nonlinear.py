@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, checked
 from haselab.identify.model_choice import APART
 from haselab.identify.noise import fit_percent
 from haselab.identify.nonlinear.hammerstein import DEGREES, fit_hammerstein
@@ -38,13 +38,14 @@ _WHITE = 1e-3
 _ONE = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
 
 
+@checked
 def fit_nonlinear(
-    records: Sequence[Record], structure: TransferStructure | None, kind: str
+    records: Record | Sequence[Record], structure: TransferStructure | None, kind: str
 ) -> NonlinearFit:
     """Fit one nonlinear model.
 
     Args:
-        records: experiments.
+        records: experiments, or one.
         structure: structure of the linear part. Default: one resonance with a delay.
         kind: one of `NONLINEAR`: a polynomial of degree 2 or 3 of the input, a spring with a cubic
             or a quadratic and a cubic part, a curve of the output.

@@ -74,6 +74,8 @@ def open_archive(path: Path | str) -> Archive:
         InputError: no such file, unknown kind, or damaged.
     """
     file = Path(path)
+    if file.is_dir():
+        raise InputError(f"The path is a folder, not a file. Name the file in it: {file}")
     if not file.is_file():
         raise InputError(f"There is no such file. Check the path: {file}")
     kind = file.suffix.lower()

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from haselab.base import table_at
 from haselab.controllers import Measurement
 from haselab.rig.chip.build import simavr_header
+from haselab.store.actuator_file import ACTUATOR, read_run, write_sections
 from haselab.store.session.writer import SessionReader
 
 pytest.importorskip("setuptools", reason="builds the package of the page")
@@ -94,6 +96,34 @@ def test_the_commands_of_the_page_do_what_it_says(lab) -> None:
         check_chip(lab.folder / "out", told)
 
 
+def test_the_commands_for_the_chip_work_with_the_maps_of_any_study(make_shell) -> None:
+    """The page's last commands alone, on the small study of the firmware's tests."""
+    if shutil.which("avr-gcc") is None or simavr_header() is None:
+        pytest.skip("avr-gcc or libsimavr is not installed")
+    shell = make_shell("chip", PACKAGE)
+    run = read_run(ROOT / "tests" / "firmware" / "data")
+    assert CONTROL is not None
+    control = tomllib.loads(CONTROL[1])["control"]
+    mine = {"kind": control.pop("kind"), "parameters": control}
+    controller = dict(table_at(run, "controller")) | {"alternatives": [mine]}
+    write_sections(shell.folder / "out" / "mine" / ACTUATOR, dict(run) | {"controller": controller})
+    told = {}
+    for command in [c for c in COMMANDS if re.match("cp|pip", c) or re.search("firmware|chip", c)]:
+        done = shell.run(command)
+        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+        told[command] = done.stdout
+    assert "CRC-32" in (shell.folder / "out" / "mine-firmware" / "settings.h").read_text()
+    simulated = next(text for command, text in told.items() if "simulate" in command)
+    assert "not compared: only the step of a PI or PID is predicted" in simulated
+    assert re.findall(r"loop +(.*)", simulated) == [
+        "desktop, 100 Hz", "desktop, 1000 Hz", "chip, 1000 Hz"
+    ]  # fmt: skip
+    _, fast, chip = map(float, re.findall(r"steady_state_error +(\S+)", simulated))
+    # The two sense with different instruments: 0.5 % strain of a step of 4 %, as in test_safety.py.
+    assert abs(chip - fast) < 5e-3 / 0.04
+    check_steps(shell.folder / "out")
+
+
 def check_study(out: Path) -> None:
     """Recorded, analysed again with the same numbers, exported, reported."""
     rows = {
@@ -133,6 +163,11 @@ def check_chip(out: Path, told: dict[str, str]) -> None:
     assert set(ends) == {"desktop, 100 Hz", "desktop, 1000 Hz", "chip, 1000 Hz"}
     # The two sense with different instruments: 0.5 % strain, as in test_safety.py.
     assert abs(ends["chip, 1000 Hz"] - ends["desktop, 1000 Hz"]) < 5e-3
+    check_steps(out)
+
+
+def check_steps(out: Path) -> None:
+    """The trial on the chip ends at its reference, but for what creep moves within the step."""
     rows = json.loads((out / "mine-chip" / "results.json").read_text())["quantities"]
     error = next(row for row in rows if row["id"] == "S26.error")["measured"]["value"]
     assert abs(error) < 0.05

@@ -32,8 +32,9 @@ from haselab.identify.record import Record
 from haselab.models import VoltageMap
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
+from haselab.runtime.lockin import BLANKING_S, lockin_of
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import BLANKING_S, Runner, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.sensing import Lockin
 from haselab.signals import constant, linear_chirp, triangle
 

@@ -101,12 +101,17 @@ def test_a_general_fit_is_its_own_nominal_model():
         ({"matrix": np.diag([0.1, -0.1, 0.0, 0.0])}, "a negative or missing variance"),
         ({"matrix": 0.01 * (np.eye(4) + np.eye(4, k=1))}, "not symmetric"),
         ({"matrix": 0.01 * (1.9 * np.eye(4) - 0.9)}, "a negative eigenvalue"),
-        ({"matrix": np.zeros((3, 3))}, "needs one value, one row and one column per name"),
+        (
+            {"matrix": np.zeros((3, 3))},
+            r"rows of \[3, 3, 3\] numbers, but its 4 names need as many",
+        ),
         ({"names": ["gain", "natural_frequency_rad_s", "damping", "delay_s"]}, "names damping"),
         ({"logarithmic": [False, False, True, False]}, "draws may be negative"),
         ({"values": [1.0, 32.1, 0.0, 0.0]}, "has no logarithm"),
         ({"values": [1.0, 32.1]}, "needs one value"),
-        ({"matrix": [[1.0], [1.0, 2.0]]}, "is incomplete or has a wrong value"),
+        ({"matrix": [[1.0], [1.0, 2.0]]}, r"rows of \[1, 2\] numbers, but its 4 names"),
+        ({"matrix": 4 * [[1.0, 2.0, "three", 4.0]]}, "is incomplete or has a wrong value"),
+        ({"matrix": 4 * [1.0]}, "is incomplete or has a wrong value"),
     ],
 )
 def test_what_is_no_posterior_is_refused(change, message):

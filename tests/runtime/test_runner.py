@@ -21,8 +21,9 @@ from haselab.rig import Rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.lockin import lockin_of, printed_chain_of
 from haselab.runtime.loop import LoopSettings
-from haselab.runtime.runner import Runner, lockin_of, printed_chain_of
+from haselab.runtime.runner import Runner
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings

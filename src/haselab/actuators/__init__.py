@@ -6,10 +6,11 @@ from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.motion import ActuatorState, advance, rates, simulate
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
 from haselab.actuators.planar_hasel import PlanarHasel
-from haselab.actuators.registry import actuator_kind, actuator_kinds, actuator_law
+from haselab.actuators.registry import ACTUATORS, actuator_law
 from haselab.actuators.table import LawTable, law_table, motion_substeps
 
 __all__ = [
+    "ACTUATORS",
     "VACUUM_F_PER_M",
     "ActuatorLaw",
     "ActuatorState",
@@ -20,8 +21,6 @@ __all__ = [
     "OperatingPoint",
     "Parameter",
     "PlanarHasel",
-    "actuator_kind",
-    "actuator_kinds",
     "actuator_law",
     "advance",
     "equilibrium_m",

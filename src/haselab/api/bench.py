@@ -23,6 +23,7 @@ from haselab.rig.twin.config import load_twin, twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime import runner as runtime
 from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.lockin import lockin_of
 from haselab.store.columns.table import Table
 from haselab.study.fits.observe import gauge_length
 
@@ -238,7 +239,7 @@ class Runner:
             baseline_v,
             frame_rate_hz,
         )
-        self._lockin = runtime.lockin_of(rig.description, carrier_hz)
+        self._lockin = lockin_of(rig.description, carrier_hz)
         self._zero_m = math.nan
         self._played = 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import checked
 from haselab.identify.fit import Prediction, several
@@ -30,6 +30,7 @@ def predict(
     posterior: PlantPosterior | None = None,
     noise_std: float = 0.0,
     free_start: bool = True,
+    fitted_to: ArrayLike = (),
     rng: np.random.Generator,
 ) -> Prediction:
     r"""Simulate records from their inputs and compare the result with their outputs.
@@ -45,6 +46,7 @@ def predict(
         posterior: of the model's parameters; None: no band.
         noise_std: root mean square of the residuals of the fit, in the unit of the output.
         free_start: fit initial state and constant; False: the record starts at 0 in steady state.
+        fitted_to: fingerprint of the outputs that the model was fitted to; empty: not known.
         rng: random generator of the plants.
     Returns:
         The prediction.
@@ -54,8 +56,9 @@ def predict(
         >>> plant, time_s = Plant(0.5, 5.0, 0.1), np.arange(400) / 100.0
         >>> u = np.sign(np.sin(time_s))
         >>> record = Record(u, 100.0, 1.0 + plant.simulate(u, 100.0, time_s), time_s)
-        >>> round(predict(plant, [record], rng=np.random.default_rng(1)).fit_percent, 6)
-        100.0
+        >>> found = predict(plant, [record], rng=np.random.default_rng(1))
+        >>> round(found.fit_percent, 6), found.status
+        (100.0, 'ok')
     """
     records = several(records)
     modelled = [fitted_output(model, record, free_start) for record in records]
@@ -63,7 +66,7 @@ def predict(
     if posterior is not None:
         spread = [_spread(posterior, record, free_start, rng) for record in records]
         half = _HALF_WIDTH * np.sqrt(np.concatenate(spread) ** 2 + noise_std**2)
-    return Prediction.of([record.y for record in records], modelled, half)
+    return Prediction.of([record.y for record in records], modelled, half, fitted_to=fitted_to)
 
 
 def _spread(

@@ -11,7 +11,7 @@ from haselab.rig import RigDescription
 from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, NotPlayedError, Outcome
 from haselab.study.fits.observe import Observation, Source
-from haselab.study.registry import experiment_classes
+from haselab.study.registry import EXPERIMENTS
 
 __all__ = ["Analysis", "AnyExperiment", "experiments_of", "fitting", "foreign"]
 
@@ -25,7 +25,9 @@ class _NotRecordedError(InputError):
 
 def experiments_of(study: Study) -> tuple[AnyExperiment, ...]:
     """The experiments of a study, in the order of playing."""
-    found = [cast("type[AnyExperiment]", kind).of(study) for kind in experiment_classes()]
+    tables = ("operating_point", *study.tables)
+    names = [name for name in EXPERIMENTS.packages() if name in tables]
+    found = [cast("type[AnyExperiment]", EXPERIMENTS.find(name)).of(study) for name in names]
     return tuple(experiment for experiment in found if experiment is not None)
 
 
@@ -93,7 +95,7 @@ class Analysis:
                 )
         if kind in self._known:
             return cast("Value", self._known[kind])
-        tables = [c.table for c in experiment_classes() if kind in c.gives]
+        tables = [name for name, c in EXPERIMENTS.usable().items() if kind in c.gives]
         wanted = f"[{tables[0]}]" if tables else f"an experiment that finds a {kind.__name__}"
         raise NotPlayedError(f"needs {wanted}, which is not in this study")
 

@@ -20,8 +20,9 @@ from haselab.rig import Rig, RigDescription
 from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.camera_recorder import CameraRecorder, KeepVideo
+from haselab.runtime.lockin import lockin_of
 from haselab.runtime.observer import Observer
-from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.runtime.scheduling import with_priority
 from haselab.runtime.threaded_observer import ThreadedObserver
 from haselab.safety.armed import arm_simulated

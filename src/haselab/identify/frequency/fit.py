@@ -80,8 +80,7 @@ class ResponseFit(RecordFit[Record]):
             ResultError: no result, a parameter is not identifiable, or not one resonance without
                 zeros.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
@@ -116,8 +115,7 @@ class ResponseFit(RecordFit[Record]):
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`; magnitude and phase over frequency."""
         del names
-        if not self.residuals:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._present(self.residuals or None)
         measured = self.modelled + self.residuals[0] + 1j * self.residuals[1]
         return lines_chart("Frequency response and fit", self.frequency_hz, measured, self.modelled)
 

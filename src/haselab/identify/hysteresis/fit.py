@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import loop_chart
 from haselab.identify.fit import RecordFit, rescaled, several
@@ -109,9 +109,12 @@ class HysteresisFit(RecordFit[LoopRecord]):
         Raises:
             ResultError: the fit has no result.
         """
-        if self.fitted is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.fitted
+        return self._present(self.fitted)
+
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
 
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:

@@ -106,8 +106,7 @@ class NonlinearFit(TransferFit):
         Raises:
             ResultError: the fit has no result, or the slope of the curve is not different from 0.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         gain = self.parameters["gain"]
         if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
             raise ResultError(
@@ -142,9 +141,7 @@ class NonlinearFit(TransferFit):
         return record.y, self._usable().modelled(record)
 
     def _usable(self) -> Nonlinear:
-        if self.model is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.model
+        return self._present(self.model)
 
     @property
     def plant(self) -> Plant:

@@ -91,10 +91,13 @@ class ArxFit(RecordFit[Record]):
     aic: float
     bic: float
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
+
     def _fitted(self) -> ArxModel:
-        if self.model is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.model
+        return self._present(self.model)
 
     @property
     def a(self) -> tuple[Estimate, ...]:

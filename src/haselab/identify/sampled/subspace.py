@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError, checked, generator
+from haselab.base import Estimate, InputError, JsonObject, checked, generator
 from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
@@ -63,9 +63,12 @@ class SubspaceFit(RecordFit[Record]):
         Raises:
             ResultError: the fit has no result.
         """
-        if self.model is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.model
+        return self._present(self.model)
+
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
 
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
@@ -85,8 +88,7 @@ class SubspaceFit(RecordFit[Record]):
 
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
-        if not self.residuals:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._present(self.residuals or None)
         return sampled_chart("Subspace model", self.record, self.residuals[0], names)
 
     def answer(self) -> JsonObject:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from haselab.base import Estimate, JsonObject, ResultError, checked
+from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit
@@ -65,9 +65,7 @@ class MapFit(CurveFit):
         Raises:
             ResultError: the fit has no result.
         """
-        if self.curve is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.curve
+        return self._present(self.curve)
 
     def value_std(self, x: ArrayLike) -> Floats:
         """Standard deviation of the value, in the unit of y.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, JsonObject, ResultError, checked
+from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, propagated
@@ -78,9 +78,7 @@ class VoltageMapFit(CurveFit):
         return self._fitted().std_v(np.asarray(strain, dtype=np.float64))
 
     def _fitted(self) -> _Curve:
-        if self.curve is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.curve
+        return self._present(self.curve)
 
     @checked
     def simulate(self, x: ArrayLike) -> Floats:

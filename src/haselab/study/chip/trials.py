@@ -118,7 +118,7 @@ def _play_chip_steps(runner: Runner, study: StepStudy) -> None:
     """Play row S24 with the rig's controller, at rest first for the camera's reference."""
     trials = study.step_trials
     lead_s = max(_REST_S, _REST_FRAMES / trials.frame_rate_hz)
-    lead = np.full(round(lead_s * UPDATE_HZ), np.nan)
+    lead = np.full(round(lead_s * UPDATE_HZ), np.nan)  # no reference: the rig is at rest
     reference = np.concatenate([lead, step_reference(trials)])
     for name in chip_names(study):
         runner.settle(0.0, trials.rest_s)

@@ -181,14 +181,11 @@ class StepTest(Experiment[Steps]):
             group: [analysis.observe(name) for name in closed_names(self.study, group)]
             for group in (*_CLOSED, OWN)
         }
-        groups: dict[str, Sequence[Observation]] = {"open loop": opened, "PI": trials["pi"]}
-        if trials["pid"]:
-            groups["PID"] = trials["pid"]
-        if trials[OWN]:
-            groups[OWN] = trials[OWN]
+        closed = {"PI": trials["pi"], "PID": trials["pid"], OWN: trials[OWN]}
+        groups = {"open loop": opened} | {name: seen for name, seen in closed.items() if seen}
         found = compare_trials(groups, maps, self.study, scale)
         further, notes, drawn = further_trials(
-            trials, found.groups["PI"], maps, loops, self.study, scale
+            trials, found.groups.get("PI"), maps, loops, self.study, scale
         )
         return Outcome(
             {**found.quantities, **further},

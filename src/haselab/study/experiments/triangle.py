@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from haselab.rig import RigDescription
+from haselab.runtime.lockin import counted_s
 from haselab.runtime.observer import PARTICLES
-from haselab.runtime.runner import counted_s
 from haselab.safety.feasibility import Drive
 from haselab.signals import constant, triangle
 from haselab.store.session.writer import ExperimentPlan

@@ -289,7 +289,7 @@ CALLS = {
         "electrode_natural": (1.0, NUMBER_OR_NONE),
         "electrode_stiffening": (False, FLAG),
     },
-    identify.fit_spring: {
+    identify.fit_duffing: {
         "records": RECORDS,
         "structure": STRUCTURE,
         "powers": ((3,), OBJECT),

@@ -12,11 +12,11 @@ from haselab.control import (
     LoopSetting,
     PidGains,
     Saturation,
+    binomial_proportion,
     design_pi,
     design_plausible,
     margins,
     plausible_margins,
-    share_of,
 )
 from haselab.models import Plant, PlantPosterior, RationalModel
 
@@ -174,13 +174,13 @@ def test_the_unit_of_the_model_changes_no_share():
 
 
 def test_a_share_has_the_binomial_error_and_an_interval_that_is_never_empty():
-    share = share_of(np.arange(100) < 90)
+    share = binomial_proportion(np.arange(100) < 90)
     assert (share.value, share.std) == (0.9, pytest.approx(0.03))
     # Wilson's interval of 90 out of 100, by his formula in another program (R, prop.test).
     assert share.ci95 == pytest.approx((0.8256, 0.9448), abs=5e-5)
-    assert share_of(np.ones(400, bool)).ci95 == (pytest.approx(0.99049, abs=5e-6), 1.0)
+    assert binomial_proportion(np.ones(400, bool)).ci95 == (pytest.approx(0.99049, abs=5e-6), 1.0)
     with pytest.raises(InputError, match="at least one draw"):
-        share_of(np.zeros(0, bool))
+        binomial_proportion(np.zeros(0, bool))
 
 
 @pytest.mark.long

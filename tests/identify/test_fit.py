@@ -22,12 +22,12 @@ from haselab.identify import (
     fit_arx,
     fit_capacitance_map,
     fit_creep,
+    fit_duffing,
     fit_free_response,
     fit_hammerstein,
     fit_hyperelastic,
     fit_hysteresis,
     fit_map,
-    fit_spring,
     fit_subspace,
     fit_transfer,
     fit_voltage_map,
@@ -110,7 +110,7 @@ RECORDS = {
         ),
         NEW, lambda u: moved(u + 0.3 * u**2),
     ),
-    "spring": (lambda: fit_spring(sampled(HELD, moved(HELD))), NEW, moved),
+    "spring": (lambda: fit_duffing(sampled(HELD, moved(HELD))), NEW, moved),
     "creep": (lambda: fit_creep(sampled(STEP, CREEP.simulate(STEP, RATE_HZ)), "prony"),
               NEW, lambda u: CREEP.simulate(u, RATE_HZ)),
     "voltage plant": (
@@ -316,7 +316,7 @@ def test_rescaling_keeps_correlations_and_marks_what_is_not_identifiable():
 
 @pytest.mark.parametrize("wrong", [None, "u.csv", 3.0, {"u": [1.0], "y": [1.0]}, [[1.0, 2.0]]])
 @pytest.mark.parametrize(
-    "fit", [fit_transfer, fit_arx, fit_hysteresis, fit_free_response, fit_spring, choose_transfer]
+    "fit", [fit_transfer, fit_arx, fit_hysteresis, fit_free_response, fit_duffing, choose_transfer]
 )
 def test_what_is_no_record_is_refused_with_how_to_make_one(fit, wrong):
     with pytest.raises(InputError, match=r" is .*; it must be a .*\. Make .* haselab\."):

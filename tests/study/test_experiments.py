@@ -17,7 +17,7 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import describe
 from haselab.safety.feasibility import Drive
 from haselab.store.toml import Section
-from haselab.study import Analysis, Experiment, NotPlayedError, Outcome, Player, Quantity
+from haselab.study import Analysis, Experiment, ExperimentResult, NotPlayedError, Player, Quantity
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study, builtin_study, load_study
 from haselab.study.feasibility import rating_of_twin, study_drives, study_masses_kg
@@ -56,7 +56,7 @@ class _Own(Experiment[_Settings]):
     def play(self, player: Player) -> None:
         raise NotImplementedError
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         raise NotImplementedError
 
     def rows(self) -> Mapping[str, Quantity]:
@@ -180,13 +180,13 @@ class _Failing(_Own):
     def play(self, player: Player) -> None:
         raise KeyError("nothing here")
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         raise ZeroDivisionError("by nothing")
 
 
 class _Unnamed(_Own):
-    def fit(self, analysis: Analysis) -> Outcome:
-        return Outcome({"own.result": Estimate.normal(1.0, 0.1, "s")})
+    def fit(self, analysis: Analysis) -> ExperimentResult:
+        return ExperimentResult({"own.result": Estimate.normal(1.0, 0.1, "s")})
 
 
 def test_the_code_of_another_package_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

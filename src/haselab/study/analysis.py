@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 from haselab.base import HaselabError, InputError, ResultError
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
-from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult, NotPlayedError
 from haselab.study.fits.observe import Observation, Source
 from haselab.study.registry import EXPERIMENTS
 
@@ -50,7 +50,7 @@ class Analysis:
         rig: RigDescription,
         source: Source,
         on_fit: Callable[[str], None] = lambda what: None,
-        fitted: Callable[[Outcome], None] = lambda outcome: None,
+        fitted: Callable[[ExperimentResult], None] = lambda outcome: None,
         repeated: Mapping[type, object] | None = None,
         known: Mapping[type, object] | None = None,
     ) -> None:
@@ -60,7 +60,7 @@ class Analysis:
         self._repeated = {} if repeated is None else repeated
         self._known = known or {}
         self._seen: dict[str, Observation] = {}
-        self._outcomes: dict[str, Outcome | NotPlayedError] = {}
+        self._outcomes: dict[str, ExperimentResult | NotPlayedError] = {}
         self._under_way: list[str] = []
 
     def observe(self, name: str) -> Observation:
@@ -118,7 +118,7 @@ class Analysis:
         repeated = self.repeated(kind)
         return self.need(kind) if repeated is None else repeated
 
-    def outcome(self, experiment: AnyExperiment) -> Outcome:
+    def outcome(self, experiment: AnyExperiment) -> ExperimentResult:
         """Return the outcome of an experiment's fit, which is made at the first call.
 
         Raises:
@@ -152,7 +152,7 @@ class Analysis:
         return found
 
 
-def _check_rows(experiment: AnyExperiment, found: Outcome) -> None:
+def _check_rows(experiment: AnyExperiment, found: ExperimentResult) -> None:
     """Refuse results for which the report has no row.
 
     Raises:

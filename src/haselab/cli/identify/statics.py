@@ -31,7 +31,11 @@ from haselab.cli.identify.common import (
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
-from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
+from haselab.identify.statics.hyperelastic import (
+    HyperelasticFit,
+    TensileTest,
+    fit_hyperelastic_tests,
+)
 from haselab.identify.statics.regions import find_regions
 from haselab.identify.statics.voltage_map import fit_voltage_map
 from haselab.models import DEFORMATIONS, LAWS, Deformation
@@ -124,7 +128,7 @@ def hyperelastic(
         wanted = {STRETCH: test["stretch_column"], STRESS: test["stress_column"]}
         stretch, stress = read_quantities(file, wanted, columns)
         stretch, stress = _between(stretch, stress, stretch_min, stretch_max, file)
-        tests.append(SheetTest(stretch, stress, kind))
+        tests.append(TensileTest(stretch, stress, kind))
     fit = fit_hyperelastic_tests(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )

@@ -41,7 +41,7 @@ from haselab.control import (
     margins,
 )
 from haselab.control.plants.general import AnyPlant
-from haselab.control.stability.plausible import PlausibleMargins, share_of
+from haselab.control.stability.plausible import PlausibleMargins, binomial_proportion
 from haselab.models.posterior import PlantPosterior
 from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
@@ -256,9 +256,9 @@ def _designed(
 def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
     """Shares of the plausible plants: stable, phase margin kept, gain margin kept, both kept."""
     return {
-        "stable": share_of(found.stable),
-        "phase_margin": share_of(found.keeps_phase),
-        "gain_margin": share_of(found.keeps_gain),
+        "stable": binomial_proportion(found.stable),
+        "phase_margin": binomial_proportion(found.keeps_phase),
+        "gain_margin": binomial_proportion(found.keeps_gain),
         "margins": found.share,
     }
 

@@ -20,7 +20,7 @@ from haselab.identify.transfer.problem import fine_input
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import search_bounds
 
-__all__ = ["fit_output_curve", "fit_spring"]
+__all__ = ["fit_duffing", "fit_output_curve"]
 
 Floats = NDArray[np.float64]
 _PLANT = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
@@ -233,7 +233,7 @@ class _Fitted:
 
 
 @checked
-def fit_spring(
+def fit_duffing(
     records: Record | Sequence[Record],
     structure: TransferStructure | None = None,
     powers: tuple[int, ...] = (3,),
@@ -261,7 +261,7 @@ def fit_spring(
         >>> rng = np.random.default_rng(7)
         >>> u, time_s = np.repeat(rng.normal(size=400), 10), np.arange(4000) / 400.0
         >>> y = Plant(0.5, 5.11, 0.09).simulate(u, 400.0, time_s) + 0.01 * rng.normal(size=4000)
-        >>> fit = fit_spring(Record(u, 400.0, y, time_s))
+        >>> fit = fit_duffing(Record(u, 400.0, y, time_s))
         >>> low, high = fit.parameters["stiffness_ratio_3"].ci95
         >>> fit.status, low < 0.0 < high
         ('ok', True)
@@ -284,7 +284,7 @@ def fit_output_curve(
         records: experiments, or one.
         structure: two poles, no zeros or slow branches; its fixed parameters are kept.
         powers: of the curve, 2 or 3 each.
-        linear: as in `fit_spring`.
+        linear: as in `fit_duffing`.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:

@@ -14,7 +14,7 @@ from haselab.identify.model_choice import APART
 from haselab.identify.noise import fit_percent
 from haselab.identify.nonlinear.hammerstein import DEGREES, fit_hammerstein
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, cut, no_fit, shortened
-from haselab.identify.nonlinear.oscillator import fit_output_curve, fit_spring
+from haselab.identify.nonlinear.oscillator import fit_duffing, fit_output_curve
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.clipping import richer_fits
 from haselab.identify.transfer.fit import TransferFit
@@ -61,7 +61,7 @@ def fit_nonlinear(
         return fit_hammerstein(records, structure, int(which))
     if family == "wiener":
         return fit_output_curve(records, structure)
-    return fit_spring(records, structure, (2, 3) if which else (3,))
+    return fit_duffing(records, structure, (2, 3) if which else (3,))
 
 
 def nonlinear_candidates(
@@ -85,8 +85,8 @@ def nonlinear_candidates(
     fits = []
     if start is not None:
         fits = [
-            fit_spring(records, one, (3,), start),
-            fit_spring(records, one, (2, 3), start),
+            fit_duffing(records, one, (3,), start),
+            fit_duffing(records, one, (2, 3), start),
             fit_output_curve(records, one, linear=start),
         ]
     clear = any(f.residual_whiteness_p > _WHITE for f in (linear, *fits) if f.succeeded)

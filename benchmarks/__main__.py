@@ -27,11 +27,11 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     "identify": (
         Measurement("identification.static_laws"),
         Measurement(
-            "identification.transfer", quick={"runs": 300, "structures": 0, "libraries": False}
+            "identification.transfer", quick={"runs": 60, "structures": 0, "libraries": False}
         ),
         Measurement("control.many_loops"),
         Measurement("identification.frequency_response", quick={"runs": 10}),
-        Measurement("identification.model_comparison", quick={"count": 1}),
+        Measurement("identification.model_comparison", quick={"count": 1, "readings": ("hz",)}),
         Measurement("identification.hysteresis", quick={"runs": 8}),
     ),
     "identify-board": (

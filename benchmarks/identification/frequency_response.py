@@ -16,7 +16,7 @@ from scipy.signal import csd, welch
 
 from benchmarks.identification.transfer import CHIRP, GAIN, OMEGA, RATE_HZ, TIME_S, ZETA, bound
 from benchmarks.rows import Row, medians
-from haselab.identify import estimate_frequency_response, fit_response
+from haselab.identify import Record, estimate_frequency_response, fit_response
 from haselab.models import Plant, RationalModel, SlowMode, from_scipy, to_scipy
 
 Floats = NDArray[np.float64]
@@ -68,13 +68,13 @@ def resonance_rows(runs: int) -> list[Row]:
     for run in range(runs):
         y, _ = drawn(30, run)
         for method in ("rational", "polynomial", "h1"):
-            found = estimate_frequency_response(CHIRP, y, RATE_HZ, method=method)
+            found = estimate_frequency_response(Record.sampled(CHIRP, y, RATE_HZ), method=method)
             errors.setdefault(f"ours, {method}", []).append(
                 error(found.frequency_hz, found.response)
             )
         errors.setdefault("scipy csd/welch, 5 s Hann", []).append(error(*scipy_h1(y, 2000)))
         errors.setdefault("numpy, ratio of spectra", []).append(error(*plain_ratio(y)))
-    clean = estimate_frequency_response(CHIRP, CLEAN, RATE_HZ)
+    clean = estimate_frequency_response(Record.sampled(CHIRP, CLEAN, RATE_HZ))
     rows = [
         Row("  noise-free, ours, rational", error(clean.frequency_hz, clean.response), "%", 1e-3,
             False, "numpy, ratio of spectra "
@@ -92,7 +92,9 @@ def interval_rows(runs: int) -> list[Row]:
     for level_db in (20, 30, 40):
         scaled: dict[float, list[complex]] = {}
         for run in range(runs):
-            found = estimate_frequency_response(CHIRP, drawn(level_db, run)[0], RATE_HZ)
+            found = estimate_frequency_response(
+                Record.sampled(CHIRP, drawn(level_db, run)[0], RATE_HZ)
+            )
             ratio = (found.response - truth(found.frequency_hz)) / found.std
             for at_hz, value in zip(found.frequency_hz.round(4), ratio, strict=True):
                 scaled.setdefault(float(at_hz), []).append(complex(value))
@@ -145,7 +147,7 @@ def fit_rows(runs: int) -> list[Row]:
         others["scikit-rf vector fitting on our lines"] = []
     for run in range(runs):
         y, std = drawn(30, run)
-        found = estimate_frequency_response(CHIRP, y, RATE_HZ)
+        found = estimate_frequency_response(Record.sampled(CHIRP, y, RATE_HZ))
         estimates = [found.fit().parameters[name] for name in NAMES]
         ours.append(([e.value for e in estimates] - x[:4]) / best / std)
         held.append([e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, x, strict=False)])
@@ -178,16 +180,19 @@ def time_rows() -> list[Row]:
     u, y = rng.normal(size=4000), rng.normal(size=4000)
 
     def ours() -> object:
-        return estimate_frequency_response(u, y, RATE_HZ, method="h1", segment_s=1.25)
+        return estimate_frequency_response(
+            Record.sampled(u, y, RATE_HZ), method="h1", segment_s=1.25
+        )
 
     def theirs() -> object:
         return (csd(u, y, RATE_HZ, nperseg=500), welch(u, RATE_HZ, nperseg=500),
                 welch(y, RATE_HZ, nperseg=500))  # fmt: skip
 
     noisy, _ = drawn(30, 0)
-    lines = estimate_frequency_response(CHIRP, noisy, RATE_HZ)
+    record = Record.sampled(CHIRP, noisy, RATE_HZ)
+    lines = estimate_frequency_response(record)
     ours_s, theirs_s, local_s, together_s, apart_s = medians(
-        ours, theirs, lambda: estimate_frequency_response(CHIRP, noisy, RATE_HZ), lines.fit,
+        ours, theirs, lambda: estimate_frequency_response(record), lines.fit,
         lambda: fit_response(lines.frequency_hz, lines.response, lines.std), rounds=15,
     )  # fmt: skip
     return [

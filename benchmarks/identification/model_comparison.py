@@ -12,6 +12,7 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -31,8 +32,9 @@ from haselab.identify.record import Record
 from haselab.models import VoltageMap
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
+from haselab.runtime.lockin import BLANKING_S, lockin_of
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import BLANKING_S, Runner, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.sensing import Lockin
 from haselab.signals import constant, linear_chirp, triangle
 
@@ -196,13 +198,17 @@ def _kept(task: tuple[str, str, int, Path | None]) -> dict[str, Any]:
 
 
 def runs(
-    count: int, folder: Path | None = None, processes: int = 1, first_seed: int = FIRST_SEED
+    count: int,
+    folder: Path | None = None,
+    processes: int = 1,
+    first_seed: int = FIRST_SEED,
+    readings: Sequence[str] = ("rad", "hz"),
 ) -> list[dict[str, Any]]:
-    """`count` runs of each of the four kinds of twin."""
+    """`count` runs of each of the four kinds of twin, two for each reading."""
     tasks = [
         (reading, creep, seed, folder)
         for seed in range(first_seed, first_seed + count)
-        for reading in ("rad", "hz")
+        for reading in readings
         for creep in ("mechanical", "electrical")
     ]
     if processes == 1:
@@ -239,9 +245,9 @@ def table(results: list[dict[str, Any]]) -> list[Row]:
     return made
 
 
-def rows(count: int = 2) -> list[Row]:
+def rows(count: int = 2, readings: Sequence[str] = ("rad", "hz")) -> list[Row]:
     """A few runs of each kind; `--runs 50` gives a hundred of each truth."""
-    return table(runs(count))
+    return table(runs(count, readings=readings))
 
 
 def main() -> None:

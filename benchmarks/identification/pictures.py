@@ -81,7 +81,7 @@ def draw_frequency_response():
     whole, close = figure.subplots(1, 2)
     styles = {"h1": (BLUE, "v"), "polynomial": (PURPLE, "x"), "rational": (RED, "o")}
     for method, (colour, marker) in styles.items():
-        response = estimate_frequency_response(SWEEP, y, 400.0, method=method)
+        response = estimate_frequency_response(Record.sampled(SWEEP, y, 400.0), method=method)
         for axes in (whole, close):
             axes.errorbar(
                 response.frequency_hz, np.abs(response.response), 1.96 * response.magnitude_std,

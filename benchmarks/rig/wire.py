@@ -28,8 +28,9 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.real_bench import RealBench
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.client import TwinClient
+from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
-from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.gate import Gate
 

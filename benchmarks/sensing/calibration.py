@@ -17,7 +17,7 @@ from haselab.models.actuator import StrainMap
 from haselab.rig import Rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
-from haselab.runtime.runner import BLANKING_S
+from haselab.runtime.lockin import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.calibration import (
     Calibration,

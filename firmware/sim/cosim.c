@@ -86,6 +86,8 @@ typedef struct {
     avr_cycle_count_t asleep, next_byte;
     uint8_t queue[MOST_QUEUED];
     unsigned queued, sent;
+    uint8_t uart_bytes[MOST_QUEUED]; /* from the chip, until the end of the command */
+    unsigned received;
     unsigned resets, crashes, conversions, short_slots;
     uint16_t lowest_sp;
     unsigned track_every, slots;
@@ -230,10 +232,29 @@ static void output_changed(bench *b)
     printf("out %llu %u %u\n", (unsigned long long)b->avr->cycle, b->code, b->enable);
 }
 
+/* Bytes of the link, as one line. */
+static void print_uart(bench *b)
+{
+    unsigned k;
+    if (b->received) {
+        fputs("uart ", stdout);
+        for (k = 0; k < b->received; ++k) {
+            putchar("0123456789abcdef"[b->uart_bytes[k] >> 4]);
+            putchar("0123456789abcdef"[b->uart_bytes[k] & 15]);
+        }
+        putchar('\n');
+        b->received = 0;
+    }
+}
+
 static void on_uart(avr_irq_t *irq, uint32_t value, void *context)
 {
-    (void)irq, (void)context;
-    printf("uart %02x\n", value & 0xffu);
+    bench *b = context;
+    (void)irq;
+    if (b->received == MOST_QUEUED) {
+        print_uart(b);
+    }
+    b->uart_bytes[b->received++] = (uint8_t)value;
 }
 
 /* The output converter: shifts data in at rising clocks, takes it over when deselected. */
@@ -513,6 +534,7 @@ int main(int argc, char **argv)
         if (!obey(&b, line)) {
             printf("bad %s\n", line);
         }
+        print_uart(&b);
         printf("ok cycle=%llu asleep=%llu resets=%u crashes=%u conversions=%u short_slots=%u "
                "stack=%u code=%u enable=%u length=%.9g high=%.9g broken=%d\n",
                (unsigned long long)b.avr->cycle, (unsigned long long)b.asleep, b.resets, b.crashes,

@@ -79,7 +79,8 @@ private:
     std::size_t pixels() const { return light_x_.size() * light_y_.size(); }
 
     void check(const Table &lengths_px, std::size_t frames, std::size_t height, std::size_t width) const {
-        if (lengths_px.shape(1) == 0) throw std::invalid_argument("lengths_px: no sub-sample");
+        if (lengths_px.shape(1) == 0 || lengths_px.shape(1) > CAMERA_SAMPLES_MAX)
+            throw std::invalid_argument("lengths_px: 1 to 64 sub-samples");
         if (frames != lengths_px.shape(0) || height != light_y_.size() || width != light_x_.size())
             throw std::invalid_argument("out: shape (frames, height, width)");
     }

@@ -10,7 +10,8 @@
 #define EDGE_REACH 16.0 /* in edge widths */
 #define BLOB_REACH 5.0  /* in sigmas */
 #define FALLOFF_SIZE 72 /* 2 * EDGE_REACH * CAMERA_EDGE_MAX_PX, and the two roundings */
-#define PROFILE_SIZE 64 /* 2 * BLOB_REACH * CAMERA_SIGMA_MAX_PX, and the centre */
+#define LANES 16        /* pixels at a time */
+#define PROFILE_SIZE 80 /* 2 * BLOB_REACH * CAMERA_SIGMA_MAX_PX, the centre, and LANES */
 #define NOISE_BLOCK 256
 
 static float logistic(double distance_px, double edge_px)
@@ -57,26 +58,59 @@ static void fill_windows(const camera_scene *s, const double *lengths_px, size_t
     }
 }
 
-/* Adds weight times the coverage of a span between two logistic edges to one row. */
-static void add_span(float *cover, int width, double left_px, double right_px, double edge_px,
-                     const float *falloff, float weight)
+/* One sample's part of a row of the sheet, a span between two logistic edges. */
+typedef struct {
+    int from, full, end, to; /* rises over [from, full), is 1 over [full, end], falls over (end, to] */
+    float rise, fall, weight;
+} span;
+
+static span span_of(double left_px, double right_px, double edge_px, float weight)
 {
     const double reach = EDGE_REACH * edge_px;
-    const int from = (int)floor(left_px - reach), to = (int)ceil(right_px + reach);
-    const int full = (int)ceil(left_px + reach), end = (int)floor(right_px - reach);
-    const float rise = (float)exp((left_px - from) / edge_px);
-    const float fall = (float)exp((to - right_px) / edge_px);
-    const int full_stop = full < width ? full : width;
-    for (int x = from > 0 ? from : 0; x < full_stop; x++) {
-        cover[x] += weight / (1.0f + rise * falloff[x - from]);
+    span s;
+    s.from = (int)floor(left_px - reach);
+    s.to = (int)ceil(right_px + reach);
+    s.full = (int)ceil(left_px + reach);
+    s.end = (int)floor(right_px - reach);
+    s.rise = (float)exp((left_px - s.from) / edge_px);
+    s.fall = (float)exp((s.to - right_px) / edge_px);
+    s.weight = weight;
+    return s;
+}
+
+/* Adds spans to a row that is 0, each in its turn. Where all are full, their sum is the same. */
+static inline void add_spans(float *cover, int width, const span *spans, size_t count, const float *falloff)
+{
+    int first = 0, last = width - 1;
+    float all = 0.0f;
+    for (size_t k = 0; k < count; k++) {
+        first = spans[k].full > first ? spans[k].full : first;
+        last = spans[k].end < last ? spans[k].end : last;
+        all += spans[k].weight;
     }
-    const int end_stop = end < width ? end : width - 1;
-    for (int x = full > 0 ? full : 0; x <= end_stop; x++) {
-        cover[x] += weight;
+    if (first > last) {
+        first = width, last = width - 1;
     }
-    const int to_stop = to < width ? to : width - 1;
-    for (int x = end + 1 > 0 ? end + 1 : 0; x <= to_stop; x++) {
-        cover[x] += weight / (1.0f + fall * falloff[to - x]);
+    for (size_t k = 0; k < count; k++) {
+        const span s = spans[k];
+        const int full_stop = s.full < width ? s.full : width;
+        for (int x = s.from > 0 ? s.from : 0; x < full_stop; x++) {
+            cover[x] += s.weight / (1.0f + s.rise * falloff[x - s.from]);
+        }
+        const int end_stop = s.end < first ? s.end : first - 1;
+        for (int x = s.full > 0 ? s.full : 0; x <= end_stop; x++) {
+            cover[x] += s.weight;
+        }
+        for (int x = last + 1; x <= s.end && x < width; x++) {
+            cover[x] += s.weight;
+        }
+        const int to_stop = s.to < width ? s.to : width - 1;
+        for (int x = s.end + 1 > 0 ? s.end + 1 : 0; x <= to_stop; x++) {
+            cover[x] += s.weight / (1.0f + s.fall * falloff[s.to - x]);
+        }
+    }
+    for (int x = first; x <= last; x++) {
+        cover[x] = all;
     }
 }
 
@@ -85,12 +119,14 @@ HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths
                                     float *level)
 {
     float falloff[FALLOFF_SIZE];
+    span spans[CAMERA_SAMPLES_MAX];
     for (int i = 0; i < FALLOFF_SIZE; i++) {
         falloff[i] = (float)exp(-i / s->edge_px);
     }
     const float weight = (s->sheet_grey - s->background_grey) / (float)samples;
     const size_t row_bytes = (size_t)s->width * sizeof(float);
     for (int y = 0; y < s->height; y++) {
+        size_t spanned = 0;
         memset(cover, 0, row_bytes);
         for (size_t k = 0; k < samples; k++) {
             const float window = sheet[k * (size_t)s->height + (size_t)y];
@@ -100,9 +136,10 @@ HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths
             const double along = (y - s->top_px) / lengths_px[k];
             const double neck = contraction(s, lengths_px[k]) * 4.0 * along * (1.0 - along);
             const double half = s->half_width_px * (1.0 - neck);
-            add_span(cover, s->width, s->mid_px - half, s->mid_px + half, s->edge_px, falloff,
-                     weight * window);
+            spans[spanned++] =
+                span_of(s->mid_px - half, s->mid_px + half, s->edge_px, weight * window);
         }
+        add_spans(cover, s->width, spans, spanned, falloff);
         const float clamp = (s->clamp_grey - s->background_grey) * clamps[y];
         const float light = s->illumination_y[y];
         float *row = level + (size_t)y * (size_t)s->width;
@@ -113,48 +150,118 @@ HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths
     }
 }
 
-/* exp(-(i - centre)^2 / (2 sigma^2)) for the 2 reach + 1 integers i around the nearest one, which is
- * returned. g(i + 1) / g(i) is a geometric series, so two exponentials are enough. */
-static int fill_profile(double centre_px, double sigma_px, int reach, float *profile)
+/* What all images of a blob have in common. */
+typedef struct {
+    double inverse, shrink, half_step; /* 1 / sigma^2, exp(-inverse), sqrt(shrink) */
+    int reach;
+} shape;
+
+static shape shape_of(const camera_blob *blob)
 {
-    const double nearest = floor(centre_px + 0.5);
-    const double offset = centre_px - nearest, inverse = 1.0 / (sigma_px * sigma_px);
-    const double shrink = exp(-inverse), peak = exp(-0.5 * offset * offset * inverse);
-    const double tilt = exp(offset * inverse), half_step = sqrt(shrink);
-    double up = peak, down = peak, up_ratio = half_step * tilt, down_ratio = half_step / tilt;
+    shape s;
+    s.inverse = 1.0 / (blob->sigma_px * blob->sigma_px);
+    s.shrink = exp(-s.inverse);
+    s.half_step = sqrt(s.shrink);
+    s.reach = (int)ceil(BLOB_REACH * blob->sigma_px);
+    return s;
+}
+
+/* exp(-(i - centre)^2 / (2 sigma^2)) for the 2 reach + 1 integers i around the nearest one, the
+ * centre lying `offset` beyond it. g(i + 1) / g(i) is a geometric series, so two exponentials are
+ * enough. */
+static void fill_profile(double offset, const shape *s, float *profile)
+{
+    const int reach = s->reach;
+    const double peak = exp(-0.5 * offset * offset * s->inverse), tilt = exp(offset * s->inverse);
+    double up = peak, down = peak, up_ratio = s->half_step * tilt, down_ratio = s->half_step / tilt;
     profile[reach] = (float)peak;
     for (int i = 1; i <= reach; i++) {
         up *= up_ratio;
         down *= down_ratio;
-        up_ratio *= shrink;
-        down_ratio *= shrink;
+        up_ratio *= s->shrink;
+        down_ratio *= s->shrink;
         profile[reach + i] = (float)up;
         profile[reach - i] = (float)down;
     }
-    return (int)nearest;
 }
 
-/* Subtracts one blob at one position; window, or NULL, is its visibility along y. */
-HS_CLONES static void subtract_blob(const camera_scene *s, const camera_blob *blob, double x_px,
-                                    double y_px, float depth, const float *window, float *level)
+/* The images of a blob that lie around one pixel. */
+typedef struct {
+    size_t count;
+    int left, upper, size; /* of the square they cover */
+    float x[CAMERA_SAMPLES_MAX][PROFILE_SIZE];
+    float y[CAMERA_SAMPLES_MAX][PROFILE_SIZE]; /* times depth and visibility */
+} images;
+
+/* Subtracts the images from the level, each in its turn. */
+HS_CLONES static void subtract_images(const camera_scene *s, const images *b, float *level)
 {
-    const int reach = (int)ceil(BLOB_REACH * blob->sigma_px);
-    if (!(x_px > -reach && x_px < s->width - 1 + reach && y_px > -reach &&
-          y_px < s->height - 1 + reach)) {
-        return;
-    }
-    float profile_x[PROFILE_SIZE], profile_y[PROFILE_SIZE];
-    const int left = fill_profile(x_px, blob->sigma_px, reach, profile_x) - reach;
-    const int upper = fill_profile(y_px, blob->sigma_px, reach, profile_y) - reach;
-    const int x_from = left > 0 ? left : 0, y_from = upper > 0 ? upper : 0;
-    const int x_stop = left + 2 * reach < s->width ? left + 2 * reach + 1 : s->width;
-    const int y_stop = upper + 2 * reach < s->height ? upper + 2 * reach + 1 : s->height;
+    const int y_from = b->upper > 0 ? b->upper : 0;
+    const int y_stop = b->upper + b->size < s->height ? b->upper + b->size : s->height;
     for (int y = y_from; y < y_stop; y++) {
-        const float amount = depth * profile_y[y - upper] * (window ? window[y] : 1.0f);
         float *row = level + (size_t)y * (size_t)s->width;
-        for (int x = x_from; x < x_stop; x++) {
-            row[x] -= amount * profile_x[x - left];
+        for (int x = 0; x < b->size; x += LANES) { /* beyond its size a profile is 0 */
+            const int from = b->left + x;
+            if (from >= 0 && from + LANES <= s->width) {
+                float grey[LANES];
+                memcpy(grey, row + from, sizeof grey);
+                for (size_t k = 0; k < b->count; k++) {
+                    const float amount = b->y[k][y - b->upper];
+                    for (int i = 0; i < LANES; i++) {
+                        grey[i] -= amount * b->x[k][x + i];
+                    }
+                }
+                memcpy(row + from, grey, sizeof grey);
+                continue;
+            }
+            for (int i = from < 0 ? -from : 0; i < LANES && from + i < s->width; i++) {
+                for (size_t k = 0; k < b->count; k++) {
+                    row[from + i] -= b->y[k][y - b->upper] * b->x[k][x + i];
+                }
+            }
         }
+    }
+}
+
+/* Subtracts a blob at all samples of the exposure. */
+static void subtract_blob(const camera_scene *s, const camera_blob *blob, const double *lengths_px,
+                          size_t samples, const float *sheet, float *level)
+{
+    const float depth = (float)(blob->depth_grey / (double)samples);
+    const int on_sheet = blob->along > 0.0 && blob->along < 1.0;
+    const shape form = shape_of(blob);
+    const int reach = form.reach;
+    images batch;
+    batch.count = 0;
+    batch.size = 2 * reach + 1;
+    for (size_t k = 0; k < samples; k++) {
+        const double neck = contraction(s, lengths_px[k]) * 4.0 * blob->along * (1.0 - blob->along);
+        const double x = s->mid_px + s->half_width_px * (blob->across - neck * blob->across_necked);
+        const double y = s->top_px + blob->along * lengths_px[k];
+        const double column = floor(x + 0.5), line = floor(y + 0.5);
+        if (!(x > -reach && x < s->width - 1 + reach && y > -reach && y < s->height - 1 + reach)) {
+            continue;
+        }
+        if (batch.count && (batch.left != (int)column - reach || batch.upper != (int)line - reach)) {
+            subtract_images(s, &batch, level);
+            batch.count = 0;
+        }
+        batch.left = (int)column - reach;
+        batch.upper = (int)line - reach;
+        float *px = batch.x[batch.count], *py = batch.y[batch.count];
+        memset(px + batch.size, 0, LANES * sizeof *px);
+        fill_profile(x - column, &form, px);
+        fill_profile(y - line, &form, py);
+        for (int i = 0; i < batch.size; i++) {
+            const int at = batch.upper + i;
+            const int visible = at >= 0 && at < s->height;
+            const float window = on_sheet && visible ? sheet[k * (size_t)s->height + (size_t)at] : 1.0f;
+            py[i] = depth * py[i] * window;
+        }
+        batch.count++;
+    }
+    if (batch.count) {
+        subtract_images(s, &batch, level);
     }
 }
 
@@ -166,16 +273,7 @@ void camera_expect(const camera_scene *s, const double *lengths_px, size_t sampl
     fill_windows(s, lengths_px, samples, sheet, clamps);
     fill_surfaces(s, lengths_px, samples, sheet, clamps, cover, level);
     for (size_t i = 0; i < s->blob_count; i++) {
-        const camera_blob *blob = s->blobs + i;
-        const float depth = (float)(blob->depth_grey / (double)samples);
-        const int on_sheet = blob->along > 0.0 && blob->along < 1.0;
-        for (size_t k = 0; k < samples; k++) {
-            const double neck =
-                contraction(s, lengths_px[k]) * 4.0 * blob->along * (1.0 - blob->along);
-            const double x = s->mid_px + s->half_width_px * (blob->across - neck * blob->across_necked);
-            const double y = s->top_px + blob->along * lengths_px[k];
-            subtract_blob(s, blob, x, y, depth, on_sheet ? sheet + k * (size_t)s->height : NULL, level);
-        }
+        subtract_blob(s, s->blobs + i, lengths_px, samples, sheet, level);
     }
 }
 

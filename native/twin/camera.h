@@ -26,6 +26,7 @@
 #define CAMERA_SIGMA_MAX_PX 6.0
 #define CAMERA_EDGE_MAX_PX 2.0
 #define CAMERA_TABLE_SIZE 4096
+#define CAMERA_SAMPLES_MAX 64 /* of an exposure */
 
 typedef struct {
     double along;         /* S */
@@ -60,7 +61,7 @@ typedef struct {
 /* Floats of scratch memory that camera_expect needs. */
 size_t camera_scratch_size(const camera_scene *scene, size_t samples);
 
-/* Mean of the images at `samples` lengths, in grey levels; level holds width * height floats. */
+/* Mean of the images at `samples` lengths, at most CAMERA_SAMPLES_MAX, in grey levels; level holds width * height floats. */
 void camera_expect(const camera_scene *scene, const double *lengths_px, size_t samples, float *scratch,
                    float *level);
 

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from haselab.actuators import (
+    ACTUATORS,
     VACUUM_F_PER_M,
     ActuatorLaw,
     DeaStack,
     Losses,
     PlanarHasel,
-    actuator_kinds,
     actuator_law,
     equilibrium_m,
 )
@@ -170,8 +170,8 @@ def test_a_neo_hookean_stack_rests_where_its_cubic_has_a_root(voltage_v):
 
 
 def test_unknown_kinds_names_and_values_are_refused_with_what_to_do():
-    assert {"planar-hasel", "dea-stack"} <= set(actuator_kinds())
-    with pytest.raises(InputError, match=r"No actuator of kind 'muscle' .* dea-stack"):
+    assert {"planar-hasel", "dea-stack"} <= set(ACTUATORS.packages())
+    with pytest.raises(InputError, match=r"No actuator 'muscle' .* dea-stack"):
         actuator_law("muscle", {})
     with pytest.raises(InputError, match=r"actuator.layer is not a parameter .* layers, "):
         actuator_law("dea-stack", {"layer": 3.0})

@@ -1,12 +1,14 @@
 """Motion by a law in Python against the compiled twin, a solver of its own, and linear systems."""
 
 import dataclasses
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from haselab.actuators import (
+    ACTUATORS,
     ActuatorLaw,
     ActuatorState,
     DeaStack,
@@ -82,9 +84,8 @@ class Saturating(DeaStack):
 
 @pytest.fixture
 def saturating(monkeypatch: pytest.MonkeyPatch) -> TwinConfig:
-    monkeypatch.setattr(
-        "haselab.actuators.registry._BUILT_IN", {"dea-stack": DeaStack, "saturating": Saturating}
-    )
+    theirs = EntryPoint("saturating", f"{__name__}:Saturating", ACTUATORS.group)
+    monkeypatch.setattr(ACTUATORS, "others", lambda: (theirs,))
     return TwinConfig(kind="saturating")
 
 

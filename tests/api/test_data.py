@@ -9,6 +9,7 @@ import xarray as xr
 
 import haselab as hl
 from haselab.base import InputError
+from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 TIME_S = np.arange(200) / 50.0
 U = np.repeat(np.random.default_rng(1).normal(size=20), 10)
@@ -31,6 +32,11 @@ SOURCES = {
     "frame with an index of clock times": pd.DataFrame(
         {"u": U, "y": Y}, index=pd.Timestamp("2026-01-01") + pd.to_timedelta(TIME_S, unit="s")
     ),
+    "frame with an index in a time zone": pd.DataFrame(
+        {"u": U, "y": Y},
+        index=pd.Timestamp("2026-03-29", tz="Europe/Zurich") + pd.to_timedelta(TIME_S, unit="s"),
+    ),
+    "frame of nullable numbers": pd.DataFrame({"time_s": TIME_S, "u": U, "y": Y}, dtype="Float64"),
     "data set": xr.Dataset({"u": ("time_s", U), "y": ("time_s", Y)}, {"time_s": TIME_S}),
     "table": hl.table({"time_s": TIME_S, "u": U, "y": Y}),
 }
@@ -102,3 +108,53 @@ def test_a_rate_that_contradicts_the_times_is_refused(name):
     assert kept.input_rate_hz == 50.0
     with pytest.raises(InputError, match=r"rate_hz is 25, but the data have 50 rows per second"):
         hl.records(SOURCES[name], rate_hz=25.0)
+
+
+def at_a_path(folder: Path, name: str) -> object:
+    return csv(folder) if name == "file" else SOURCES[name]
+
+
+@pytest.mark.parametrize("name", ["file", *sorted(SOURCES)])
+def test_a_table_has_the_rate_that_is_stated_or_refuses_it(tmp_path, name):
+    data = at_a_path(tmp_path, name)
+    assert hl.table(data, rate_hz=50.0).rate_hz == 50.0
+    for read in (hl.table, hl.records):
+        with pytest.raises(InputError, match=r"rate_hz is 25, but the data have 50 rows per sec"):
+            read(data, rate_hz=25.0)
+
+
+def test_a_stated_rate_must_not_contradict_the_attribute_or_the_attribute_the_times():
+    frame = pd.DataFrame({"u": U, "y": Y})
+    frame.attrs["rate_hz"] = 30.0
+    with pytest.raises(InputError, match=r"rate_hz is 50, but the data have 30 rows per second"):
+        hl.table(frame, rate_hz=50.0)
+    frame.index = pd.Index(TIME_S, name="time_s")
+    with pytest.raises(InputError, match=r"rate_hz is 30, but the data have 50 rows per second"):
+        hl.table(frame)
+
+
+def test_a_stated_rate_does_not_close_a_gap_in_the_times(tmp_path):
+    frame = pd.DataFrame({"time_s": TIME_S, "u": U, "y": Y}).drop(index=range(90, 105))
+    frame.to_csv(tmp_path / "gap.csv", index=False)
+    for data in (frame, tmp_path / "gap.csv"):
+        assert [record.y.size for record in hl.records(data, rate_hz=50.0)] == [90, 95]
+
+
+def test_a_column_that_is_only_called_like_times_is_none():
+    table = hl.table({"t": Y, "u": U, "y": Y}, rate_hz=50.0)
+    assert table.time_s is None and hl.records(table)[0].input_rate_hz == 50.0
+
+
+def test_other_columns_of_a_file_may_hold_anything(tmp_path):
+    frame = pd.DataFrame({"time_s": TIME_S, "u": U, "y": Y, "spare": np.nan, "note": "a"})
+    frame.to_csv(tmp_path / "spare.csv", index=False)
+    (record,) = hl.records(tmp_path / "spare.csv")
+    assert np.array_equal(record.u, U)
+
+
+@pytest.mark.parametrize("read", [hl.table, hl.records])
+def test_a_session_is_no_table(tmp_path, read):
+    with SessionWriter(tmp_path / "session.h5", [ExperimentPlan("x", "test", 6, {})], 100, {}):
+        pass
+    with pytest.raises(InputError, match=r"holds one table for each experiment\. Use hl\.load"):
+        read(tmp_path)

@@ -1,6 +1,7 @@
 """Estimates, limits, errors: the words and numbers every room shares."""
 
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,14 @@ def test_a_value_outside_or_none_at_all_is_refused_with_the_four_facts(value):
         limits.check(value)
 
 
+def test_the_file_of_the_limit_that_was_crossed_is_named():
+    limits = Limits("drive voltage", 0.0, 2.0, "V", high_source="leg.toml")
+    with pytest.raises(LimitError, match=r"widen the limit in leg\.toml\.$"):
+        limits.check(3.0)
+    with pytest.raises(LimitError, match=r"widen the limit in the rig file\.$"):
+        limits.check(-1.0)
+
+
 def test_every_error_is_one_of_ours_and_one_of_the_language():
     kinds = [getattr(base, name) for name in base.__all__ if name.endswith("Error")]
     for kind in kinds:
@@ -67,8 +76,7 @@ def test_every_error_is_one_of_ours_and_one_of_the_language():
 
 
 def test_base_needs_nothing_but_numpy_and_the_language():
-    allowed = {"__future__", "collections", "dataclasses", "haselab", "importlib", "math"}
-    allowed |= {"numpy", "typing"}
+    allowed = {"haselab", "numpy", *sys.stdlib_module_names}
     for path in Path(base.__file__).parent.glob("*.py"):
         for line in path.read_text().splitlines():
             if line.startswith(("import ", "from ")):

@@ -312,3 +312,18 @@ def test_of_two_runs_that_start_together_one_records(tmp_path):
         for process in both:
             process.kill()
             process.communicate()
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_missing_folders_of_out_and_plot_are_created_and_removed_if_nothing_is_written(
+    works, tmp_path
+) -> None:
+    gain = "gain = 1.0\n" if works else ""
+    model = tmp_path / "a.toml"
+    model.write_text(f"[model]\n{gain}natural_frequency_rad_s = 30.0\ndamping_ratio = 0.1\n")
+    out, plot = tmp_path / "one" / "b.toml", tmp_path / "two" / "three" / "b.svg"
+    code = code_of("design", model, "--rate-hz", 100, "--delay-s", 0.0075, "--out", out,
+                   "--plot", plot)  # fmt: skip
+    assert code == (0 if works else 2)
+    assert (out.is_file(), plot.is_file()) == (works, works)
+    assert (out.parent.exists(), plot.parents[1].exists()) == (works, works)

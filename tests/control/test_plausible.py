@@ -12,11 +12,11 @@ from haselab.control import (
     LoopSetting,
     PidGains,
     Saturation,
+    binomial_proportion,
     design_pi,
     design_plausible,
     margins,
     plausible_margins,
-    share_of,
 )
 from haselab.models import Plant, PlantPosterior, RationalModel
 
@@ -101,12 +101,17 @@ def test_a_general_fit_is_its_own_nominal_model():
         ({"matrix": np.diag([0.1, -0.1, 0.0, 0.0])}, "a negative or missing variance"),
         ({"matrix": 0.01 * (np.eye(4) + np.eye(4, k=1))}, "not symmetric"),
         ({"matrix": 0.01 * (1.9 * np.eye(4) - 0.9)}, "a negative eigenvalue"),
-        ({"matrix": np.zeros((3, 3))}, "needs one value, one row and one column per name"),
+        (
+            {"matrix": np.zeros((3, 3))},
+            r"rows of \[3, 3, 3\] numbers, but its 4 names need as many",
+        ),
         ({"names": ["gain", "natural_frequency_rad_s", "damping", "delay_s"]}, "names damping"),
         ({"logarithmic": [False, False, True, False]}, "draws may be negative"),
         ({"values": [1.0, 32.1, 0.0, 0.0]}, "has no logarithm"),
         ({"values": [1.0, 32.1]}, "needs one value"),
-        ({"matrix": [[1.0], [1.0, 2.0]]}, "is incomplete or has a wrong value"),
+        ({"matrix": [[1.0], [1.0, 2.0]]}, r"rows of \[1, 2\] numbers, but its 4 names"),
+        ({"matrix": 4 * [[1.0, 2.0, "three", 4.0]]}, "is incomplete or has a wrong value"),
+        ({"matrix": 4 * [1.0]}, "is incomplete or has a wrong value"),
     ],
 )
 def test_what_is_no_posterior_is_refused(change, message):
@@ -169,13 +174,13 @@ def test_the_unit_of_the_model_changes_no_share():
 
 
 def test_a_share_has_the_binomial_error_and_an_interval_that_is_never_empty():
-    share = share_of(np.arange(100) < 90)
+    share = binomial_proportion(np.arange(100) < 90)
     assert (share.value, share.std) == (0.9, pytest.approx(0.03))
     # Wilson's interval of 90 out of 100, by his formula in another program (R, prop.test).
     assert share.ci95 == pytest.approx((0.8256, 0.9448), abs=5e-5)
-    assert share_of(np.ones(400, bool)).ci95 == (pytest.approx(0.99049, abs=5e-6), 1.0)
+    assert binomial_proportion(np.ones(400, bool)).ci95 == (pytest.approx(0.99049, abs=5e-6), 1.0)
     with pytest.raises(InputError, match="at least one draw"):
-        share_of(np.zeros(0, bool))
+        binomial_proportion(np.zeros(0, bool))
 
 
 @pytest.mark.long

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 import tomllib
 from dataclasses import replace
-from importlib.metadata import EntryPoint, EntryPoints
+from importlib.metadata import EntryPoint
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from haselab import _core
 from haselab.base import InputError
-from haselab.cli.doctor.controllers import controller_findings
+from haselab.cli.doctor.extensions import extension_findings
 from haselab.controllers import (
-    GROUP,
+    CONTROLLERS,
     ChosenController,
     ControllerKind,
     ControllerSetting,
@@ -23,8 +23,6 @@ from haselab.controllers import (
     OpenLoop,
     Parameter,
     chosen_controller,
-    controller_kind,
-    controller_names,
     pid_controller,
 )
 from haselab.store.toml import toml_text
@@ -35,13 +33,17 @@ FOREIGN = ControllerKind("foreign", OpenLoop, (Parameter("rate", "1/s", None, 0.
 NAMELESS = 3
 
 
+class TheirPoint(EntryPoint):
+    dist = SimpleNamespace(name="theirs", version="1.0")
+
+
 @pytest.fixture
 def installed(monkeypatch):
     """Packages of other people, as importlib.metadata shows them."""
 
     def install(**points: str) -> None:
-        found = EntryPoints(EntryPoint(name, value, GROUP) for name, value in points.items())
-        monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: found)
+        found = [TheirPoint(name, value, CONTROLLERS.group) for name, value in points.items()]
+        monkeypatch.setattr(CONTROLLERS, "others", lambda: found)
 
     return install
 
@@ -94,7 +96,7 @@ def test_the_summary_has_kind_values_and_units():
     [
         ({"kp": 1.0}, r"has no kind\. Set kind to one of: open-loop, pi, pid"),
         ({"kind": 3}, r"has no kind"),
-        ({"kind": "lqr"}, r"of kind 'lqr' is registered\. Known kinds: open-loop, pi"),
+        ({"kind": "lqr"}, r"No controller 'lqr' is registered\. Use one of open-loop, pi"),
         ({"kind": "pi", "kp": 1.0}, r"ki \(1/s\) is missing"),
         ({"kind": "pi", "kp": -1.0, "ki": 2.0}, r"kp = -1 is outside 0 to 1e\+09"),
         ({"kind": "pi", "kp": math.nan, "ki": 2.0}, r"kp = nan is outside"),
@@ -112,40 +114,40 @@ def test_a_wrong_section_is_refused_in_one_line(table, said):
 
 def test_a_kind_of_another_package_is_found_by_its_entry_point(installed):
     installed(foreign=f"{__name__}:FOREIGN")
-    assert "foreign" in controller_names()
+    assert "foreign" in CONTROLLERS.packages()
     chosen = chosen_controller({"kind": "foreign", "rate": 2})
     assert chosen == ChosenController(FOREIGN, (("rate", 2.0),))
 
 
 def test_a_package_that_does_not_import_is_named_only_when_it_is_asked_for(installed):
     installed(broken="no_such_module_at_all:KIND")
-    assert controller_kind("pid").name == "pid"
-    with pytest.raises(InputError, match="'broken' cannot be imported from no_such_module_at_all"):
-        controller_kind("broken")
+    assert CONTROLLERS.find("pid").name == "pid"
+    with pytest.raises(InputError, match=r"'broken' of package theirs 1\.0 \(no_such_.*NotFound"):
+        CONTROLLERS.find("broken")
 
 
 def test_doctor_names_what_loads_and_what_does_not(installed):
     installed(broken="no_such_module_at_all:KIND", foreign=f"{__name__}:FOREIGN")
-    broken, foreign = controller_findings()
+    broken, foreign = extension_findings()
     assert (broken.name, broken.found, broken.advice) == (
         "broken",
         False,
-        "Fix or uninstall that package.",
+        "Fix or uninstall the package.",
     )
-    assert "cannot be imported from no_such_module_at_all" in broken.detail
+    assert "it does not load (ModuleNotFoundError: No module" in broken.detail
     assert foreign.found
     assert foreign.detail.endswith("; no C step; parameters: rate")
 
 
 def test_an_entry_point_that_is_no_kind_is_refused(installed):
     installed(nameless=f"{__name__}:NAMELESS", other=f"{__name__}:FOREIGN")
-    with pytest.raises(InputError, match="'int', not a ControllerKind with the name 'nameless'"):
-        controller_kind("nameless")
-    with pytest.raises(InputError, match="'foreign', not a ControllerKind with the name 'other'"):
-        controller_kind("other")
+    with pytest.raises(InputError, match=r"'nameless'.* it is of the type 'int', not a Contr"):
+        CONTROLLERS.find("nameless")
+    with pytest.raises(InputError, match=r"controller 'other' .*its name is 'foreign'"):
+        CONTROLLERS.find("other")
 
 
 def test_a_built_in_name_cannot_be_taken(installed):
     installed(pid=f"{__name__}:FOREIGN")
-    with pytest.raises(InputError, match="'pid' is registered more than once"):
-        controller_kind("pid")
+    with pytest.raises(InputError, match=r"'pid' is .* more than once, by haselab and theirs 1\.0"):
+        CONTROLLERS.find("pid")

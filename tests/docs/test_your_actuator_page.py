@@ -121,10 +121,13 @@ def test_the_journey_from_records_to_firmware(
         pytest.skip("avr-gcc or libsimavr is not installed")
     for line in COMMANDS[len(desk) :]:
         answer = run(capsys, line + " --json")
-    chip = json.loads(answer)["loops"][-1]
+    simulated = json.loads(answer)
+    assert simulated["status"] == "ok"
+    chip = simulated["loops"][-1]
     # The map's band, some 0.0005 of strain, is 1.3 % of the step of 0.04; and the sheet creeps.
     assert abs(chip["steady_state_error"]) < 0.05
     assert chip["overshoot"] < 0.1
+    assert abs(chip["overshoot"] - chip["predicted"]["overshoot"]) < 0.05
     assert (folder / "firmware" / "firmware.hex").is_file()
 
 

@@ -63,6 +63,9 @@ def test_the_chip_steps_like_the_desktop_at_its_rate(answer: dict[str, Any]) -> 
     assert slow["overshoot"] < 0.07
     assert chip["overshoot"] < 0.12
     assert chip["phase_margin_deg"] > 45.0
+    assert answer["status"] == "ok"
+    assert answer["deviation"] < answer["deviation_covered"] < 0.2
+    assert abs(chip["overshoot"] - chip["predicted"]["overshoot"]) < 0.1
     assert chip["phase_margin_deg"] > slow["phase_margin_deg"]
     assert answer["load"] <= 0.60
     assert answer["overruns"] == 0
@@ -70,6 +73,37 @@ def test_the_chip_steps_like_the_desktop_at_its_rate(answer: dict[str, Any]) -> 
     # The reference capacitor: the simulated charge is a mean over 6.25 us, sinc(pi f T) cos(pi f T)
     # smaller than it ought to be, 0.7 %; the band-pass of both channels is the same.
     assert 1.0 < answer["calibration"] < 1.015
+
+
+def test_a_step_that_differs_from_the_prediction_says_why_and_exits_with_3(
+    firmware: Firmware, cosim_program: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text, error = run(capsys, "firmware", "simulate", DATA, "--precondition", 0,
+                            "--before-s", 3, "--after-s", 3, "--json")  # fmt: skip
+    assert code == 3
+    answer = json.loads(text)
+    assert answer["status"] == "differs from the prediction"
+    assert answer["deviation"] > answer["deviation_covered"]
+    assert "Cause: the step stretches the twin farther than before" in error
+    assert error.count("\n") == 1
+    chip = answer["loops"][-1]
+    assert chip["overshoot"] > chip["predicted"]["overshoot"] + 0.15
+
+
+def test_a_loop_that_is_unstable_on_the_twin_is_refused_at_the_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, error = run(capsys, "firmware", "simulate", DATA, "--reading", "rad")
+    assert code == 3
+    assert "unstable on this twin" in error and "rad/s" in error
+    # Without an option, the twin is that of the run.
+    for name in ("model.json", "controller.toml"):
+        shutil.copy(DATA / name, tmp_path)
+    twin = twin_of_reading("rad").model_dump(mode="json")
+    (tmp_path / "results.json").write_text(json.dumps({"provenance": {"rig_config": twin}}))
+    code, _, again = run(capsys, "firmware", "simulate", tmp_path)
+    assert code == 3
+    assert again == error.replace(str(DATA), str(tmp_path))
 
 
 def test_build_gives_a_program_for_the_programmer(

@@ -178,7 +178,7 @@ def test_the_name_of_the_c_file_is_the_kind_where_none_is_given(tmp_path: Path) 
     [
         ("", "own", None, r"no controller of kind 'own', only pid, pi"),
         ('kind = "open-loop"', "open-loop", None, "'open-loop' has no C step"),
-        ('kind = "lqr"', "lqr", None, "No controller of kind 'lqr' is registered"),
+        ('kind = "lqr"', "lqr", None, "No controller 'lqr' is registered"),
         ('kind = "lqr"\nparameters = {gain = "much"}', "lqr", C_FILE, "number"),
         ("", None, DATA / "model.json", r"does not define hs_controller_init\(\)"),
         ("", "pid", DATA / "none.c", "none.c"),

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from haselab.base import DeviceError
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import (
     ClearFault,
@@ -123,6 +124,14 @@ def test_lost_sensing_takes_the_output_off_within_5_ms(fault: str, chip: CoSim) 
     # A wire that had 1.4 V on it throws its stage to the rail: that is reported as a breakdown.
     expected = Fault.BREAKDOWN if fault == "wire_v" else Fault.SENSING
     assert status(chip).fault == expected
+
+
+def test_a_refused_command_names_the_fault_that_tripped_the_chip(chip: CoSim) -> None:
+    close_loop(chip)
+    chip.fault("carrier")
+    chip.run(0.05)
+    with pytest.raises(DeviceError, match=r"did not accept SetReference \(tripped: sensing\)"):
+        chip.execute(SetReference(0.03))
 
 
 def test_a_module_that_does_not_follow_trips(chip: CoSim) -> None:

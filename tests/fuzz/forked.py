@@ -19,7 +19,7 @@ from mutations import Case
 
 from haselab.cli.main import main
 
-__all__ = ["Outcome", "run"]
+__all__ = ["ExperimentResult", "run"]
 
 CPU_S, WALL_S = 10, 60  # what a case may compute; how long it may wait on a busy machine
 MEMORY_BYTES = 2 << 30  # beyond what the parent has
@@ -36,7 +36,7 @@ _NOTHING = SimpleNamespace(flash_bytes=0, static_bytes=0, hex="")
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ExperimentResult:
     """What a case did.
 
     Args:
@@ -54,7 +54,7 @@ class Outcome:
     bytes: int
 
 
-def run(case: Case) -> Outcome:
+def run(case: Case) -> ExperimentResult:
     """Run a case in a child of its own; nothing of it is left behind."""
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as name:
@@ -71,7 +71,7 @@ def run(case: Case) -> Outcome:
     resident = usage.ru_maxrss * 1024
     cpu_s = usage.ru_utime + usage.ru_stime
     fault = _fault(code, printed, cpu_s, resident, in_time)
-    return Outcome(code, fault, "\n".join(printed.splitlines()[-40:]), cpu_s, resident)
+    return ExperimentResult(code, fault, "\n".join(printed.splitlines()[-40:]), cpu_s, resident)
 
 
 def _lay_out(case: Case, folder: Path) -> None:

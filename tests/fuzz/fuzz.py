@@ -27,7 +27,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # a pool of threads does not survive a fork
 
 import targets  # noqa: E402
-from forked import Outcome, run  # noqa: E402
+from forked import ExperimentResult, run  # noqa: E402
 from mutations import Case, mutated  # noqa: E402
 from seeds import seed_files  # noqa: E402
 
@@ -58,7 +58,7 @@ def _preload() -> None:
         importlib.import_module(name)
 
 
-def _name_of(outcome: Outcome) -> str:
+def _name_of(outcome: ExperimentResult) -> str:
     """What tells one defect from another: its kind, and the place in haselab."""
     places = re.findall(r'File "[^"]*/(haselab/[^"]+)", line \d+, in (\S+)', outcome.where)
     kind = re.search(r"^(\w+(?:\.\w+)*(?:Error|Exception|Warning)\b)", outcome.where, re.MULTILINE)
@@ -156,7 +156,7 @@ def _save_state(file: Path | None, state: dict[str, Any]) -> None:
         file.write_text(json.dumps(state), encoding="utf-8")
 
 
-def _count(row: dict[str, int], outcome: Outcome) -> None:
+def _count(row: dict[str, int], outcome: ExperimentResult) -> None:
     for name in ("cases", outcome.fault or f"exit {outcome.exit_code}"):
         row[name] = row.get(name, 0) + 1
     row["most ms"] = max(row.get("most ms", 0), round(1e3 * outcome.cpu_s))
@@ -193,7 +193,7 @@ def _fuzz(options: argparse.Namespace) -> int:
     return sum(state["names"].values())
 
 
-def _report(number: int, case: Case, name: str, outcome: Outcome) -> None:
+def _report(number: int, case: Case, name: str, outcome: ExperimentResult) -> None:
     line = " ".join(word[:60] for word in case.argv)
     print(f"case {number}, {case.target}: {name}\n  {line}  {dict(case.special) or ''}")
     print(f"{outcome.where}\n", flush=True)

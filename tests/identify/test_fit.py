@@ -16,17 +16,18 @@ from haselab.identify import (
     RecordFit,
     TransferStructure,
     VoltageStructure,
+    choose_transfer,
     estimate_frequency_response,
     find_regions,
     fit_arx,
     fit_capacitance_map,
     fit_creep,
+    fit_duffing,
     fit_free_response,
     fit_hammerstein,
     fit_hyperelastic,
     fit_hysteresis,
     fit_map,
-    fit_spring,
     fit_subspace,
     fit_transfer,
     fit_voltage_map,
@@ -92,7 +93,7 @@ def sampled(u: np.ndarray, y: np.ndarray) -> Record:
 RECORDS = {
     "transfer": (lambda: fit_transfer(sampled(HELD, moved(HELD))), NEW, moved),
     "response": (
-        lambda: estimate_frequency_response(HELD, moved(HELD) + noise(HELD.size), RATE_HZ).fit(),
+        lambda: estimate_frequency_response(sampled(HELD, moved(HELD))).fit(),
         NEW, moved,
     ),
     "arx": (
@@ -109,7 +110,7 @@ RECORDS = {
         ),
         NEW, lambda u: moved(u + 0.3 * u**2),
     ),
-    "spring": (lambda: fit_spring([sampled(HELD, moved(HELD))]), NEW, moved),
+    "spring": (lambda: fit_duffing(sampled(HELD, moved(HELD))), NEW, moved),
     "creep": (lambda: fit_creep(sampled(STEP, CREEP.simulate(STEP, RATE_HZ)), "prony"),
               NEW, lambda u: CREEP.simulate(u, RATE_HZ)),
     "voltage plant": (
@@ -314,7 +315,9 @@ def test_rescaling_keeps_correlations_and_marks_what_is_not_identifiable():
 
 
 @pytest.mark.parametrize("wrong", [None, "u.csv", 3.0, {"u": [1.0], "y": [1.0]}, [[1.0, 2.0]]])
-@pytest.mark.parametrize("fit", [fit_transfer, fit_arx, fit_hysteresis])
+@pytest.mark.parametrize(
+    "fit", [fit_transfer, fit_arx, fit_hysteresis, fit_free_response, fit_duffing, choose_transfer]
+)
 def test_what_is_no_record_is_refused_with_how_to_make_one(fit, wrong):
-    with pytest.raises(InputError, match=r"is no record\. Make records .* haselab\.records"):
+    with pytest.raises(InputError, match=r" is .*; it must be a .*\. Make .* haselab\."):
         fit(wrong)

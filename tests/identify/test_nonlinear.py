@@ -7,7 +7,7 @@ from scipy.stats import binom
 
 from haselab.base import InputError, ResultError
 from haselab.identify.nonlinear.hammerstein import fit_hammerstein
-from haselab.identify.nonlinear.oscillator import fit_output_curve, fit_spring
+from haselab.identify.nonlinear.oscillator import fit_duffing, fit_output_curve
 from haselab.identify.record import Record
 from haselab.identify.transfer.choice import choose_transfer
 from haselab.identify.transfer.fit import TransferStructure
@@ -101,7 +101,7 @@ def test_a_cubic_spring_is_found_with_its_numbers(q2):
     u = levels(rng)
     y = duffing(u, RATE_HZ, 9.0, 0.1, 0.8, q2, 1.5) + 0.01 * rng.normal(size=COUNT) + 0.3
     record = Record.sampled(u, y, RATE_HZ)
-    fit = fit_spring([record], powers=(2, 3) if q2 else (3,))
+    fit = fit_duffing([record], powers=(2, 3) if q2 else (3,))
     truth = {"natural_frequency_rad_s": 9.0, "damping_ratio": 0.1, "gain": 0.8, "delay_s": 0.0}
     is_right(fit, truth | {"stiffness_ratio_3": 1.5} | ({"stiffness_ratio_2": q2} if q2 else {}))
     assert fit.validation_fit_percent > 90.0
@@ -116,7 +116,7 @@ def test_records_of_a_cubic_spring_share_its_numbers_and_keep_known_ones():
         y = duffing(u, RATE_HZ, 9.0, 0.1, 0.8, 0.0, 1.5) + offset
         records.append(Record.sampled(u, y + 0.01 * rng.normal(size=COUNT), RATE_HZ))
     structure = TransferStructure(delay=0.0, fixed={"damping_ratio": 0.1})
-    fit = fit_spring(records, structure)
+    fit = fit_duffing(records, structure)
     is_right(fit, {"natural_frequency_rad_s": 9.0, "gain": 0.8, "stiffness_ratio_3": 1.5})
     assert fit.parameters["damping_ratio"].std == 0.0 == fit.parameters["delay_s"].value
 
@@ -139,9 +139,9 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(InputError, match="degree = 4; must be 2 or 3"):
         fit_hammerstein([record], degree=4)
     with pytest.raises(InputError, match="The structure has 3 poles"):
-        fit_spring([record], TransferStructure(poles=3))
+        fit_duffing([record], TransferStructure(poles=3))
     with pytest.raises(InputError, match=r"powers = \(4,\); must be 2 or 3"):
-        fit_spring([record], powers=(4,))
+        fit_duffing([record], powers=(4,))
 
 
 @pytest.mark.long
@@ -216,6 +216,6 @@ def test_the_silverbox_is_simulated_to_one_per_cent(shared_data):
     u, y = columns[np.isfinite(columns).all(axis=1)].T
     part = slice(60_000, 60_000 + 8_192)  # of the multisines
     record = Record.sampled(u[part], y[part], SILVERBOX_HZ, hold="band-limited")
-    fit = fit_spring([record], powers=(2, 3))
+    fit = fit_duffing([record], powers=(2, 3))
     assert fit.status == "ok"
     assert fit.residuals[0].std() < 0.012 * y[part].std()

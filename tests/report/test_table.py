@@ -43,7 +43,9 @@ def test_columns_about_a_paper_stand_only_where_a_row_is_compared_with_one():
 def test_a_value_without_noise_outside_the_interval_is_said():
     measured = {"value": 5.0, "std": 0.1, "ci95": [4.8, 5.2], "unit": ""}
     row = {"id": "S20.zeta", "measured": measured, "noise_free": 5.3, "verdict": "agrees"}
-    assert "5.3 (outside)" in results_table({"quantities": [row]})
+    text = results_table({"quantities": [row]})
+    assert "5.3 (outside)" in text
+    assert "(outside): the noise-free result is outside the measured 95 % interval" in text
 
 
 def test_a_document_of_another_kind_is_refused():

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.instruments import registry
+from haselab.rig.instruments.registry import INSTRUMENTS
 from haselab.rig.real_bench import identify
 from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.safety.gate import Gate
@@ -45,16 +45,16 @@ def module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: own-daq\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text(
-        f"[{registry.GROUP}]\nown-daq = own_daq:OwnDaq\nown-generator = own_daq:OwnGenerator\n"
+        f"[{INSTRUMENTS.group}]\nown-daq = own_daq:OwnDaq\nown-generator = own_daq:OwnGenerator\n"
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
-        registry.forget()
+        INSTRUMENTS.others.cache_clear()
         import own_daq
 
         yield own_daq
     del sys.modules["own_daq"]
-    registry.forget()
+    INSTRUMENTS.others.cache_clear()
 
 
 @pytest.fixture

@@ -15,8 +15,9 @@ from haselab.models.maps import VoltageMap
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings, RunningController
-from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
 EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)

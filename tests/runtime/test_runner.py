@@ -21,8 +21,9 @@ from haselab.rig import Rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.lockin import lockin_of, printed_chain_of
 from haselab.runtime.loop import LoopSettings
-from haselab.runtime.runner import Runner, lockin_of, printed_chain_of
+from haselab.runtime.runner import Runner
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
@@ -300,7 +301,7 @@ def test_an_interrupted_run_leaves_a_video_that_can_be_read(tmp_path, keep):
     scene = Scene(tmp_path, {"advance": (3, KeyboardInterrupt())}, keep)
     with pytest.raises(KeyboardInterrupt), scene.camera_recorder, scene.runner as runner:
         play(runner)
-    path = tmp_path / "video" / "x.mkv"
+    path = tmp_path / "video" / "x.avi"
     assert path.exists() == (keep != "none")
     if keep != "none":
         frames = scene.record("x").frame_time_s

@@ -16,9 +16,10 @@ from haselab.models.maps import VoltageMap
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.runtime.sensors import PATIENCE_BLOCKS, VideoSensor
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 

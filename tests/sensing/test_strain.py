@@ -192,7 +192,7 @@ def test_a_strain_that_falls_with_the_capacitance_is_no_result(kind):
 
 def test_unknown_kinds_and_coverages_are_refused():
     c, _ = cycles(2)
-    with pytest.raises(InputError, match="kind = 'quartic'"):
+    with pytest.raises(InputError, match="kind is 'quartic'; it must be auto or line"):
         fit_strain_map(c, straight(c), "quartic")
     with pytest.raises(InputError, match=r"coverage = 1 is outside \(0, 1\)"):
         fit_strain_map(c, straight(c), coverage=1.0)

@@ -100,6 +100,29 @@ def test_a_value_in_the_place_of_a_section_is_refused_and_the_file_stays(path):
     assert path.read_text() == "model = 3\n"
 
 
+def test_the_target_of_a_link_is_written_and_the_link_stays(path, tmp_path):
+    (tmp_path / "lab").mkdir()
+    link = tmp_path / "lab" / "link.toml"
+    link.symlink_to("../a.toml")
+    write_section(link, "model", {"gain": 2.5}, provenance())
+    assert link.is_symlink() and tomllib.loads(path.read_text())["model"]["gain"] == 2.5
+    assert [each.name for each in link.parent.iterdir()] == ["link.toml"]
+
+
+def test_a_read_only_file_and_one_in_a_read_only_folder_are_refused(path, tmp_path):
+    path.chmod(0o444)
+    with pytest.raises(InputError, match=r"^The file is read-only\. Make it writable .*a\.toml$"):
+        write_section(path, "model", {"gain": 2.5}, None)
+    path.chmod(0o644)
+    tmp_path.chmod(0o555)
+    try:
+        with pytest.raises(InputError, match=r"^The folder of this file is read-only"):
+            write_section(path, "model", {"gain": 2.5}, None)
+    finally:
+        tmp_path.chmod(0o755)
+    assert path.read_text() == TYPED
+
+
 def test_a_missing_file_is_named_with_the_command_that_makes_one(tmp_path):
     with pytest.raises(InputError, match=r"haselab init NAME --out no\.toml"):
         write_section(tmp_path / "no.toml", "model", {}, None)

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import stat
 import sys
 from pathlib import Path
 
@@ -99,6 +100,15 @@ def test_a_new_file_has_the_rights_that_the_user_gives_to_new_files(tmp_path):
     write_text(tmp_path / "a", "x")
     (tmp_path / "b").write_text("x")
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="permissions of POSIX")
+def test_a_private_file_stays_private(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    path.chmod(0o600)
+    write_text(path, "new")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600 and path.read_text() == "new"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="devices are files on POSIX systems")

@@ -17,8 +17,7 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import describe
 from haselab.safety.feasibility import Drive
 from haselab.store.toml import Section
-from haselab.study import Analysis, Experiment, NotPlayedError, Outcome, Player, Quantity
-from haselab.study import registry as registry_module
+from haselab.study import Analysis, Experiment, ExperimentResult, NotPlayedError, Player, Quantity
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study, builtin_study, load_study
 from haselab.study.feasibility import rating_of_twin, study_drives, study_masses_kg
@@ -26,6 +25,7 @@ from haselab.study.fits.maps import Maps
 from haselab.study.fits.static import Static
 from haselab.study.paper.quantity_table import quantities
 from haselab.study.pipeline import investigate
+from haselab.study.registry import EXPERIMENTS
 
 REFERENCE = builtin_study(quick=True)
 TRIANGLE = """
@@ -56,7 +56,7 @@ class _Own(Experiment[_Settings]):
     def play(self, player: Player) -> None:
         raise NotImplementedError
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         raise NotImplementedError
 
     def rows(self) -> Mapping[str, Quantity]:
@@ -180,13 +180,13 @@ class _Failing(_Own):
     def play(self, player: Player) -> None:
         raise KeyError("nothing here")
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         raise ZeroDivisionError("by nothing")
 
 
 class _Unnamed(_Own):
-    def fit(self, analysis: Analysis) -> Outcome:
-        return Outcome({"own.result": Estimate.normal(1.0, 0.1, "s")})
+    def fit(self, analysis: Analysis) -> ExperimentResult:
+        return ExperimentResult({"own.result": Estimate.normal(1.0, 0.1, "s")})
 
 
 def test_the_code_of_another_package_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,23 +205,25 @@ def test_a_result_without_a_row_is_refused() -> None:
 
 
 def test_packages_that_cannot_be_loaded_or_take_a_name_are_named(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def with_package(value: str) -> None:
-        points = [EntryPoint("theirs", value, registry_module.GROUP)]
-        monkeypatch.setattr(registry_module, "entry_points", lambda group: points)
-        registry_module.experiment_classes.cache_clear()
+    def with_package(name: str, value: str) -> None:
+        points = (EntryPoint(name, value, EXPERIMENTS.group),)
+        monkeypatch.setattr(EXPERIMENTS, "others", lambda: points)
 
-    try:
-        with_package("no_such_package:Theirs")
-        with pytest.raises(InputError, match=r"'theirs'.*cannot be loaded: ModuleNotFoundError"):
-            registry_module.experiment_classes()
-        with_package("haselab.study.experiments.chirp:ChirpTest")
-        with pytest.raises(InputError, match=r"\[chirp\], which haselab.study.experiments.chirp"):
-            registry_module.experiment_classes()
-    finally:
-        monkeypatch.undo()
-        registry_module.experiment_classes.cache_clear()
+    path = tmp_path / "study.toml"
+    path.write_text('name = "x"\n[theirs]\n')
+    with_package("theirs", "no_such_package:Theirs")
+    with pytest.raises(InputError, match=r"^The experiment 'theirs' .*load \(ModuleNotFoundError"):
+        load_study(path)
+    with_package("theirs", "haselab.study.experiments.chirp:ChirpTest")
+    with pytest.raises(InputError, match=r"its attribute table is 'chirp'"):
+        load_study(path)
+    path.write_text('name = "x"\n' + TRIANGLE)
+    assert load_study(path).has("triangle")  # which needs none of theirs
+    with_package("triangle", "haselab.study.experiments.chirp:ChirpTest")
+    with pytest.raises(InputError, match=r"The experiment 'triangle' is registered more than once"):
+        load_study(path)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +247,7 @@ def test_steps_without_a_plant_are_played_in_open_loop_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     steps = {"step": 0.04, "zero_s": 6.0, "step_s": 8.0, "rest_s": 20.0, "frame_rate_hz": 20.0,
-             "open_trials": 1, "pi_trials": 1, "pid_trials": 1}  # fmt: skip
+             "open_trials": 1, "pi_trials": 0, "pid_trials": 0}  # fmt: skip
     lines = [f"{key} = {value}" for key, value in steps.items()]
     text = 'name = "open loop"\n[steps]\n' + "\n".join(lines) + TRIANGLE
     (tmp_path / "study.toml").write_text(text)

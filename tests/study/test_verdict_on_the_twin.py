@@ -7,7 +7,8 @@ from haselab.base import SilentProgress
 from haselab.identify import Record, compare, creep_hypotheses, reading_hypotheses
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
-from haselab.runtime.runner import BLANKING_S, Runner, lockin_of
+from haselab.runtime.lockin import BLANKING_S, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.signals import constant, linear_chirp, square
 
 RATE_HZ, SLEW_V_S = 100.0, 2400.0  # 12 mA into 1 nF behind a gain of 5,000

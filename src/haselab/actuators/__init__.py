@@ -6,7 +6,7 @@ from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
 from haselab.actuators.planar_hasel import PlanarHasel
-from haselab.actuators.registry import actuator_kind, actuator_kinds, actuator_law
+from haselab.actuators.registry import ACTUATORS, actuator_law
 from haselab.actuators.response import (
     ADDED_INERTIA,
     Drive,
@@ -18,6 +18,7 @@ from haselab.actuators.response import (
 from haselab.actuators.table import LawTable, law_table
 
 __all__ = [
+    "ACTUATORS",
     "ADDED_INERTIA",
     "VACUUM_F_PER_M",
     "ActuatorLaw",
@@ -32,8 +33,6 @@ __all__ = [
     "PlanarHasel",
     "Response",
     "SampledLaw",
-    "actuator_kind",
-    "actuator_kinds",
     "actuator_law",
     "equilibrium_m",
     "law_table",

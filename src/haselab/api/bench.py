@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.api.design import Actuator
-from haselab.base import InputError, Progress, SilentProgress
+from haselab.base import InputError, Progress, SilentProgress, checked, real_array, shown
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.record import Record
 from haselab.models.maps import VoltageMap
@@ -23,6 +23,7 @@ from haselab.rig.twin.config import load_twin, twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime import runner as runtime
 from haselab.runtime.camera_recorder import CameraRecorder
+from haselab.runtime.lockin import lockin_of
 from haselab.store.columns.table import Table
 from haselab.study.fits.observe import gauge_length
 
@@ -34,11 +35,15 @@ if TYPE_CHECKING:
 __all__ = ["Recording", "Runner", "twin"]
 
 Floats = NDArray[np.float64]
+_SEEDS = 2**64
 _BASELINE_S = 4.0  # for which the voltage of zero strain is held at first
 _NO_FOLDER = Path()  # no video is kept
 
 
-def twin(file: str | Path | None = None, *, frequency_unit: str = "hz", seed: int = 1) -> Rig:
+@checked
+def twin(
+    file: str | Path | None = None, *, frequency_unit: Literal["rad", "hz"] = "hz", seed: int = 1
+) -> Rig:
     """A simulated bench.
 
     Args:
@@ -50,6 +55,8 @@ def twin(file: str | Path | None = None, *, frequency_unit: str = "hz", seed: in
     Raises:
         InputError: no such file, or a value out of range.
     """
+    if not 0 <= seed < _SEEDS:
+        raise InputError(f"seed is {shown(seed)}; it must be a whole number of 0 to {_SEEDS - 1}.")
     return make_twin(
         twin_of_reading(frequency_unit) if file is None else load_twin(Path(file)), seed
     )
@@ -211,6 +218,7 @@ class Runner:
             not at 0 V, or not known to be.
     """
 
+    @checked
     def __init__(
         self,
         rig: Rig,
@@ -231,7 +239,7 @@ class Runner:
             baseline_v,
             frame_rate_hz,
         )
-        self._lockin = runtime.lockin_of(rig.description, carrier_hz)
+        self._lockin = lockin_of(rig.description, carrier_hz)
         self._zero_m = math.nan
         self._played = 0
 
@@ -258,6 +266,7 @@ class Runner:
     ) -> None:
         self._runner.__exit__(kind, error, trace)
 
+    @checked
     def play(self, drive_v: ArrayLike) -> Recording:
         """Put out a drive in open loop.
 
@@ -274,6 +283,7 @@ class Runner:
         self._runner.play(name, _vector(drive_v), self._frame_rate_hz, self._runner.mass_kg)
         return self._recording()
 
+    @checked
     def close_loop(self, reference: ArrayLike, actuator: Actuator) -> Recording:
         """Follow a strain in closed loop, measured by self-sensing.
 
@@ -287,12 +297,11 @@ class Runner:
             SafetyError: no strain could be measured, or the bench protected itself.
             DeviceError: an instrument failed.
         """
-        loop, name = actuator.loop(), self._begin()
-        self._runner.close_loop(
-            name, _vector(reference), loop, self._frame_rate_hz, self._runner.mass_kg
-        )
+        desired, loop, name = _vector(reference), actuator.loop(), self._begin()
+        self._runner.close_loop(name, desired, loop, self._frame_rate_hz, self._runner.mass_kg)
         return self._recording()
 
+    @checked
     def hold(self, drive_v: float, duration_s: float) -> None:
         """Hold a drive with nothing recorded, so that creep fades before what comes.
 
@@ -329,9 +338,12 @@ class Runner:
 
 
 def _vector(values: ArrayLike) -> Floats:
-    vector = np.asarray(values, dtype=np.float64)
+    vector = real_array("values", values)
     if vector.ndim != 1 or vector.size == 0:
         raise InputError(
             f"The values have shape {vector.shape}. Give one value for each update of the output."
         )
+    if not np.isfinite(vector).all():
+        row = int(np.flatnonzero(~np.isfinite(vector))[0])
+        raise InputError(f"The value at index {row} is {vector[row]}; it must be finite.")
     return vector

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, checked, real_array, shown
 from haselab.identify.record import Record
 from haselab.pipelines.examples.data_sets import find_data_set, write_data_set
 from haselab.pipelines.sensing.series import derived_series
 from haselab.pipelines.time_axis import records_of, time_axis
 from haselab.store.columns.reader import rate_of_times, rates_agree
-from haselab.store.columns.table import Table, read_every_column
+from haselab.store.columns.table import Table, read_every_column, read_table
 from haselab.store.export.frames import session_dataset, session_tables
 from haselab.store.session.reader import SessionReader, session_file
 
@@ -24,10 +25,15 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-__all__ = ["Data", "Session", "checked_rate", "example", "load", "records", "table"]
+    Data: TypeAlias = (
+        Table | Mapping[str, ArrayLike] | pandas.DataFrame | xarray.Dataset | str | Path
+    )
+else:
+    Data = Any  # pandas and xarray need not be there; `_columns` refuses what has no columns
+
+__all__ = ["Data", "Session", "example", "is_uneven", "load", "records", "table", "wanted"]
 
 Floats = NDArray[np.float64]
-Data: TypeAlias = "Table | Mapping[str, ArrayLike] | pandas.DataFrame | xarray.Dataset | str | Path"
 _TIMES = ("time_s", "time", "t")
 _SESSION = "session.h5"
 
@@ -70,6 +76,7 @@ class Session:
         return session_dataset(self.path, experiment, derived=derived_series)
 
 
+@checked
 def load(path: str | Path) -> Table | Session:
     """Read a file of columns, or open a recorded session.
 
@@ -82,94 +89,178 @@ def load(path: str | Path) -> Table | Session:
         InputError: no such file, or nothing in it that can be read.
     """
     path = Path(path)
-    if path.name == _SESSION or (path.is_dir() and (path / _SESSION).exists()):
-        path = session_file(path)
-        with SessionReader(path) as reader:
-            return Session(path, tuple(reader.names))
+    if (session := _session_in(path)) is not None:
+        with SessionReader(session) as reader:
+            return Session(session, tuple(reader.names))
     return read_every_column(path)
 
 
+@checked
 def table(data: Data, *, rate_hz: float | None = None) -> Table:
     """Columns of any source as a table.
 
     Args:
         data: a file, a table, a pandas DataFrame, an xarray Dataset with one dimension, or a
             dictionary of columns. Columns that are no numbers are left out.
-        rate_hz: rows a second, in Hz. None: from the attribute `rate_hz`, or from the times in an
-            index or a column `time_s`, `time` or `t`.
+        rate_hz: rows a second, in Hz, which the times must not contradict. None: from the file or
+            the attribute `rate_hz`, or from the times in an index or a column `time_s`, `time` or
+            `t`.
     Returns:
         The table.
     Raises:
-        InputError: columns of unequal lengths, or a session, which holds several tables.
+        InputError: no column of numbers, columns of unequal lengths, a rate that the data
+            contradict, or a session, which holds several tables.
+    """
+    if not isinstance(data, (str, Path)):
+        return _at_rate(data if isinstance(data, Table) else _table(data), rate_hz)
+    found = load(data)
+    if isinstance(found, Session):
+        raise _is_session(found.path)
+    return _at_rate(found, rate_hz)
+
+
+def wanted(data: Data, names: Sequence[str], rate_hz: float | None) -> Table:
+    """Columns of any source as a table in which some are numbers.
+
+    Args:
+        data: as of `table`.
+        names: columns that must be there.
+        rate_hz: rows a second, in Hz. None: as the data state it.
+    Returns:
+        The table; of a file, these columns alone.
+    Raises:
+        InputError: a column that is missing or holds something else, or as of `table`.
     """
     if isinstance(data, (str, Path)):
-        found = load(data)
-        if isinstance(found, Session):
-            raise InputError(
-                "A session holds one table for each experiment. Use "
-                f"hl.load(path).to_pandas(experiment). {found.path}"
-            )
+        if (file := _session_in(Path(data))) is not None:
+            raise _is_session(file)
+        return _at_rate(read_table(data, names), rate_hz)
+    found = table(data, rate_hz=rate_hz)
+    for name in names:
+        if name not in found.columns:
+            reasons = {} if isinstance(data, Table) else _columns(data)[1]
+            listed = f"There is no column {name!r}; the data have {', '.join(found)}."
+            raise InputError(f"{reasons.get(name, listed)} Name another column.")
+    return found
+
+
+def is_uneven(found: Table) -> bool:
+    """Whether a table has times that one rate does not describe.
+
+    Args:
+        found: the table.
+    Returns:
+        False also for a table without times.
+    """
+    return found.time_s is not None and rate_of_times(found.time_s) is None
+
+
+def _at_rate(found: Table, given_hz: float | None) -> Table:
+    """The table with the rate that the caller states; its own rate must not contradict it."""
+    if given_hz is None:
         return found
-    if isinstance(data, Table):
-        return data
-    columns = _columns(data)
+    if not 0.0 < given_hz < math.inf:
+        raise InputError(f"rate_hz is {given_hz:g}; it must be above 0 Hz and finite.")
+    known_hz = [found.rate_hz] if found.rate_hz is not None else _rates_hz(found.time_s)
+    rows = max((values.size for values in found.columns.values()), default=0) or 1
+    if known_hz and not any(rates_agree(each, given_hz, rows) for each in known_hz):
+        raise InputError(
+            f"rate_hz is {given_hz:g}, but the data have {known_hz[-1]:.6g} rows per second. Leave "
+            "out rate_hz, or change the data."
+        )
+    return replace(found, rate_hz=float(given_hz))
+
+
+def _rates_hz(time_s: Floats | None) -> list[float]:
+    """Rates that uneven times can mean: by the mean step and by the usual one."""
+    steps_s = np.diff(time_s) if time_s is not None else np.zeros(0)
+    if not steps_s.size or not (steps_s > 0.0).all():
+        return []
+    return [1.0 / float(step_s) for step_s in (steps_s.mean(), np.median(steps_s))]
+
+
+def _session_in(path: Path) -> Path | None:
+    """The session file that a path means, or None."""
+    is_one = path.name == _SESSION or (path.is_dir() and (path / _SESSION).exists())
+    return session_file(path) if is_one else None
+
+
+def _is_session(file: Path) -> InputError:
+    return InputError(
+        "A session holds one table for each experiment. Use "
+        f"hl.load(path).to_pandas(experiment). {file}"
+    )
+
+
+def _table(data: Any) -> Table:
+    """Columns of numbers of a DataFrame, a Dataset or a dictionary."""
+    columns, reasons = _columns(data)
     lengths = {values.size for values in columns.values()}
-    if len(lengths) != 1:
+    if not columns:
+        why = next(iter(reasons.values()), "Give columns by name.")
+        raise InputError(f"The data have no column of numbers. {why}")
+    if len(lengths) > 1:
         raise InputError(
             f"The data have columns of the lengths {sorted(lengths)}. Give columns of one length."
         )
-    stated = getattr(data, "attrs", {}).get("rate_hz")
-    time_name = next((name for name in _TIMES if name in columns), None)
+    if lengths == {0}:
+        raise InputError(f"The columns {', '.join(columns)} have no rows. Give at least one row.")
+    time_name = next((n for n in _TIMES if n in columns and _may_be_times(n, columns[n])), None)
     time_s = None if time_name is None else columns[time_name]
-    if stated is None and time_s is not None:
-        stated = rate_of_times(time_s)
-    rate = checked_rate(None if stated is None else float(stated), rate_hz, lengths.pop())
-    return Table(columns, rate, time_name=time_name, time_s=time_s)
+    rate_hz = None if time_s is None else rate_of_times(time_s)
+    found = Table(columns, rate_hz, time_name=time_name, time_s=time_s)
+    stated = getattr(data, "attrs", {}).get("rate_hz")
+    if stated is None:
+        return found
+    number = real_array("The attribute rate_hz", stated)
+    if number.size != 1:
+        raise InputError(f"The attribute rate_hz has shape {number.shape}; it must be one number.")
+    return _at_rate(found, float(number.item()))
 
 
-def checked_rate(stated_hz: float | None, given_hz: float | None, rows: int) -> float | None:
-    """The rate that the caller gives, else that of the data.
+def _may_be_times(name: str, values: Floats) -> bool:
+    """A column that is only called like times, such as t, has to rise, as in files."""
+    return name == "time_s" or bool((np.diff(values) > 0.0).all())
 
-    Args:
-        stated_hz: by the data or their times; None: not at all.
-        given_hz: by the caller; None: not given.
-        rows: of the data.
-    Returns:
-        The rate in Hz; None where nobody states one.
-    Raises:
-        InputError: the two contradict each other.
+
+def _columns(data: Any) -> tuple[dict[str, Floats], dict[str, str]]:
+    """Columns of numbers by name, and why each other column is none.
+
+    An index or a coordinate of times is a column too.
     """
-    if given_hz is None or stated_hz is None:
-        return stated_hz if given_hz is None else float(given_hz)
-    if not rates_agree(stated_hz, given_hz, rows):
+    if not (hasattr(data, "keys") and hasattr(data, "__getitem__")):
         raise InputError(
-            f"rate_hz is {given_hz:g}, but the data have {stated_hz:.6g} rows per second. Leave "
-            "out rate_hz, or change the data."
+            f"The data are {shown(data)}; they must be a file, a table, a DataFrame, a Dataset or "
+            "a dictionary of columns, such as {'u': u, 'y': y}."
         )
-    return float(given_hz)
-
-
-def _median_hz(time_s: Floats) -> float | None:
-    step_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else 0.0
-    return 1.0 / step_s if step_s > 0.0 else None
-
-
-def _columns(data: Any) -> dict[str, Floats]:
-    """Columns of numbers by name; an index or a coordinate of times is one too."""
-    found = {str(name): np.asarray(data[name]) for name in data.keys()}  # noqa: SIM118
-    found |= {str(name): np.asarray(each) for name, each in getattr(data, "coords", {}).items()}
+    found = {str(name): data[name] for name in data.keys()}  # noqa: SIM118
+    found |= {str(name): each for name, each in getattr(data, "coords", {}).items()}
     index = getattr(data, "index", None)
-    if index is not None and (index.name in _TIMES or np.asarray(index).dtype.kind in "mM"):
-        found["time_s"] = np.asarray(index)
-    columns = {}
+    if index is not None and (index.name in _TIMES or index.dtype.kind in "mM"):
+        found["time_s"] = index
+    columns, reasons = {}, {}
     for name, values in found.items():
-        if values.dtype.kind in "mM":
-            values = (values - values[0]) / np.timedelta64(1, "s")
-        if values.dtype.kind in "fiub" and values.ndim == 1:
-            columns[name] = np.asarray(values, dtype=np.float64)
-    return columns
+        try:
+            columns[name] = _column(f"Column {name}", values)
+        except InputError as error:
+            reasons[name] = str(error)
+    return columns, reasons
 
 
+def _column(name: str, values: Any) -> Floats:
+    """One column as numbers; clock times become seconds since the first."""
+    kind = getattr(getattr(values, "dtype", None), "kind", "")
+    array = np.asarray(values, dtype="datetime64[ns]") if kind == "M" else values
+    if kind in ("m", "M"):
+        array = np.asarray(array)
+        array = (array - array[:1]) / np.timedelta64(1, "s")
+    column = real_array(name, array)
+    if column.ndim != 1:
+        raise InputError(f"{name} has shape {column.shape}; it must have one number for each row.")
+    return column
+
+
+@checked
 def records(
     data: Data | Record | Sequence[Record],
     input: str = "u",
@@ -184,7 +275,7 @@ def records(
         data: as of `table`.
         input: column of the input.
         output: column of the output.
-        rate_hz: rows a second, in Hz. None: from the times.
+        rate_hz: rows a second, in Hz, which the times must not contradict. None: from the times.
         hold: the input between its rows: "zero" (held), "first" (straight lines) or
             "band-limited".
     Returns:
@@ -199,20 +290,11 @@ def records(
     """
     if isinstance(data, Record):
         return [data]
-    if isinstance(data, Sequence) and not isinstance(data, str):
+    if isinstance(data, Sequence) and data and all(isinstance(each, Record) for each in data):
         return list(data)
-    found = table(data)
-    for name in (input, output):
-        if name not in found.columns:
-            raise InputError(
-                f"There is no column {name!r}; the data have {', '.join(found)}. Name input and "
-                "output."
-            )
-    if rate_hz is not None and found.rate_hz is None and found.time_s is not None:
-        checked_rate(_median_hz(found.time_s), rate_hz, found[input].size)
-    rate = checked_rate(found.rate_hz, rate_hz, found[input].size)
-    if rate is not None:
-        return [Record.sampled(found[input], found[output], rate, hold=hold)]
+    found = wanted(data, (input, output), rate_hz)
+    if found.rate_hz is not None and not is_uneven(found):
+        return [Record.sampled(found[input], found[output], found.rate_hz, hold=hold)]
     if found.time_s is None or found.time_name is None:
         raise InputError("The data state no sampling rate. Give rate_hz, or a column time_s.")
     axis = time_axis(found.time_s, Path("data"), found.time_name)
@@ -222,6 +304,7 @@ def records(
     return kept
 
 
+@checked
 def example(name: str, folder: str | Path) -> list[Path]:
     """Write one of the small data sets that come with haselab.
 

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from haselab.base import InputError
+from haselab.base import InputError, check_fields, checked, generator
 from haselab.control import (
     Design,
     DesignSpec,
@@ -33,6 +31,7 @@ from haselab.store.toml import validated
 __all__ = ["Actuator", "design"]
 
 
+@checked
 def design(
     model: TransferFit | PlantPosterior | Plant | RationalModel,
     spec: DesignSpec | Mapping[str, float | bool] | None = None,
@@ -66,10 +65,8 @@ def design(
         >>> found.shortfalls, found.nominal.margins.phase_margin_deg >= 60.0
         ((), True)
     """
-    if controller not in ("pi", "pid"):
-        raise InputError(f"controller is {controller!r}. Use pi or pid.")
     demands = spec if isinstance(spec, DesignSpec) else DesignSpec.from_mapping(spec or {})
-    loop, rng = LoopSetting(rate_hz, delay_s, Saturation(*limits)), np.random.default_rng(seed)
+    loop, rng = LoopSetting(rate_hz, delay_s, Saturation(*limits)), generator(seed)
     posterior = model.posterior if isinstance(model, TransferFit) else model
     if isinstance(posterior, PlantPosterior):
         return design_plausible(
@@ -102,7 +99,11 @@ class Actuator:
     saturation: Saturation | None = None
     plant: Plant | None = None
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
     @classmethod
+    @checked
     def load(cls, path: str | Path) -> Actuator:
         """Read an actuator file, or the folder of a run.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain, islice
@@ -11,24 +12,25 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.api.data import Data, checked_rate, table
-from haselab.base import InputError
+from haselab.api.data import Data, wanted
+from haselab.base import InputError, checked, real_array, shown
 from haselab.pipelines.sensing.series import DEFAULT_REQUEST
 from haselab.pipelines.sensing.source import at_the_actuator, lockin_config
 from haselab.pipelines.sensing.table import columns_of
 from haselab.pipelines.tracking.points import find_points
 from haselab.sensing import Lockin
-from haselab.store.columns.table import Table, read_table
+from haselab.store.columns.table import Table
 from haselab.store.video.opening import open_video
 from haselab.tracking import TrackOptions, Tracks, track_frames
 
 __all__ = ["sense", "track"]
 
 Floats = NDArray[np.float64]
-Frames: TypeAlias = "str | Path | Iterable[NDArray[np.uint8]]"
+Frames: TypeAlias = str | Path | Iterable[NDArray[np.uint8]]
 _AUTOMATIC = 200  # points at most
 
 
+@checked
 def sense(
     data: Data,
     *,
@@ -57,15 +59,24 @@ def sense(
     Raises:
         InputError: a column that is missing, no rate, or fewer samples than one block.
     """
-    found = read_table(data, [v, i]) if isinstance(data, (str, Path)) else table(data)
-    missing = [name for name in (v, i) if name not in found.columns]
-    if missing:
+    found = wanted(data, [v, i], rate_hz)
+    for name in (v, i):
+        if not np.isfinite(found[name]).any():
+            raise InputError(f"Column {name} has no finite value. Name another column.")
+    rate = found.rate_hz
+    if rate is None and found.time_s is not None:
         raise InputError(
-            f"There is no column {missing[0]!r}; the data have {', '.join(found)}. Name v and i."
+            f"The times in column {found.time_name} are uneven. Resample the data, or give rate_hz."
         )
-    rate = checked_rate(found.rate_hz, rate_hz, found[v].size)
     if rate is None:
         raise InputError("The data state no sampling rate. Give rate_hz, or a column time_s.")
+    for name, given in (
+        ("carrier_hz", carrier_hz),
+        ("block_s", block_s),
+        ("volt_per_monitor_volt", volt_per_monitor_volt),
+        ("ampere_per_monitor_volt", ampere_per_monitor_volt),
+    ):
+        _positive(name, given)
     request = replace(
         DEFAULT_REQUEST,
         carrier_hz=carrier_hz,
@@ -96,6 +107,7 @@ def sense(
     return Table(columns, None, time_name="time_s", time_s=columns["time_s"])
 
 
+@checked
 def track(
     video: Frames,
     points: Any = None,
@@ -121,6 +133,8 @@ def track(
     Raises:
         InputError: a video that cannot be read, a point outside the frame, too few frames.
     """
+    for name, given in (("rate_hz", rate_hz), ("scale_mm_per_px", scale_mm_per_px)):
+        _positive(name, given)
     if isinstance(video, (str, Path)):
         with open_video(video) as reader:
             times: list[float] = []
@@ -155,21 +169,50 @@ def track(
     return Table(columns, rate_hz)
 
 
+def _positive(name: str, number: float | None) -> None:
+    if number is not None and not 0.0 < number < math.inf:
+        raise InputError(f"{name} is {number:g}; it must be above 0 and finite.")
+
+
 def _tracked(
     frames: Iterable[NDArray[np.uint8]],
     points: Any,
     rest_frames: int,
     options: TrackOptions | None,
 ) -> Tracks:
-    stream = iter(frames)
+    stream = map(_frame, frames)
     head = list(islice(stream, 1))
     if not head:
         raise InputError("The video holds no frame. Give a video with frames.")
     if points is None:
         found = find_points(head[0], _AUTOMATIC, None)
         place, options = found.place_px, options or TrackOptions(subset_px=found.subset_px)
-    elif hasattr(points, "keys"):
-        place = np.stack([np.asarray(points[key], np.float64) for key in ("x_px", "y_px")], axis=1)
     else:
-        place = np.asarray(points, dtype=np.float64)
+        place = _place(points)
     return track_frames(chain(head, stream), place, options, rest_frames)
+
+
+def _frame(frame: NDArray[Any]) -> NDArray[np.uint8]:
+    """A frame of the kind that the tracker takes."""
+    if not isinstance(frame, np.ndarray) or frame.ndim != 2 or frame.dtype.kind != "u":
+        raise InputError(
+            f"A frame is {shown(frame)}; it must be an array of shape (H, W) and type uint8 or "
+            "uint16."
+        )
+    return frame
+
+
+def _place(points: Any) -> Floats:
+    """Positions of points, shape `(P, 2)`."""
+    if not hasattr(points, "keys"):
+        place = real_array("points", points)
+        if place.ndim != 2 or place.shape[1] != 2 or place.size == 0:
+            raise InputError(f"points have shape {place.shape}; it must be (P, 2): x_px and y_px.")
+        return place
+    for name in ("x_px", "y_px"):
+        if name not in points:
+            raise InputError(f"points have no column {name!r}. Give x_px and y_px.")
+    x_px, y_px = (np.atleast_1d(real_array(name, points[name])) for name in ("x_px", "y_px"))
+    if x_px.shape != y_px.shape:
+        raise InputError(f"points have {x_px.size} x_px and {y_px.size} y_px. Give one for each.")
+    return np.stack([x_px, y_px], axis=1)

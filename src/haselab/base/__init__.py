@@ -1,5 +1,6 @@
 """Foundations that every package uses: estimates, limits, errors, progress."""
 
+from haselab.base.arguments import check_fields, checked, generator, real_array, shown
 from haselab.base.closing import Closing
 from haselab.base.errors import (
     DeviceError,
@@ -29,6 +30,11 @@ __all__ = [
     "ResultError",
     "SafetyError",
     "SilentProgress",
+    "check_fields",
+    "checked",
+    "generator",
+    "real_array",
+    "shown",
     "table_at",
     "to_plain",
 ]

@@ -21,6 +21,8 @@ class Limits:
         low: smallest allowed value, in `unit`.
         high: largest allowed value, in `unit`.
         unit: SI unit.
+        low_source: file that `low` comes from, for error messages.
+        high_source: file that `high` comes from.
 
     Example:
         >>> Limits("drive voltage", 0.0, 2.0, "V").check(1.5)
@@ -30,6 +32,8 @@ class Limits:
     low: float
     high: float
     unit: str
+    low_source: str = "the rig file"
+    high_source: str = "the rig file"
 
     def check(self, value: ArrayLike) -> None:
         """Raise `LimitError` unless every element of `value` is finite and inside the range."""
@@ -38,7 +42,8 @@ class Limits:
         if outside.any():
             worst = float(values[outside][0])
             unit = f" {self.unit}" if self.unit else ""
+            source = self.low_source if worst < self.low else self.high_source
             raise LimitError(
                 f"{self.name} = {worst:g}{unit} is outside [{self.low:g}, {self.high:g}]{unit}. "
-                "Lower the request, or widen the limit in the rig file."
+                f"Lower the request, or widen the limit in {source}."
             )

@@ -10,11 +10,14 @@ from pathlib import Path
 import click
 
 from haselab import __version__
+from haselab.actuators import ACTUATORS
+from haselab.base import Json, table_at
 from haselab.cli.invocation import Invocation
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.spelling import misspelled_keys
 from haselab.store.actuator_file import (
     Provenance,
+    check_writable,
     hashed,
     read_actuator,
     read_run,
@@ -23,18 +26,33 @@ from haselab.store.actuator_file import (
 )
 from haselab.store.toml import validated
 
-__all__ = ["load_actuator", "load_run", "mark_sections", "save_section", "warn_misspelled"]
+__all__ = [
+    "load_actuator",
+    "load_run",
+    "mark_sections",
+    "save_section",
+    "unknown_kind",
+    "warn_misspelled",
+]
 
+_WITHOUT_LAW = "peano-hasel"  # a kind that `init` names and no twin simulates
 _WARNED = "haselab.misspelled"  # in the context of the command
 
 
-def load_actuator(path: Path) -> ActuatorTables:
+def load_actuator(path: Path, *, to_write: bool = False) -> ActuatorTables:
     """Read the sections of an actuator file.
 
+    Args:
+        path: of the file.
+        to_write: the command will write a section; refuse a file that cannot be written now.
+    Returns:
+        The checked sections.
     Raises:
-        InputError: no such file, or an impossible value.
+        InputError: no such file, a read-only one, or an impossible value.
     """
     sections = read_actuator(path)
+    if to_write:
+        check_writable(path)
     warn_misspelled(sections, path)
     return validated(ActuatorTables, sections, path)
 
@@ -50,8 +68,8 @@ def load_run(path: Path) -> ActuatorTables:
     return validated(ActuatorTables, sections, path)
 
 
-def warn_misspelled(sections: Mapping[str, object], path: Path) -> None:
-    """Warn of keys that look like misspelled ones, each once in a command.
+def warn_misspelled(sections: Mapping[str, Json], path: Path) -> None:
+    """Warn of an unknown kind and of keys that look like misspelled ones, each once in a command.
 
     Args:
         sections: of an actuator file, unchecked.
@@ -59,11 +77,26 @@ def warn_misspelled(sections: Mapping[str, object], path: Path) -> None:
     """
     context = click.get_current_context(silent=True)
     warned: set[str] = set() if context is None else context.meta.setdefault(_WARNED, set())
-    for found in misspelled_keys(sections):
+    kind = table_at(sections, "actuator").get("kind")
+    for found in (*misspelled_keys(sections), *unknown_kind(kind)):
         line = f"haselab: warning: {found} {path}"
         if line not in warned:
             click.echo(line, err=True)
         warned.add(line)
+
+
+def unknown_kind(kind: object) -> list[str]:
+    """Doubts about a kind of actuator, which only a twin of it needs.
+
+    Args:
+        kind: of `[actuator]`.
+    Returns:
+        One sentence; nothing for a known kind.
+    """
+    known = [*ACTUATORS.packages(), _WITHOUT_LAW]
+    if not isinstance(kind, str) or kind in known:
+        return []
+    return [f"[actuator] kind {kind!r} is unknown; the known kinds are {', '.join(known)}."]
 
 
 def save_section(

@@ -24,6 +24,7 @@ __all__ = [
     "check_unit",
     "column_option",
     "column_options",
+    "note_conversions",
     "note_seconds",
     "note_units",
 ]
@@ -142,7 +143,17 @@ def note_units(table: Table, file: Path) -> None:
     """Report on stderr which columns were converted, and times whose unit nobody states."""
     if table.assumed_seconds:
         note_seconds(str(table.time_name), file)
-    for name, unit in table.units.items():
+    note_conversions(table.units, file)
+
+
+def note_conversions(units: Mapping[str, Unit | None], file: Path) -> None:
+    """Report on stderr which columns were converted.
+
+    Args:
+        units: that the columns state, by their names.
+        file: of the columns.
+    """
+    for name, unit in units.items():
         if unit is not None and unit.factor != 1.0:
             to = "a pure number" if unit.si == "1" else unit.si
             click.echo(f"haselab: column {name} was converted from {unit.symbol} to {to}. {file}",

@@ -41,7 +41,7 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--kind": (None, "Choose the kind of actuator."),
     "--method": (None, "Choose the method."),
     "--model": (None, "Choose the model."),
-    "--out": (None, "Write the result to this path."),
+    "--out": (None, "Write the result to this path; missing folders are created."),
     "--output": ("COLUMN", "Name the column of the output."),
     "--quick": (None, "Play the short version of the study."),
     "--rate-hz": (None, "Set the sampling rate in Hz."),

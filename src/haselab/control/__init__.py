@@ -14,7 +14,11 @@ from haselab.control.plausible_design import design_plausible
 from haselab.control.simulate import LoopSetting, LoopTrace, simulate_drive, simulate_loop
 from haselab.control.spec import DesignSpec
 from haselab.control.stability.margins import Crossover, Margins, loop_response, margins
-from haselab.control.stability.plausible import PlausibleMargins, plausible_margins, share_of
+from haselab.control.stability.plausible import (
+    PlausibleMargins,
+    binomial_proportion,
+    plausible_margins,
+)
 from haselab.control.step_metrics import StepMetrics, StepNumbers, over_trials, step_metrics
 
 __all__ = [
@@ -34,6 +38,7 @@ __all__ = [
     "StepMetrics",
     "StepNumbers",
     "WhiteNoise",
+    "binomial_proportion",
     "design_pi",
     "design_pid",
     "design_plausible",
@@ -42,7 +47,6 @@ __all__ = [
     "over_trials",
     "plausible_margins",
     "predict",
-    "share_of",
     "simulate_drive",
     "simulate_ensemble",
     "simulate_loop",

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from haselab.base import InputError
+from haselab.base import InputError, check_fields
 
 __all__ = ["DesignSpec"]
 
@@ -52,6 +52,7 @@ class DesignSpec:
     step: float = 0.04
 
     def __post_init__(self) -> None:
+        check_fields(self)
         ranges = {
             "rise_time_s": (1e-4, 1e4),
             "rise_time_tolerance": (1e-4, 1.0),

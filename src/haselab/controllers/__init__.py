@@ -8,17 +8,10 @@ from haselab.controllers.protocol import (
     LinearisableController,
     Measurement,
 )
-from haselab.controllers.registry import (
-    GROUP,
-    chosen_controller,
-    controller_kind,
-    controller_names,
-    installed_controllers,
-    parameters_of,
-)
+from haselab.controllers.registry import CONTROLLERS, chosen_controller, parameters_of
 
 __all__ = [
-    "GROUP",
+    "CONTROLLERS",
     "ChosenController",
     "Controller",
     "ControllerKind",
@@ -29,9 +22,6 @@ __all__ = [
     "Parameter",
     "PidController",
     "chosen_controller",
-    "controller_kind",
-    "controller_names",
-    "installed_controllers",
     "parameters_of",
     "pid_controller",
 ]

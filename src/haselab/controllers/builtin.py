@@ -8,7 +8,7 @@ from haselab import _core
 from haselab.controllers.kind import ChosenController, ControllerKind, Parameter
 from haselab.controllers.protocol import ControllerSetting, Measurement
 
-__all__ = ["BUILTIN", "OpenLoop", "PidController", "pid_controller"]
+__all__ = ["OPEN_LOOP", "PI", "PID", "OpenLoop", "PidController", "pid_controller"]
 
 _GAIN = 1e9
 
@@ -64,14 +64,9 @@ _PID = (
     Parameter("kd", "s", 0.0, 0.0, _GAIN),
     Parameter("derivative_filter_s", "s", 0.0, 0.0, _GAIN),
 )
-BUILTIN = {
-    kind.name: kind
-    for kind in (
-        ControllerKind("pid", PidController, _PID),
-        ControllerKind("pi", PidController, _PI),
-        ControllerKind("open-loop", OpenLoop),
-    )
-}
+PID = ControllerKind("pid", PidController, _PID)
+PI = ControllerKind("pi", PidController, _PI)
+OPEN_LOOP = ControllerKind("open-loop", OpenLoop)
 
 
 def pid_controller(
@@ -90,4 +85,4 @@ def pid_controller(
         InputError: A gain is negative or not finite.
     """
     gains = {"kp": kp, "ki": ki, "kd": kd, "derivative_filter_s": derivative_filter_s}
-    return BUILTIN["pid"].choose(gains)
+    return PID.choose(gains)

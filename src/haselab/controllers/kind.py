@@ -123,8 +123,8 @@ class ChosenController:
         """The section `[controller]` of a TOML file.
 
         Example:
-            >>> from haselab.controllers import controller_kind
-            >>> controller_kind("pi").choose({"kp": 0.85, "ki": 1.5}).table()
+            >>> from haselab.controllers import CONTROLLERS
+            >>> CONTROLLERS.find("pi").choose({"kp": 0.85, "ki": 1.5}).table()
             {'kind': 'pi', 'parameters': {'kp': 0.85, 'ki': 1.5}}
         """
         return {"kind": self.kind.name, "parameters": dict(self.values)}

@@ -52,11 +52,13 @@ def unstuff(data: bytes) -> bytes | None:
         >>> unstuff(bytes([3, 0x11, 0x22, 2, 0x33])).hex(" ")
         '11 22 00 33'
     """
+    if 0 in data:
+        return None
     out, at = bytearray(), 0
     while at < len(data):
         code = data[at]
         run = data[at + 1 : at + code]
-        if code == 0 or len(run) != code - 1 or 0 in run:
+        if len(run) != code - 1:
             return None
         out += run
         at += code
@@ -116,19 +118,22 @@ def decode_message(frame: bytes) -> tuple[Any, int] | None:
     return _build(kind, struct.unpack(kind.LAYOUT, data[_HEADER.size :])), sequence
 
 
+def _array_field(kind: type[Any]) -> tuple[int, int]:
+    """Index of a message's array field, past the end if there is none, and the number of fields."""
+    arrays = [str(field.type).startswith("tuple") for field in fields(kind)]
+    return [*arrays, True].index(True), len(arrays)
+
+
+_ARRAY_FIELDS = {kind.CODE: _array_field(kind) for kind in _KINDS.values()}
+
+
 def _build(kind: type[Any], values: tuple[Any, ...]) -> Any:
-    """Assign values to fields; an array field takes the remaining values."""
-    own = fields(kind)
-    many = len(values) - len(own) + 1
-    parts: list[Any] = []
-    rest = list(values)
-    for field in own:
-        if str(field.type).startswith("tuple"):
-            parts.append(tuple(rest[:many]))
-            rest = rest[many:]
-        else:
-            parts.append(rest.pop(0))
-    return kind(*parts)
+    """Assign values to fields; an array field takes those that the others leave."""
+    at, count = _ARRAY_FIELDS[kind.CODE]
+    if at == count:
+        return kind(*values)
+    end = at + 1 + len(values) - count
+    return kind(*values[:at], values[at:end], *values[end:])
 
 
 class FrameReader:

@@ -13,7 +13,7 @@ from haselab.identify.frequency.response import (
     estimate_frequency_response,
 )
 from haselab.identify.hysteresis.fit import HysteresisFit, LoopRecord, fit_hysteresis
-from haselab.identify.model_comparison.agreement import Agreement, agree
+from haselab.identify.model_comparison.agreement import Agreement, compare_estimates
 from haselab.identify.model_comparison.comparison import ModelComparison, compare
 from haselab.identify.model_comparison.hypotheses import (
     creep_hypotheses,
@@ -28,7 +28,7 @@ from haselab.identify.model_comparison.voltage_plant import (
 )
 from haselab.identify.nonlinear.hammerstein import fit_hammerstein
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
-from haselab.identify.nonlinear.oscillator import fit_output_curve, fit_spring
+from haselab.identify.nonlinear.oscillator import fit_duffing, fit_output_curve
 from haselab.identify.prediction import predict
 from haselab.identify.record import Record
 from haselab.identify.sampled.arx import ArxFit, ArxOrders, fit_arx
@@ -36,8 +36,8 @@ from haselab.identify.sampled.subspace import SubspaceFit, fit_subspace
 from haselab.identify.statics.capacitance_map import CapacitanceMapFit, fit_capacitance_map
 from haselab.identify.statics.hyperelastic import (
     HyperelasticFit,
-    SheetTest,
     StressPrediction,
+    TensileTest,
     fit_hyperelastic,
     fit_hyperelastic_tests,
 )
@@ -79,25 +79,26 @@ __all__ = [
     "Region",
     "RegionsFit",
     "ResponseFit",
-    "SheetTest",
     "StressPrediction",
     "SubspaceFit",
+    "TensileTest",
     "TransferChoice",
     "TransferFit",
     "TransferStructure",
     "VoltageMapFit",
     "VoltagePlantFit",
     "VoltageStructure",
-    "agree",
     "bootstrap_transfer",
     "choose_transfer",
     "compare",
+    "compare_estimates",
     "creep_hypotheses",
     "estimate_frequency_response",
     "find_regions",
     "fit_arx",
     "fit_capacitance_map",
     "fit_creep",
+    "fit_duffing",
     "fit_free_response",
     "fit_hammerstein",
     "fit_hyperelastic",
@@ -107,7 +108,6 @@ __all__ = [
     "fit_nonlinear",
     "fit_output_curve",
     "fit_response",
-    "fit_spring",
     "fit_subspace",
     "fit_transfer",
     "fit_voltage_map",

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
+from haselab.identify.fingerprint import fingerprint, share_used
 from haselab.identify.noise import fit_percent
 
 if TYPE_CHECKING:
@@ -23,8 +24,10 @@ __all__ = ["CurveFit", "Fit", "Prediction", "RecordFit", "propagated", "rescaled
 
 Floats = NDArray[np.float64]
 Recorded = TypeVar("Recorded")
+Part = TypeVar("Part")
 _QUALITIES = ("fit_percent", "r_squared", "residual_whiteness_p", "chi_squared_ratio")
 _NAME_WIDTH = 28
+_USED = 0.05  # share of samples that a fit has used, from which a prediction is no validation
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,9 @@ class Prediction:
     """Measured data beside what a model says of them.
 
     Args:
+        status: "ok", or why this is no validation of the model.
+        used_for_fit: share of the samples that the fit has used, recognised by their values; NaN
+            where it is not known what the model was fitted to.
         fit_percent: NRMSE fit: 100 is perfect, 0 no better than the mean.
         rms_error: root mean square of measured minus predicted, in the unit of the output.
         inside_band: share of the samples inside the 95 % band; NaN where there is no band.
@@ -40,6 +46,8 @@ class Prediction:
         measured: of all records. Shape `(M,)`.
     """
 
+    status: str
+    used_for_fit: float
     fit_percent: float
     rms_error: float
     inside_band: float
@@ -53,6 +61,8 @@ class Prediction:
         measured: Sequence[Floats],
         modelled: Sequence[Floats],
         half_band: Floats | None = None,
+        *,
+        fitted_to: ArrayLike = (),
     ) -> Prediction:
         """Judge the modelled outputs of some records.
 
@@ -60,19 +70,39 @@ class Prediction:
             measured: outputs of each record. Shape `(M_r,)` each.
             modelled: the same by the model. Shape `(M_r,)` each.
             half_band: half the width of the band, of all records. None: there is no band.
+            fitted_to: fingerprint of the outputs that the model was fitted to; empty: not known.
         Returns:
             Both, with the error between them.
         """
+        used = share_used(measured, fitted_to) if np.size(fitted_to) else math.nan
+        percent = fit_percent(measured, modelled)
         error = np.abs(np.concatenate(list(measured)) - np.concatenate(list(modelled)))
         half = np.zeros(0) if half_band is None else half_band
         return cls(
-            fit_percent=fit_percent(measured, modelled),
+            status=_status(used, percent),
+            used_for_fit=used,
+            fit_percent=percent,
             rms_error=float(np.sqrt(np.mean(error**2))),
             inside_band=float(np.mean(error <= half)) if half.size else math.nan,
             predicted=np.concatenate(list(modelled)),
             half_band=half,
             measured=np.concatenate(list(measured)),
         )
+
+
+def _status(used: float, percent: float) -> str:
+    """What a prediction is worth."""
+    if used > _USED:
+        return (
+            f"not a validation: {100.0 * used:.0f} % of the samples were used for the fit. Use "
+            "another record"
+        )
+    if percent < 0.0:
+        return (
+            "the prediction is worse than the mean of the record. Check the columns, their units "
+            "and the operating point"
+        )
+    return "ok"
 
 
 def _no_covariance() -> Floats:
@@ -178,9 +208,14 @@ class Fit(ABC):
                 yield name, value
 
     def _require(self) -> None:
-        """Refuse to use a fit that has no result."""
-        if not self.succeeded:
+        """Refuse to use a fit that has no usable result."""
+        self._present(self if self.succeeded else None)
+
+    def _present(self, part: Part | None) -> Part:
+        """A part of the result; refuse to use a fit that lacks it."""
+        if part is None:
             raise ResultError(f"The fit gives no model: {self.status}")
+        return part
 
 
 def _row(name: str, value: str, interval: str, unit: str) -> str:
@@ -204,10 +239,16 @@ class RecordFit(Fit, Generic[Recorded]):
             InputError: a wrong shape, or a rate that the model cannot take.
         """
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """Measured outputs that the fit has used; empty where it does not keep them."""
+        return ()
+
     @abstractmethod
     def _modelled(self, record: Recorded) -> tuple[Floats, Floats]:
         """Measured and modelled output of a record, initial state and constant fitted to it."""
 
+    @checked
     def compare(self, records: Recorded | Sequence[Recorded]) -> Prediction:
         """Predict records that were not used for the fit, and compare with their outputs.
 
@@ -217,14 +258,16 @@ class RecordFit(Fit, Generic[Recorded]):
         Args:
             records: new ones, of the kind that the fit took.
         Returns:
-            The fit in percent, the error, and the predicted output.
+            The fit in percent, the error, and the predicted output; `status` says whether these are
+            new records and the prediction is better than their mean.
         Raises:
             ResultError: the fit has no result.
             InputError: no record.
         """
         self._require()
         pairs = [self._modelled(record) for record in several(records)]
-        return Prediction.of([y for y, _ in pairs], [m for _, m in pairs])
+        known = fingerprint(self.fitted_outputs)
+        return Prediction.of([y for y, _ in pairs], [m for _, m in pairs], fitted_to=known)
 
 
 class CurveFit(Fit):
@@ -242,6 +285,7 @@ class CurveFit(Fit):
             ResultError: the fit has no result.
         """
 
+    @checked
     def compare(self, x: ArrayLike, y: ArrayLike) -> Prediction:
         """Predict pairs that were not used for the fit, and compare.
 
@@ -257,7 +301,7 @@ class CurveFit(Fit):
         self._require()
         measured = np.asarray(y, dtype=np.float64)
         modelled = self.simulate(x)
-        if measured.shape != modelled.shape:
+        if measured.shape != modelled.shape or measured.size == 0:
             raise InputError(
                 f"x has shape {modelled.shape} and y {measured.shape}. Give one y for each x."
             )

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
-from haselab.identify.fit import Prediction
+from haselab.base import checked
+from haselab.identify.fit import Prediction, several
 from haselab.identify.record import Record
 from haselab.models.plant import Plant
 from haselab.models.posterior import PlantPosterior
@@ -22,13 +22,15 @@ _HALF_WIDTH = 1.959963984540054  # standard deviations of a 95 % interval
 _SLOWEST = 10.0  # lengths of a record beyond which a free response counts as a straight line
 
 
+@checked
 def predict(
     model: Plant | RationalModel,
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     *,
     posterior: PlantPosterior | None = None,
     noise_std: float = 0.0,
     free_start: bool = True,
+    fitted_to: ArrayLike = (),
     rng: np.random.Generator,
 ) -> Prediction:
     r"""Simulate records from their inputs and compare the result with their outputs.
@@ -40,10 +42,11 @@ def predict(
 
     Args:
         model: model under test.
-        records: records that were not used for the fit.
+        records: records that were not used for the fit, or one.
         posterior: of the model's parameters; None: no band.
         noise_std: root mean square of the residuals of the fit, in the unit of the output.
         free_start: fit initial state and constant; False: the record starts at 0 in steady state.
+        fitted_to: fingerprint of the outputs that the model was fitted to; empty: not known.
         rng: random generator of the plants.
     Returns:
         The prediction.
@@ -53,17 +56,17 @@ def predict(
         >>> plant, time_s = Plant(0.5, 5.0, 0.1), np.arange(400) / 100.0
         >>> u = np.sign(np.sin(time_s))
         >>> record = Record(u, 100.0, 1.0 + plant.simulate(u, 100.0, time_s), time_s)
-        >>> round(predict(plant, [record], rng=np.random.default_rng(1)).fit_percent, 6)
-        100.0
+        >>> found = predict(plant, [record], rng=np.random.default_rng(1))
+        >>> round(found.fit_percent, 6), found.status
+        (100.0, 'ok')
     """
-    if not records:
-        raise InputError("There is no record to predict. Give at least one.")
+    records = several(records)
     modelled = [fitted_output(model, record, free_start) for record in records]
     half = None
     if posterior is not None:
         spread = [_spread(posterior, record, free_start, rng) for record in records]
         half = _HALF_WIDTH * np.sqrt(np.concatenate(spread) ** 2 + noise_std**2)
-    return Prediction.of([record.y for record in records], modelled, half)
+    return Prediction.of([record.y for record in records], modelled, half, fitted_to=fitted_to)
 
 
 def _spread(

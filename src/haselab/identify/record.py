@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, check_fields, checked, real_array
 
 __all__ = ["HOLDS", "Record", "finite_vector"]
 
@@ -20,7 +22,7 @@ _LARGEST_SHARE = 0.05  # of the record
 
 def finite_vector(name: str, values: object, least: int) -> Floats:
     """`values` as a finite vector of at least `least` numbers, or an `InputError`."""
-    vector = np.asarray(values, dtype=np.float64)
+    vector = real_array(name, values)
     if vector.ndim != 1 or vector.size < least:
         raise InputError(
             f"{name} has shape {vector.shape}; it must be a vector of at least {least} values. "
@@ -60,8 +62,10 @@ class Record:
     output_time_s: Floats
     input_before: float | None = 0.0
     hold: str = "zero"
+    made_by: ClassVar[str] = "Make records of columns with haselab.records(data, input, output)."
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, least in (("u", 1), ("y", 8), ("output_time_s", 8)):
             object.__setattr__(self, name, finite_vector(name, getattr(self, name), least))
         if self.y.size != self.output_time_s.size:
@@ -70,9 +74,9 @@ class Record:
                 "must be equally long. Give one time for each output."
             )
         _check_times(self.output_time_s)
-        if not self.input_rate_hz > 0.0:
+        if not 0.0 < self.input_rate_hz < math.inf:
             raise InputError(
-                f"input_rate_hz = {self.input_rate_hz:g} Hz; must be above 0 Hz. "
+                f"input_rate_hz = {self.input_rate_hz:g} Hz; must be above 0 Hz and finite. "
                 "Give the rate at which the input was updated."
             )
         if self.hold not in HOLDS:
@@ -100,10 +104,11 @@ class Record:
         return float(np.median(np.diff(self.output_time_s)))
 
     @classmethod
+    @checked
     def sampled(
         cls,
-        u: object,
-        y: object,
+        u: ArrayLike,
+        y: ArrayLike,
         rate_hz: float,
         input_before: float | None = None,
         *,
@@ -121,9 +126,9 @@ class Record:
             held_at_hz: actual update rate of the input, a whole fraction of `rate_hz`,
                 if the command was recorded faster than the converter updates. None: `rate_hz`.
         """
-        if not rate_hz > 0.0:
+        if not 0.0 < rate_hz < math.inf:
             raise InputError(
-                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz. Give the sampling rate."
+                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz and finite. Give the sampling rate."
             )
         source, output = finite_vector("u", u, 8), finite_vector("y", y, 8)
         if source.size != output.size:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, JsonObject
+from haselab.base import InputError, JsonObject, check_fields, checked, real_array
 from haselab.models.held_input import HeldInput
 
 __all__ = ["Plant", "SlowMode"]
@@ -39,6 +39,7 @@ class SlowMode:
     time_constant_s: float
 
     def __post_init__(self) -> None:
+        check_fields(self)
         _require("time_constant_s", self.time_constant_s, "s", positive=True)
 
 
@@ -71,6 +72,7 @@ class Plant:
     slow_modes: tuple[SlowMode, ...] = ()
 
     def __post_init__(self) -> None:
+        check_fields(self)
         _require("natural_frequency_rad_s", self.natural_frequency_rad_s, "rad/s", positive=True)
         _require("damping_ratio", self.damping_ratio, "", positive=False)
         _require("delay_s", self.delay_s, "s", positive=False)
@@ -95,6 +97,7 @@ class Plant:
         fast = -omega_rad_s * (zeta + root)
         return (omega_rad_s * omega_rad_s / fast, fast)
 
+    @checked
     def frequency_response(self, omega_rad_s: ArrayLike) -> NDArray[np.complex128]:
         """Complex gain at angular frequencies.
 
@@ -103,13 +106,14 @@ class Plant:
         Returns:
             Complex gain, in the unit of the output per unit of the input. Shape `(...)`.
         """
-        s = 1j * np.asarray(omega_rad_s, dtype=np.float64)
+        s = 1j * real_array("omega_rad_s", omega_rad_s)
         wn = self.natural_frequency_rad_s
         total = self.gain * wn**2 / (s * s + 2.0 * self.damping_ratio * wn * s + wn**2)
         for mode in self.slow_modes:
             total = total + mode.gain / (mode.time_constant_s * s + 1.0)
         return np.asarray(total * np.exp(-s * self.delay_s), dtype=np.complex128)
 
+    @checked
     def simulate(
         self,
         u: ArrayLike,
@@ -133,8 +137,8 @@ class Plant:
             InputError: `u` or the times are not finite vectors, or the state has a wrong length.
         Source: variation of constants, pole by pole; no step-size error.
         """
-        held = HeldInput(np.ascontiguousarray(u, dtype=np.float64), input_rate_hz)
-        time_s = np.asarray(time_s, dtype=np.float64)
+        held = HeldInput(np.ascontiguousarray(real_array("u", u)), input_rate_hz)
+        time_s = real_array("time_s", time_s)
         if time_s.ndim != 1 or not np.isfinite(time_s).all():
             raise InputError(
                 f"time_s has shape {time_s.shape} or contains NaN; it must be a finite vector. "

@@ -251,6 +251,12 @@ class PlantPosterior:
             InputError: a missing key, or as for the class.
         """
         try:
+            lengths = [len(row) for row in data["matrix"]]
+            if lengths != [len(data["names"])] * len(data["names"]):
+                raise InputError(
+                    f"The matrix of the covariance has rows of {lengths} numbers, but its "
+                    f"{len(data['names'])} names need as many rows of as many numbers. {_ADVICE}"
+                )
             # fmt: off
             return cls(
                 tuple(str(name) for name in data["names"]),

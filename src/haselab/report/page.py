@@ -11,7 +11,7 @@ from typing import Any
 import jinja2
 
 from haselab.report.charts import chart_plans
-from haselab.report.figures import PLANS, Drawing, FigurePlan, draw_figure
+from haselab.report.figures import PLANS, DrawnFigure, FigurePlan, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.numbers import value_text
 from haselab.report.results import Results
@@ -42,7 +42,7 @@ class Page:
     """
 
     html: str
-    drawings: tuple[Drawing, ...]
+    drawings: tuple[DrawnFigure, ...]
 
     @property
     def left_out(self) -> dict[str, str]:

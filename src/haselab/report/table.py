@@ -113,6 +113,8 @@ def _count(results: Results) -> str:
             ". (set): set in the twin or in the study; (twin): follows from the twin's parameters; "
             "neither is evidence"
         )
+    if any(row.noise_free_inside is False for row in rows):
+        text += ". (outside): the noise-free result is outside the measured 95 % interval"
     if results.simulated:
         compared = any(row.has_paper for row in rows)
         text += ". SIMULATED" + (": no verdict is evidence about the paper" if compared else "")

@@ -2,8 +2,8 @@
 
 from haselab.rig.protocols import (
     Acquisition,
+    BuiltInController,
     Camera,
-    ClosesLoop,
     Frames,
     FunctionGenerator,
     GaplessAcquisition,
@@ -21,8 +21,8 @@ from haselab.rig.protocols import (
 
 __all__ = [
     "Acquisition",
+    "BuiltInController",
     "Camera",
-    "ClosesLoop",
     "Frames",
     "FunctionGenerator",
     "GaplessAcquisition",

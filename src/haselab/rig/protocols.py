@@ -13,8 +13,8 @@ from haselab.base import Limits
 
 __all__ = [
     "Acquisition",
+    "BuiltInController",
     "Camera",
-    "ClosesLoop",
     "Frames",
     "FunctionGenerator",
     "GaplessAcquisition",
@@ -248,7 +248,7 @@ class ReportsOutputState(Protocol):
         """
 
 
-class ClosesLoop(Protocol):
+class BuiltInController(Protocol):
     """A built-in controller: the program requests strains, the rig computes the outputs.
 
     It has its own protection; `Acquisition.read` raises its trips as `SafetyError`.
@@ -365,7 +365,7 @@ class Rig:
     stand: LoadStand
     fixture: ReferenceFixture | None = None
     supply: HighVoltageSupply | None = None
-    controller: ClosesLoop | None = None
+    controller: BuiltInController | None = None
     gate: Gate | None = None
     simulated: bool = False
 

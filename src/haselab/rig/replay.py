@@ -56,7 +56,7 @@ def _described(header: Mapping[str, Any], path: Path) -> RigDescription:
 
 def _films(folder: Path) -> list[_Film]:
     found = []
-    for path in sorted(folder.glob("*.mkv")):
+    for path in sorted([*folder.glob("*.mkv"), *folder.glob("*.avi")]):
         table = path.with_suffix(".csv")
         if table.is_file():
             with table.open(newline="") as rows:

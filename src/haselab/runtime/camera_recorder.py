@@ -165,11 +165,11 @@ class CameraRecorder:
         self._waiting = []
         self._tail.clear()
         if self._keep != "none":
-            path = self._folder / f"{name}{part}.mkv"
+            path = self._folder / f"{name}{part}"
             if self._helper is None:
-                self._video = VideoWriter(path, rate_hz, hashed=True)
+                self._video = VideoWriter(path.with_name(f"{path.name}.avi"), rate_hz, hashed=True)
             else:
-                self._video = RawVideoWriter(path, rate_hz)
+                self._video = RawVideoWriter(path.with_name(f"{path.name}.mkv"), rate_hz)
         self._camera.start(rate_hz)
 
     def look(self) -> Seen | None:

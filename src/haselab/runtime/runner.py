@@ -3,49 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import textwrap
-from collections import deque
-from dataclasses import replace
 from types import TracebackType
 from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab import _core
 from haselab.base import DeviceError, HaselabError, InputError, Progress, SafetyError
-from haselab.controllers import Measurement
-from haselab.rig import Rig, RigDescription
-from haselab.runtime.loop import LoopSettings, RunningController
+from haselab.rig import Rig
+from haselab.runtime.closed_loop import ClosedLoop
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Observer
-from haselab.runtime.sensors import (
-    PATIENCE_BLOCKS,
-    CapacitanceSensor,
-    PrintedChainSensor,
-    StrainSensor,
-    VideoSensor,
-)
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.signals import OrderlyEnd
-from haselab.safety.watchdog.loop_model import loop_model
-from haselab.safety.watchdog.loop_watchdog import LoopSample, LoopWatchdog, OutputWatchdog
-from haselab.sensing import Lockin, LockinConfig, PaperChain
+from haselab.safety.watchdog.loop_watchdog import OutputWatchdog
 
-__all__ = [
-    "BLANKING_S",
-    "Recorder",
-    "Runner",
-    "counted_s",
-    "lockin_of",
-    "printed_chain_of",
-]
+__all__ = ["Recorder", "Runner"]
 
-BLANKING_S = 0.5e-3  # after an output update, until amplifier and monitors have settled
 _LOOK_EVERY = 20  # blocks between two calls of the camera recorder
 _STATIC_FRAMES = 40  # for each static load
-_REACH_POINTS = 1001  # points of the saturation range where a loop's voltages are checked
 _SETUP_S = 30.0  # longest time for disk and camera between experiments
 _EVENT_LETTERS = 90  # longest event of a session
 _EVENT_LINES = 5  # most events for one reason
@@ -66,59 +44,12 @@ class Recorder(Protocol):
         """Record that something happened."""
 
 
-def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
-    """Make the lock-in for a rig, which ignores each block until its output has settled.
-
-    The samples before the update contain information too, but late: in a loop the delay matters
-    more.
-    """
-    settled = rig.switch_in_block + round(BLANKING_S * rig.rate_hz)
-    config = LockinConfig(
-        rate_hz=rig.rate_hz,
-        block_samples=rig.block_samples,
-        carrier_hz=carrier_hz,
-        skew_s=rig.skew_s,
-        ohm_per_ratio=rig.i_monitor_v_per_a / rig.v_monitor_v_per_v,
-        blank=(0, settled),
-    )
-    if (found := rig.calibration) is not None:
-        volt_v, ampere_v = found.offsets_v
-        config = replace(
-            config,
-            scale_s=complex(*found.scale_s),
-            stray_s=complex(*found.stray_s),
-            offsets=(volt_v / rig.volt_per_code, ampere_v / rig.volt_per_code),
-        )
-    return Lockin(config)
-
-
-def counted_s(rig: RigDescription, carrier_hz: float) -> float:
-    """Time that the lock-in of a rig fits: twice from the middle of the fit to the block's end."""
-    last_s = (rig.block_samples - 1) / rig.rate_hz
-    return 2.0 * (last_s - lockin_of(rig, carrier_hz).middle_s) + 1.0 / rig.rate_hz
-
-
-def printed_chain_of(rig: RigDescription, carrier_hz: float) -> PaperChain:
-    """Make the reference study's own chain for a rig, which uses all samples of a block."""
-    return PaperChain(replace(lockin_of(rig, carrier_hz).config, blank=(0, 0)))
-
-
 def _left(found: str, error: BaseException | None) -> str:
     """Describe an output that is not at 0 V, and what had ended the run."""
     why = "" if error is None else str(error)
     if error is None or (why and why in found):
         return found
     return f"{found} The run had ended by {type(error).__name__}{': ' * bool(why)}{why}"
-
-
-def _outside(blocks: int, played: int, loop: LoopSettings) -> str:
-    """How often a loop left the range in which its strain map was fitted."""
-    low_f, high_f = loop.strain_map.range_f or (-math.inf, math.inf)
-    return (
-        f"in {blocks} of {played} blocks the capacitance was outside {low_f:.4g} to {high_f:.4g} F,"
-        " where the strain map was fitted: their strain is extrapolated, the map's band does not "
-        "hold"
-    )
 
 
 class Runner:
@@ -341,33 +272,19 @@ class Runner:
             SafetyError: The sensor was lost, or the bench tripped.
             DeviceError: The disk or an instrument failed.
         """
-        controller = RunningController(loop, self._rig.description.block_s)
-        sensor, watchdog = self._sensor(loop), self._watchdog(loop)
-        lost = outside = 0
-        self._check_reach(loop)
+        closed = ClosedLoop(self._rig, self._camera_recorder, self._carrier, loop, name)
         self._begin(name)
         self._note(f"controller {name}: {loop.controller.summary()}")
         if loop.carrier_v is not None:
             self._rig.generator.sine(self._carrier[0], loop.carrier_v)
         self._camera_recorder.start(name, frame_rate_hz, mass_kg)
-        output_v = self._voltage(loop, 0.0)
-        waiting = deque([output_v] * loop.extra_delay_blocks)
         for k, desired in enumerate(reference):
-            waiting.append(output_v)
-            due_v = waiting.popleft()
-            codes = self._block(name, k, due_v, float(desired), look=not sensor.watches)
-            strain = sensor.strain(codes)
-            lost = 0 if strain == strain else lost + 1
-            outside += not sensor.in_range
-            if lost >= PATIENCE_BLOCKS:
-                raise self._safety.trip(f"No strain in {lost} blocks of {name!r}. {sensor.lost()}")
-            if fault := watchdog.fault(codes, self._sample(sensor, strain, float(desired))):
-                raise self._safety.trip(fault)
-            if desired == desired:
-                drive = self._step(controller, float(desired), self._measured(sensor, strain))
-                output_v = output_v if drive is None else self._voltage(loop, drive)
-        if outside:
-            self._note(f"{name}: {_outside(outside, len(reference), loop)}")
+            codes = self._block(
+                name, k, closed.due_v(), float(desired), look=not closed.watches_camera
+            )
+            closed.step(codes, float(desired))
+        if note := closed.note(len(reference)):
+            self._note(note)
         self._end(name)
         if loop.carrier_v is not None:
             self._rig.generator.sine(*self._carrier)
@@ -410,68 +327,6 @@ class Runner:
                 raise self._safety.trip(fault)
         self.rest()  # the next steps take longer than a controller waits for a keep-alive
         self._end(name)
-
-    def _sensor(self, loop: LoopSettings) -> StrainSensor:
-        if loop.video_zero_px is not None:
-            return VideoSensor(self._camera_recorder, loop.video_zero_px)
-        lockin = lockin_of(self._rig.description, self._carrier[0])
-        if loop.printed_chain:
-            chain = printed_chain_of(self._rig.description, self._carrier[0])
-            return PrintedChainSensor(chain, loop.strain_map)
-        return CapacitanceSensor(lockin, loop.strain_map)
-
-    def _watchdog(self, loop: LoopSettings) -> LoopWatchdog:
-        settings, by_video = self._safety.settings, loop.video_zero_px is not None
-        model = loop_model(
-            self._rig.description,
-            loop.voltage_map,
-            (loop.saturation.low, loop.saturation.high),
-            (self._carrier[0], self._carrier[1] if loop.carrier_v is None else loop.carrier_v),
-            settings.settle_s,
-            None if by_video else loop.strain_map.coefficients,
-        )
-        return LoopWatchdog(model, settings.loop, settings.rating, self._rig.present_drive_v)
-
-    def _sample(self, sensor: StrainSensor, strain: float, desired: float) -> LoopSample:
-        """Collect what the watchdog checks of the block just read."""
-        age_s = None
-        if sensor.frame_time_s is not None:
-            age_s = self._rig.acquisition.time_s - sensor.frame_time_s
-        return LoopSample(
-            strain, sensor.capacitance_f, self._rig.present_drive_v, desired, sensor.fresh, age_s
-        )
-
-    def _measured(self, sensor: StrainSensor, strain: float) -> Measurement:
-        """Collect what a controller gets of the block just read."""
-        farad = sensor.capacitance_f
-        return Measurement(
-            strain=strain,
-            capacitance_f=math.nan if farad is None else farad,
-            voltage_v=self._rig.present_drive_v,
-            time_s=self._rig.acquisition.time_s,
-            valid=not math.isnan(strain),
-            in_range=sensor.in_range,
-        )
-
-    def _step(
-        self, controller: RunningController, desired: float, measured: Measurement
-    ) -> float | None:
-        """Compute the next drive; a controller that fails trips the bench."""
-        try:
-            return controller.step(desired, measured)
-        except SafetyError as error:
-            raise self._safety.trip(str(error)) from error
-
-    def _check_reach(self, loop: LoopSettings) -> None:
-        """Refuse a loop whose voltage map exceeds the drive limits within the saturation."""
-        strains = np.linspace(loop.saturation.low, loop.saturation.high, _REACH_POINTS)
-        voltages = [self._voltage(loop, float(strain)) for strain in (*strains, 0.0)]
-        self._rig.description.drive_limits.check(voltages)
-
-    @staticmethod
-    def _voltage(loop: LoopSettings, strain: float) -> float:
-        v = loop.voltage_map
-        return _core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, strain)
 
     def hang(
         self, name: str, masses_kg: list[float], settle_s: float, frame_rate_hz: float

@@ -7,7 +7,7 @@ import contextlib
 import os
 from collections.abc import Callable
 
-from haselab.base import SafetyError
+from haselab.base import SafetyError, checked
 from haselab.rig import Rig
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.signals import OrderlyEnd
@@ -16,6 +16,7 @@ from haselab.safety.state_machine import Safety, SafetySettings, Stage
 __all__ = ["arm_simulated", "armed", "ends_at_zero"]
 
 
+@checked
 def armed(
     rig: Rig, settings: SafetySettings | None = None, *, acknowledged: str = ""
 ) -> contextlib.AbstractContextManager[GuardedRig]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from haselab.base import HaselabError, InputError, Limits
 from haselab.rig import (
     Acquisition,
-    ClosesLoop,
+    BuiltInController,
     FunctionGenerator,
     HighVoltageSupply,
     LoadStand,
@@ -267,12 +267,12 @@ class GuardedSupply(_Part):
 
 
 class GuardedController(_Part):
-    """See `haselab.rig.ClosesLoop`."""
+    """See `haselab.rig.BuiltInController`."""
 
     _name = "controller"
     strain_limits: Limits
 
-    def __init__(self, bench: GuardedBench, plain: ClosesLoop) -> None:
+    def __init__(self, bench: GuardedBench, plain: BuiltInController) -> None:
         self._bench, self._plain = bench, plain
         vars(self)["strain_limits"] = plain.strain_limits
 
@@ -287,7 +287,7 @@ class GuardedController(_Part):
 
     @property
     def output_v(self) -> float:
-        """See `haselab.rig.ClosesLoop`."""
+        """See `haselab.rig.BuiltInController`."""
         return self._plain.output_v
 
 

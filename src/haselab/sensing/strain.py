@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, ResultError, checked
 from haselab.models.actuator.strain_map import StrainMap
 
 __all__ = ["DriftCheck", "MapKind", "drift_check", "fit_strain_map"]
@@ -45,6 +45,7 @@ class DriftCheck:
     verdict: str
 
 
+@checked
 def fit_strain_map(
     capacitance_f: ArrayLike, strain: ArrayLike, kind: MapKind = "auto", *, coverage: float = 0.95
 ) -> StrainMap:
@@ -77,8 +78,6 @@ def fit_strain_map(
         (True, True)
     """
     c, e = _checked(capacitance_f, strain, coverage)
-    if kind not in get_args(MapKind):
-        raise InputError(f"kind = {kind!r}; must be one of {', '.join(get_args(MapKind))}.")
     ends_f = (float(c.min()), float(c.max()))
     turns = _turns(c)
     record = _Record(c, e, _branches(c.size, turns), ends_f)
@@ -102,6 +101,7 @@ def fit_strain_map(
     )
 
 
+@checked
 def drift_check(
     fitted: StrainMap, capacitance_f: ArrayLike, strain: ArrayLike, time_s: ArrayLike
 ) -> DriftCheck:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, checked
 
 __all__ = ["constant", "linear_chirp", "multisine", "prbs", "square", "triangle"]
 
@@ -34,6 +34,7 @@ def _count(duration_s: float, rate_hz: float) -> int:
     return round(count)
 
 
+@checked
 def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:
     """Create a constant signal.
 
@@ -52,6 +53,7 @@ def constant(level: float, duration_s: float, rate_hz: float) -> NDArray[np.floa
     return np.full(_count(duration_s, rate_hz), float(level))
 
 
+@checked
 def triangle(
     low: float, high: float, frequency_hz: float, cycles: int, rate_hz: float
 ) -> NDArray[np.float64]:
@@ -72,12 +74,15 @@ def triangle(
         >>> triangle(0.0, 2.0, 0.25, 1, 2.0)
         array([0. , 0.5, 1. , 1.5, 2. , 1.5, 1. , 0.5])
     """
+    if not 0.0 < frequency_hz < np.inf:
+        raise InputError(f"frequency_hz is {frequency_hz:g}; it must be above 0 Hz and finite.")
     time_s = np.arange(_count(cycles / frequency_hz, rate_hz)) / rate_hz
     phase = (time_s * frequency_hz) % 1.0
     rise: NDArray[np.float64] = 1.0 - np.abs(2.0 * phase - 1.0)
     return low + (high - low) * rise
 
 
+@checked
 def linear_chirp(
     start_hz: float, stop_hz: float, duration_s: float, rate_hz: float
 ) -> NDArray[np.float64]:
@@ -109,6 +114,7 @@ def linear_chirp(
     return np.sin(2.0 * np.pi * (start_hz * time_s + 0.5 * sweep_hz_s * time_s**2))
 
 
+@checked
 def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np.float64]:
     """Create a square wave of plus and minus one, plus first: signs for alternating polarity.
 
@@ -133,6 +139,7 @@ def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np
     return np.where(np.floor(halves + 1e-9) % 2 == 0, 1.0, -1.0)
 
 
+@checked
 def prbs(
     bit_s: float, duration_s: float, rate_hz: float, register_start: int = 1
 ) -> NDArray[np.float64]:
@@ -174,6 +181,7 @@ def prbs(
     return np.repeat(signs, held)[:count]
 
 
+@checked
 def multisine(
     frequencies_hz: ArrayLike,
     duration_s: float,
@@ -203,7 +211,13 @@ def multisine(
         (1.0, True)
     """
     lines_hz = np.atleast_1d(np.asarray(frequencies_hz, dtype=np.float64))
-    share = np.broadcast_to(np.asarray(power, dtype=np.float64), lines_hz.shape)
+    share = np.asarray(power, dtype=np.float64)
+    if share.shape not in ((), lines_hz.shape):
+        raise InputError(
+            f"power has shape {share.shape} for {lines_hz.size} lines. Give one value for each, or "
+            "one for all."
+        )
+    share = np.broadcast_to(share, lines_hz.shape)
     inside = (lines_hz > 0.0) & (lines_hz < 0.5 * rate_hz)
     if not inside.all() or not (share >= 0.0).all() or not share.sum() > 0.0:
         raise InputError(

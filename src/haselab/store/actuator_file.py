@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,6 +23,7 @@ from haselab.store.toml import read_toml
 __all__ = [
     "ACTUATOR",
     "Provenance",
+    "check_writable",
     "hashed",
     "read_actuator",
     "read_run",
@@ -86,6 +88,24 @@ def read_actuator(path: Path) -> JsonObject:
     return read_toml(path, "actuator file")
 
 
+def check_writable(path: Path) -> None:
+    """Refuse a file that must not be written, before the work whose result it would hold.
+
+    Args:
+        path: of the file, or a link to it.
+    Raises:
+        InputError: the file or its folder is read-only.
+    """
+    file = path.resolve()
+    for place, what in ((file, "file"), (file.parent, "folder of this file")):
+        # The superuser may write everywhere, but a file without any write bit is not to be changed.
+        if not (os.access(place, os.W_OK) and place.stat().st_mode & 0o222):
+            raise InputError(
+                f"The {what} is read-only. Make it writable with chmod u+w, or write to a copy. "
+                f"{path}"
+            )
+
+
 def read_run(path: Path) -> JsonObject:
     """Read the sections of an actuator file, or of the folder of a run.
 
@@ -145,22 +165,23 @@ def write_section(
     """Write one section of an actuator file, and keep everything else.
 
     Args:
-        path: of an existing file.
+        path: of an existing file; the target of a link is written, and the link stays.
         section: name of the section: "model", "sensing.strain_map".
         values: its keys; nested mappings become tables; a value of None is left out.
         provenance: written to `[provenance.SECTION]`; None: not written.
         owned: keys that are removed from the section if `values` lacks them. Other keys and all
             comments are kept.
     Raises:
-        InputError: the file cannot be read, or a section is not a table.
+        InputError: the file cannot be read, is read-only, or a section is not a table.
         DeviceError: the file cannot be written.
     """
     read_actuator(path)  # TOML of a bounded depth
+    check_writable(path)
     changes: dict[str, tuple[Mapping[str, object], Collection[str]]] = {section: (values, owned)}
     if provenance is not None:
         origin = provenance.table()
         changes[f"provenance.{section}"] = (origin, list(origin))
-    write_text(path, _changed(read_text(path, "actuator file"), changes, path))
+    write_text(path.resolve(), _changed(read_text(path, "actuator file"), changes, path))
 
 
 def write_sections(

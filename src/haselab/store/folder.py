@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,9 @@ def drafted(path: Path) -> Iterator[Path]:
     """Write a file under a temporary name, and rename it when it is complete.
 
     Args:
-        path: of the file; an older one is replaced at the end, in one step. A link is replaced,
-            not followed. A pipe or a device is written to, not replaced.
+        path: of the file; an older one is replaced at the end, in one step, by one with the same
+            permissions. A link is replaced, not followed. A pipe or a device is written to, not
+            replaced.
     Yields:
         An empty file of a random name in the same folder, made by this process, with the same
         ending. It is removed where the context ends by an error.
@@ -39,6 +41,8 @@ def drafted(path: Path) -> Iterator[Path]:
     draft = path.with_name(f".haselab-{secrets.token_hex(8)}{path.suffix[:_LONGEST_ENDING]}")
     os.close(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY | _NO_LINK, 0o666))
     try:
+        if path.is_file() and not path.is_symlink():
+            draft.chmod(stat.S_IMODE(path.stat().st_mode))  # a private file stays private
         yield draft
         draft.replace(path)
     except BaseException:

@@ -1,7 +1,7 @@
 """Studies: experiments as objects, played and fitted, and what packages need to add their own."""
 
 from haselab.study.analysis import Analysis
-from haselab.study.experiment import Chart, Curve, Experiment, NotPlayedError, Outcome
+from haselab.study.experiment import Chart, Curve, Experiment, ExperimentResult, NotPlayedError
 from haselab.study.player import UPDATE_HZ, Player
 from haselab.study.quantity import Quantity
 
@@ -11,8 +11,8 @@ __all__ = [
     "Chart",
     "Curve",
     "Experiment",
+    "ExperimentResult",
     "NotPlayedError",
-    "Outcome",
     "Player",
     "Quantity",
 ]

@@ -9,9 +9,9 @@ from typing import Any, TypeVar, cast
 from haselab.base import HaselabError, InputError, ResultError
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
-from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult, NotPlayedError
 from haselab.study.fits.observe import Observation, Source
-from haselab.study.registry import experiment_classes
+from haselab.study.registry import EXPERIMENTS
 
 __all__ = ["Analysis", "AnyExperiment", "experiments_of", "fitting", "foreign"]
 
@@ -25,7 +25,9 @@ class _NotRecordedError(InputError):
 
 def experiments_of(study: Study) -> tuple[AnyExperiment, ...]:
     """The experiments of a study, in the order of playing."""
-    found = [cast("type[AnyExperiment]", kind).of(study) for kind in experiment_classes()]
+    tables = ("operating_point", *study.tables)
+    names = [name for name in EXPERIMENTS.packages() if name in tables]
+    found = [cast("type[AnyExperiment]", EXPERIMENTS.find(name)).of(study) for name in names]
     return tuple(experiment for experiment in found if experiment is not None)
 
 
@@ -48,7 +50,7 @@ class Analysis:
         rig: RigDescription,
         source: Source,
         on_fit: Callable[[str], None] = lambda what: None,
-        fitted: Callable[[Outcome], None] = lambda outcome: None,
+        fitted: Callable[[ExperimentResult], None] = lambda outcome: None,
         repeated: Mapping[type, object] | None = None,
         known: Mapping[type, object] | None = None,
     ) -> None:
@@ -58,7 +60,7 @@ class Analysis:
         self._repeated = {} if repeated is None else repeated
         self._known = known or {}
         self._seen: dict[str, Observation] = {}
-        self._outcomes: dict[str, Outcome | NotPlayedError] = {}
+        self._outcomes: dict[str, ExperimentResult | NotPlayedError] = {}
         self._under_way: list[str] = []
 
     def observe(self, name: str) -> Observation:
@@ -93,7 +95,7 @@ class Analysis:
                 )
         if kind in self._known:
             return cast("Value", self._known[kind])
-        tables = [c.table for c in experiment_classes() if kind in c.gives]
+        tables = [name for name, c in EXPERIMENTS.usable().items() if kind in c.gives]
         wanted = f"[{tables[0]}]" if tables else f"an experiment that finds a {kind.__name__}"
         raise NotPlayedError(f"needs {wanted}, which is not in this study")
 
@@ -116,7 +118,7 @@ class Analysis:
         repeated = self.repeated(kind)
         return self.need(kind) if repeated is None else repeated
 
-    def outcome(self, experiment: AnyExperiment) -> Outcome:
+    def outcome(self, experiment: AnyExperiment) -> ExperimentResult:
         """Return the outcome of an experiment's fit, which is made at the first call.
 
         Raises:
@@ -150,7 +152,7 @@ class Analysis:
         return found
 
 
-def _check_rows(experiment: AnyExperiment, found: Outcome) -> None:
+def _check_rows(experiment: AnyExperiment, found: ExperimentResult) -> None:
     """Refuse results for which the report has no row.
 
     Raises:

@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 from pydantic import ConfigDict, create_model, model_validator
 
 from haselab.base import InputError
-from haselab.controllers import controller_kind
+from haselab.controllers import CONTROLLERS
 from haselab.store.toml import Section, read_toml, validated
-from haselab.study.registry import table_types
+from haselab.study.registry import EXPERIMENTS, table_types
 from haselab.study.tables import (
     Chirp,
     Control,
@@ -165,8 +165,7 @@ def file_model(data: Mapping[str, Any]) -> type[_Head]:
     Args:
         data: of the file; keys that are not tables of experiments are refused.
     """
-    known = {name: kind for name, kind in table_types().items() if name in data}
-    fields: dict[str, Any] = {name: (kind, ...) for name, kind in known.items()}
+    fields: dict[str, Any] = {name: (kind, ...) for name, kind in table_types(data).items()}
     return create_model("StudyFile", __base__=_Head, **fields)
 
 
@@ -208,7 +207,7 @@ def _with_all_parameters(study: Study, path: Path) -> Study:
     if not study.has("control") or study.control.kind is None:
         return study
     control = study.control
-    values = dict(controller_kind(str(control.kind)).choose(control.parameters, path).values)
+    values = dict(CONTROLLERS.find(str(control.kind)).choose(control.parameters, path).values)
     return study.model_copy(update={"control": control.model_copy(update={"parameters": values})})
 
 
@@ -222,7 +221,7 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
         InputError: an unknown table, no experiment at all, or a value
             out of range.
     """
-    kinds = table_types()
+    kinds = [name for name in EXPERIMENTS.packages() if name not in _Head.model_fields]
     fields = {*_Head.model_fields, *kinds}
     if unknown := sorted(set(data) - fields):
         close = difflib.get_close_matches(unknown[0], fields, 1)
@@ -232,7 +231,7 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
             f"name.{meant} The known tables are {', '.join(sorted(fields - {'name'}))}. Change the "
             f"name, or install the package of the experiment. {source}"
         )
-    if not set(data) & set(kinds):
+    if not table_types(data):
         raise InputError(
             "The study has no experiment. Add at least one of the tables "
             f"{', '.join(f'[{name}]' for name in kinds)}. {source}"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from haselab.study.analysis import Analysis
     from haselab.study.player import Player
 
-__all__ = ["Chart", "Curve", "Experiment", "NotPlayedError", "Outcome"]
+__all__ = ["Chart", "Curve", "Experiment", "ExperimentResult", "NotPlayedError"]
 
 Settings = TypeVar("Settings", bound=Section)
 
@@ -82,7 +82,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ExperimentResult:
     """The result of an experiment's fit.
 
     Args:
@@ -171,7 +171,7 @@ class Experiment(ABC, Generic[Settings]):
         """
 
     @abstractmethod
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """Compute the results from the recording only, so that the fit can be repeated.
 
         Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from haselab.base import InputError
-from haselab.controllers import controller_kind
+from haselab.controllers import CONTROLLERS
 from haselab.models.actuator import ActuatorTables
 from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
@@ -53,7 +53,7 @@ def with_known(study: Study, tables: ActuatorTables) -> Study:
                 "[controller] has no limits, the range of its output. Design it with haselab "
                 "design, or add limits = {low = -0.05, high = 0.1}."
             )
-        chosen = controller_kind(held.kind).choose(_given(held.parameters, held.kind))
+        chosen = CONTROLLERS.find(held.kind).choose(_given(held.parameters, held.kind))
         changes["control"] = Control(
             kind=held.kind,
             parameters=dict(chosen.values),

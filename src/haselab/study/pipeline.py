@@ -11,7 +11,7 @@ from haselab.rig import RigDescription
 from haselab.runtime.runner import Runner
 from haselab.study.analysis import Analysis, foreign
 from haselab.study.definition import Study
-from haselab.study.experiment import Chart, NotPlayedError, Outcome
+from haselab.study.experiment import Chart, ExperimentResult, NotPlayedError
 from haselab.study.fits.observe import Source
 from haselab.study.player import Player
 
@@ -52,7 +52,7 @@ def investigate(
     runner: Runner | None = None,
     on_fit: Callable[[str], None] = lambda what: None,
     repeated: Mapping[type, object] | None = None,
-    fitted: Callable[[Outcome], None] = lambda outcome: None,
+    fitted: Callable[[ExperimentResult], None] = lambda outcome: None,
     known: Mapping[type, object] | None = None,
 ) -> Findings:
     """Play and fit all experiments of a study.
@@ -99,7 +99,7 @@ def investigate(
         except NotPlayedError as missing:
             reason = str(missing)
         if reason:
-            outcomes.append(Outcome(missing=dict.fromkeys(experiment.rows(), reason)))
+            outcomes.append(ExperimentResult(missing=dict.fromkeys(experiment.rows(), reason)))
     return Findings(
         quantities=_joined([part.quantities for part in outcomes]),
         notes=_joined_notes([part.notes for part in outcomes]),

@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable
-from importlib.metadata import EntryPoint, entry_points
+from collections.abc import Collection
 from typing import ClassVar, Protocol
 
-from haselab.base import InputError
+from haselab.base.registry import Registry
 from haselab.store.toml import Section
 
-__all__ = ["GROUP", "ExperimentClass", "experiment_classes", "table_types"]
-
-GROUP = "haselab.experiments"  # of entry points
-# In the order of playing; experiments of other packages follow.
-_BUILT_IN = {
-    "triangle": "haselab.study.experiments.triangle:TriangleTest",
-    "static_load": "haselab.study.experiments.static_load:StaticLoadTest",
-    "operating_point": "haselab.study.experiments.operating_point:OperatingPointTest",
-    "free_response": "haselab.study.experiments.free_response:FreeResponseTest",
-    "chirp": "haselab.study.experiments.chirp:ChirpTest",
-    "control": "haselab.study.experiments.design:ControllerDesign",
-    "steps": "haselab.study.experiments.steps:StepTest",
-}
+__all__ = ["EXPERIMENTS", "ExperimentClass", "table_types"]
 
 
 class ExperimentClass(Protocol):
@@ -33,44 +19,40 @@ class ExperimentClass(Protocol):
     gives: ClassVar[tuple[type, ...]]
 
 
-@functools.cache
-def experiment_classes() -> tuple[type[ExperimentClass], ...]:
-    """All classes of experiments, in the order of playing.
+def _fault(kind: object, name: str) -> str:
+    """Return what is wrong with the class of an entry point, or an empty text."""
+    table = getattr(kind, "table", None)
+    return "" if table == name else f"its attribute table is {table!r}"
 
+
+EXPERIMENTS: Registry[type[ExperimentClass]] = Registry(
+    "experiment",
+    "haselab.experiments",
+    {  # in the order of playing; experiments of other packages follow
+        "triangle": "haselab.study.experiments.triangle:TriangleTest",
+        "static_load": "haselab.study.experiments.static_load:StaticLoadTest",
+        "operating_point": "haselab.study.experiments.operating_point:OperatingPointTest",
+        "free_response": "haselab.study.experiments.free_response:FreeResponseTest",
+        "chirp": "haselab.study.experiments.chirp:ChirpTest",
+        "control": "haselab.study.experiments.design:ControllerDesign",
+        "steps": "haselab.study.experiments.steps:StepTest",
+    },
+    _fault,
+)
+
+
+def table_types(names: Collection[str]) -> dict[str, type[Section]]:
+    """The classes that check the tables of a study.
+
+    Args:
+        names: of the study's tables; other experiments are not loaded.
     Returns:
-        Those of haselab, then those of installed packages in the order of their names.
+        The classes by name, in the order of playing.
     Raises:
-        InputError: a package's experiment cannot be loaded, or its table has a name in use.
+        InputError: an experiment of an installed package cannot be used.
     """
-    built_in = [EntryPoint(name, value, GROUP) for name, value in _BUILT_IN.items()]
-    return _loaded([*built_in, *sorted(entry_points(group=GROUP), key=lambda point: point.name)])
-
-
-def _loaded(points: Iterable[EntryPoint]) -> tuple[type[ExperimentClass], ...]:
-    found: dict[str, type[ExperimentClass]] = {}
-    for point in points:
-        try:
-            loaded = point.load()
-            table = loaded.table
-        except Exception as error:  # another package's code may fail in any way
-            raise InputError(
-                f"The experiment {point.name!r} of an installed package ({point.value}) cannot be "
-                f"loaded: {type(error).__name__}: {error}. Repair or uninstall that package."
-            ) from error
-        if table in found:
-            raise InputError(
-                f"The experiment {point.name!r} ({point.value}) has the table [{table}], which "
-                f"{found[table].__module__} already uses. Rename its table, or uninstall its "
-                "package."
-            )
-        found[table] = loaded
-    return tuple(found.values())
-
-
-def table_types() -> dict[str, type[Section]]:
-    """The classes that check the tables of a study, by name, in the order of playing."""
     return {
-        kind.table: kind.settings_type
-        for kind in experiment_classes()
-        if kind.table != "operating_point"  # which every study has
+        name: EXPERIMENTS.find(name).settings_type
+        for name in EXPERIMENTS.packages()
+        if name in names and name != "operating_point"  # which every study has
     }

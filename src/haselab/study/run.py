@@ -20,8 +20,9 @@ from haselab.rig import Rig, RigDescription
 from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.camera_recorder import CameraRecorder, KeepVideo
+from haselab.runtime.lockin import lockin_of
 from haselab.runtime.observer import Observer
-from haselab.runtime.runner import Runner, lockin_of
+from haselab.runtime.runner import Runner
 from haselab.runtime.scheduling import with_priority
 from haselab.runtime.threaded_observer import ThreadedObserver
 from haselab.safety.armed import arm_simulated
@@ -35,7 +36,7 @@ from haselab.store.source_commit import source_commit
 from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study, checked_study
-from haselab.study.experiment import Outcome
+from haselab.study.experiment import ExperimentResult
 from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
 from haselab.study.known import known_values
@@ -149,7 +150,7 @@ def run_study(
     rig: Rig,
     options: RunOptions,
     progress: Progress,
-    fitted: Callable[[Outcome], None] = lambda outcome: None,
+    fitted: Callable[[ExperimentResult], None] = lambda outcome: None,
 ) -> Findings:
     """Play a study on a rig and fit all of it; the session file grows block by block.
 

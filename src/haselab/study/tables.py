@@ -115,7 +115,7 @@ class Steps(Section):
     rest_s: float = Field(ge=0, le=_DAY_S)
     frame_rate_hz: float = _frames
     open_trials: int = Field(ge=1, le=1000)
-    pi_trials: int = Field(ge=1, le=1000)
+    pi_trials: int = Field(ge=0, le=1000)
     pid_trials: int = Field(ge=0, le=1000)
     printed_chain_trials: int = Field(
         0, ge=0, le=100, description="with the PI and the paper's sensing chain"

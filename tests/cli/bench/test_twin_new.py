@@ -46,7 +46,7 @@ def test_it_prints_toml_or_json(capsys) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--kind", "muscle"), "Known kinds: "),
+        (("--kind", "muscle"), "No actuator 'muscle' is registered. Use one of "),
         (("--set", "shell.length_m"), "is not KEY=VALUE"),
         (("--set", "length_m=3"), "is not KEY=VALUE"),
         (("--set", "shell.length_m=long"), "is not KEY=VALUE"),

@@ -448,3 +448,38 @@ def test_units_need_no_header_of_their_own_kind(tmp_path):
     assert table.rate_hz == pytest.approx(RATE_HZ)
     with pytest.raises(InputError, match="states the unit 'lbf'"):
         read_table(tmp_path / "a.npz", ["U"], ColumnOptions(units={"U": "lbf"}))
+
+
+def test_sense_says_which_columns_it_converted(tmp_path, capsys):
+    path = tmp_path / "mv.csv"
+    path.write_text("U (mV),I (V)\n" + rows(1e3 * V, I))
+    asked = ("--v", "U", "--i", "I", "--carrier-hz", 2000, "--rate-hz", RATE_HZ)
+    assert code_of("sense", path, *asked) == 0
+    error = capsys.readouterr().err
+    assert f"haselab: column U was converted from mV to V. {path}\n" in error
+    assert "column I" not in error
+
+
+def test_the_note_of_a_small_drive_does_not_contradict_the_header(tmp_path, capsys):
+    strain = 0.05 * (1.0 - np.cos(2.0 * np.pi * np.arange(400) / 200.0))
+    volt = VoltageMap(1.324, 3.124, -0.2805, -26.92).voltage_v(strain)
+    path = tmp_path / "map.csv"
+    path.write_text("strain,U (mV)\n" + rows(strain, 1e3 * volt))
+    answer = answer_of(capsys, "identify", "voltage-map", path, "--voltage", "U")
+    (note,) = answer["notes"]
+    assert "ahead of the amplifier. If its unit is not V" in note and "kV" not in note
+
+
+def test_a_capacitance_map_shows_one_slope(tmp_path, capsys):
+    strain = 0.05 * (1.0 - np.cos(2.0 * np.pi * np.arange(800) / 200.0))
+    noise = 2e-13 * np.random.default_rng(2).normal(size=800)
+    path, actuator = tmp_path / "map.csv", tmp_path / "a.toml"
+    path.write_text("strain,capacitance_f\n" + rows(strain, 5e-10 * (1.0 + 2.0 * strain) + noise))
+    assert code_of("init", "leg", "--out", actuator) == 0
+    capsys.readouterr()
+    asked = ("identify", "capacitance-map", path, "--actuator", actuator)
+    assert code_of(*asked) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("slope") == 1
+    assert "cubic map with its band, for loops: written to [sensing.strain_map]" in shown
+    assert "slope_per_f" in answer_of(capsys, *asked)["strain_map"]

@@ -332,6 +332,36 @@ def test_a_session_states_everything_that_its_codes_need(tmp_path, monkeypatch):
         np.testing.assert_allclose(columns[name], values, rtol=5e-9)
 
 
+def test_updates_at_known_times_cost_no_accuracy(tmp_path):
+    """A staircase of the twin: as a session, which knows the updates, and as plain columns."""
+    bench = make_twin(TwinConfig(), 1)
+    bench.generator.sine(CARRIER_HZ, 0.02)
+    whole = {"rig": asdict(RIG), "study": {"sensing": {"carrier_hz": CARRIER_HZ}}}
+    codes = []
+    with SessionWriter(
+        tmp_path / "session.h5", [ExperimentPlan("play", "play", 1, {})], BLOCK, whole
+    ) as writer:
+        for k in range(80):
+            volt = 0.4 + 0.75 * (1.0 - np.cos(0.078 * k))  # steps of up to 59 mV
+            bench.source.write(volt)
+            codes.append(bench.acquisition.read())
+            writer.append_block("play", codes[-1], 7.0 + k * 0.01, volt, np.nan)
+    np.save(tmp_path / "monitors.npy", np.concatenate(codes) * RIG.volt_per_code)
+    known, sought = tmp_path / "known.csv", tmp_path / "sought.csv"
+    assert run(tmp_path / "session.h5", "--experiment", "play", "--out", known) == 0
+    options = [*ASK, "--skew-s", RIG.skew_s, "--out", sought]
+    assert run(tmp_path / "monitors.npy", *options) == 0
+    ours, theirs = read(known), read(sought)
+    assert ours["valid"].all()
+    both = theirs["valid"] > 0.0
+    assert both.sum() > 40
+    std, other = (columns["capacitance_std_f"][both] for columns in (ours, theirs))
+    # At worst the 15 carrier periods after the update count, and 19 of 20 without that knowledge.
+    assert np.median(std / other) < 1.05 * np.sqrt(19 / 15)
+    far = (ours["capacitance_f"] - theirs["capacitance_f"])[both] / np.hypot(std, other)
+    assert np.sqrt(np.mean(far**2)) < 1.0  # the same samples: less than independent errors
+
+
 @pytest.mark.parametrize(
     ("header", "options", "words"),
     [

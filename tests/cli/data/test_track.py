@@ -455,7 +455,7 @@ def test_a_recorded_video_that_changed_is_refused_or_marked(clip, tmp_path, caps
     run, points = tmp_path / "run", tmp_path / "p.csv"
     points.write_text("point,x_px,y_px\nupper,110,40\nlower,110,200\n")
     (run / "video").mkdir(parents=True)
-    video = run / "video" / "chirp.mkv"
+    video = run / "video" / "chirp.avi"
     shutil.copy(clip, video)
     seal(run, "SEALED", {})
     out = tmp_path / "tracks.csv"

@@ -8,6 +8,7 @@ import pytest
 
 from haselab.cli.main import main
 from haselab.control import PidGains, margins
+from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 from haselab.models.posterior import PlantPosterior
 
@@ -152,7 +153,129 @@ def test_compare_predicts_a_record_that_was_not_used(known, capsys):
     assert answer["fit_percent"] == pytest.approx(fit, abs=1e-9)
     code, text, error = run(capsys, "compare", actuator, first, "--json")
     assert code == 3 and json.loads(text)["status"].startswith("not a validation")
-    assert "Use another one" in error
+    assert "100 % of the samples were used for the fit. Use another record" in error
+    assert answer["used_for_fit"] == 0.0
+
+
+def rewritten(path, first, **how):
+    """The rows of a record in another text."""
+    rows = np.loadtxt(first, delimiter=",", skiprows=1)[how.pop("rows", slice(None))]
+    rows[:, 2] *= how.pop("factor", 1.0)
+    np.savetxt(path, rows, comments="", **how)
+    return path
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"fmt": "%.17g", "delimiter": ",", "header": "# exported\n# again\ntime_s,u,y"},
+        {"fmt": "%.12g", "delimiter": ";", "header": "time_s;u;y (%)", "factor": 100.0},
+        {"fmt": "%.9g", "delimiter": ",", "header": "time_s,u,y", "rows": slice(0, 600)},
+        {"fmt": "%.9g", "delimiter": ",", "header": "time_s,u,y", "rows": slice(333, 453)},
+    ],
+    ids=["preamble and digits", "percent", "half", "a tenth of it"],
+)
+@pytest.mark.parametrize("form", ["toml", "json"])
+def test_a_record_of_the_fit_is_known_by_its_samples(known, tmp_path, capsys, how, form):
+    model, first, _ = known
+    if form == "json":
+        model = tmp_path / "model.json"
+        assert run(capsys, "identify", "transfer", first, "--out", model)[0] == 0
+    again = rewritten(tmp_path / "again.csv", first, **how)
+    code, text, error = run(capsys, "compare", model, again, "--json")
+    answer = json.loads(text)
+    assert code == 3 and answer["used_for_fit"] == 1.0 and answer["fit_percent"] > 98.0
+    assert error.splitlines()[-1].startswith("haselab: not a validation: 100 %")
+
+
+def test_records_of_the_fit_are_known_after_an_export_and_a_design(known, tmp_path, capsys):
+    actuator, first, second = known
+    plant, other = tmp_path / "plant.json", tmp_path / "other.toml"
+    assert run(capsys, "export", actuator, "--to", "plant", "--out", plant)[0] == 0
+    assert run(capsys, "design", plant, "--out", other)[0] == 0
+    for model in (plant, other):
+        assert run(capsys, "compare", model, first)[0] == 3
+        assert run(capsys, "compare", model, second)[0] == 0
+
+
+def test_a_record_that_contains_the_one_of_the_fit_has_its_share(known, tmp_path, capsys):
+    actuator, first, second = known
+    rows = np.vstack([np.loadtxt(path, delimiter=",", skiprows=1) for path in (first, second)])
+    rows[:, 0] = np.arange(len(rows)) / RATE_HZ
+    both = tmp_path / "both.csv"
+    np.savetxt(both, rows, "%.9g", ",", header="time_s,u,y", comments="")
+    code, text, _ = run(capsys, "compare", actuator, both, "--json")
+    # 256 hashes below the limit in each half: 4 standard deviations of a binomial share
+    assert json.loads(text)["used_for_fit"] == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(512))
+    assert code == 3
+
+
+def test_a_prediction_worse_than_the_mean_is_not_ok(known, tmp_path, capsys):
+    actuator, _, second = known
+    wrong = rewritten(tmp_path / "wrong.csv", second, fmt="%.9g", delimiter=",",
+                      header="time_s,u,y", factor=-1.0)  # fmt: skip
+    code, text, error = run(capsys, "compare", actuator, wrong, "--json")
+    answer = json.loads(text)
+    assert code == 3 and answer["fit_percent"] < 0.0
+    assert answer["status"].startswith("the prediction is worse than the mean of the record")
+    assert "Check the columns, their units" in error
+
+
+EQ4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+MAP = "\n[drive.voltage_map]\na1_v = 1.324\nb1 = 3.124\na2_v = -0.2805\nb2 = -26.92\n"
+
+
+@pytest.fixture
+def driven(files, tmp_path):
+    """An actuator file with its voltage map, and two records in mV and %."""
+    actuator, *plain = files
+    actuator.write_text(actuator.read_text() + MAP)
+    for path in plain:
+        rows = np.loadtxt(path, delimiter=",", skiprows=1)
+        rows[:, 1:] = np.c_[1e3 * EQ4.voltage_v(rows[:, 1]), 100.0 * rows[:, 2]]
+        np.savetxt(path, rows, "%.9g", ";", header="t (s);U (mV);S (%)", comments="")
+    return actuator, *plain, ("--input", "U", "--output", "S")
+
+
+def test_units_that_contradict_the_model_are_refused(driven, capsys):
+    actuator, first, second, names = driven
+    through = "--through-voltage-map"
+    assert (
+        run(capsys, "identify", "transfer", first, *names, through, "--actuator", actuator)[0] == 0
+    )
+    model = tomllib.loads(actuator.read_text())["model"]
+    assert (model["input_unit"], model["output_unit"]) == ("1", "1")
+    assert run(capsys, "compare", actuator, second, *names, through)[0] == 0
+    code, _, error = run(capsys, "compare", actuator, second, *names)
+    assert code == 2 and error.splitlines()[-1] == (
+        "haselab: The model's input is a pure number, such as a strain, but column U is in V. Add "
+        f"--through-voltage-map: {second}"
+    )
+    second.write_text(second.read_text().replace("S (%)", "S (mm)"))
+    code, _, error = run(capsys, "compare", actuator, second, *names, through)
+    assert code == 2
+    assert "model's output is a pure number, such as a strain, but column S is in m. Name" in error
+    code, _, error = run(capsys, "identify", "transfer", first, second, *names)
+    assert code == 2 and "Column S is in m, but in another file a pure number" in error
+    swapped = ("--input", "S", "--output", "U", through, "--actuator", actuator)
+    code, _, error = run(capsys, "identify", "transfer", first, *swapped)
+    assert code == 2 and "converts a voltage, but column S is a pure number" in error
+
+
+def test_a_model_from_volts_takes_no_strain_map_and_no_limits_of_strain(driven, tmp_path, capsys):
+    actuator, first, second, names = driven
+    out = tmp_path / "volts.json"
+    assert (
+        run(capsys, "identify", "transfer", first, *names, "--actuator", actuator, "--out", out)[0]
+        == 0
+    )
+    code, _, error = run(capsys, "compare", actuator, second, *names, "--through-voltage-map")
+    assert code == 2 and "model's input is in V, but --through-voltage-map gives a strain" in error
+    code, _, error = run(capsys, "design", actuator)
+    assert code == 2 and "[drive.voltage_map] expects a strain" in error
+    code, _, error = run(capsys, "design", out)
+    assert code == 2 and "Give the limits in V with --limits LOW HIGH" in error
+    assert run(capsys, "design", out, "--limits", 0, 2)[0] == 0
 
 
 def test_another_actuator_is_seen_by_the_band(known, tmp_path, capsys):
@@ -205,6 +328,76 @@ def test_a_misspelled_key_is_warned_of_once_and_keys_of_ones_own_are_not(known, 
     assert error == line
 
 
+@pytest.mark.parametrize(
+    "command",
+    ["design {a}", "identify transfer no.csv --actuator {a}",
+     "calibrate --rig twin --capacitor 1e-9 --actuator {a}",
+     "identify capacitance-map no.csv --actuator {a}",
+     "identify voltage-map no.csv --actuator {a}"],
+)  # fmt: skip
+def test_a_read_only_file_is_refused_before_the_work(files, capsys, command):
+    actuator, *_ = files
+    text = actuator.read_text()
+    actuator.chmod(0o444)
+    code, _, error = run(capsys, *command.format(a=actuator).split())
+    assert code == 2 and error.count("\n") == 1 and "The file is read-only" in error
+    assert actuator.read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('kind = "planar-hasel"', 'kind = "unicorn"',
+         "[actuator] kind 'unicorn' is unknown; the known kinds are planar-hasel, dea-stack, "
+         "peano-hasel."),
+        ("[mine]", "[contorller]", "[contorller] has no effect; did you mean [controller]?"),
+        ("[mine]", "[Modle]", "[Modle] has no effect; did you mean [model]?"),
+    ],
+)  # fmt: skip
+def test_an_unknown_kind_and_a_misspelled_section_are_warned_of(known, capsys, old, new, said):
+    actuator, *_ = known
+    actuator.write_text(actuator.read_text().replace(old, new))
+    code, _, error = run(capsys, "design", actuator)
+    assert (code, error) == (0, f"haselab: warning: {said} {actuator}\n")
+
+
+def test_init_warns_of_an_unknown_kind_and_not_of_one_without_a_law(tmp_path, capsys):
+    code, _, error = run(capsys, "init", "a", "--kind", "unicorn", "--out", tmp_path / "a.toml")
+    assert code == 0 and error.startswith("haselab: warning: [actuator] kind 'unicorn' is unknown")
+    code, _, error = run(capsys, "init", "b", "--kind", "peano-hasel", "--out", tmp_path / "b.toml")
+    assert (code, error) == (0, "")
+
+
+_MAP = "[sensing.strain_map]\nslope_per_f = 4.9e8\noffset = -0.27\n"
+_CURVE = "[drive.voltage_map]\na1_v = 1.3\nb1 = 3.1\na2_v = -0.3\nb2 = -27.0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"{_MAP}range_f = [8e-10, 5e-10]", "range_f: Value error, [8e-10, 5e-10] must have the"),
+        (f"{_MAP}range_f = [nan, 5e-10]", "range_f.0: Input should be a finite number (got nan)"),
+        (f"{_MAP}band = [0.01, -0.01]", "band: Value error, [0.01, -0.01] must have the lower end"),
+        (f"{_MAP}hysteresis_strain = -0.1", "hysteresis_strain: Input should be greater than or"),
+        (f"{_CURVE}strain_low = 0.2\nstrain_high = 0.1", "strain_low = 0.2 must be below strain_"),
+        ("[drive]\nlow_v = 3\nhigh_v = 1", "drive: Value error, low_v = 3 must be below high_v"),
+        ("[drive]\nhighest_field_v_per_m = -1.0", "Input should be greater than 0 (got -1.0)"),
+        ("[controller]\nlimits = {low = 0.1, high = -0.05}", "low = 0.1 must be below high = -0"),
+        ('[[controller.alternatives]]\nkind = "x"\nlimits = {low = 0.1, high = 0.1}',
+         "alternatives.0.limits: Value error, low = 0.1 must be below high = 0.1"),
+        ("[controller.demands]\nphase_margin_deg = -5.0", "phase_margin_deg = -5; must be within"),
+    ],
+)  # fmt: skip
+def test_reversed_and_impossible_ranges_are_refused_when_the_file_is_read(
+    tmp_path, capsys, text, said
+):
+    actuator = tmp_path / "a.toml"
+    model = "[model]\ngain = 1.0\nnatural_frequency_rad_s = 30.0\ndamping_ratio = 0.1\n"
+    actuator.write_text(model + "rate_hz = 100.0\nloop_delay_s = 0.0075\n" + text + "\n")
+    code, _, error = run(capsys, "design", actuator)
+    assert code == 2 and said in error and error.endswith(f"{actuator}\n")
+
+
 def test_the_highest_field_lowers_the_limits_of_a_design(known, capsys):
     """1.28e7 V/m in 0.5 mm, 4000 V/V: 1.6 V, as of the test of high_v above."""
     actuator, *_ = known
@@ -224,3 +417,20 @@ def test_compare_draws_the_prediction_with_its_band(known, capsys, tmp_path):
     assert run(capsys, "compare", actuator, second, "--plot", figure)[0] == 0
     text = figure.read_text()
     assert "predicted, 95 % band" in text and "Measured less predicted" in text
+
+
+@pytest.mark.parametrize("section", ["drive.voltage_map", "sensing.strain_map"])
+@pytest.mark.parametrize(
+    ("matrix", "rows"), [("[[1.0, 0.0], [0.0]]", "[2, 1]"), ("[[1.0]]", "[1]")], ids=str
+)
+def test_a_ragged_covariance_of_a_map_is_one_line(files, tmp_path, capsys, section, matrix, rows):
+    actuator, *_ = files
+    numbers = "slope_per_f = 1e8\noffset = -0.1\n"
+    if section == "drive.voltage_map":
+        numbers = MAP.split("]\n")[1]
+    actuator.write_text(f"{actuator.read_text()}\n[{section}]\n{numbers}covariance = {matrix}\n")
+    code, _, error = run(capsys, "report", actuator, "--out", tmp_path / "page.html")
+    assert code == 2 and error == (
+        f"haselab: 1 error(s): {section}.covariance: Input should be 4 rows of 4 numbers, not rows "
+        f"of {rows}. Change these values. {actuator}\n"
+    )

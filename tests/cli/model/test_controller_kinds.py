@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from haselab.cli.main import main
-from haselab.controllers import ControllerKind, Parameter, registry
+from haselab.controllers import CONTROLLERS, ControllerKind, Parameter
 
 ACTUATOR = """\
 [model]
@@ -63,7 +63,7 @@ def actuator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         SimpleNamespace(name=name, value="plug_in", dist=None, load=lambda kind=kind: kind)
         for name, kind in KINDS.items()
     ]
-    monkeypatch.setattr(registry, "_entry_points", lambda: points)
+    monkeypatch.setattr(CONTROLLERS, "others", lambda: points)
     path = tmp_path / "a.toml"
     path.write_text(ACTUATOR)
     return path
@@ -109,7 +109,7 @@ def test_a_kind_without_one_is_refused_with_what_to_do(actuator, capsys, command
     assert code == 2 and error.count("\n") == 1
     assert "have no method linear_feedback, so their margins cannot be computed" in error
     code, _, error = run(capsys, command, actuator, "--controller", "nobody")
-    assert code == 2 and "No controller of kind 'nobody' is registered" in error
+    assert code == 2 and "No controller 'nobody' is registered" in error
 
 
 def test_an_unstable_loop_is_no_design(actuator, capsys) -> None:

@@ -21,13 +21,13 @@ from haselab.rig.twin.config import twin_of_reading
 from haselab.store.toml import toml_text
 from haselab.study.chip.rows import chip_rows
 from haselab.study.definition import builtin_study, step_study_of
-from haselab.study.experiment import Outcome
+from haselab.study.experiment import ExperimentResult
 from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.loops import Loops
 from haselab.study.fits.maps import Maps
 
 # What has to be fitted before they begin; its content is of no concern here.
-FITTED = Outcome(values=tuple(object.__new__(kind) for kind in (Maps, Dynamics, Loops)))
+FITTED = ExperimentResult(values=tuple(object.__new__(kind) for kind in (Maps, Dynamics, Loops)))
 DATA = Path(__file__).resolve().parents[2] / "firmware" / "data"
 
 

@@ -15,7 +15,7 @@ from haselab.base import ResultError
 from haselab.cli.study.noise_free_run import NoiseFreeRun, SentValues
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.definition import Study, builtin_study, checked_study
-from haselab.study.experiment import Outcome
+from haselab.study.experiment import ExperimentResult
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.static import Static
 from haselab.study.run import noise_free_results
@@ -74,14 +74,14 @@ def test_a_process_that_ends_early_takes_nothing_but_its_results(study: Study) -
     with NoiseFreeRun(CONFIG, study) as run:
         run._process.kill()
         run._process.wait()
-        run.start(Outcome(values=(1.0,)))
+        run.start(ExperimentResult(values=(1.0,)))
         with pytest.raises(ResultError, match=r"noise-free run ended early: exit code -9\."):
             run.results()
 
 
 def test_a_value_that_cannot_be_sent_is_named(study: Study) -> None:
     with NoiseFreeRun(CONFIG, study) as run:
-        run.start(Outcome(values=(lambda: None,)))
+        run.start(ExperimentResult(values=(lambda: None,)))
         with pytest.raises(
             ResultError, match=r"A value that the study plays cannot be sent: .*lambda"
         ):

@@ -118,7 +118,8 @@ def test_the_highest_field_of_the_file_limits_the_drive(
     geometry = "[actuator.geometry]\n"
     leg.write_text(text.replace(geometry, f"{geometry}gap_m = 0.5e-3\n", 1))
     assert run("run", known / "triangle.toml", *arguments) == 2
-    assert "1.5" in capsys.readouterr().err
+    said = f"[0, 1.5] V. Lower the request, or widen the limit in [drive] of {leg}."
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -176,7 +176,7 @@ def test_further_ctrl_c_in_the_clean_up_leave_it_alone(tmp_path: Path) -> None:
     assert len(run.sent_at_v) >= 5
     assert run.sent_at_v[0] > 100.0
     assert run.events[-1] == "ended by KeyboardInterrupt; output at 0 V"
-    with open_video(run.folder / "video" / "triangle.mkv") as video:
+    with open_video(run.folder / "video" / "triangle.avi") as video:
         times_s = [time for time, _ in video.timed()]
     with SessionReader(run.folder / "session.h5") as session:
         frames = session.experiment("triangle").frame_time_s
@@ -192,7 +192,7 @@ def test_a_disk_that_fills_up_with_video_ends_at_zero_with_4(tmp_path: Path) -> 
     run = play(tmp_path, "nowhere", keep="all", start=limit)
     assert run.code == 4
     assert run.stdout == ""
-    video = run.folder / "video" / "triangle.mkv"
+    video = run.folder / "video" / "triangle.avi"
     assert run.line.startswith("haselab: The video cannot be written (File too large). Free disk")
     assert run.line.endswith(str(video))
     assert (run.output_v, run.carrier_v) == (0.0, 0.0)

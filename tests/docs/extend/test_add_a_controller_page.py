@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from haselab.base import table_at
 from haselab.controllers import Measurement
 from haselab.rig.chip.build import simavr_header
+from haselab.store.actuator_file import ACTUATOR, read_run, write_sections
 from haselab.store.session.writer import SessionReader
 
 pytest.importorskip("setuptools", reason="builds the package of the page")
@@ -22,6 +24,9 @@ PACKAGE = ROOT / "examples" / "plugins" / "haselab-mycontroller"
 TEXT = (ROOT / "docs" / "extend" / "add-a-controller.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    ((?:cp|pip|haselab) .*)", TEXT, re.MULTILINE)
 SNIPPET = re.search(r"```python\n(.*?)```", TEXT, re.DOTALL)
+PROJECT = re.search(r"```toml\n(\[project\]\n.*?)```", TEXT, re.DOTALL)
+STUDY = re.search(r"```toml\n(name = .*?)```", TEXT, re.DOTALL)
+OWN = [command for command in COMMANDS if re.search(r"my-package|mine\.toml", command)]
 CONTROL = re.search(r"```toml\n(\[control\]\n.*?)```", TEXT, re.DOTALL)
 
 
@@ -49,15 +54,38 @@ def test_the_class_of_the_page_is_a_controller() -> None:
     assert controller.step(0.04, Measurement(0.02, 6e-10, 1.0, 0.0)) == pytest.approx(0.05)
 
 
+@pytest.mark.long
+def test_the_study_of_the_page_plays_its_controller_alone(lab) -> None:
+    assert SNIPPET is not None and PROJECT is not None and STUDY is not None and len(OWN) == 2
+    package = lab.folder / "my-package"
+    package.mkdir()
+    (package / "my_package.py").write_text(SNIPPET[1])
+    (package / "pyproject.toml").write_text(PROJECT[1])
+    (lab.folder / "mine.toml").write_text(STUDY[1])
+    lab.run_all(OWN)
+    results = lab.json("out/proportional/results.json")
+    rows = {row["id"]: row for row in results["quantities"]}
+    opened, own = (rows[key]["measured"]["value"] for key in ("S24.error_open", "S25.error_own"))
+    assert f"{-100 * opened:.0f} % of the step in open loop" in TEXT
+    assert f"{-100 * own:.0f} % with this controller" in TEXT
+    # y = G (r + k (r - y)) with G = y / r of the open loop; 0.35 % is the camera's resolution, and
+    # the maps are not quite linear.
+    assert own == pytest.approx(opened / (1.0 + 0.5 * (1.0 - opened)), abs=0.01)
+    assert "S24.rise_closed" not in rows and "S25.rise_pid" not in rows
+    shown = lab.json("out/proportional/analysis.json")["steps"]["groups"]
+    assert list(shown) == ["open loop", "proportional"]
+    shutil.rmtree(lab.folder / "out")
+
+
 @pytest.mark.slow
 def test_the_commands_of_the_page_do_what_it_says(lab) -> None:
     has_chip = shutil.which("avr-gcc") is not None and simavr_header() is not None
     wanted = lab.run(f"haselab run {PACKAGE}/study.toml --rig twin.toml --out out/none")
     assert wanted.returncode == 2
-    assert "Known kinds: open-loop, pi, pid. Install the package" in wanted.stderr
+    assert "Use one of open-loop, pi, pid, or install the package" in wanted.stderr
     assert not (lab.folder / "out").exists()
     told = {}
-    for command in COMMANDS:
+    for command in (one for one in COMMANDS if one not in OWN):
         if not has_chip and re.search("firmware|chip", command):
             continue
         done = lab.run(command)
@@ -66,6 +94,34 @@ def test_the_commands_of_the_page_do_what_it_says(lab) -> None:
     check_study(lab.folder / "out")
     if has_chip:
         check_chip(lab.folder / "out", told)
+
+
+def test_the_commands_for_the_chip_work_with_the_maps_of_any_study(make_shell) -> None:
+    """The page's last commands alone, on the small study of the firmware's tests."""
+    if shutil.which("avr-gcc") is None or simavr_header() is None:
+        pytest.skip("avr-gcc or libsimavr is not installed")
+    shell = make_shell("chip", PACKAGE)
+    run = read_run(ROOT / "tests" / "firmware" / "data")
+    assert CONTROL is not None
+    control = tomllib.loads(CONTROL[1])["control"]
+    mine = {"kind": control.pop("kind"), "parameters": control}
+    controller = dict(table_at(run, "controller")) | {"alternatives": [mine]}
+    write_sections(shell.folder / "out" / "mine" / ACTUATOR, dict(run) | {"controller": controller})
+    told = {}
+    for command in [c for c in COMMANDS if re.match("cp|pip", c) or re.search("firmware|chip", c)]:
+        done = shell.run(command)
+        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+        told[command] = done.stdout
+    assert "CRC-32" in (shell.folder / "out" / "mine-firmware" / "settings.h").read_text()
+    simulated = next(text for command, text in told.items() if "simulate" in command)
+    assert "not compared: only the step of a PI or PID is predicted" in simulated
+    assert re.findall(r"loop +(.*)", simulated) == [
+        "desktop, 100 Hz", "desktop, 1000 Hz", "chip, 1000 Hz"
+    ]  # fmt: skip
+    _, fast, chip = map(float, re.findall(r"steady_state_error +(\S+)", simulated))
+    # The two sense with different instruments: 0.5 % strain of a step of 4 %, as in test_safety.py.
+    assert abs(chip - fast) < 5e-3 / 0.04
+    check_steps(shell.folder / "out")
 
 
 def check_study(out: Path) -> None:
@@ -107,6 +163,11 @@ def check_chip(out: Path, told: dict[str, str]) -> None:
     assert set(ends) == {"desktop, 100 Hz", "desktop, 1000 Hz", "chip, 1000 Hz"}
     # The two sense with different instruments: 0.5 % strain, as in test_safety.py.
     assert abs(ends["chip, 1000 Hz"] - ends["desktop, 1000 Hz"]) < 5e-3
+    check_steps(out)
+
+
+def check_steps(out: Path) -> None:
+    """The trial on the chip ends at its reference, but for what creep moves within the step."""
     rows = json.loads((out / "mine-chip" / "results.json").read_text())["quantities"]
     error = next(row for row in rows if row["id"] == "S26.error")["measured"]["value"]
     assert abs(error) < 0.05

@@ -43,10 +43,10 @@ def results(folder: Path, name: str) -> Any:
 
 
 def test_the_page_has_what_is_run_here() -> None:
-    from haselab.study.registry import experiment_classes
+    from haselab.study.registry import EXPERIMENTS
 
     assert len(COMMANDS) == 6
-    assert [kind.table for kind in experiment_classes()] == TABLES
+    assert list(EXPERIMENTS.packages()) == TABLES
 
 
 def test_a_study_of_one_triangle_has_its_results_and_no_others(folder: Path) -> None:

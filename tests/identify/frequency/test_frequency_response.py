@@ -6,6 +6,7 @@ from scipy.signal import csd, max_len_seq, welch
 
 from haselab.base import InputError
 from haselab.identify.frequency.response import estimate_frequency_response
+from haselab.identify.record import Record
 from haselab.models import Plant
 
 OMEGA = float(np.sqrt(26.14))
@@ -15,6 +16,13 @@ SWEEP = np.sin(2 * np.pi * (0.1 * TIME_S + 0.5 * 0.99 * TIME_S**2))
 CLEAN = PLANT.simulate(SWEEP, 400.0, TIME_S)
 # |error|^2/std^2 of a complex normal is exponential: 95 % below -ln 0.05 = 1.73^2.
 INSIDE = float(np.sqrt(-np.log(0.05)))
+
+
+def estimate(u, y, rate_hz, *, hold="zero", **how):
+    """The response from vectors, or from lists with one vector for each record."""
+    pairs = zip(u, y, strict=True) if np.ndim(u[0]) else [(u, y)]
+    records = [Record.sampled(a, b, rate_hz, hold=hold) for a, b in pairs]
+    return estimate_frequency_response(records, **how)
 
 
 def truth(response):
@@ -40,7 +48,7 @@ def calibration(runs, noisy_of, **how):
 
 
 def test_one_sweep_without_noise_gives_the_plant():
-    response = estimate_frequency_response(SWEEP, CLEAN, 400.0)
+    response = estimate(SWEEP, CLEAN, 400.0)
     swept = response.frequency_hz <= 9.0
     error = np.abs(response.response / truth(response) - 1)[swept]
     # What is left is aliasing of the held input's images at 400 Hz: (0.81/400)^2 of the gain.
@@ -52,9 +60,7 @@ def test_one_sweep_without_noise_gives_the_plant():
 def test_intervals_hold_on_all_lines_of_a_sweep_and_no_line_is_biased(level_db):
     def one(run, how):
         noise = np.random.default_rng([5, level_db, run]).normal(size=4000)
-        return estimate_frequency_response(
-            SWEEP, CLEAN + noise * CLEAN.std() / 10 ** (level_db / 20), 400.0, **how
-        )
+        return estimate(SWEEP, CLEAN + noise * CLEAN.std() / 10 ** (level_db / 20), 400.0, **how)
 
     runs = 40
     at_hz, ratio = calibration(runs, one)
@@ -77,14 +83,14 @@ def test_several_sweeps_are_pooled_whatever_their_lengths():
         noisy = CLEAN + rng.normal(size=4000) * CLEAN.std() / np.sqrt(1e3)
         again = CLEAN + rng.normal(size=4000) * CLEAN.std() / np.sqrt(1e3)
         pair = [SWEEP, SWEEP[shorter]], [noisy, again[shorter]]
-        return estimate_frequency_response(*pair, 400.0, **how)
+        return estimate(*pair, 400.0, **how)
 
     runs = 25
     at_hz, ratio = calibration(runs, one)
     inside = (np.abs(ratio) <= INSIDE)[:, at_hz < 6.0]
     assert inside.mean() >= 0.945 - 4 * np.sqrt(0.055 * 0.945 / (6 * runs))
     both = one(0, {})
-    alone = estimate_frequency_response(SWEEP, CLEAN + 0 * SWEEP, 400.0)
+    alone = estimate(SWEEP, CLEAN + 0 * SWEEP, 400.0)
     assert np.array_equal(both.frequency_hz[:80], alone.frequency_hz[:80])
 
 
@@ -92,7 +98,7 @@ def test_the_polynomial_form_and_welch_fail_where_the_rational_one_holds():
     near = (0.5, 1.2)
 
     def worst(method):
-        response = estimate_frequency_response(SWEEP, CLEAN, 400.0, method=method)
+        response = estimate(SWEEP, CLEAN, 400.0, method=method)
         inside = (response.frequency_hz > near[0]) & (response.frequency_hz < near[1])
         return float(np.abs(response.response / truth(response) - 1)[inside].max())
 
@@ -114,7 +120,7 @@ DRIVES = {
 @pytest.mark.parametrize("drive", DRIVES)
 def test_the_warning_comes_for_a_sweep_or_step_and_for_nothing_else(drive, segment_s):
     u = DRIVES[drive](np.random.default_rng(1))
-    response = estimate_frequency_response(
+    response = estimate(
         u, PLANT.simulate(u, 400.0, TIME_S), 400.0, method="h1", segment_s=segment_s
     )
     warned = any("like a single sweep" in note for note in response.notes)
@@ -124,7 +130,7 @@ def test_the_warning_comes_for_a_sweep_or_step_and_for_nothing_else(drive, segme
 def test_h1_and_its_coherence_are_those_of_scipy():
     rng = np.random.default_rng(2)
     u, y = rng.normal(size=4000), rng.normal(size=4000)
-    response = estimate_frequency_response(u, y, 400.0, method="h1", segment_s=1.25, held=False)
+    response = estimate(u, y, 400.0, method="h1", segment_s=1.25, hold="band-limited")
     at_hz, cross = csd(u, y, 400.0, nperseg=500)
     left, right = welch(u, 400.0, nperseg=500)[1], welch(y, 400.0, nperseg=500)[1]
     same = np.isin(at_hz.round(6), response.frequency_hz.round(6))
@@ -141,8 +147,8 @@ def test_each_average_is_right_for_noise_on_its_side(method, on):
         u = rng.normal(size=8000)
         y = 2.0 * u + (on != "u") * 2.0 * rng.normal(size=8000)
         seen = u + (on != "y") * rng.normal(size=8000)
-        response = estimate_frequency_response(seen, y, 100.0, method=method, segment_s=5.0,
-                                               held=False)  # fmt: skip
+        response = estimate(seen, y, 100.0, method=method, segment_s=5.0,
+                                               hold="band-limited")  # fmt: skip
         gains.append(np.abs(response.response).mean())
         inside.append(np.abs(response.response - 2.0) <= INSIDE * response.std)
         assert 0.2 < response.coherence.mean() < 0.7
@@ -155,7 +161,7 @@ def test_each_average_is_right_for_noise_on_its_side(method, on):
 def test_one_segment_says_that_it_has_no_spread():
     rng = np.random.default_rng(4)
     u = rng.normal(size=400)
-    response = estimate_frequency_response(u, u, 100.0, method="h1", segment_s=4.0)
+    response = estimate(u, u, 100.0, method="h1", segment_s=4.0)
     assert np.isinf(response.std).all()
     assert "no standard deviation" in response.notes[0]
 
@@ -168,7 +174,7 @@ def test_periods_are_averaged_without_waiting_for_the_transient(periods):
 
     def one(run, how):
         noise = np.random.default_rng([7, run]).normal(size=drive.size) * clean.std() / np.sqrt(1e3)
-        return estimate_frequency_response(drive, clean + noise, 400.0, method="periodic",
+        return estimate(drive, clean + noise, 400.0, method="periodic",
                                            period_s=10.0)  # fmt: skip
 
     runs = 25
@@ -188,7 +194,7 @@ def test_several_realisations_show_nonlinear_distortion_and_one_drive_does_not()
     def answer(cubic, inputs):
         outputs = [PLANT.simulate(u + cubic * u**3, 400.0, time_s) for u in inputs]
         outputs = [y + 1e-4 * rng.normal(size=y.size) for y in outputs]
-        return estimate_frequency_response(
+        return estimate(
             inputs, outputs, 400.0, method="periodic", period_s=10.0
         )  # fmt: skip
 
@@ -214,8 +220,8 @@ def test_a_measured_input_with_noise_of_its_own_keeps_the_intervals_of_periods()
     for run in range(20):
         rng = np.random.default_rng([9, run])
         noisy = [x + rng.normal(size=x.size) for x in (drive, y)]
-        response = estimate_frequency_response(*noisy, 400.0, method="periodic", period_s=10.0,
-                                               held=False)  # fmt: skip
+        response = estimate(*noisy, 400.0, method="periodic", period_s=10.0,
+                                               hold="band-limited")  # fmt: skip
         driven = response.frequency_hz < 10.05
         inside += list(np.abs(response.response - 2.0)[driven] <= INSIDE * response.std[driven])
     assert np.mean(inside) == pytest.approx(0.945, abs=5 * np.sqrt(0.05 / 400))
@@ -223,7 +229,7 @@ def test_a_measured_input_with_noise_of_its_own_keeps_the_intervals_of_periods()
 
 def test_the_charts_agree_with_the_response():
     noise = 0.01 * np.random.default_rng(10).normal(size=4000)
-    response = estimate_frequency_response(SWEEP, CLEAN + noise, 400.0)
+    response = estimate(SWEEP, CLEAN + noise, 400.0)
     bode, nyquist, nichols = response.bode(), response.nyquist(), response.nichols()
     turned = bode.magnitude * np.exp(1j * bode.phase_rad)
     assert np.allclose(turned, response.response)
@@ -241,8 +247,8 @@ def test_the_charts_agree_with_the_response():
 @pytest.mark.long
 def test_the_hold_of_the_input_is_taken_out_or_left_in():
     u = np.random.default_rng(3).normal(size=2000)
-    held = estimate_frequency_response(u, u, 100.0)
-    raw = estimate_frequency_response(u, u, 100.0, held=False)
+    held = estimate(u, u, 100.0)
+    raw = estimate(u, u, 100.0, hold="band-limited")
     assert np.allclose(raw.response, 1.0)
     expected = 1.0 / np.sinc(held.frequency_hz / 100.0)
     assert np.abs(np.abs(held.response) / expected - 1).max() < 1e-3
@@ -253,7 +259,7 @@ def test_the_arrays_of_the_caller_stay_as_they_are():
     for how in ({}, {"method": "h1"}, {"method": "periodic", "period_s": 10.0}):
         arrays = (np.tile(u, 2), np.tile(y, 2))
         kept = [x.copy() for x in arrays]
-        estimate_frequency_response(*arrays, 400.0, **how)
+        estimate(*arrays, 400.0, **how)
         assert all(np.array_equal(a, b) for a, b in zip(arrays, kept, strict=True))
 
 
@@ -264,11 +270,11 @@ RAMP = np.arange(100.0)
     ("arguments", "how", "match"),
     [
         ((RAMP, RAMP[:99], 1.0), {}, "must be equally long"),
-        (([RAMP, RAMP], [RAMP], 1.0), {}, "2 records and y 1"),
         ((np.ones(100), RAMP, 1.0), {}, "excites nothing"),
         ((RAMP, RAMP, 0.0), {}, "rate_hz = 0 Hz"),
-        ((RAMP[:50], RAMP[:50], 1.0), {}, "at least 64"),
+        ((RAMP[:50], RAMP[:50], 1.0), {}, "A record has 50 samples; it must have 64 or more"),
         ((np.where(RAMP == 3, np.nan, RAMP), RAMP, 1.0), {}, "nan at index 3"),
+        ((RAMP, RAMP, 1.0), {"hold": "first"}, "have the hold first; it must be zero for all"),
         ((RAMP, RAMP, 1.0), {"method": "etfe"}, "method = etfe; must be one of rational"),
         ((RAMP, RAMP, 1.0), {"method": "periodic"}, "the method periodic requires a period"),
         ((RAMP, RAMP, 1.0), {"period_s": 2.0}, "and the other methods take none"),
@@ -281,7 +287,21 @@ RAMP = np.arange(100.0)
 )
 def test_bad_records_and_options_are_refused(arguments, how, match):
     with pytest.raises(InputError, match=match):
-        estimate_frequency_response(*arguments, **how)
+        estimate(*arguments, **how)
+
+
+def test_one_record_is_as_good_as_a_list_of_one():
+    record = Record.sampled(SWEEP, CLEAN, 400.0)
+    one, several = estimate_frequency_response(record), estimate_frequency_response([record])
+    assert np.array_equal(one.response, several.response)
+
+
+def test_records_of_several_rates_or_other_times_are_refused():
+    slow, fast = (Record.sampled(RAMP, RAMP, rate_hz) for rate_hz in (1.0, 2.0))
+    with pytest.raises(InputError, match=r"rates of 1 to 2 Hz, but one estimate needs one rate"):
+        estimate_frequency_response([slow, fast])
+    with pytest.raises(InputError, match=r"100 inputs at 1 Hz and 100 outputs at other times"):
+        estimate_frequency_response(Record(RAMP, 1.0, RAMP, RAMP + 0.3))
 
 
 FAST = Plant(0.02, 32.0, 0.12, 0.012)
@@ -301,8 +321,8 @@ def test_a_clipped_output_has_no_result_and_an_unclipped_one_has(drive, more):
     half = 0.5 * float(np.abs(y - 1.0).max())
     noise = 0.02 * y.std() * np.random.default_rng(12).normal(size=y.size)
     for free in (y, y + half * np.linspace(-1.0, 1.0, y.size)):
-        assert estimate_frequency_response(u, free + noise, 200.0, **more).status == "ok"
-    response = estimate_frequency_response(u, np.minimum(y, 1.0 + half) + noise, 200.0, **more)
+        assert estimate(u, free + noise, 200.0, **more).status == "ok"
+    response = estimate(u, np.minimum(y, 1.0 + half) + noise, 200.0, **more)
     assert not response.succeeded
     # The median of rows whose noise is normal: known to a tenth of its deviation with 100 of them.
     limit = float(response.status.split("stays at ")[1].split()[0])
@@ -314,7 +334,7 @@ def test_an_output_that_rests_at_its_extremes_is_not_clipped(drive):
     rng = np.random.default_rng(13)
     u = DRIVES[drive](rng)
     y = PLANT.simulate(u, 400.0, TIME_S)
-    response = estimate_frequency_response(u, y + 0.02 * rng.normal(size=y.size) * y.std(), 400.0)
+    response = estimate(u, y + 0.02 * rng.normal(size=y.size) * y.std(), 400.0)
     assert response.status == "ok"
 
 
@@ -326,7 +346,7 @@ def test_circles_hold_about_a_resonance_wider_than_the_narrow_window():
     inside = []
     for run in range(24):
         noise = 5e-4 * np.random.default_rng([14, run]).normal(size=clean.size)
-        response = estimate_frequency_response(sweep, clean + noise, 200.0)
+        response = estimate(sweep, clean + noise, 200.0)
         true = FAST.frequency_response(2 * np.pi * response.frequency_hz)
         near = np.abs(response.frequency_hz - 5.1) < 1.5
         inside.append(np.mean((np.abs(response.response - true) <= INSIDE * response.std)[near]))

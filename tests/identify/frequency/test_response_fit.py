@@ -6,6 +6,7 @@ import pytest
 from haselab.base import InputError, ResultError
 from haselab.identify.frequency.fit import fit_response
 from haselab.identify.frequency.response import estimate_frequency_response
+from haselab.identify.record import Record
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.models import Plant, SlowMode
 
@@ -85,7 +86,7 @@ def test_one_sweep_by_local_models_gives_the_numbers_near_the_bound():
     errors, inside = [], np.zeros(4)
     for run in range(runs):
         noise = std * np.random.default_rng([3, run]).normal(size=4000)
-        response = estimate_frequency_response(sweep, clean + noise, 400.0)
+        response = estimate_frequency_response(Record.sampled(sweep, clean + noise, 400.0))
         estimates = [response.fit().parameters[name] for name in NAMES]
         errors.append([e.value - t for e, t in zip(estimates, TRUTH, strict=True)])
         inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, TRUTH, strict=True)]

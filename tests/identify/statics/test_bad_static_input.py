@@ -127,7 +127,7 @@ def test_strain_in_other_units_is_refused() -> None:
 def test_voltage_that_cannot_be_is_refused_and_what_may_be_kilovolts_is_reported() -> None:
     assert "at most 100000 V" in refusal(fit_voltage_map, STRAIN, 1e6 * VOLTS)
     notes = fit_voltage_map(STRAIN, VOLTS).notes
-    assert any("if the column is in kV, multiply it by 1000" in note for note in notes)
+    assert any("If its unit is not V, state the unit" in note for note in notes)
     assert not any("kV" in note for note in fit_voltage_map(STRAIN, 2000.0 * VOLTS).notes)
 
 

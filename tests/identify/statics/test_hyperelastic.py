@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from haselab.base import InputError
 from haselab.identify.statics.hyperelastic import (
-    SheetTest,
+    TensileTest,
     fit_hyperelastic,
     fit_hyperelastic_tests,
 )
@@ -207,7 +207,7 @@ OGDEN_1972 = OgdenThreeTerms(
 
 def sheet_test(pairs, kind):
     x, y = np.array(pairs).T
-    return SheetTest(x, y * KGF_CM2, Deformation(kind))
+    return TensileTest(x, y * KGF_CM2, Deformation(kind))
 
 
 def treloar():
@@ -266,7 +266,7 @@ def test_three_kinds_of_test_give_the_published_ogden_law_back():
         x = np.linspace(1.05, top, 80)
         deformation = Deformation(kind)
         stress_pa = OGDEN_1972.nominal_stress_pa(*deformation.stretches(x))
-        tests.append(SheetTest(x, stress_pa + 300.0 * rng.normal(size=80), deformation))
+        tests.append(TensileTest(x, stress_pa + 300.0 * rng.normal(size=80), deformation))
     fit = fit_hyperelastic_tests(tests, "ogden-3")
     order = [("mu3_pa", "alpha3"), ("mu1_pa", "alpha1"), ("mu2_pa", "alpha2")]
     for place, pair in enumerate(order, start=1):
@@ -409,7 +409,7 @@ def test_two_terms_are_distinguished_and_named_by_rising_exponent():
     for kind in ("uniaxial", "equibiaxial"):
         deformation, x = Deformation(kind), np.linspace(1.0, 3.0, 100)
         stress_pa = truth.nominal_stress_pa(*deformation.stretches(x))
-        tests.append(SheetTest(x, stress_pa + 20.0 * rng.normal(size=100), deformation))
+        tests.append(TensileTest(x, stress_pa + 20.0 * rng.normal(size=100), deformation))
     fit = fit_hyperelastic_tests(tests, "ogden-2")
     for name, value in truth.parameters().items():
         assert abs(fit.best.parameters[name].value - value) <= 4.0 * fit.best.parameters[name].std

@@ -95,7 +95,7 @@ def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('kind = "muscle"\n', "No actuator of kind 'muscle' is registered"),
+        ('kind = "muscle"\n', "No actuator 'muscle' is registered"),
         ('kind = "dea-stack"\n[actuator]\nlayer = 3.0\n', "actuator.layer is not a parameter"),
         ('kind = "dea-stack"\n[actuator]\nlayers = 0.0\n', "actuator.layers = 0 is outside"),
         ('kind = "dea-stack"\n[shell]\nlength_m = 0.05\n', "the table shell describes"),

@@ -24,16 +24,17 @@ def read_back(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(time_s), np.stack(images)
 
 
+@pytest.mark.parametrize("name", ["a.mkv", "a.avi"])
 @pytest.mark.parametrize("shape", [(48, 64), (512, 512), (47, 65), (64, 4)])
-def test_frames_come_back_exact_to_the_grey_level_in_their_order(tmp_path, shape):
+def test_frames_come_back_exact_to_the_grey_level_in_their_order(tmp_path, shape, name):
     images = pictures(23, shape)
     images[3], images[4] = 0, 255
     time_s = 12.5 + np.cumsum(np.random.default_rng(1).uniform(0.002, 0.003, 23))
-    writer = VideoWriter(tmp_path / "new" / "a.mkv", 400.0)
+    writer = VideoWriter(tmp_path / "new" / name, 400.0)
     for part in np.array_split(np.arange(23), 7):
         writer.append(images[part], time_s[part])
     writer.close()
-    back_s, back = read_back(tmp_path / "new" / "a.mkv")
+    back_s, back = read_back(tmp_path / "new" / name)
     np.testing.assert_array_equal(back, images)
     # The reader counts from the first frame; the table itself holds the acquisition's clock.
     np.testing.assert_allclose(back_s, time_s - time_s[0], atol=1e-12)

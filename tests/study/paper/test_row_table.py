@@ -9,7 +9,7 @@ import pytest
 
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import describe
-from haselab.runtime.runner import counted_s, lockin_of
+from haselab.runtime.lockin import counted_s, lockin_of
 from haselab.study.paper.paper_check import recompute_paper
 from haselab.study.paper.row_table import markdown_table, study_rows
 from haselab.study.results import quantities

@@ -266,7 +266,7 @@ def command(
     if out is not None and out.is_dir():
         raise InputError(f"--out names a folder, not a file. Name a file in it. {out}")
     if actuator is not None:
-        load_actuator(actuator)
+        load_actuator(actuator, to_write=True)
     request = _Request(**options)
     if len(request.references) < 2:
         raise InputError(

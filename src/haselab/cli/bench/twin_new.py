@@ -10,7 +10,7 @@ from typing import Any
 import click
 from pydantic import BaseModel
 
-from haselab.actuators import PlanarHasel, actuator_kind
+from haselab.actuators import ACTUATORS, PlanarHasel
 from haselab.base import InputError
 from haselab.cli.common import answer_options
 from haselab.cli.options import shared_option
@@ -58,7 +58,7 @@ def _data(kind: str, name: str, values: Sequence[str]) -> dict[str, Any]:
     """Tables of TWIN.toml from the options."""
     data: dict[str, Any] = {"name": name, "kind": kind}
     if kind != PLANAR_HASEL:
-        law = actuator_kind(kind)
+        law = ACTUATORS.find(kind)
         data["actuator"] = {about.name: getattr(law, about.name) for about in law.described()}
     for given in values:
         key, equals, value = given.partition("=")
@@ -80,7 +80,7 @@ def _data(kind: str, name: str, values: Sequence[str]) -> dict[str, Any]:
 
 
 def _lines(config: TwinConfig) -> Iterator[str]:
-    law = PlanarHasel if config.kind == PLANAR_HASEL else actuator_kind(config.kind)
+    law = PlanarHasel if config.kind == PLANAR_HASEL else ACTUATORS.find(config.kind)
     yield '# A simulated bench. Use it in a rig file: kind = "twin", twin = "THIS FILE".'
     yield f"name = {json.dumps(config.name)}"
     yield f"kind = {json.dumps(config.kind)}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from haselab import sensing
 from haselab.base import InputError, ResultError
 from haselab.base.chart import Chart, Curve, Panel
-from haselab.cli.columns import advice_on_columns, column_options
+from haselab.cli.columns import advice_on_columns, column_options, note_conversions
 from haselab.cli.common import (
     REAL,
     actuator_option,
@@ -264,6 +264,9 @@ def _sense(
     summary, collected = Summary(), Collected()
     with ExitStack() as opened:
         source = open_source(path, request, opened)
+        if source.session is None:
+            names = (request.v_column, request.i_column)
+            note_conversions(dict(zip(names, source.stream.units, strict=True)), path)
         doubt = "" if source.session is None else source.session.doubt
         sinks: list[_Sink] = [summary]
         if as_json or plot is not None:

@@ -44,7 +44,7 @@ def overlay_to(path: Path | None, frame_count: int) -> Overlay:
     if path is None:
         return _Nothing()
     if path.suffix.lower() == ".png":
-        # Drawing takes a third of a second to load, which most calls do not need.
+        # DrawnFigure takes a third of a second to load, which most calls do not need.
         from haselab.cli.data.contact_sheet import ContactSheet
 
         return ContactSheet(path, frame_count)

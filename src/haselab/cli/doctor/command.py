@@ -19,7 +19,7 @@ import click
 from haselab import __version__
 from haselab.base import DeviceError, HaselabError
 from haselab.cli.common import answer_options
-from haselab.cli.doctor.controllers import controller_findings
+from haselab.cli.doctor.extensions import extension_findings
 from haselab.cli.doctor.machine import Finding, Machine
 from haselab.cli.doctor.system import examine_system
 from haselab.cli.options import shared_option
@@ -27,7 +27,7 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.chip.build import simavr_header
 from haselab.rig.instruments.instrument import Instrument, SystemNeeds
-from haselab.rig.instruments.registry import Driver, camera_of, installed
+from haselab.rig.instruments.registry import INSTRUMENTS, camera_of
 from haselab.rig.real_bench import identify
 from haselab.rig.rig_file import load_rig
 from haselab.safety.gate import Gate
@@ -91,19 +91,19 @@ def _tool(name: str) -> Finding:
     return Finding("program", name, True, path)
 
 
-def _driver(driver: Driver) -> Iterator[Finding]:
+def _driver(kind: str, package: str) -> Iterator[Finding]:
     """Check what one kind of instrument needs on this computer."""
     try:
-        instrument = driver.load()
+        instrument = INSTRUMENTS.find(kind)()
     except DeviceError as error:
-        what, _, advice = str(error).partition(". ")
-        yield Finding("driver", driver.kind, False, what, advice)
+        what, _, advice = str(error).rpartition(". ")
+        yield Finding("driver", kind, False, what, advice)
         return
-    needs = f"For {instrument.purpose or driver.kind}"
-    source = "pip install 'haselab[instruments]'" if driver.is_own else f"see {driver.package}"
-    if not driver.is_own:
-        detail = f"section {instrument.section}, package {driver.package}"
-        yield Finding("driver", driver.kind, True, detail)
+    needs = f"For {instrument.purpose or kind}"
+    source = "pip install 'haselab[instruments]'" if package == "haselab" else f"see {package}"
+    if package != "haselab":
+        detail = f"section {instrument.section}, package {package}"
+        yield Finding("driver", kind, True, detail)
     yield from (_package(name, "optional", f"{needs}: {source}") for name in instrument.packages)
     if instrument.library:
         yield _library(instrument, needs)
@@ -178,9 +178,9 @@ def _examine() -> list[Finding]:
             _package(name, "optional", f"For {purpose}: pip install 'haselab[formats]'")
             for name, purpose in _OPTIONAL.items()
         ),
-        *(finding for driver in installed() for finding in _driver(driver)),
+        *(finding for each in INSTRUMENTS.packages().items() for finding in _driver(*each)),
         *(_tool(name) for name in _TOOLS),
-        *controller_findings(),
+        *extension_findings(),
         _twin(),
     ]
 

@@ -46,6 +46,8 @@ __all__ = [
     "read_record",
     "read_valid",
     "recorded",
+    "unit_of_name",
+    "unit_text",
 ]
 
 FILE = click.argument("file", type=click.Path(path_type=Path))
@@ -135,12 +137,12 @@ class Recorded:
     Args:
         records: one for each part without gaps.
         notes: how uneven times were treated.
-        input_unit: "V", or "" if the input has another unit or an unknown one.
+        units: SI units of input and output, "1" for a pure number; "" where the file states none.
     """
 
     records: list[Record]
     notes: list[str]
-    input_unit: str
+    units: tuple[str, str]
 
 
 def recorded(
@@ -170,11 +172,16 @@ def recorded(
         LimitError: a voltage outside the voltage map.
     """
     table = read_columns(file, names, columns)
-    unit = _input_unit(table, names[0])
+    units = (_unit(table, names[0]), _unit(table, names[1]))
     if through is not None:
+        if units[0] not in ("", "V"):
+            raise InputError(
+                f"--through-voltage-map converts a voltage, but column {names[0]} is "
+                f"{unit_text(units[0])}. Leave out the option, or name another column: {file}"
+            )
         to_volt = load_actuator(through).voltage_map()
         strain = to_volt.strain(table[names[0]])
-        table, unit = replace(table, columns={**table.columns, names[0]: strain}), ""
+        table, units = replace(table, columns={**table.columns, names[0]: strain}), ("1", units[1])
     time_s = table.time_s if table.rate_hz is None else None
     if time_s is not None and held_at_hz is None:
         axis = time_axis(time_s, file, table.time_name or "time_s")
@@ -186,17 +193,26 @@ def recorded(
                 f"Every part between gaps of column {table.time_name} is too short or constant. "
                 f"Record without gaps: {file}"
             )
-        return Recorded(records, notes, unit)
+        return Recorded(records, notes, units)
     rate = rate_hz_of(table, rate_hz, file)
     u, y = (table[name] for name in names)
-    return Recorded([Record.sampled(u, y, rate, hold=hold, held_at_hz=held_at_hz)], [], unit)
+    return Recorded([Record.sampled(u, y, rate, hold=hold, held_at_hz=held_at_hz)], [], units)
 
 
-def _input_unit(table: Table, name: str) -> str:
-    """Return "V" if the file or the name of the column states a voltage, else ""."""
+def unit_of_name(name: str) -> str:
+    """SI unit of columns with such a name, as haselab writes them; "" where it says nothing."""
+    return "1" if name.endswith("strain") else "V" if name.endswith("_v") else ""
+
+
+def unit_text(unit: str) -> str:
+    """A unit in a sentence."""
+    return "a pure number, such as a strain" if unit == "1" else f"in {unit}"
+
+
+def _unit(table: Table, name: str) -> str:
+    """SI unit that the file or the name of the column states."""
     stated = table.units.get(name)
-    is_voltage = name.endswith("_v") if stated is None else stated.si == "V"
-    return "V" if is_voltage else ""
+    return unit_of_name(name) if stated is None else stated.si
 
 
 def read_valid(

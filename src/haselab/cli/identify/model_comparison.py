@@ -16,7 +16,7 @@ from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, 
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.charts import odds_chart
-from haselab.identify.model_comparison.agreement import Agreement, agree
+from haselab.identify.model_comparison.agreement import Agreement, compare_estimates
 from haselab.identify.model_comparison.comparison import CandidateModel, ModelComparison, compare
 from haselab.identify.model_comparison.hypotheses import (
     QUESTIONS,
@@ -167,7 +167,7 @@ def _agreement(files: Sequence[Path], key: str, risk: float) -> Agreement:
     for file in files:
         name = file.stem if file.stem not in estimates else str(file)
         estimates[name] = _estimate(file, key)
-    return agree(estimates, risk=risk)
+    return compare_estimates(estimates, risk=risk)
 
 
 def _estimate(file: Path, key: str) -> Estimate:

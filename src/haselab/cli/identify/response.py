@@ -20,6 +20,7 @@ from haselab.identify.free.response import FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
 from haselab.identify.frequency.response import RESPONSE_METHODS, estimate_frequency_response
 from haselab.identify.frequency.response_chart import response_chart
+from haselab.identify.record import Record
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table
@@ -69,12 +70,11 @@ def frequency_response(
     The answer includes coherence and standard deviations. Several FILES give one estimate.
     """
     tables = [read_valid(file, [source, output], columns) for file in files]
+    rate = _common_rate_hz(tables, rate_hz, files)
+    hold = "band-limited" if choice["measured_input"] else "zero"
     response = estimate_frequency_response(
-        [table[source] for table in tables],
-        [table[output] for table in tables],
-        _common_rate_hz(tables, rate_hz, files),
+        [Record.sampled(table[source], table[output], rate, hold=hold) for table in tables],
         method=choice["method"],
-        held=not choice["measured_input"],
         period_s=choice["period_s"],
         segment_s=choice["segment_s"],
     )

@@ -31,7 +31,11 @@ from haselab.cli.identify.common import (
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
-from haselab.identify.statics.hyperelastic import HyperelasticFit, SheetTest, fit_hyperelastic_tests
+from haselab.identify.statics.hyperelastic import (
+    HyperelasticFit,
+    TensileTest,
+    fit_hyperelastic_tests,
+)
 from haselab.identify.statics.regions import find_regions
 from haselab.identify.statics.voltage_map import fit_voltage_map
 from haselab.models import DEFORMATIONS, LAWS, Deformation
@@ -41,6 +45,7 @@ __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
 Floats = NDArray[np.float64]
 _KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
+_FOR_LOOPS = "cubic map with its band, for loops: written to [sensing.strain_map]"
 _LOWEST = shared_option("--stretch-min", type=REAL, detail="Default: no limit.")
 _HIGHEST = shared_option("--stretch-max", type=REAL, detail="Default: no limit.")
 
@@ -123,7 +128,7 @@ def hyperelastic(
         wanted = {STRETCH: test["stretch_column"], STRESS: test["stress_column"]}
         stretch, stress = read_quantities(file, wanted, columns)
         stretch, stress = _between(stretch, stress, stretch_min, stretch_max, file)
-        tests.append(SheetTest(stretch, stress, kind))
+        tests.append(TensileTest(stretch, stress, kind))
     fit = fit_hyperelastic_tests(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )
@@ -252,7 +257,7 @@ def voltage_map(
     order of time.
     """
     if actuator is not None:
-        load_actuator(actuator)
+        load_actuator(actuator, to_write=True)
     strain, voltage_v = read_quantities(
         file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns
     )
@@ -292,13 +297,14 @@ def capacitance_map(
     is per F for a capacitance in F, and per unit of relative capacitance otherwise.
     """
     if actuator is not None:
-        load_actuator(actuator)
+        load_actuator(actuator, to_write=True)
     files = [file] if strain_file is None else [file, strain_file]
     pairs = read_pairs(files, capacitance_column, strain_column, columns)
     fit = fit_capacitance_map(pairs.capacitance, pairs.strain)
     more: dict[str, object] = {}
     if actuator is not None and fit.succeeded:
         section = save_strain_map(actuator, pairs, files)
-        more = {"strain_map": {name: part for name, part in section.items() if part is not None}}
+        found = {name: part for name, part in section.items() if part is not None}
+        more = {"strain_map": found if as_json or out is not None else _FOR_LOOPS}
     give(fit, files, as_json, out, more)
     save_plot(plot, fit.chart)

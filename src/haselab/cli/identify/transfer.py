@@ -22,6 +22,7 @@ from haselab.cli.identify.common import (
     about,
     give,
     recorded,
+    unit_text,
 )
 from haselab.cli.model.sections import MODEL_KEYS, model_section
 from haselab.cli.options import shared_option
@@ -143,10 +144,10 @@ def transfer(
             "--actuator."
         )
     if actuator is not None:
-        load_actuator(actuator)  # before a long fit
+        load_actuator(actuator, to_write=True)  # before a long fit
     records: list[Record] = []
     notes: list[str] = []
-    unit = ""
+    units = ("", "")
     for file in files:
         with about(file):
             found_records = recorded(
@@ -160,7 +161,7 @@ def transfer(
             )
             records += found_records.records
             notes += found_records.notes
-            unit = found_records.input_unit
+            units = _agreed(units, found_records.units, (source, output))
     found: TransferFit | TransferChoice
     fit: TransferFit
     if options["nonlinear"] and options["choose"]:
@@ -178,7 +179,9 @@ def transfer(
             fit = found.fit
         else:
             found = fit = fit_transfer(records, structure)
-    more: dict[str, Any] = {}
+    modelled = "strain" if options["through_voltage_map"] else source
+    more: dict[str, Any] = {"input": modelled, "output": output}
+    more |= {f"{end}_unit": unit for end, unit in zip(more, units, strict=True) if unit}
     if notes:
         more["notes"] = [*fit.notes, *notes]
     if options["bootstrap"] is not None and fit.succeeded:
@@ -190,8 +193,7 @@ def transfer(
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
     if actuator is not None:
-        modelled = "strain" if options["through_voltage_map"] else source
-        _save(actuator, fit, (modelled, output), unit, files)
+        _save(actuator, fit, (modelled, output), units, files)
     save_plot(plot, lambda: fit.chart((source, output)))
 
 
@@ -199,7 +201,7 @@ def _save(
     actuator: Path,
     fit: TransferFit,
     names: tuple[str, str],
-    unit: str,
+    units: tuple[str, str],
     files: tuple[Path, ...],
 ) -> None:
     """Write [model] of the actuator file."""
@@ -208,8 +210,21 @@ def _save(
             f"[model] of an actuator file needs a linear model, but the fit is {fit.kind}. Leave "
             f"out --nonlinear, or write the model with --out. {actuator}"
         )
-    section = model_section(fit, *names, unit)
+    section = model_section(fit, names, units)
     save_section(actuator, "model", section, files, MODEL_KEYS)
+
+
+def _agreed(
+    known: tuple[str, str], new: tuple[str, str], names: tuple[str, str]
+) -> tuple[str, str]:
+    """Units of input and output; files that state different ones are refused."""
+    for name, one, other in zip(names, known, new, strict=True):
+        if one and other and one != other:
+            raise InputError(
+                f"Column {name} is {unit_text(other)}, but in another file {unit_text(one)}. One "
+                "model needs one quantity. Fit the files separately, or state the unit with --unit."
+            )
+    return known[0] or new[0], known[1] or new[1]
 
 
 def _varied(choices: Sequence[str]) -> list[str]:

@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import ResultError, table_at
+from haselab.base import InputError, ResultError
 from haselab.cli.columns import column_options
 from haselab.cli.common import REAL, SEED, answer_options, emit
-from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, about, recorded
+from haselab.cli.identify.common import (
+    FILES,
+    INPUT,
+    OUTPUT,
+    RATE,
+    about,
+    recorded,
+    unit_of_name,
+    unit_text,
+)
 from haselab.cli.model.charts import prediction_chart
-from haselab.cli.model.model_file import read_any_plant, read_posterior
+from haselab.cli.model.model_file import read_any_plant, read_origin, read_posterior
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import predict
 from haselab.identify.record import Record
-from haselab.store.actuator_file import read_actuator
+from haselab.models.actuator.model_tables import OriginTable
 from haselab.store.columns.selection import ColumnOptions
-from haselab.store.manifest import sha256_of
 
 __all__ = ["command"]
 
-_KNOWN = "not a validation: this record was used for the fit. Use another one"
 _NO_BAND = "no uncertainty: the model has no covariance"
 
 
@@ -62,32 +70,65 @@ def command(
 
     MODEL is an actuator file or a model.json. The command reports the fit in percent, the rms error
     and the share of samples inside the 95 % band. It first estimates the initial state and the
-    offset of each record, unless --at-rest is given.
+    offset of each record, unless --at-rest is given. Samples that were used for the fit are
+    recognised by their values, also in a part of a record and in another format: used_for_fit is
+    their share, and the exit code is 3 from 5 % on, or if the prediction is worse than the mean.
     """
-    plant, posterior = read_any_plant(model), read_posterior(model)
+    plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
     through = model if through_voltage_map else None
     records = []
     for file in files:
         with about(file):
             found = recorded(file, (source, output), rate_hz, held_at_hz, columns, through=through)
+            _check_units(origin, found.units, (source, output), through_voltage_map)
             records += found.records
     with about(*files):
-        found_prediction = predict(
+        prediction = predict(
             plant,
             records,
             posterior=posterior,
-            noise_std=_noise_std(model),
+            noise_std=origin.residual_std,
             free_start=not at_rest,
+            fitted_to=origin.fitted_to,
             rng=np.random.default_rng(seed),
         )
-    used = [file for file in files if sha256_of(file) in _used(model)]
-    answer = _answer(found_prediction, posterior is not None, used)
-    emit(answer, as_json=as_json, out=out)
+    if not origin.fitted_to:
+        click.echo(
+            "haselab: warning: the model does not state the samples that it was fitted to. Whether "
+            f"this record is new was not checked. {model}",
+            err=True,
+        )
+    emit(_answer(prediction, posterior is not None), as_json=as_json, out=out)
     names = ", ".join(file.name for file in files)
-    title = f"Prediction of {names}: {found_prediction.fit_percent:.1f} %"
-    save_plot(plot, lambda: prediction_chart(found_prediction, _times(records), title))
-    if used:
-        raise ResultError(f"{_KNOWN}. {used[0]}")
+    title = f"Prediction of {names}: {prediction.fit_percent:.1f} %"
+    save_plot(plot, lambda: prediction_chart(prediction, _times(records), title))
+    if prediction.status != "ok":
+        raise ResultError(f"{prediction.status}. {' '.join(map(str, files))}")
+
+
+def _check_units(
+    origin: OriginTable, units: tuple[str, str], names: tuple[str, str], mapped: bool
+) -> None:
+    """Refuse columns whose units contradict those of the model."""
+    stated = (
+        origin.input_unit or unit_of_name(origin.input),
+        origin.output_unit or unit_of_name(origin.output),
+    )
+    for end, column, wanted, unit in zip(("input", "output"), names, stated, units, strict=True):
+        if not (wanted and unit) or wanted == unit:
+            continue
+        if end == "input" and mapped:
+            raise InputError(
+                f"The model's input is {unit_text(wanted)}, but --through-voltage-map gives a "
+                "strain. Leave out the option"
+            )
+        advice = f"Name another column with --{end}"
+        if (end, wanted, unit) == ("input", "1", "V"):
+            advice = "Add --through-voltage-map"
+        raise InputError(
+            f"The model's {end} is {unit_text(wanted)}, but column {column} is {unit_text(unit)}. "
+            f"{advice}"
+        )
 
 
 def _times(records: Sequence[Record]) -> NDArray[np.float64]:
@@ -99,26 +140,7 @@ def _times(records: Sequence[Record]) -> NDArray[np.float64]:
     return np.concatenate(parts)
 
 
-def _model_table(model: Path) -> Mapping[str, object]:
-    table = read_actuator(model).get("model", {}) if model.suffix.lower() == ".toml" else {}
-    return table if isinstance(table, dict) else {}
-
-
-def _noise_std(model: Path) -> float:
-    """Root mean square of the fit's residuals; 0 if the file does not state it."""
-    value = _model_table(model).get("residual_std", 0.0)
-    return float(value) if isinstance(value, (int, float)) else 0.0
-
-
-def _used(model: Path) -> list[str]:
-    """Hashes of the files that [model] was identified from."""
-    if model.suffix.lower() != ".toml":
-        return []
-    hashes = table_at(read_actuator(model), "provenance", "model").get("sha256", [])
-    return [str(item) for item in hashes] if isinstance(hashes, list) else []
-
-
-def _answer(found: Prediction, has_band: bool, used: list[Path]) -> dict[str, object]:
+def _answer(found: Prediction, has_band: bool) -> dict[str, object]:
     return {
         "fit_percent": found.fit_percent,
         "rms_error": found.rms_error,
@@ -127,5 +149,6 @@ def _answer(found: Prediction, has_band: bool, used: list[Path]) -> dict[str, ob
         if has_band
         else _NO_BAND,
         "samples": found.measured.size,
-        "status": _KNOWN if used else "ok",
+        "used_for_fit": None if math.isnan(found.used_for_fit) else found.used_for_fit,
+        "status": found.status,
     }

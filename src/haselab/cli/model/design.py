@@ -20,6 +20,7 @@ from haselab.cli.model.model_file import (
     loop_options,
     read_any_plant,
     read_loop,
+    read_origin,
     read_posterior,
 )
 from haselab.cli.model.sections import (
@@ -40,7 +41,7 @@ from haselab.control import (
     margins,
 )
 from haselab.control.plants.general import AnyPlant
-from haselab.control.stability.plausible import PlausibleMargins, share_of
+from haselab.control.stability.plausible import PlausibleMargins, binomial_proportion
 from haselab.models.posterior import PlantPosterior
 from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
@@ -100,6 +101,8 @@ def command(
     The margins include the delay of the loop. If the model has a covariance, plausible plants are
     drawn from it, and the share of them that keeps the margins is reported.
     """
+    if out is None and model.suffix.lower() == ".toml":
+        load_actuator(model, to_write=True)
     if loop["structure"] not in ("pi", "pid"):
         _judge(model, out, loop, as_json, plot)
         return
@@ -177,12 +180,15 @@ def _judge(
 
 def _demands(model: Path, spec: Path | None) -> DesignSpec:
     """The demands of --spec, else those of the actuator file, else the built-in ones."""
+    table: Mapping[str, object] = {}
     if spec is not None:
-        return _read_spec(spec)
-    if model.suffix.lower() != ".toml":
-        return DesignSpec()
-    typed = load_actuator(model).controller
-    return DesignSpec() if typed is None else DesignSpec.from_mapping(typed.demands)
+        table = read_toml(spec, "specification")
+    elif model.suffix.lower() == ".toml" and (typed := load_actuator(model).controller):
+        table = typed.demands
+    try:
+        return DesignSpec.from_mapping(table)
+    except InputError as error:
+        raise InputError(f"{error} {spec or model}") from None
 
 
 def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path | None) -> None:
@@ -191,7 +197,8 @@ def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path 
     if out is not None:
         write_text(out, read_text(model) if own else "# Model and controller of haselab design\n")
         if not own:
-            table = {**read_any_plant(model).to_dict(), **_loop_and_covariance(model)}
+            origin = read_origin(model).model_dump(exclude_defaults=True)
+            table = {**origin, **read_any_plant(model).to_dict(), **_loop_and_covariance(model)}
             save_section(out, "model", table, [model], MODEL_KEYS)
     target = out or (model if own else None)
     if target is not None:
@@ -249,9 +256,9 @@ def _designed(
 def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
     """Shares of the plausible plants: stable, phase margin kept, gain margin kept, both kept."""
     return {
-        "stable": share_of(found.stable),
-        "phase_margin": share_of(found.keeps_phase),
-        "gain_margin": share_of(found.keeps_gain),
+        "stable": binomial_proportion(found.stable),
+        "phase_margin": binomial_proportion(found.keeps_phase),
+        "gain_margin": binomial_proportion(found.keeps_gain),
         "margins": found.share,
     }
 
@@ -303,11 +310,3 @@ def _answer(design: Design) -> dict[str, Any]:
         "shortfalls": list(design.shortfalls),
         **more,
     }
-
-
-def _read_spec(path: Path) -> DesignSpec:
-    try:
-        return DesignSpec.from_mapping(read_toml(path, "specification"))
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if str(path) in text else f"{text} {path}") from None

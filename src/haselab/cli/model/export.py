@@ -8,7 +8,7 @@ import click
 
 from haselab.base import InputError
 from haselab.cli.common import answer_options, emit
-from haselab.cli.model.model_file import MAT_NAME, read_model
+from haselab.cli.model.model_file import MAT_NAME, read_model, read_origin
 from haselab.cli.options import shared_option
 from haselab.store.columns.mat_struct import write_mat_struct
 
@@ -46,9 +46,10 @@ def command(
         "input": input_name or rational.input_name,
         "output": output_name or rational.output_name,
     }
-    data = rational.to_dict() | names
+    origin = read_origin(model).model_dump(exclude_defaults=True)
+    data = rational.to_dict() | origin | names
     if form == "plant":
-        emit({"plant": rational.to_plant().to_dict()}, as_json=as_json, out=out)
+        emit({"plant": rational.to_plant().to_dict(), **origin}, as_json=as_json, out=out)
         return
     if form == "json":
         emit(data, as_json=as_json, out=out)

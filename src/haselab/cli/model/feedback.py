@@ -7,7 +7,7 @@ from pathlib import Path
 from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.control import LinearController, PidGains
-from haselab.controllers import LinearisableController, controller_kind
+from haselab.controllers import CONTROLLERS, LinearisableController
 from haselab.models.actuator import ControllerSection
 
 __all__ = ["feedback_of", "held_controller"]
@@ -27,7 +27,7 @@ def held_controller(path: Path, kind: str | None) -> ControllerSection:
     tables = load_actuator(path)
     held = {} if tables.controller is None else tables.controller.all_kinds
     if kind is not None and kind not in held and kind not in ("pi", "pid"):
-        return ControllerSection(kind=controller_kind(kind).name)
+        return ControllerSection(kind=CONTROLLERS.find(kind).name)
     try:
         return tables.designed(kind)
     except InputError as error:
@@ -47,7 +47,7 @@ def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearCon
     """
     if held.kind in ("pi", "pid"):
         return PidGains(**held.parameters)
-    controller = controller_kind(held.kind).choose(held.parameters).make()
+    controller = CONTROLLERS.find(held.kind).choose(held.parameters).make()
     if not isinstance(controller, LinearisableController):
         raise InputError(
             f"Controllers of kind {held.kind!r} have no method linear_feedback, so their margins "

@@ -10,13 +10,14 @@ from typing import Any
 import click
 from matplotlib.figure import Figure
 
-from haselab.base import DeviceError, InputError, to_plain
+from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
 from haselab.cli.actuator_file import load_run
 from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.control import PidGains
 from haselab.firmware import FrontEnd
+from haselab.models.plant import Plant
 from haselab.report import write_report
 from haselab.report.analysis import Section
 from haselab.report.chart_file import write_figure
@@ -31,15 +32,24 @@ from haselab.rig.chip import (
     read_design,
 )
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
-from haselab.store.folder import write_json
-from haselab.study.chip.loops import StepPlan, loop_row, section_of, step_experiment
+from haselab.store.folder import read_json, write_json
+from haselab.study.chip.agreement import (
+    Agreement,
+    StepCase,
+    agreement_of,
+    check_stable,
+    predicted_loop,
+)
+from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
+from haselab.study.simulated.truth import twin_of
 
 __all__ = ["build", "command", "flash", "simulate"]
 
 _BAUD = 115_200  # baud rate of the boot loader
 _UPDATE_CYCLES = 16_000
+_PREDICTED = ("rise_time_s", "overshoot", "settling_time_s", "steady_state_error")
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = shared_option(
     "--controller", "--structure", "structure",
@@ -118,7 +128,10 @@ def build(
 @_structure
 @_source
 @shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
-@shared_option("--reading", type=click.Choice(["rad", "hz"]), detail="Default: hz.")
+@shared_option(
+    "--reading", type=click.Choice(["rad", "hz"]),
+    detail="Default: the twin of the run in RUN, else hz.",
+)  # fmt: skip
 @click.option(
     "--step",
     "step",
@@ -165,22 +178,27 @@ def simulate(
     The microcontroller, in co-simulation, and two loops on the desktop, at 100 Hz and at 1 kHz,
     control the same twin. RUN is an actuator file or the folder of a run, whose report then shows
     all three. The desktop loop at 1 kHz has the delay and the limits of the microcontroller. All
-    three are calibrated with one reference capacitor first.
+    three are calibrated with one reference capacitor first. For a PI or PID, the chip's step is
+    compared with the step that [model] predicts. If they differ by more than the design covers, the
+    command says why and exits with code 3.
     """
     refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")
     design = read_design(run, structure, FrontEnd(), source)
-    settings, zero_m, plant = design.settings, design.zero_length_m, design.plant
-    twin, reading = options["twin"], options["reading"]
-    config = twin_of_reading(reading or "hz") if twin is None else load_twin(twin)
+    settings, zero_m = design.settings, design.zero_length_m
+    config = _twin(run, options["reading"], options["twin"])
     before, after = options["step"]
     precondition_v = options["precondition"]
     plan = StepPlan(before, after, options["before_s"], options["after_s"], zero_m, precondition_v)
-    found = step_experiment(settings, config, options["seed"], plan)
-    runs, chip = found.runs, found.chip
-    gains = None
+    case = None
     if settings.own is None:
         gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
+        case = StepCase(design, gains, config, plan, options["seed"])
+        check_stable(case)
+    found = step_experiment(settings, config, options["seed"], plan)
+    runs, chip = found.runs, found.chip
+    rows = [_row(loop, case, design.plant) for loop in runs]
+    agreement = None if case is None else agreement_of(runs[-2], runs[-1], case)
     answer = {
         **_sizes(found.built),
         "stack_bytes": chip.stack_bytes,
@@ -190,9 +208,10 @@ def simulate(
         "overruns": chip.overruns,
         "calibration": found.correction,
         "highest_code": chip.highest_code,
-        "loops": [loop_row(loop, gains, plant) for loop in runs],
+        "loops": rows,
+        **_compared(agreement),
     }
-    section = to_plain(section_of(runs, answer["loops"]))
+    section = to_plain(section_of(runs, rows))
     if plot is not None:
         with figure_style():
             write_figure(_draw(section), "Step by the chip and by the computer", plot)
@@ -200,6 +219,47 @@ def simulate(
         write_json(run / "firmware" / "simulation.json", section)
         write_report(run)
     emit(answer, as_json=as_json, out=out)
+    if agreement is not None and not agreement.agrees:
+        raise ResultError(f"{answer['comparison']} {run}")
+
+
+def _twin(run: Path, reading: str | None, twin: Path | None) -> TwinConfig:
+    """The twin of the options, else that of the run in the folder, else the default one."""
+    if twin is not None:
+        return load_twin(twin)
+    results = run / "results.json"
+    if reading is None and results.is_file():
+        known = twin_of(table_at(read_json(results), "provenance", "rig_config"))
+        if known is not None:
+            return known
+    return twin_of_reading(reading or "hz")
+
+
+def _row(loop: LoopRun, case: StepCase | None, plant: Plant) -> JsonObject:
+    """Metrics of a loop's step, and those of its prediction."""
+    row = loop_row(loop, None if case is None else case.gains, plant)
+    if case is not None:
+        expected = loop_row(predicted_loop(loop, case), None, plant)
+        row["predicted"] = {name: expected[name] for name in _PREDICTED}
+    return row
+
+
+def _compared(found: Agreement | None) -> dict[str, Any]:
+    """Status and comparison for the answer."""
+    if found is None:
+        return {"status": "not compared: only the step of a PI or PID is predicted"}
+    sentence = (
+        f"The chip's step deviates from the predicted one by up to {100.0 * found.deviation:.3g} % "
+        f"of the step; the design covers {100.0 * found.covered:.3g} %."
+    )
+    if not found.agrees:
+        sentence += f" Cause: {'; '.join(found.causes) or 'none of those that are checked'}."
+    return {
+        "deviation": found.deviation,
+        "deviation_covered": found.covered,
+        "comparison": sentence,
+        "status": "ok" if found.agrees else "differs from the prediction",
+    }
 
 
 def _draw(section: Mapping[str, Any]) -> Figure:

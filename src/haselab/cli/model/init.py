@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from haselab.base import InputError
+from haselab.cli.actuator_file import unknown_kind
 from haselab.cli.common import POSITIVE, REAL, answer_options, emit
 from haselab.cli.options import shared_option
 from haselab.store.folder import write_text
@@ -106,6 +107,8 @@ def command(
         low=_line("low_v", low_v, 0.0),
         high=_line("high_v", high_v, 2.0),
     )
+    for doubt in unknown_kind(kind):
+        click.echo(f"haselab: warning: {doubt}", err=True)
     write_text(out, page)
     emit({"actuator": str(out), "kind": kind}, as_json=as_json, out=None)
 

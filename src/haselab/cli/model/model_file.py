@@ -15,6 +15,7 @@ from haselab.cli.options import shared_option
 from haselab.models.actuator.model_tables import (
     CovarianceTable,
     LoopTable,
+    OriginTable,
     PlantTable,
     PolesTable,
     RationalTable,
@@ -35,6 +36,7 @@ __all__ = [
     "read_any_plant",
     "read_loop",
     "read_model",
+    "read_origin",
     "read_plant",
     "read_posterior",
 ]
@@ -175,6 +177,18 @@ def read_posterior(path: Path) -> PlantPosterior | None:
             f"Identify the model again, or remove the key covariance: {path}"
         )
     return posterior
+
+
+def read_origin(path: Path) -> OriginTable:
+    """Read what signals and records a model was fitted to, as far as its file states them.
+
+    Raises:
+        InputError: an impossible value.
+    """
+    if path.suffix.lower() == ".mat":
+        return OriginTable()
+    data = _data(path)
+    return validated(OriginTable, {**data, **data.get("plant", {})}, path)
 
 
 def loop_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -10,17 +10,20 @@ import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError
 from haselab.cli.actuator_file import load_actuator
+from haselab.cli.model.model_file import read_origin
 from haselab.control import Design, Saturation
 from haselab.control.reach import reachable
 from haselab.control.stability.plausible import PlausibleMargins
+from haselab.identify.fingerprint import fingerprint
 from haselab.identify.transfer.fit import TransferFit
+from haselab.models.actuator import ActuatorTables
 
 __all__ = ["CONTROLLER_KEYS", "MODEL_KEYS", "controller_section", "limits_of", "model_section"]
 
 MODEL_KEYS = (
     "gain", "natural_frequency_rad_s", "damping_ratio", "delay_s", "slow_modes", "poles", "zeros",
     "numerator", "denominator", "covariance", "residual_std", "fit_percent", "input", "output",
-    "input_unit", "output_unit",
+    "input_unit", "output_unit", "fitted_to",
 )  # fmt: skip
 CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
@@ -30,14 +33,15 @@ _DEFAULT = (-0.05, 0.1)  # strain, the study's saturation
 _NO_UNCERTAINTY = "no uncertainty: [model] has no covariance"
 
 
-def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -> dict[str, object]:
+def model_section(
+    fit: TransferFit, names: tuple[str, str], units: tuple[str, str]
+) -> dict[str, object]:
     """`[model]` of a transfer function, its full covariance included.
 
     Args:
         fit: with a result.
-        source: name of the input.
-        output: name of the output.
-        input_unit: of the input.
+        names: of input and output.
+        units: of input and output; "" where they are not known.
     Returns:
         The keys of the section.
     Raises:
@@ -51,15 +55,16 @@ def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -
         )
     value = {name: estimate.value for name, estimate in fit.parameters.items()}
     simple = fit.structure.poles == 2 and not fit.structure.zeros
-    names = ("natural_frequency_rad_s", "damping_ratio")
+    resonance = ("natural_frequency_rad_s", "damping_ratio")
     roots = {} if simple else {"poles": list(fit.poles), "zeros": list(fit.zeros)}
     residuals = np.concatenate(fit.residuals)
     return {
-        "input": source,
-        "input_unit": input_unit,
-        "output": output,
+        "input": names[0],
+        "input_unit": units[0],
+        "output": names[1],
+        "output_unit": units[1],
         "gain": value["gain"],
-        **{name: value[name] for name in names if name in value},
+        **{name: value[name] for name in resonance if name in value},
         "delay_s": max(value["delay_s"], 0.0),
         "slow_modes": [
             {"gain": gain.value, "time_constant_s": tau.value} for gain, tau in fit.slow_modes
@@ -69,6 +74,7 @@ def model_section(fit: TransferFit, source: str, output: str, input_unit: str) -
         "fit_percent": fit.fit_percent,
         "residual_std": float(np.sqrt(np.mean(residuals**2))),
         "covariance": fit.posterior.to_dict(),
+        "fitted_to": fingerprint(fit.fitted_outputs).tolist(),
     }
 
 
@@ -81,30 +87,31 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
         path: of the model.
         given: on the command line.
     Raises:
-        InputError: the file has impossible values.
+        InputError: the file has impossible values, or the model's input is a voltage and the limits
+            or the map are those of a strain.
         ResultError: the drive does not reach zero strain.
     """
-    if path.suffix.lower() != ".toml":
-        return Saturation(*(given or _DEFAULT))
-    known = load_actuator(path)
+    in_volts = read_origin(path).input_unit == "V"
+    own = path.suffix.lower() == ".toml"
+    known = load_actuator(path) if own else ActuatorTables()
     typed = None if known.controller is None else known.controller.limits
-    wanted = Saturation(*(given or _DEFAULT))
-    if given is None and typed is not None:
-        wanted = Saturation(typed.low, typed.high)
     drive, ends_v = known.drive, known.drive_ends_v()
-    if drive.voltage_map is None or ends_v == (None, None):
-        return wanted
-    if _is_voltage(path):
+    if in_volts and drive.voltage_map is not None:
         raise InputError(
             "The input of [model] is a voltage, but [drive.voltage_map] expects a strain. Identify "
             f"the model again with --through-voltage-map, or remove the map. {path}"
         )
+    if in_volts and given is None and typed is None:
+        raise InputError(
+            f"The model's input is a voltage, but the default limits {_DEFAULT[0]:g} to "
+            f"{_DEFAULT[1]:g} are strains. Give the limits in V with --limits LOW HIGH. {path}"
+        )
+    wanted = Saturation(*(given or _DEFAULT))
+    if given is None and typed is not None:
+        wanted = Saturation(typed.low, typed.high)
+    if drive.voltage_map is None or ends_v == (None, None):
+        return wanted
     return reachable(wanted, drive.voltage_map.map(), *ends_v)
-
-
-def _is_voltage(path: Path) -> bool:
-    model = load_actuator(path).model
-    return model is not None and (model.model_extra or {}).get("input_unit") == "V"
 
 
 def controller_section(

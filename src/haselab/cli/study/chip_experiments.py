@@ -37,7 +37,7 @@ from haselab.study.chip.loops import (
 from haselab.study.chip.miniature import MiniatureDesign, design_miniature
 from haselab.study.chip.rows import CHIP, EXPERIMENTS, MINIATURE
 from haselab.study.definition import StepStudy, Study, load_step_study, step_study_of
-from haselab.study.experiment import Outcome
+from haselab.study.experiment import ExperimentResult
 from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.loops import Loops
 from haselab.study.fits.maps import Maps
@@ -76,7 +76,7 @@ class ChipExperiments:
         self._output: dict[str, IO[bytes]] = {}
         self._found: dict[type, object] = {}
 
-    def start(self, outcome: Outcome) -> None:
+    def start(self, outcome: ExperimentResult) -> None:
         """Start the experiments as soon as all their inputs are known.
 
         Args:

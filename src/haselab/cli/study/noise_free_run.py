@@ -21,7 +21,7 @@ from haselab.models.actuator import ActuatorTables
 from haselab.rig.twin.config import TwinConfig
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
-from haselab.study.experiment import Outcome
+from haselab.study.experiment import ExperimentResult
 from haselab.study.run import noise_free_results
 
 __all__ = ["NoiseFreeRun", "SentValues", "main"]
@@ -54,7 +54,7 @@ class NoiseFreeRun:
         self._send(self._problem)
         return self
 
-    def start(self, outcome: Outcome) -> None:
+    def start(self, outcome: ExperimentResult) -> None:
         """Send what a fit of the study gives.
 
         Args:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from haselab.base import InputError, Limits
+from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.cli.common import actuator_option, answer_options
@@ -27,7 +27,7 @@ from haselab.rig.chip import ChipFile
 from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.rig_file import TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.runner import lockin_of
+from haselab.runtime.lockin import lockin_of
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
@@ -162,16 +162,18 @@ def _limit(rig: Rig, actuator: Path) -> None:
     Raises:
         InputError: no voltage is within both ranges.
     """
-    limits = rig.description.drive_limits
+    limits = narrowed = rig.description.drive_limits
     low, high = load_actuator(actuator).drive_ends_v(rig.description.amplifier_gain)
-    low_v = limits.low if low is None else max(limits.low, low)
-    high_v = limits.high if high is None else min(limits.high, high)
-    if not low_v < high_v:
+    source = f"[drive] of {actuator}"
+    if low is not None and low > limits.low:
+        narrowed = replace(narrowed, low=low, low_source=source)
+    if high is not None and high < limits.high:
+        narrowed = replace(narrowed, high=high, high_source=source)
+    if not narrowed.low < narrowed.high:
         raise InputError(
             f"[drive] permits {low} to {high} V, but the rig outputs {limits.low:g} to "
             f"{limits.high:g} V. Change low_v, high_v and highest_field_v_per_m. {actuator}"
         )
-    narrowed = Limits(limits.name, low_v, high_v, limits.unit)
     rig.description = replace(rig.description, drive_limits=narrowed)
 
 

@@ -27,7 +27,7 @@ from haselab.store.actuator_file import ACTUATOR
 from haselab.store.manifest import read_manifest, recorded_when
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.definition import Study
-from haselab.study.experiment import Outcome
+from haselab.study.experiment import ExperimentResult
 from haselab.study.feasibility import check_drives
 from haselab.study.folder import sections_found, write_findings
 from haselab.study.pipeline import Findings
@@ -58,7 +58,7 @@ keep_video_option = shared_option(
 class ParallelExperiments(Protocol):
     """Experiments of a study that run on another bench at the same time."""
 
-    def start(self, outcome: Outcome) -> None:
+    def start(self, outcome: ExperimentResult) -> None:
         """Take the outcome of a fit; start once all that the experiments need is known."""
 
     def finish(self) -> Mapping[str, str]:
@@ -148,7 +148,7 @@ def _execute(
     running = ExitStack()
     companions = [one for one in (noise_free_run, parallel) if one is not None]
 
-    def fitted(outcome: Outcome) -> None:
+    def fitted(outcome: ExperimentResult) -> None:
         for one in companions:
             one.start(outcome)
 

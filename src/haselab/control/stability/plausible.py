@@ -18,7 +18,7 @@ from haselab.control.spec import DesignSpec
 from haselab.control.stability.grid import PlantGrid
 from haselab.control.stability.margins import margins
 
-__all__ = ["Chance", "PlausibleMargins", "plausible_margins", "share_of"]
+__all__ = ["Chance", "PlausibleMargins", "binomial_proportion", "plausible_margins"]
 
 _NEAR_DEG, _NEAR_DB = 0.5, 0.1  # closer to a limit the exact margins are computed
 _NEAR_PEAK = 30.0  # sensitivity above which the count of a coarse grid is checked
@@ -60,10 +60,10 @@ class PlausibleMargins:
     @property
     def share(self) -> Estimate:
         """Share of the plants that keep both margins."""
-        return share_of(self.keeps_phase & self.keeps_gain)
+        return binomial_proportion(self.keeps_phase & self.keeps_gain)
 
 
-def share_of(kept: NDArray[np.bool_]) -> Estimate:
+def binomial_proportion(kept: NDArray[np.bool_]) -> Estimate:
     """Estimate a share, with the binomial standard error and Wilson's 95 % interval.
 
     Args:
@@ -74,7 +74,7 @@ def share_of(kept: NDArray[np.bool_]) -> Estimate:
         InputError: no draw.
     Source: E. B. Wilson, Journal of the American Statistical Association 22 (1927).
     Example:
-        >>> share = share_of(np.arange(400) < 388)
+        >>> share = binomial_proportion(np.arange(400) < 388)
         >>> share.value, round(share.std, 4), [round(end, 3) for end in share.ci95]
         (0.97, 0.0085, [0.948, 0.983])
     """

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
 from haselab.identify.creep.laws import (
@@ -160,10 +160,14 @@ class CreepFit(RecordFit[Record]):
         Raises:
             ResultError: the fit has no result.
         """
-        if self.fitted is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.fitted
+        return self._present(self.fitted)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.setting.y,)
+
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
         return self.model.simulate(u, rate_hz or self.setting.span.rate_hz)
@@ -192,8 +196,7 @@ class CreepFit(RecordFit[Record]):
             ResultError: the fit has no result.
             InputError: a time that is not above 0 s.
         """
-        if not self.candidates:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._present(self.candidates or None)
         if not 0.0 < later_s < math.inf:
             raise InputError(f"later_s = {later_s:g} s; must be above 0 s.")
         entries = [_forecast(self.setting, candidate, later_s) for candidate in self.candidates]
@@ -216,6 +219,7 @@ class CreepFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_creep(
     records: Record | Sequence[Record], model: str = "auto", *, leave_out_s: float = 0.0
 ) -> CreepFit:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from haselab.base import InputError, JsonObject
+from haselab.base import InputError, JsonObject, checked
 from haselab.identify.experiment_design.drives import BenchLimits, DriveCandidate, candidate_drives
 from haselab.identify.model_comparison.voltage_plant import (
     VoltageStructure,
@@ -150,6 +150,7 @@ def goals_of(plant: VoltagePlant) -> tuple[str, ...]:
     return ("creep", "reading", "modes", "all", *known)
 
 
+@checked
 def plan_experiment(
     plant: VoltagePlant,
     goal: str,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject
+from haselab.base import Estimate, InputError, JsonObject, check_fields, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
 from haselab.identify.fit import CurveFit, Prediction, propagated, rescaled
@@ -45,8 +46,10 @@ class FreeTrial:
 
     x: Floats
     time_s: Floats
+    made_by: ClassVar[str] = "Make one of two columns: haselab.identify.FreeTrial(x, time_s)."
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("x", "time_s"):
             object.__setattr__(self, name, finite_vector(name, getattr(self, name), 16))
         if self.x.size != self.time_s.size or not (np.diff(self.time_s) > 0.0).all():
@@ -105,12 +108,14 @@ class FreeResponseFit(CurveFit):
     motion: tuple[Floats, ...] = field(repr=False)
     search: Floats = field(repr=False)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Motion of the first trial at times since its release, in s; see `CurveFit`."""
         self._require()
         time_s = np.atleast_1d(np.asarray(x, dtype=np.float64))
         return np.asarray(_shapes(self.search, time_s) @ self.motion[0])
 
+    @checked
     def compare(self, x: ArrayLike, y: ArrayLike) -> Prediction:
         """Predict another free motion with the fitted frequency and decay, and compare.
 
@@ -154,13 +159,16 @@ class FreeResponseFit(CurveFit):
         }
 
 
-def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None) -> FreeResponseFit:
+@checked
+def fit_free_response(
+    trials: FreeTrial | Sequence[FreeTrial], *, creep: bool | None = None
+) -> FreeResponseFit:
     r"""Fit all trials jointly, each with its own amplitude, phase, offset and creep.
 
     $\omega_0 = \sqrt{\omega_d^2 + \delta^2},\quad \zeta = \delta/\omega_0$
 
     Args:
-        trials: free motions; samples before the drop are left out.
+        trials: free motions, or one; samples before the drop are left out.
         creep: whether to add exponential creep to the oscillation. None: added if the fit
             without it has coloured residuals or no result, and the fit with it is better.
     Returns:
@@ -172,12 +180,13 @@ def fit_free_response(trials: Sequence[FreeTrial], *, creep: bool | None = None)
         >>> t = np.arange(800) / 400.0
         >>> x = 0.01 * np.exp(-4.0 * t) * np.cos(32.0 * t - 0.3)
         >>> x = x + 1e-4 * np.random.default_rng(1).normal(size=t.size)
-        >>> fit = fit_free_response([FreeTrial(x, t)])
+        >>> fit = fit_free_response(FreeTrial(x, t))
         >>> low, high = fit.parameters["damped_frequency_rad_s"].ci95
         >>> low < 32.0 < high
         True
     """
-    if not trials:
+    trials = [trials] if isinstance(trials, FreeTrial) else trials
+    if len(trials) == 0:
         raise InputError("trials is empty. Pass at least one FreeTrial.")
     moving = [trial.moving() for trial in trials]
     joint = _fit(moving, bool(creep))

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import chdtrc
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import lines_chart
 from haselab.identify.fit import RecordFit
@@ -80,8 +80,7 @@ class ResponseFit(RecordFit[Record]):
             ResultError: no result, a parameter is not identifiable, or not one resonance without
                 zeros.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
@@ -102,6 +101,7 @@ class ResponseFit(RecordFit[Record]):
             tuple(SlowMode(gain.value, tau.value) for gain, tau in self.slow_modes),
         )
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; lines have no rate, so `rate_hz` is needed."""
         inputs = finite_vector("u", u, 1)
@@ -115,8 +115,7 @@ class ResponseFit(RecordFit[Record]):
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`; magnitude and phase over frequency."""
         del names
-        if not self.residuals:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._present(self.residuals or None)
         measured = self.modelled + self.residuals[0] + 1j * self.residuals[1]
         return lines_chart("Frequency response and fit", self.frequency_hz, measured, self.modelled)
 
@@ -133,6 +132,7 @@ class ResponseFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_response(
     frequency_hz: object,
     response: object,

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from haselab.base import InputError, JsonObject
+from haselab.base import InputError, JsonObject, checked
+from haselab.identify.fit import several
 from haselab.identify.frequency.charts import BodeChart, NicholsChart, NyquistChart
 from haselab.identify.frequency.clipping import clipped_at
 from haselab.identify.frequency.fit import ResponseFit, fit_response
@@ -17,7 +18,8 @@ from haselab.identify.frequency.lines import Lines, Pair, hold_spectrum
 from haselab.identify.frequency.local_models import Spectrum, local_response
 from haselab.identify.frequency.periodic import periodic_response
 from haselab.identify.frequency.welch import averaged_response
-from haselab.identify.record import finite_vector
+from haselab.identify.record import Record
+from haselab.identify.sampled.record import driven
 from haselab.identify.transfer.layout import TransferStructure
 
 __all__ = ["RESPONSE_METHODS", "FrequencyResponse", "estimate_frequency_response"]
@@ -105,17 +107,18 @@ class FrequencyResponse:
         }
 
 
+@checked
 def estimate_frequency_response(
-    u: object,
-    y: object,
-    rate_hz: float,
+    records: Record | Sequence[Record],
     *,
     method: str = "rational",
-    held: bool = True,
     period_s: float | None = None,
     segment_s: float | None = None,
 ) -> FrequencyResponse:
     r"""Estimate a frequency response from one record, or from several of one system.
+
+    An input with the hold "zero" was held between its updates, and the hold is corrected for; one
+    with the hold "band-limited" was measured.
 
     `rational` and `polynomial` remove the leakage of transients: around each line response and
     leakage are smooth, $Y(k+r) = G(r)\,U(k+r) + T(r)$; `rational` gives both a common local
@@ -124,30 +127,29 @@ def estimate_frequency_response(
     averages whole periods.
 
     Args:
-        u: input. Shape `(N,)`, or one such vector per record.
-        y: output at the same moments. As `u`.
-        rate_hz: sampling rate, in Hz.
+        records: input and output at the same moments (`Record.sampled`), all at one rate.
         method: one of `RESPONSE_METHODS`.
-        held: whether `u` was held between its updates; the hold is then corrected for.
         period_s: period of the drive, in s; for `periodic`, and for it alone.
         segment_s: length of a segment, in s; for `h1`, `h2`, `hv` alone.
     Returns:
         Response on the lines where the input has 5 % or more of its largest spectrum.
     Raises:
-        InputError: unequal lengths, too few samples, a constant input, an unknown method, an
-            option of another method.
+        InputError: times that are not those of the input, several rates, too few samples, a
+            constant input, straight lines between the inputs, an unknown method, an option of
+            another method.
     Source: Pintelon and Schoukens, System Identification (2012), chapters 2 and 7; Bendat and
         Piersol, Random Data (2010), chapters 6 and 9.
     Example:
         >>> u = np.random.default_rng(1).normal(size=2000)
-        >>> response = estimate_frequency_response(u, 3.0 * u, 100.0, held=False)
+        >>> record = Record.sampled(u, 3.0 * u, 100.0, hold="band-limited")
+        >>> response = estimate_frequency_response(record)
         >>> bool(np.allclose(response.response, 3.0))
         True
     """
-    if not 0.0 < rate_hz < np.inf:
-        raise InputError(f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz.")
     _check_method(method, period_s, segment_s)
-    pairs = _pairs(u, y)
+    found = [driven(record) for record in several(records)]
+    rate_hz, held = _rate_hz(found), _is_held(found)
+    pairs = [(each.u - each.u.mean(), each.y - each.y.mean()) for each in found]
     if method == "periodic" and period_s is not None:
         lines = periodic_response(pairs, rate_hz, period_s, held)
     elif method in ("h1", "h2", "hv"):
@@ -155,7 +157,7 @@ def estimate_frequency_response(
     else:
         lines = local_response([_spectrum(pair, rate_hz, held) for pair in pairs], method)
     limits = clipped_at(pairs, rate_hz, held, lines.frequency_hz, lines.response)
-    return _result(lines, _status(limits, _vectors("y", y)))
+    return _result(lines, _status(limits, [each.y for each in found]))
 
 
 def _status(limits: Sequence[float], outputs: Sequence[Floats]) -> str:
@@ -184,34 +186,32 @@ def _check_method(method: str, period_s: float | None, segment_s: float | None) 
         )
 
 
-def _pairs(u: object, y: object) -> list[Pair]:
-    """The records with their means subtracted."""
-    inputs, outputs = _vectors("u", u), _vectors("y", y)
-    if len(inputs) != len(outputs):
+def _rate_hz(records: Sequence[Record]) -> float:
+    """The one sampling rate of all records."""
+    rates_hz = [record.input_rate_hz for record in records]
+    if max(rates_hz) - min(rates_hz) > 1e-6 * rates_hz[0]:
         raise InputError(
-            f"u has {len(inputs)} records and y {len(outputs)}; the numbers must be equal. "
-            "Give one output for each input."
+            f"The records have rates of {min(rates_hz):g} to {max(rates_hz):g} Hz, but one "
+            "estimate needs one rate. Resample them, or estimate each alone."
         )
-    for source, output in zip(inputs, outputs, strict=True):
-        if source.size != output.size:
+    for record in records:
+        if record.u.size < _LEAST:
             raise InputError(
-                f"u has {source.size} values and y {output.size}, but they must be equally long. "
-                "Give both at the same times."
+                f"A record has {record.u.size} samples; it must have {_LEAST} or more. Record "
+                "longer."
             )
-        if np.ptp(source) == 0.0:
-            raise InputError(
-                f"The input is {source[0]:g} throughout, so it excites nothing. It "
-                "must change. Name the right column, or record a chirp."
-            )
-    return [(a - a.mean(), b - b.mean()) for a, b in zip(inputs, outputs, strict=True)]
+    return rates_hz[0]
 
 
-def _vectors(name: str, values: object) -> list[Floats]:
-    if isinstance(values, np.ndarray):
-        values = list(values) if values.ndim > 1 else [values]
-    if isinstance(values, Sequence) and len(values) > 0 and np.ndim(values[0]) > 0:
-        return [finite_vector(name, vector, _LEAST) for vector in values]
-    return [finite_vector(name, values, _LEAST)]
+def _is_held(records: Sequence[Record]) -> bool:
+    """Whether the inputs were held between their updates."""
+    holds = {record.hold for record in records}
+    if len(holds) > 1 or "first" in holds:
+        raise InputError(
+            f"The records have the hold {' and '.join(sorted(holds))}; it must be zero for all, "
+            "or band-limited for all."
+        )
+    return "zero" in holds
 
 
 def _spectrum(pair: Pair, rate_hz: float, held: bool) -> Spectrum:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import loop_chart
 from haselab.identify.fit import RecordFit, rescaled, several
@@ -109,10 +109,14 @@ class HysteresisFit(RecordFit[LoopRecord]):
         Raises:
             ResultError: the fit has no result.
         """
-        if self.fitted is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.fitted
+        return self._present(self.fitted)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
+
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the memory is that of rest at the first value of the input."""
         inputs = self._driven(finite_vector("u", u, 1))
@@ -157,6 +161,7 @@ class HysteresisFit(RecordFit[LoopRecord]):
         }
 
 
+@checked
 def fit_hysteresis(
     records: LoopRecord | Sequence[LoopRecord],
     model: str = "auto",

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, InputError, JsonObject
+from haselab.base import Estimate, InputError, JsonObject, check_fields
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.record import finite_vector
 from haselab.identify.statics.cycles import loop_cells, loop_width, rising_edges
@@ -40,8 +41,10 @@ class LoopRecord:
     y: Floats
     rate_hz: float
     counted_from_s: float = 0.0
+    made_by: ClassVar[str] = "Make one of two columns: haselab.identify.LoopRecord(u, y, rate_hz)."
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("u", "y"):
             column = finite_vector(name, getattr(self, name), _LEAST_SAMPLES)
             if np.ptp(column) == 0.0:

@@ -10,10 +10,10 @@ from itertools import combinations
 import numpy as np
 from scipy.special import chdtrc, ndtri
 
-from haselab.base import Estimate, InputError, JsonObject
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.estimate import Z95
 
-__all__ = ["Agreement", "agree"]
+__all__ = ["Agreement", "compare_estimates"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Agreement:
 
     Args:
         status: "ok", or why there is no result.
-        verdict: "agree", "disagree: NAMES", or "cannot tell".
+        verdict: "compare_estimates", "disagree: NAMES", or "cannot tell".
         mean: weighted mean, widened by the Birge ratio where that exceeds 1.
         birge_ratio: root of chi-square over its degrees of freedom; about 1 for correct intervals.
         chi_square_p: probability of a scatter as large or larger.
@@ -56,7 +56,8 @@ class Agreement:
         }
 
 
-def agree(
+@checked
+def compare_estimates(
     estimates: Mapping[str, Estimate], *, risk: float = 0.01, matters: float = 0.2
 ) -> Agreement:
     r"""Test whether independent estimates of one quantity agree.
@@ -76,9 +77,9 @@ def agree(
     Source: Birge, Phys. Rev. 40 (1932), 207; Bonferroni's bound for the pairs.
     Example:
         >>> chirp = Estimate.normal(5.11, 0.02, "rad/s")
-        >>> agree({"chirp": chirp, "decay": Estimate.normal(6.4, 0.1, "rad/s")}).verdict
+        >>> compare_estimates({"chirp": chirp, "decay": Estimate.normal(6.4, 0.1, "rad/s")}).verdict
         'disagree: chirp and decay'
-        >>> agree({"chirp": chirp, "decay": Estimate.normal(4.0, 2.0, "rad/s")}).verdict
+        >>> compare_estimates({"chirp": chirp, "decay": Estimate.normal(4.0, 2.0, "rad/s")}).verdict
         'cannot tell'
     """
     finite, notes = _finite(estimates, risk, matters)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from haselab.base import Estimate, InputError, JsonObject
+from haselab.base import Estimate, InputError, JsonObject, checked
+from haselab.identify.fit import several
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
 from haselab.identify.record import Record
 
@@ -213,9 +214,10 @@ def noise_shape(residuals: Sequence[Floats]) -> NoiseShape:
     return NoiseShape(samples, float(spectrum.max()) / mean, min(variance / total, 1.0))
 
 
+@checked
 def compare(
     hypotheses: Sequence[Hypothesis],
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     *,
     risk: float = 0.01,
     unexplained: float = 0.3,
@@ -245,6 +247,7 @@ def compare(
         that are not nested.
     """
     _check(hypotheses, risk, unexplained)
+    records = several(records)
     explained = [hypothesis.explain(records) for hypothesis in hypotheses]
     first = min(explained, key=lambda e: e.cost)
     if math.isfinite(first.cost):

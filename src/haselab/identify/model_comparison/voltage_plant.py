@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import RecordFit, rescaled
@@ -161,6 +161,12 @@ class VoltagePlantFit(RecordFit[Record]):
     parameter_count: int = 0
     modelled: tuple[Floats, ...] = field(default=(), repr=False)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
+
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the first voltage has stood for ever."""
         plant = self._fitted()
@@ -169,9 +175,7 @@ class VoltagePlantFit(RecordFit[Record]):
         return plant.simulate(inputs, rate, np.arange(inputs.size) / rate)
 
     def _fitted(self) -> VoltagePlant:
-        if self.plant is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.plant
+        return self._present(self.plant)
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:
         moved = self._fitted().simulate(record.u, record.input_rate_hz, record.output_time_s)
@@ -195,6 +199,7 @@ class VoltagePlantFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_voltage_plant(
     records: Sequence[Record],
     structure: VoltageStructure | None = None,

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, InputError
+from haselab.base import Estimate, InputError, checked
+from haselab.identify.fit import several
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
 from haselab.identify.prediction import fitted_output
@@ -150,8 +151,9 @@ class _Hammerstein:
         return fitted_output(self.linear.rational, bent[0])
 
 
+@checked
 def fit_hammerstein(
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     structure: TransferStructure | None = None,
     degree: int = 2,
     known: Sequence[Floats] = (),
@@ -163,7 +165,7 @@ def fit_hammerstein(
     $u_0$. The strain of an actuator over its voltage squared is a polynomial of degree 2.
 
     Args:
-        records: experiments.
+        records: experiments, or one.
         structure: structure of the linear part. Default: one resonance with a delay.
         degree: 2 or 3.
         known: searched parameters of a linear fit to start from; its delay is then kept.
@@ -178,12 +180,12 @@ def fit_hammerstein(
         >>> rng = np.random.default_rng(7)
         >>> u, time_s = np.repeat(rng.uniform(0.0, 2.0, 400), 10), np.arange(4000) / 400.0
         >>> y = Plant(0.5, 5.11, 0.09).simulate(u**2, 400.0, time_s) + 0.01 * rng.normal(size=4000)
-        >>> fit = fit_hammerstein([Record(u, 400.0, y, time_s)])
+        >>> fit = fit_hammerstein(Record(u, 400.0, y, time_s))
         >>> low, high = fit.parameters["gain_2"].ci95
         >>> fit.status, low < 0.5 < high
         ('ok', True)
     """
-    structure = structure or TransferStructure()
+    records, structure = several(records), structure or TransferStructure()
     layout, kind = layout_of(structure), f"hammerstein-{degree}"
     if degree not in DEGREES:
         raise InputError(f"degree = {degree}; must be 2 or 3.")

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base import Estimate, JsonObject, ResultError, checked
 from haselab.identify.fit import Prediction, RecordFit
 from haselab.identify.noise import fit_percent
 from haselab.identify.record import Record, finite_vector
@@ -106,8 +106,7 @@ class NonlinearFit(TransferFit):
         Raises:
             ResultError: the fit has no result, or the slope of the curve is not different from 0.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         gain = self.parameters["gain"]
         if gain.ci95[0] <= 0.0 <= gain.ci95[1]:
             raise ResultError(
@@ -127,11 +126,13 @@ class NonlinearFit(TransferFit):
             fit_percent=self.fit_percent,
         )
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; the nonlinearity is a part of it."""
         inputs = finite_vector("u", u, 1)
         return self._usable().simulated(inputs, self._rate_hz(rate_hz))
 
+    @checked
     def compare(self, records: Record | Sequence[Record]) -> Prediction:
         """See `RecordFit`; there is no band."""
         return RecordFit.compare(self, records)
@@ -140,9 +141,7 @@ class NonlinearFit(TransferFit):
         return record.y, self._usable().modelled(record)
 
     def _usable(self) -> Nonlinear:
-        if self.model is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.model
+        return self._present(self.model)
 
     @property
     def plant(self) -> Plant:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _identify
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, ResultError, checked
+from haselab.identify.fit import several
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
 from haselab.identify.record import Record
@@ -19,7 +20,7 @@ from haselab.identify.transfer.problem import fine_input
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import search_bounds
 
-__all__ = ["fit_output_curve", "fit_spring"]
+__all__ = ["fit_duffing", "fit_output_curve"]
 
 Floats = NDArray[np.float64]
 _PLANT = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
@@ -231,8 +232,9 @@ class _Fitted:
         return end
 
 
-def fit_spring(
-    records: Sequence[Record],
+@checked
+def fit_duffing(
+    records: Record | Sequence[Record],
     structure: TransferStructure | None = None,
     powers: tuple[int, ...] = (3,),
     linear: Best | None = None,
@@ -244,7 +246,7 @@ def fit_spring(
     of $m\ddot x + c\dot x + k x + k_2 x^2 + k_3 x^3 = b u$.
 
     Args:
-        records: experiments.
+        records: experiments, or one.
         structure: two poles, no zeros or slow branches; its fixed parameters are kept.
         powers: `(3,)`, or `(2, 3)` for a spring that differs between both directions.
         linear: linear fit to start from; None: it is fitted first.
@@ -259,7 +261,7 @@ def fit_spring(
         >>> rng = np.random.default_rng(7)
         >>> u, time_s = np.repeat(rng.normal(size=400), 10), np.arange(4000) / 400.0
         >>> y = Plant(0.5, 5.11, 0.09).simulate(u, 400.0, time_s) + 0.01 * rng.normal(size=4000)
-        >>> fit = fit_spring([Record(u, 400.0, y, time_s)])
+        >>> fit = fit_duffing(Record(u, 400.0, y, time_s))
         >>> low, high = fit.parameters["stiffness_ratio_3"].ci95
         >>> fit.status, low < 0.0 < high
         ('ok', True)
@@ -267,8 +269,9 @@ def fit_spring(
     return _fit(records, structure or TransferStructure(), powers, linear, spring=True)
 
 
+@checked
 def fit_output_curve(
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     structure: TransferStructure | None = None,
     powers: tuple[int, ...] = (2, 3),
     linear: Best | None = None,
@@ -278,10 +281,10 @@ def fit_output_curve(
     $y = x + q_2 x^2 + q_3 x^3 + y_0$, with $x$ the output of the linear part
 
     Args:
-        records: experiments.
+        records: experiments, or one.
         structure: two poles, no zeros or slow branches; its fixed parameters are kept.
         powers: of the curve, 2 or 3 each.
-        linear: as in `fit_spring`.
+        linear: as in `fit_duffing`.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -291,7 +294,7 @@ def fit_output_curve(
 
 
 def _fit(
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     structure: TransferStructure,
     powers: tuple[int, ...],
     linear: Best | None,
@@ -308,7 +311,7 @@ def _fit(
         raise InputError(f"powers = {powers}; must be 2 or 3.")
     model = _Oscillator(structure, powers, spring)
     kind = model.kind
-    layout = layout_of(structure)
+    layout, records = layout_of(structure), several(records)
     linear = best_fit(layout, records) if linear is None else linear
     if linear is None:
         return no_fit(structure, kind, "no start led to a stable linear model")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, check_fields, checked
 from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit
 from haselab.identify.noise import fit_percent, whiteness_p
@@ -48,6 +48,7 @@ class ArxOrders:
     nk: int = 1
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, least in (("na", 0), ("nb", 1), ("nk", 0)):
             value, most = getattr(self, name), _MOST[name]
             if not least <= value <= most:
@@ -90,10 +91,13 @@ class ArxFit(RecordFit[Record]):
     aic: float
     bic: float
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
+
     def _fitted(self) -> ArxModel:
-        if self.model is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.model
+        return self._present(self.model)
 
     @property
     def a(self) -> tuple[Estimate, ...]:
@@ -156,6 +160,7 @@ class ArxFit(RecordFit[Record]):
         part = self.covariance[: self.orders.na, : self.orders.na]
         return Estimate.normal(value, math.sqrt(max(float(slope @ part @ slope), 0.0)), unit)
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; rest is the operating point, and the rate that of the record."""
         model = self._fitted()
@@ -206,6 +211,7 @@ class ArxFit(RecordFit[Record]):
         return {"numerator": top, "denominator": bottom, "delay_s": delay_s}
 
 
+@checked
 def fit_arx(
     records: Record | Sequence[Record],
     orders: ArxOrders | None = None,

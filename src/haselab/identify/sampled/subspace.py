@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, checked, generator
 from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
@@ -63,10 +63,14 @@ class SubspaceFit(RecordFit[Record]):
         Raises:
             ResultError: the fit has no result.
         """
-        if self.model is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.model
+        return self._present(self.model)
 
+    @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return (self.record.y,)
+
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`; rest is the operating point, and the rate that of the record."""
         check_same_rate(rate_hz, self.plant.rate_hz)
@@ -84,8 +88,7 @@ class SubspaceFit(RecordFit[Record]):
 
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
-        if not self.residuals:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._present(self.residuals or None)
         return sampled_chart("Subspace model", self.record, self.residuals[0], names)
 
     def answer(self) -> JsonObject:
@@ -107,6 +110,7 @@ class SubspaceFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_subspace(
     records: Record | Sequence[Record],
     order: int | None = None,
@@ -145,6 +149,8 @@ def fit_subspace(
     """
     record = driven(records)
     _check(record, order, block_rows)
+    if bootstrap < 0:
+        raise InputError(f"bootstrap is {bootstrap}; it must be 0 or more replicates.")
     rate_hz = record.input_rate_hz
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
@@ -160,7 +166,7 @@ def fit_subspace(
         )  # fmt: skip
     model, simulated = _model(inputs, outputs, space[:, :count], rate_hz)
     residuals = outputs - simulated
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     repeats = [
         _model(inputs, again, _space(inputs, again, block_rows)[1][:, :count], rate_hz)[0]
         for again in _repeated(simulated, residuals, bootstrap, rng)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, JsonObject
+from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, rescaled
@@ -50,6 +50,7 @@ class CapacitanceMapFit(CurveFit):
         self._require()
         return LinearMap(self.parameters["slope"].value, self.parameters["offset"].value)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Strain at capacitances; see `CurveFit`."""
         return np.asarray(self.map.strain(x), dtype=np.float64)
@@ -73,6 +74,7 @@ class CapacitanceMapFit(CurveFit):
         }
 
 
+@checked
 def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> CapacitanceMapFit:
     r"""Fit strain as a straight line of the capacitance, rising and falling edges averaged.
 

@@ -102,7 +102,7 @@ def plausible_strain(strain: Floats, other: str, values: Floats) -> None:
 
 
 def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:
-    """Refuse implausible voltages; return a note for those that may be kilovolts.
+    """Refuse implausible voltages; return a note for those that may have another unit.
 
     Args:
         voltage_v: column of voltages. Shape `(N,)`.
@@ -119,7 +119,7 @@ def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:
         )
     if size < _KILOVOLTS_V:
         return (
-            f"voltage_v reaches {size:.3g} V only and is taken as the drive ahead of the "
-            "amplifier; if the column is in kV, multiply it by 1000.",
+            f"The voltage reaches {size:.3g} V only and is taken as the drive ahead of the "
+            "amplifier. If its unit is not V, state the unit.",
         )
     return ()

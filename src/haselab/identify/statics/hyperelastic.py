@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, JsonObject, LimitError
+from haselab.base import InputError, JsonObject, LimitError, check_fields, checked
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import CurveFit
 from haselab.identify.statics.columns import paired, plausible_stretch
@@ -24,8 +24,8 @@ from haselab.models import LAWS, Deformation, HyperelasticLaw, law_from_paramete
 
 __all__ = [
     "HyperelasticFit",
-    "SheetTest",
     "StressPrediction",
+    "TensileTest",
     "fit_hyperelastic",
     "fit_hyperelastic_tests",
 ]
@@ -39,7 +39,7 @@ _STANDARD = ("uniaxial", "pure_shear", "equibiaxial")
 
 
 @dataclass(frozen=True)
-class SheetTest:
+class TensileTest:
     """Stress and stretch of one test, in any order.
 
     Args:
@@ -56,6 +56,7 @@ class SheetTest:
     deformation: Deformation = field(default_factory=Deformation)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         x, y = paired(
             "stretch", self.stretch, "nominal_stress_pa", self.nominal_stress_pa,
             least=_LEAST_SAMPLES, record="record a tensile test",
@@ -117,7 +118,7 @@ class HyperelasticFit(CurveFit):
 
     best: Candidate
     candidates: tuple[Candidate, ...]
-    tests: tuple[SheetTest, ...]
+    tests: tuple[TensileTest, ...]
 
     @property
     def r_squared(self) -> float:
@@ -150,6 +151,7 @@ class HyperelasticFit(CurveFit):
         self._require()
         return _law(self.best)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Nominal stress at stretches, in Pa, deformed as the first test; see `CurveFit`."""
         return self.predict(x).nominal_stress_pa
@@ -234,9 +236,10 @@ class HyperelasticFit(CurveFit):
         }
 
 
+@checked
 def fit_hyperelastic(
-    stretch: object,
-    nominal_stress_pa: object,
+    stretch: ArrayLike,
+    nominal_stress_pa: ArrayLike,
     model: str = "auto",
     *,
     deformation: str = "uniaxial",
@@ -260,7 +263,7 @@ def fit_hyperelastic(
     Returns:
         The chosen law and all candidates.
     Raises:
-        InputError: as `SheetTest`, unknown names.
+        InputError: as `TensileTest`, unknown names.
     Source: unweighted least squares; Akaike, IEEE Trans. Autom. Control 19 (1974), 716.
     Example:
         >>> from haselab.models import Ogden
@@ -271,15 +274,16 @@ def fit_hyperelastic(
         True
     """
     kind = Deformation(deformation, lateral_stretch=lateral_stretch, prestretch=prestretch)
-    test = SheetTest(np.asarray(stretch), np.asarray(nominal_stress_pa), kind)
+    test = TensileTest(np.asarray(stretch), np.asarray(nominal_stress_pa), kind)
     return fit_hyperelastic_tests(
         [test], model, electrode_natural=electrode_natural,
         electrode_stiffening=electrode_stiffening,
     )  # fmt: skip
 
 
+@checked
 def fit_hyperelastic_tests(
-    tests: Sequence[SheetTest],
+    tests: Sequence[TensileTest],
     model: str = "auto",
     *,
     electrode_natural: float | None = None,
@@ -311,13 +315,13 @@ def fit_hyperelastic_tests(
         >>> tests = []
         >>> for kind in (Deformation("uniaxial"), Deformation("equibiaxial")):
         ...     stress_pa = law.nominal_stress_pa(*kind.stretches(x)) + 50.0 * rng.normal(size=30)
-        ...     tests.append(SheetTest(x, stress_pa, kind))
+        ...     tests.append(TensileTest(x, stress_pa, kind))
         >>> low, high = fit_hyperelastic_tests(tests, "gent").best.parameters["jm"].ci95
         >>> low < 40.0 < high
         True
     """
     if not tests:
-        raise InputError("No test was given. Pass at least one SheetTest.")
+        raise InputError("No test was given. Pass at least one TensileTest.")
     if model != "auto" and model not in LAWS:
         raise InputError(f"model = {model}; must be one of auto, {', '.join(LAWS)}.")
     if electrode_stiffening and electrode_natural is None:
@@ -364,7 +368,7 @@ def _law(candidate: Candidate) -> HyperelasticLaw:
     return law_from_parameters(candidate.model, numbers)
 
 
-def _judged(candidate: Candidate, tests: Sequence[SheetTest]) -> Candidate:
+def _judged(candidate: Candidate, tests: Sequence[TensileTest]) -> Candidate:
     """The candidate with the stretch from which it softens within the data."""
     if not candidate.settled:
         return candidate
@@ -412,7 +416,7 @@ def _spread(candidate: Candidate, length: Floats, width: Floats) -> Floats:
 
 
 def _notes(
-    best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
+    best: Candidate, tests: Sequence[TensileTest], electrodes: Electrodes | None
 ) -> tuple[str, ...]:
     return (
         *_identifiability_note(best),
@@ -433,7 +437,7 @@ def _identifiability_note(best: Candidate) -> list[str]:
     return [f"Not identifiable from these data: {', '.join(unknown)} ({reason})."]
 
 
-def _softening_notes(best: Candidate, tests: Sequence[SheetTest]) -> list[str]:
+def _softening_notes(best: Candidate, tests: Sequence[TensileTest]) -> list[str]:
     if best.softens_at is not None:
         return [
             f"{best.model} softens from stretch {best.softens_at:.3g} on, within the data, which "
@@ -455,7 +459,7 @@ def _softening_notes(best: Candidate, tests: Sequence[SheetTest]) -> list[str]:
 
 
 def _range_notes(
-    best: Candidate, tests: Sequence[SheetTest], electrodes: Electrodes | None
+    best: Candidate, tests: Sequence[TensileTest], electrodes: Electrodes | None
 ) -> list[str]:
     """A note where the parameters of the lower half of the range differ."""
     halves = []
@@ -481,7 +485,7 @@ def _range_notes(
     ]
 
 
-def _unit_notes(tests: Sequence[SheetTest]) -> list[str]:
+def _unit_notes(tests: Sequence[TensileTest]) -> list[str]:
     samples = [test.sample for test in tests]
     pull = np.concatenate([s.length - 1.0 / (s.length**3 * s.width**2) for s in samples])
     stress = np.concatenate([s.stress_pa for s in samples])

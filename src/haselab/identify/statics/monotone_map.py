@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit
@@ -65,9 +65,7 @@ class MapFit(CurveFit):
         Raises:
             ResultError: the fit has no result.
         """
-        if self.curve is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.curve
+        return self._present(self.curve)
 
     def value_std(self, x: ArrayLike) -> Floats:
         """Standard deviation of the value, in the unit of y.
@@ -100,6 +98,7 @@ class MapFit(CurveFit):
         x = self.map.inverse(y)
         return np.asarray(self.value_std(x) / np.abs(self.map.slope(x)))
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """See `CurveFit`."""
         return np.asarray(self.map.value(x), dtype=np.float64)
@@ -129,6 +128,7 @@ class MapFit(CurveFit):
         }
 
 
+@checked
 def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
     r"""Penalised least squares of a quadratic spline.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
-from haselab.base import Estimate, InputError, JsonObject
+from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, propagated, rescaled
@@ -84,6 +84,7 @@ class RegionsFit(CurveFit):
         """Index of the longest region."""
         return 0
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Load at stretches, in N; the first and the last piece go on. See `CurveFit`."""
         self._require()
@@ -116,6 +117,7 @@ class RegionsFit(CurveFit):
         }
 
 
+@checked
 def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = None) -> RegionsFit:
     r"""Fit a continuous broken line; its straight segments are the linear regions.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, propagated
@@ -78,10 +78,9 @@ class VoltageMapFit(CurveFit):
         return self._fitted().std_v(np.asarray(strain, dtype=np.float64))
 
     def _fitted(self) -> _Curve:
-        if self.curve is None:
-            raise ResultError(f"The fit gives no model: {self.status}")
-        return self.curve
+        return self._present(self.curve)
 
+    @checked
     def simulate(self, x: ArrayLike) -> Floats:
         """Voltage at strains, in V; see `CurveFit`."""
         return np.asarray(self.map.voltage_v(x), dtype=np.float64)
@@ -146,6 +145,7 @@ class _Curve:
         }, covariance
 
 
+@checked
 def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
     r"""Fit the sum of two exponentials through a loop, monotone over the range of the map.
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, InputError, ResultError
+from haselab.base import Estimate, InputError, ResultError, checked
 from haselab.identify.noise import noise_behind
 from haselab.identify.transfer.fit import TransferFit
 from haselab.identify.transfer.layout import Layout, layout_of
@@ -23,6 +23,7 @@ _LEAST = 100
 _BURN_IN = 2000  # samples of noise before the record
 
 
+@checked
 def bootstrap_transfer(
     fit: TransferFit, draws: int, rng: np.random.Generator
 ) -> dict[str, Estimate]:

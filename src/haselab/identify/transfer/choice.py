@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError, JsonObject
+from haselab.base import InputError, JsonObject, checked
+from haselab.identify.fit import several
 from haselab.identify.model_choice import APART
 from haselab.identify.noise import autoregression
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
@@ -98,8 +99,9 @@ def _described(fit: TransferFit) -> dict[str, Any]:
     return {**_structure_dict(fit.structure), _NONLINEAR: kind}
 
 
+@checked
 def choose_transfer(
-    records: Sequence[Record],
+    records: Record | Sequence[Record],
     start: TransferStructure | None = None,
     varied: Sequence[str] = _VARIED,
 ) -> TransferChoice:
@@ -110,7 +112,7 @@ def choose_transfer(
     a time, or a resonance added, as long as that lowers the criterion.
 
     Args:
-        records: experiments.
+        records: experiments, or one.
         start: first structure; its fields that are not varied are kept. Default: one resonance
             with a delay.
         varied: which of these may change: `poles`, `zeros`, `delay` (estimated or zero),
@@ -126,7 +128,7 @@ def choose_transfer(
         >>> u, time_s = rng.normal(size=1000), np.arange(4000) / 400.0
         >>> plant = Plant(0.5, 5.11, 0.09, 0.012, (SlowMode(0.2, 2.0),))
         >>> y = plant.simulate(u, 100.0, time_s) + 0.002 * rng.normal(size=4000)
-        >>> choice = choose_transfer([Record(u, 100.0, y, time_s)], varied=["slow_modes"])
+        >>> choice = choose_transfer(Record(u, 100.0, y, time_s), varied=["slow_modes"])
         >>> choice.fit.structure.slow_modes
         1
     """
@@ -134,6 +136,7 @@ def choose_transfer(
     unknown = sorted(set(varied) - set(allowed))
     if unknown:
         raise InputError(f"varied names {', '.join(unknown)}; must be one of {', '.join(allowed)}.")
+    records = several(records)
     fits = [fit_transfer(records, start)]
     tried = {_key(fits[0].structure)}
     ranked = _ranked(fits)

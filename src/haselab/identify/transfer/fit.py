@@ -11,9 +11,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
+from haselab.identify.fingerprint import fingerprint
 from haselab.identify.fit import Prediction, RecordFit, several
 from haselab.identify.frequency.steady_tone import steady_tone_hz
 from haselab.identify.noise import coloured_covariance, fit_percent
@@ -90,6 +91,11 @@ class TransferFit(RecordFit[Record]):
         return () if self.best is None else tuple(self.best.records)
 
     @property
+    def fitted_outputs(self) -> tuple[Floats, ...]:
+        """See `RecordFit`."""
+        return tuple(record.y for record in self.records)
+
+    @property
     def parameter_count(self) -> int:
         """Count of all fitted parameters, the state and offset of each record included."""
         if self.best is None:
@@ -137,8 +143,7 @@ class TransferFit(RecordFit[Record]):
             ResultError: the fit has no result, a parameter is not identifiable, or the fit is not
                 one resonance without zeros.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         if self.structure.poles != 2 or self.structure.zeros:
             raise ResultError(
                 f"The fit has {self.structure.poles} poles and {self.structure.zeros} zeros; a "
@@ -166,8 +171,7 @@ class TransferFit(RecordFit[Record]):
         Raises:
             ResultError: the fit has no result, or a gain, pole or zero is not identifiable.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         gain, delay_s = (self.parameters[name].value for name in ("gain", "delay_s"))
         if not np.isfinite([gain, delay_s, *self.poles, *self.zeros]).all():
             raise ResultError(
@@ -186,16 +190,17 @@ class TransferFit(RecordFit[Record]):
             InputError: a parameter is not identifiable.
             ResultError: the fit has no result.
         """
-        if not self.succeeded:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._require()
         return PlantPosterior.from_dict(covariance_table(self.parameters, self.covariance))
 
+    @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
         inputs = finite_vector("u", u, 1)
         rate = self._rate_hz(rate_hz)
         return self.rational.simulate(inputs, rate, np.arange(inputs.size) / rate)
 
+    @checked
     def compare(self, records: Record | Sequence[Record]) -> Prediction:
         """See `RecordFit`; the band is that of the covariance and of the residuals."""
         return predict(
@@ -203,6 +208,7 @@ class TransferFit(RecordFit[Record]):
             several(records),
             posterior=None if np.isinf(self.covariance).any() else self.posterior,
             noise_std=float(np.std(np.concatenate(self.residuals))),
+            fitted_to=fingerprint(self.fitted_outputs),
             rng=np.random.default_rng(1),
         )
 
@@ -217,8 +223,7 @@ class TransferFit(RecordFit[Record]):
 
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
-        if not self.records:
-            raise ResultError(f"The fit gives no model: {self.status}")
+        self._present(self.records or None)
         title = f"Transfer function, fit {self.fit_percent:.1f} %"
         return records_chart(title, self.records, self.residuals, (names or ("", "Output"))[1])
 
@@ -237,6 +242,7 @@ class TransferFit(RecordFit[Record]):
             "status": self.status,
             "notes": list(self.notes),
             "covariance": covariance_table(self.parameters, self.covariance),
+            "fitted_to": fingerprint(self.fitted_outputs),
             "other_minima": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
                 for r in self.other_minima
@@ -244,6 +250,7 @@ class TransferFit(RecordFit[Record]):
         }
 
 
+@checked
 def fit_transfer(
     records: Record | Sequence[Record],
     structure: TransferStructure | None = None,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, check_fields
 
 __all__ = ["Layout", "Section", "TransferStructure", "layout_of"]
 
@@ -47,6 +47,7 @@ class TransferStructure:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not 1 <= self.poles <= _MAX_POLES:
             raise InputError(
                 f"poles = {self.poles}; must be 1 to {_MAX_POLES}. Two form one resonance."

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, checked
 from haselab.identify.model_choice import APART
 from haselab.identify.noise import fit_percent
 from haselab.identify.nonlinear.hammerstein import DEGREES, fit_hammerstein
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, cut, no_fit, shortened
-from haselab.identify.nonlinear.oscillator import fit_output_curve, fit_spring
+from haselab.identify.nonlinear.oscillator import fit_duffing, fit_output_curve
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.clipping import richer_fits
 from haselab.identify.transfer.fit import TransferFit
@@ -38,13 +38,14 @@ _WHITE = 1e-3
 _ONE = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
 
 
+@checked
 def fit_nonlinear(
-    records: Sequence[Record], structure: TransferStructure | None, kind: str
+    records: Record | Sequence[Record], structure: TransferStructure | None, kind: str
 ) -> NonlinearFit:
     """Fit one nonlinear model.
 
     Args:
-        records: experiments.
+        records: experiments, or one.
         structure: structure of the linear part. Default: one resonance with a delay.
         kind: one of `NONLINEAR`: a polynomial of degree 2 or 3 of the input, a spring with a cubic
             or a quadratic and a cubic part, a curve of the output.
@@ -60,7 +61,7 @@ def fit_nonlinear(
         return fit_hammerstein(records, structure, int(which))
     if family == "wiener":
         return fit_output_curve(records, structure)
-    return fit_spring(records, structure, (2, 3) if which else (3,))
+    return fit_duffing(records, structure, (2, 3) if which else (3,))
 
 
 def nonlinear_candidates(
@@ -84,8 +85,8 @@ def nonlinear_candidates(
     fits = []
     if start is not None:
         fits = [
-            fit_spring(records, one, (3,), start),
-            fit_spring(records, one, (2, 3), start),
+            fit_duffing(records, one, (3,), start),
+            fit_duffing(records, one, (2, 3), start),
             fit_output_curve(records, one, linear=start),
         ]
     clear = any(f.residual_whiteness_p > _WHITE for f in (linear, *fits) if f.succeeded)

@@ -15,6 +15,7 @@ __all__ = [
     "EstimateTable",
     "LoopTable",
     "Number",
+    "OriginTable",
     "PlantTable",
     "PolesTable",
     "RationalTable",
@@ -99,6 +100,20 @@ class CovarianceTable(_Table):
         list[Annotated[list[Number | None], Field(max_length=_MOST_FACTORS)]],
         Field(max_length=_MOST_FACTORS),
     ]
+
+
+class OriginTable(_Table):
+    """Signals and records that a model was fitted to; empty where they are not known.
+
+    Units are SI units, "1" for a pure number; `fitted_to` is `identify.fingerprint` of the outputs.
+    """
+
+    input: str = ""
+    output: str = ""
+    input_unit: str = ""
+    output_unit: str = ""
+    residual_std: Annotated[Number, Field(ge=0)] = 0.0
+    fitted_to: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]] = []
 
 
 class VoltagePlantTable(_Table):

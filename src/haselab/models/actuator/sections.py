@@ -6,9 +6,11 @@ not listed here are kept unchanged.
 
 from __future__ import annotations
 
-from typing import Annotated
+import operator
+from typing import Annotated, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
 from haselab.models.actuator.model_tables import CovarianceTable, Number
@@ -38,8 +40,41 @@ _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
 _Variance = Annotated[float, Field(strict=True, ge=-1e120, le=1e120, allow_inf_nan=False)]
 
 
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] <= ends[1]:
+        raise ValueError(f"[{ends[0]:g}, {ends[1]:g}] must have the lower end first")
+    return ends
+
+
+_Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
+
+
+def _four_by_four(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+    """A covariance of the four coefficients of a map."""
+    lengths = [len(row) for row in rows]
+    if lengths != [4] * 4:
+        raise PydanticCustomError(
+            "square", "Input should be 4 rows of 4 numbers, not rows of {lengths}",
+            {"lengths": str(lengths)},
+        )  # fmt: skip
+    return rows
+
+
+_Covariance = Annotated[tuple[tuple[_Variance, ...], ...], AfterValidator(_four_by_four)]
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True)
+
+    _ends: ClassVar[tuple[str, ...]] = ()  # keys of a lower and an upper limit
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        ends = {key: getattr(self, key) for key in self._ends}
+        if ends and None not in ends.values() and not operator.lt(*ends.values()):
+            found = " must be below ".join(f"{key} = {value:g}" for key, value in ends.items())
+            raise ValueError(found)
+        return self
 
 
 class Geometry(_Section):
@@ -66,13 +101,13 @@ class StrainMapTable(_Section):
     offset: Number
     curvature_per_f2: Number = 0.0
     cubic_per_f3: Number = 0.0
-    covariance: tuple[tuple[_Variance, ...], ...] | None = None
-    range_f: tuple[Number, Number] | None = None
-    band: tuple[Number, Number] | None = None
+    covariance: _Covariance | None = None
+    range_f: _Range | None = None
+    band: _Range | None = None
     coverage: _Share = 0.95
-    held_out_coverage: Number | None = None
-    hysteresis_strain: Number | None = None
-    residual_std: Number | None = None
+    held_out_coverage: Annotated[Number, Field(ge=0, le=1)] | None = None
+    hysteresis_strain: Annotated[Number, Field(ge=0)] | None = None
+    residual_std: Annotated[Number, Field(ge=0)] | None = None
 
     def map(self) -> StrainMap:
         """The map with these coefficients.
@@ -104,13 +139,15 @@ class SensingSection(_Section):
 class VoltageMapTable(_Section):
     """`[drive.voltage_map]`: strain to drive voltage, see `VoltageMap`."""
 
+    _ends = ("strain_low", "strain_high")
+
     a1_v: Number
     b1: Number
     a2_v: Number
     b2: Number
     strain_low: Number = -0.1
     strain_high: Number = 0.2
-    covariance: tuple[tuple[_Variance, ...], ...] | None = None
+    covariance: _Covariance | None = None
 
     def map(self) -> VoltageMap:
         """The map with these coefficients.
@@ -123,6 +160,8 @@ class VoltageMapTable(_Section):
 
 class DriveSection(_Section):
     """The amplifier, the limits of the voltage, and the map from strain to voltage."""
+
+    _ends = ("low_v", "high_v")
 
     low_v: Number | None = None  # of the drive, before the amplifier
     high_v: Number | None = None
@@ -157,6 +196,8 @@ class ModelSection(_Section):
 
 class Limits(_Section):
     """Range of the controller's output, in the unit of the model's input."""
+
+    _ends = ("low", "high")
 
     low: Number
     high: Number

@@ -22,7 +22,7 @@ _WRITTEN = {
     "sensing": ("date", "amplifier", "rate_hz", "scale_std_s", "stray_s", "offsets_v", "residual",
                 "reference"),
     "model": (*PlantTable.model_fields, *RationalTable.model_fields, "fit_percent", "input_unit",
-              "output_unit", "linear_models"),
+              "output_unit", "fitted_to", "linear_models"),
     "controller": ("margins", "predicted", "plausible", "uncertainty"),
 }  # fmt: skip
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
@@ -62,7 +62,7 @@ def close_key(key: str, known: Collection[str]) -> str:
         >>> close_key("hihg_v", ["low_v", "high_v"]), close_key("colour", ["low_v", "high_v"])
         ('high_v', '')
     """
-    return next(iter(difflib.get_close_matches(key, known, 1, _CLOSE)), "")
+    return next(iter(difflib.get_close_matches(key.lower(), known, 1, _CLOSE)), "")
 
 
 def misspelled_keys(sections: Mapping[str, Any]) -> list[Misspelled]:
@@ -88,7 +88,8 @@ def _looked_into(
     for key, item in table.items():
         inner = f"{place}.{key}" if place else key
         if key not in known:
-            if meant := close_key(key, [name for name in known if name not in table]):
+            # `haselab init` writes every section, so a misspelled one stands beside the right one.
+            if meant := close_key(key, [name for name in known if not place or name not in table]):
                 yield Misspelled(place, key, meant)
             continue
         if inner in _NOT_LOOKED_INTO or key not in fields:

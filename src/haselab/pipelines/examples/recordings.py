@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, describe
-from haselab.runtime.runner import lockin_of
+from haselab.runtime.lockin import lockin_of
 from haselab.signals import linear_chirp, triangle
 
 __all__ = ["CARRIER_HZ", "Cycles", "chirp", "cycles", "monitors", "pulled", "released"]

@@ -406,7 +406,7 @@ def _blank(session: SessionReader, request: Request, rate_hz: float) -> tuple[in
         return (0, round(request.blank_s * rate_hz))
     if _is_imported(session):
         return (0, 0)  # its updates are searched
-    from haselab.runtime.runner import BLANKING_S  # imports the rig, for sessions only
+    from haselab.runtime.lockin import BLANKING_S  # imports the rig, for sessions only
 
     switch = int(session.stated("rig", "switch_sample"))
     switch %= int(session.stated("rig", "block_samples"))

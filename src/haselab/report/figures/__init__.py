@@ -14,9 +14,9 @@ from haselab.report.figures import (
     steps,
     tracks,
 )
-from haselab.report.figures.plan import Drawing, FigurePlan, draw_figure
+from haselab.report.figures.plan import DrawnFigure, FigurePlan, draw_figure
 
-__all__ = ["PLANS", "Drawing", "FigurePlan", "draw_figure"]
+__all__ = ["PLANS", "DrawnFigure", "FigurePlan", "draw_figure"]
 
 PLANS: tuple[FigurePlan, ...] = (
     *(

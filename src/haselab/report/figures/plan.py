@@ -11,7 +11,7 @@ from haselab.report.analysis import LeftOutError
 from haselab.report.folder import RunFolder
 from haselab.report.style import figure_style, inline_svg, to_svg
 
-__all__ = ["Drawing", "DrawnPanel", "FigurePlan", "Panel", "draw_figure"]
+__all__ = ["DrawnFigure", "DrawnPanel", "FigurePlan", "Panel", "draw_figure"]
 
 _POINTS = 72.0  # in an inch
 _HALF_INCH, _WIDE_INCH = 3.4, 6.8
@@ -81,7 +81,7 @@ class DrawnPanel:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class DrawnFigure:
     """A drawn figure.
 
     Args:
@@ -97,7 +97,7 @@ class Drawing:
     notes: tuple[str, ...]
 
 
-def draw_figure(plan: FigurePlan, run: RunFolder) -> Drawing:
+def draw_figure(plan: FigurePlan, run: RunFolder) -> DrawnFigure:
     """Draw the panels of a figure for which the folder has data.
 
     Args:
@@ -119,7 +119,7 @@ def draw_figure(plan: FigurePlan, run: RunFolder) -> Drawing:
             else:
                 drawn.append((panel, document))
     inline = tuple(DrawnPanel(inline_svg(document), panel.wide) for panel, document in drawn)
-    return Drawing(plan, _together(plan, drawn) if drawn else "", inline, tuple(notes))
+    return DrawnFigure(plan, _together(plan, drawn) if drawn else "", inline, tuple(notes))
 
 
 def _alone(plan: FigurePlan, panel: Panel, run: RunFolder) -> str:

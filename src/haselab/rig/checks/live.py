@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.rig import ClosesLoop, HighVoltageSupply, Rig, RigDescription
+from haselab.rig import BuiltInController, HighVoltageSupply, Rig, RigDescription
 from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.board import start_checks
 from haselab.rig.checks.dry import QUIET_SHARE, read_backs
@@ -144,7 +144,7 @@ def _wait_for(supply: HighVoltageSupply, reached: Callable[[float], bool]) -> fl
         time.sleep(0.05)
 
 
-def _see_loop(rig: Rig, controller: ClosesLoop) -> CheckResult:
+def _see_loop(rig: Rig, controller: BuiltInController) -> CheckResult:
     """Hold zero strain for half a second: the microcontroller must arm, sense and drive."""
     wanted = max(0.0, controller.strain_limits.low)
     for _ in range(_BLOCKS):

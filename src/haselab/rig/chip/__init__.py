@@ -12,7 +12,7 @@ from haselab.rig.chip.chip_bench import ChipBench
 from haselab.rig.chip.design import ChipDesign, read_design
 from haselab.rig.chip.opening import (
     ChipFile,
-    OpenedChip,
+    ConnectedChip,
     key_of_port,
     opened_chip,
 )
@@ -28,8 +28,8 @@ __all__ = [
     "ChipDesign",
     "ChipFile",
     "CoSim",
+    "ConnectedChip",
     "Firmware",
-    "OpenedChip",
     "Output",
     "SerialChip",
     "SuppliedCoSim",

@@ -87,7 +87,7 @@ def describe_chip(
 
 
 class ChipBench:
-    """A microcontroller as `Acquisition`, `VoltageSource`, `FunctionGenerator` and `ClosesLoop`.
+    """A microcontroller as acquisition, voltage source, function generator and built-in controller.
 
     Its blocks are the readings of its updates, from `Trace`. It is off after opening. If its link
     is silent for too long, it ramps its output down and trips: it is its own guardian.
@@ -316,10 +316,10 @@ class ChipBench:
         """See `haselab.rig.FunctionGenerator`."""
         self.zero()
 
-    # ---- ClosesLoop --------------------------------------------------------------------------
+    # ---- BuiltInController -----------------------------------------------------------------------
 
     def follow(self, strain: float) -> None:
-        """See `haselab.rig.ClosesLoop`; arms the microcontroller if it is off."""
+        """See `haselab.rig.BuiltInController`; arms the microcontroller if it is off."""
         self.strain_limits.check(strain)
         if self._state not in (State.ARMED, State.RUNNING):
             if self._follows:
@@ -371,7 +371,7 @@ class ChipBench:
 
     @property
     def output_v(self) -> float:
-        """See `haselab.rig.ClosesLoop`."""
+        """See `haselab.rig.BuiltInController`."""
         return self._drive_v
 
     # ---- the stand's clock -------------------------------------------------------------------

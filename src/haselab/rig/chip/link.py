@@ -12,10 +12,13 @@ from haselab.firmware.messages import (
     VERSION,
     Ack,
     ConfirmArming,
+    Fault,
     Hello,
     Identity,
     RequestArming,
     Result,
+    State,
+    Status,
 )
 
 __all__ = ["ChipLink"]
@@ -134,6 +137,9 @@ class ChipLink(ABC):
         answer = self.query(message, wait_s)
         if not isinstance(answer, Ack) or answer.result != Result.ACCEPTED:
             what = "no reply" if answer is None else Result(answer.result).name.lower()
+            states = [m for m in self.messages if isinstance(m, Status)]
+            if states and states[-1].state == State.TRIPPED:
+                what = f"tripped: {Fault(states[-1].fault).name.lower()}"
             raise DeviceError(
                 f"The microcontroller did not accept {type(message).__name__} ({what}). Check its "
                 "state, and clear its fault."

@@ -33,8 +33,8 @@ from haselab.store.toml import PrintableSection
 
 __all__ = [
     "ChipFile",
+    "ConnectedChip",
     "FrontEndConfig",
-    "OpenedChip",
     "SimulatorConfig",
     "key_of_port",
     "opened_chip",
@@ -159,7 +159,7 @@ class ChipFile(PrintableSection):
 
 
 @dataclass(frozen=True)
-class OpenedChip:
+class ConnectedChip:
     """An opened microcontroller.
 
     Args:
@@ -181,7 +181,7 @@ def key_of_port(port: str) -> str:
 
 
 @contextlib.contextmanager
-def opened_chip(file: ChipFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
+def opened_chip(file: ChipFile, path: Path, gate: Gate) -> Iterator[ConnectedChip]:
     """Open the microcontroller of a rig file; the context ends at 0 V and closes the link.
 
     In co-simulation the firmware is built, calibrated with a reference capacitor, and built again.
@@ -213,7 +213,7 @@ def opened_chip(file: ChipFile, path: Path, gate: Gate) -> Iterator[OpenedChip]:
             rig = _on_port(opened, bench, file, settings)
         rig.gate = gate
         opened.callback(rig.safe)
-        yield OpenedChip(rig, settings, zero_m, bench.identity)
+        yield ConnectedChip(rig, settings, zero_m, bench.identity)
 
 
 def _bench(

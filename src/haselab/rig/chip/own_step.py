@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from haselab.base import InputError
-from haselab.controllers import ChosenController, chosen_controller, controller_names
+from haselab.controllers import CONTROLLERS, ChosenController, chosen_controller
 from haselab.firmware import ControllerStep
 from haselab.models.actuator.sections import ControllerSection
 from haselab.store.text_file import read_text
@@ -41,7 +41,7 @@ def _chosen(controller: ControllerSection) -> ChosenController:
 
 
 def _values(controller: ControllerSection) -> tuple[tuple[str, float], ...]:
-    if controller.kind in controller_names():
+    if controller.kind in CONTROLLERS.packages():
         return _chosen(controller).values
     return tuple((name, float(value)) for name, value in controller.parameters.items())
 

@@ -130,7 +130,7 @@ class CoSim(Closing, ChipLink):
                     )
                 return other
             if kind == "uart":
-                link.append(int(words[0], 16))
+                link += bytes.fromhex(words[0])
             elif kind == "out":
                 at, code, enable = map(int, words)
                 self.outputs.append(Output(at / CLOCK_HZ, code, enable))

@@ -8,9 +8,6 @@ Another package lists its drivers in its own `pyproject.toml`:
 A rig file then chooses it by `kind = "mysupply"`. All programs that load a rig file (a run, a
 guardian process, `rig safe`, `doctor`) find its drivers here. A driver that does not load, or that
 other processes cannot shut down, is refused while the file is read, before anything is energised.
-
-The drivers of this package are entry points too, but listed here and not in its metadata: an
-outdated installation must not lose the driver that shuts a bench down.
 """
 
 from __future__ import annotations
@@ -20,13 +17,13 @@ import functools
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
 from haselab.base import DeviceError, HaselabError
+from haselab.base.registry import Registry
 from haselab.rig.instruments.instrument import (
     CameraInstrument,
     DaqInstrument,
@@ -44,34 +41,18 @@ from haselab.rig.instruments.sections import (
 
 __all__ = [
     "DEFAULT_KINDS",
-    "GROUP",
+    "INSTRUMENTS",
     "ByKind",
-    "Driver",
     "camera_of",
     "config_class",
     "daq_of",
-    "forget",
     "generator_of",
-    "installed",
     "instrument_of",
     "reported_faults",
     "supply_of",
 ]
 
-GROUP = "haselab.instruments"
 DEFAULT_KINDS = {"daq": "nidaq", "generator": "keysight33500", "supply": "petapicovoltron"}
-_OWN = "haselab"  # the package of the drivers below
-_DRIVERS = {
-    "nidaq": "haselab.rig.instruments.nidaq.instrument:NidaqInstrument",
-    "keysight33500": "haselab.rig.instruments.keysight33500.instrument:KeysightInstrument",
-    "petapicovoltron": (
-        "haselab.rig.instruments.petapicovoltron.instrument:PetaPicoVoltronInstrument"
-    ),
-    "aravis": "haselab.rig.cameras.aravis.instrument:AravisInstrument",
-    "v4l2": "haselab.rig.cameras.v4l2:V4l2Instrument",
-    "folder": "haselab.rig.cameras.folder:FolderInstrument",
-    "twin": "haselab.rig.cameras.twin_source:TwinCameraInstrument",
-}
 _ROLES: dict[str, tuple[type[Instrument[Any]], type[InstrumentConfig]]] = {
     "daq": (DaqInstrument, DaqConfig),
     "generator": (GeneratorInstrument, GeneratorConfig),
@@ -80,42 +61,9 @@ _ROLES: dict[str, tuple[type[Instrument[Any]], type[InstrumentConfig]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Driver:
-    """One entry of the group.
-
-    Args:
-        kind: its name in a rig file.
-        package: its package, with version.
-        entry: the entry point of the class.
-    """
-
-    kind: str
-    package: str
-    entry: EntryPoint
-
-    @property
-    def is_own(self) -> bool:
-        """Whether it comes with this package."""
-        return self.package == _OWN
-
-    def load(self) -> Instrument[Any]:
-        """Import it and check that it is complete.
-
-        Raises:
-            DeviceError: It does not load, or is incomplete.
-        """
-        try:
-            found = self.entry.load()
-            fault = _fault_of(found, self.kind)
-            if not fault:
-                return cast(Instrument[Any], found())
-        except Exception as error:  # another package may raise anything
-            fault = f"it does not load ({type(error).__name__}: {error})"
-        raise DeviceError(
-            f"Instrument {self.kind!r} of package {self.package} cannot be used: {fault}. Nothing "
-            f"was energised. Fix the package, or uninstall it. {self.entry.value}"
-        )
+@functools.cache
+def _instance(driver: type[Instrument[Any]]) -> Instrument[Any]:
+    return driver()
 
 
 def _fault_of(found: Any, kind: str) -> str:
@@ -135,38 +83,27 @@ def _fault_of(found: Any, kind: str) -> str:
     config = getattr(found, "config", None)
     if not (inspect.isclass(config) and issubclass(config, role[1])):
         return f"its attribute config is not derived from {role[1].__name__}"
+    _instance(found)
     return ""
 
 
-@functools.cache
-def installed() -> tuple[Driver, ...]:
-    """List all drivers without importing them, those of this package first."""
-    own = [Driver(kind, _OWN, EntryPoint(kind, at, GROUP)) for kind, at in _DRIVERS.items()]
-    return (*own, *_others())
-
-
-def _others() -> Iterator[Driver]:
-    for entry in sorted(entry_points(group=GROUP), key=lambda entry: (entry.name, entry.value)):
-        package = "?" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
-        yield Driver(entry.name, package, entry)
-
-
-@functools.cache
-def _load(section: str, kind: str) -> Instrument[Any] | None:
-    """Load the instrument of this kind for this section; None if no package provides one.
-
-    Raises:
-        DeviceError: It cannot be used, or more than one package provides it.
-    """
-    offered = [driver for driver in installed() if driver.kind == kind]
-    if len(offered) > 1:
-        raise DeviceError(
-            f"Instrument {kind!r} is provided by more than one package: "
-            f"{' and '.join(each.package for each in offered)}. Nothing was energised. Uninstall "
-            "one of them."
-        )
-    found = [driver.load() for driver in offered]
-    return next((each for each in found if each.section == section), None)
+INSTRUMENTS: Registry[type[Instrument[Any]]] = Registry(
+    "instrument",
+    "haselab.instruments",
+    {
+        "nidaq": "haselab.rig.instruments.nidaq.instrument:NidaqInstrument",
+        "keysight33500": "haselab.rig.instruments.keysight33500.instrument:KeysightInstrument",
+        "petapicovoltron": (
+            "haselab.rig.instruments.petapicovoltron.instrument:PetaPicoVoltronInstrument"
+        ),
+        "aravis": "haselab.rig.cameras.aravis.instrument:AravisInstrument",
+        "v4l2": "haselab.rig.cameras.v4l2:V4l2Instrument",
+        "folder": "haselab.rig.cameras.folder:FolderInstrument",
+        "twin": "haselab.rig.cameras.twin_source:TwinCameraInstrument",
+    },
+    _fault_of,
+    DeviceError,
+)
 
 
 @contextlib.contextmanager
@@ -189,19 +126,14 @@ def reported_faults(config: InstrumentConfig) -> Iterator[None]:
         ) from error
 
 
-def forget() -> None:
-    """Forget the found packages, because some were installed or removed meanwhile."""
-    installed.cache_clear()
-    _load.cache_clear()
-
-
 def _find(section: str, kind: str) -> Instrument[Any]:
-    found = _load(section, kind)
-    if found is None:
+    found = INSTRUMENTS.find(kind)
+    if found.section != section:
         raise DeviceError(
-            f"There is no instrument of kind {kind!r} for section {section}. Install its package."
+            f"The instrument {kind!r} is for section {found.section}, not {section}. Use one of "
+            f"{', '.join(_kinds_of(section))}."
         )
-    return found
+    return _instance(found)
 
 
 def instrument_of(section: str, config: InstrumentConfig) -> Instrument[Any]:
@@ -246,8 +178,8 @@ def config_class(section: str, data: Any) -> type[InstrumentConfig] | None:
         DeviceError: The driver cannot be used.
     """
     kind = data.get("kind", DEFAULT_KINDS.get(section)) if isinstance(data, dict) else None
-    found = _load(section, kind) if isinstance(kind, str) else None
-    return None if found is None else found.config
+    found = INSTRUMENTS.find(kind) if kind in INSTRUMENTS.packages() else None
+    return None if found is None or found.section != section else found.config
 
 
 @dataclass(frozen=True)
@@ -291,11 +223,4 @@ def _validated(section: str, data: Any) -> Any:
 
 def _kinds_of(section: str) -> list[str]:
     """List the kinds for one section, without those of packages that do not load."""
-    found = []
-    for driver in installed():
-        try:
-            if driver.load().section == section:
-                found.append(driver.kind)
-        except DeviceError:
-            continue
-    return found
+    return [kind for kind, found in INSTRUMENTS.usable().items() if found.section == section]

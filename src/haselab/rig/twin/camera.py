@@ -175,13 +175,16 @@ class TwinCamera:
         times = np.asarray(frame_times_s, dtype=np.float64)
         return np.asarray(times[:, np.newaxis] + offsets, dtype=np.float64)
 
-    def render(self, lengths_m: ArrayLike, first_index: int) -> NDArray[np.uint8]:
+    def render(
+        self, lengths_m: ArrayLike, first_index: int, out: NDArray[np.uint8] | None = None
+    ) -> NDArray[np.uint8]:
         """Render consecutive frames of a recording.
 
         Args:
             lengths_m: length between the clamp lines at each sample of each exposure, in m.
                 Shape `(F, samples)`.
             first_index: number of the first of these frames in the recording; chooses the noise.
+            out: where the frames go, of the shape and type that is returned; None: a new array.
 
         Returns:
             Grey levels of mean `expected_levels` and variance `shot_gain_grey` times the mean plus
@@ -195,7 +198,7 @@ class TwinCamera:
         if first_index < 0:
             raise InputError(f"first_index is {first_index}, but it must be at least 0.")
         lengths_px = self._lengths_px(lengths_m)
-        frames = np.empty(self._shape(lengths_px), dtype=np.uint8)
+        frames = np.empty(self._shape(lengths_px), dtype=np.uint8) if out is None else out
         self._scene.render(lengths_px, first_index, frames)
         return frames
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -351,16 +352,17 @@ class TwinBench:
         if parts == 1:  # starting a thread takes longer
             taken = self._camera.render(positions, first)
         else:
-            pieces = np.array_split(np.arange(len(positions)), parts)
+            camera = self._config.camera
+            taken = np.empty((len(positions), camera.height_px, camera.width_px), np.uint8)
+            bounds = [len(positions) * k // parts for k in range(parts + 1)]
             renderers = self._renderers or ThreadPoolExecutor(_THREADS)
             try:
-                images = renderers.map(
-                    lambda part: self._camera.render(
-                        positions[part[0] : part[-1] + 1], first + int(part[0])
-                    ),
-                    pieces,
+                drawn = renderers.map(
+                    lambda a, b: self._camera.render(positions[a:b], first + a, taken[a:b]),
+                    bounds[:-1],
+                    bounds[1:],
                 )
-                taken = np.concatenate(list(images))
+                deque(drawn, maxlen=0)  # raises the error of a thread
             except BaseException:  # Ctrl-C as a thread starts: it is not known to the pool, ...
                 self._renderers = None
                 renderers.shutdown()  # ... would never end, and the process would wait for it

@@ -74,6 +74,14 @@ def _tools_of_a_call(config: LockinConfig) -> tuple[Segments, DriveLibrary]:
     return segments, copy(library)
 
 
+def _on_one_side(config: LockinConfig) -> LockinConfig:
+    """Blank also the shorter side of a known update: no model of a drive continues across it."""
+    (low, high), n = config.blank, config.block_samples
+    if not 0 < low < high < n:
+        return config
+    return replace(config, blank=(0, high) if n - high >= low else (low, n))
+
+
 def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     """Find models for blocks that the plain model does not explain.
 
@@ -83,6 +91,7 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     Returns:
         The results; None where a block has too few periods for other models.
     """
+    config = _on_one_side(config)
     segments, library = _tools_of_a_call(config)
     if not segments.enough or segments.counts.sum() < 4:
         return None

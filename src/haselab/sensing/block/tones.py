@@ -83,6 +83,8 @@ def find_lines(readings: NDArray[np.generic], config: LockinConfig) -> Lines:
     found: list[tuple[float, Floats]] = []
     sides: list[float] = []
     shown[: int(low / bin_hz)] = 0.0
+    if config.blank[1] > config.blank[0]:
+        _without_staircase(shown, config.rate_hz / config.block_samples / bin_hz, lobe)
     for _ in range(4 * _MOST_LINES):
         k = int(np.argmax(shown))
         if shown[k] < _CLEAR or len(found) >= _MOST_LINES:
@@ -105,6 +107,14 @@ def find_lines(readings: NDArray[np.generic], config: LockinConfig) -> Lines:
         hum_hz,
         hum,
     )
+
+
+def _without_staircase(shown: Floats, spacing: float, lobe: int) -> None:
+    """Remove lines at multiples of the block rate, which one update per block causes."""
+    for k in np.rint(np.arange(spacing, shown.size - 1, spacing)).astype(int).tolist():
+        around = shown[max(0, k - lobe) : k + lobe + 1]
+        if shown[k - 1 : k + 2].max() >= around.max():
+            around[:] = 0.0
 
 
 @lru_cache(maxsize=8)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Closing, InputError
+from haselab.base.registry import Registry
 from haselab.store.columns.archive import Archive
 from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
@@ -23,6 +23,7 @@ from haselab.store.columns.selection import (
 from haselab.store.columns.units import Unit
 
 __all__ = [
+    "FORMATS",
     "ColumnStream",
     "check_rate",
     "head_of_times",
@@ -37,17 +38,34 @@ _HEAD_ROWS = 4096
 _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
 _EVEN = 0.01  # of a step: how far times may be from even ones
 
-_TEXT = ("csv_file", "CsvArchive")
 _TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".lvm", ".prn")
-_KINDS = {
-    **dict.fromkeys(_TEXT_ENDINGS, _TEXT),
-    ".mat": ("mat", "MatArchive"),
-    ".npz": ("numpy_file", "NpzArchive"),
-    ".npy": ("numpy_file", "NpyArchive"),
-    ".h5": ("hdf5", "Hdf5Archive"),
-    ".hdf5": ("hdf5", "Hdf5Archive"),
-    ".tdms": ("tdms", "TdmsArchive"),
-}
+
+
+def _fault(archive: object, ending: str) -> str:
+    """Return what is wrong with the class of an entry point, or an empty text."""
+    if not ending.startswith("."):
+        return "its name is not the ending of a file, such as .xyz"
+    is_archive = isinstance(archive, type) and issubclass(archive, Archive)
+    return "" if is_archive else "it is not a class derived from Archive"
+
+
+FORMATS: Registry[Callable[[Path, contextlib.ExitStack], Archive]] = Registry(
+    "file format",
+    "haselab.formats",
+    {
+        ending: f"haselab.store.columns.{place}"
+        for ending, place in {
+            **dict.fromkeys(_TEXT_ENDINGS, "csv_file:CsvArchive"),
+            ".mat": "mat:MatArchive",
+            ".npz": "numpy_file:NpzArchive",
+            ".npy": "numpy_file:NpyArchive",
+            ".h5": "hdf5:Hdf5Archive",
+            ".hdf5": "hdf5:Hdf5Archive",
+            ".tdms": "tdms:TdmsArchive",
+        }.items()
+    },
+    _fault,
+)
 
 
 def _unreadable(file: Path, error: Exception) -> InputError:
@@ -74,22 +92,21 @@ def open_archive(path: Path | str) -> Archive:
         InputError: no such file, unknown kind, or damaged.
     """
     file = Path(path)
+    if file.is_dir():
+        raise InputError(f"The path is a folder, not a file. Name the file in it: {file}")
     if not file.is_file():
         raise InputError(f"There is no such file. Check the path: {file}")
     kind = file.suffix.lower()
-    if kind not in _KINDS:
+    if kind not in FORMATS.packages():
         raise InputError(
             f"Files with the ending '{kind}' are not supported. Export the data as CSV, or as one "
-            f"of {' '.join(_KINDS)}: {file}"
+            f"of {' '.join(FORMATS.packages())}: {file}"
         )
     if file.stat().st_size == 0 and kind not in _TEXT_ENDINGS:
         raise InputError(f"The file is empty. Record again: {file}")
     if kind == ".mat" and _is_hdf5(file):
         kind = ".h5"  # version 7.3
-    module, name = _KINDS[kind]
-    opener: Callable[[Path, contextlib.ExitStack], Archive] = getattr(
-        importlib.import_module(f"haselab.store.columns.{module}"), name
-    )  # libraries are imported on demand: `haselab sense` must start fast
+    opener = FORMATS.find(kind)  # which imports it now: `haselab sense` must start fast
     opened = contextlib.ExitStack()
     try:
         return opener(file, opened)

@@ -58,6 +58,10 @@ class Table:
     assumed_seconds: bool = False
 
     def __getitem__(self, name: str) -> Floats:
+        if name not in self.columns:
+            raise InputError(
+                f"There is no column {name!r}; the table has {', '.join(self)}. Name one of these."
+            )
         return self.columns[name]
 
     def __iter__(self) -> Iterator[str]:

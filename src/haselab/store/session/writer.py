@@ -64,7 +64,8 @@ def _size_limit() -> int:
 def _packed(codes: NDArray[np.int16]) -> bytes:
     """Compress a chunk like HDF5's shuffle and gzip; zlib lets other threads run meanwhile."""
     planes = codes.reshape(-1).view(np.uint8).reshape(-1, codes.itemsize).T
-    return zlib.compress(planes.tobytes(), 1)
+    deflate = zlib.compressobj(1, memLevel=9)  # more memory is faster
+    return deflate.compress(planes.tobytes()) + deflate.flush()
 
 
 class _Pending:

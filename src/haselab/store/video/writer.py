@@ -1,4 +1,4 @@
-"""Write camera frames to a lossless video: FFV1 in Matroska, exact to the grey level."""
+"""Write camera frames to a lossless video, exact to the grey level."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
+from typing import cast
 
 import av
 import numpy as np
@@ -16,7 +17,10 @@ from haselab.base import DeviceError
 
 __all__ = ["VideoWriter", "frame_hash", "write_png"]
 
-
+_CODECS = {
+    ".mkv": ("ffv1", {"level": "3", "slices": "4", "context": "0"}),
+    ".avi": ("magicyuv", {"pred": "median"}),
+}
 _MOST_JOBS = 8  # batches that may wait for the encoder
 
 
@@ -52,7 +56,8 @@ class VideoWriter:
     """Writes 8-bit frames in the background, and their times to a CSV file beside the video.
 
     Args:
-        path: of the new `.mkv` file.
+        path: of the new file: `.mkv` for FFV1, the standard for archives, or `.avi` for MagicYUV,
+            which takes an eighth of the time and a tenth more space.
         rate_hz: nominal frame rate, for players.
         hashed: also write the hash of each frame to the table.
     Raises:
@@ -72,11 +77,11 @@ class VideoWriter:
             self._container = av.open(str(path), "w")
         except OSError as error:
             raise self._failed(error) from None
-        self._stream = self._container.add_stream(
-            "ffv1", rate=Fraction(rate_hz).limit_denominator()
-        )
+        codec, options = _CODECS[path.suffix]
+        stream = self._container.add_stream(codec, rate=Fraction(rate_hz).limit_denominator())
+        self._stream = cast(av.VideoStream, stream)
         self._stream.pix_fmt = "gray"
-        self._stream.options = {"level": "3", "slices": "4", "context": "0"}
+        self._stream.options = {**options}
 
     def _failed(self, error: OSError) -> DeviceError:
         return DeviceError(

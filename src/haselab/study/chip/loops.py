@@ -16,11 +16,10 @@ from haselab import _core
 from haselab.base import JsonObject
 from haselab.control import PidGains, margins, step_metrics
 from haselab.controllers import (
+    CONTROLLERS,
     ChosenController,
     ControllerSetting,
     Measurement,
-    controller_kind,
-    controller_names,
     pid_controller,
 )
 from haselab.firmware import ChipSettings
@@ -30,7 +29,7 @@ from haselab.rig.chip import REFERENCE, CoSim, Firmware, calibrated_firmware
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import TwinBench, describe
-from haselab.runtime.runner import BLANKING_S
+from haselab.runtime.lockin import BLANKING_S
 from haselab.sensing import Lockin, LockinConfig
 
 __all__ = [
@@ -180,7 +179,7 @@ def controller_of(settings: ChipSettings) -> ChosenController:
     """
     s, own = settings, settings.own
     if own is not None:
-        return controller_kind(own.kind).choose(dict(own.parameters))
+        return CONTROLLERS.find(own.kind).choose(dict(own.parameters))
     return pid_controller(s.kp, s.ki, s.kd, s.derivative_filter_s)
 
 
@@ -386,7 +385,7 @@ def step_experiment(
     with tempfile.TemporaryDirectory() as folder:
         made = calibrated_firmware(settings, config, seed, Path(folder))
         chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)
-    alone = settings.own is not None and settings.own.kind not in controller_names()
+    alone = settings.own is not None and settings.own.kind not in CONTROLLERS.packages()
     desks = [
         desktop_loop(config, seed, settings, desk, plan) for desk in (() if alone else (SLOW, FAST))
     ]

@@ -16,7 +16,6 @@ from haselab.rig import Rig, RigDescription
 from haselab.runtime.observer import FIDUCIALS
 from haselab.runtime.runner import Runner
 from haselab.sensing import sense_quadrature
-from haselab.signals import constant
 from haselab.store.folder import write_json
 from haselab.store.session.writer import (
     ExperimentPlan,
@@ -119,7 +118,8 @@ def _play_chip_steps(runner: Runner, study: StepStudy) -> None:
     """Play row S24 with the rig's controller, at rest first for the camera's reference."""
     trials = study.step_trials
     lead_s = max(_REST_S, _REST_FRAMES / trials.frame_rate_hz)
-    reference = np.concatenate([constant(np.nan, lead_s, UPDATE_HZ), step_reference(trials)])
+    lead = np.full(round(lead_s * UPDATE_HZ), np.nan)  # no reference: the rig is at rest
+    reference = np.concatenate([lead, step_reference(trials)])
     for name in chip_names(study):
         runner.settle(0.0, trials.rest_s)
         runner.follow(name, reference, trials.frame_rate_hz, runner.mass_kg)

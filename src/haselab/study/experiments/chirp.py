@@ -11,7 +11,7 @@ from haselab.rig import RigDescription
 from haselab.safety.feasibility import Drive
 from haselab.signals import constant, linear_chirp
 from haselab.study.analysis import Analysis
-from haselab.study.experiment import Experiment, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult
 from haselab.study.experiments.operating_point import baseline_v, possible_baselines_v
 from haselab.study.experiments.steps import open_names
 from haselab.study.fits.dynamics import (
@@ -66,7 +66,7 @@ class ChirpTest(Experiment[Chirp]):
         drive_v = np.concatenate([lead, self._drive_v(about_v)])
         player.play(self.table, drive_v, self.settings.frame_rate_hz)
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`; without steps or maps, only the second-order model."""
         maps, seen = analysis.find(Maps), analysis.observe(self.table)
         stop_hz = self.settings.stop_hz
@@ -78,18 +78,18 @@ class ChirpTest(Experiment[Chirp]):
             return self._alone(*found, "needs the open-loop trials of [steps]")
         opened = [analysis.observe(name) for name in open_names(self.study)]
         both = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig)
-        return Outcome(both.quantities, figures=both.figures, values=(both,))
+        return ExperimentResult(both.quantities, figures=both.figures, values=(both,))
 
     def _alone(
         self, quantities: Mapping[str, Estimate], figures: Mapping[str, object], needs: str
-    ) -> Outcome:
+    ) -> ExperimentResult:
         """The second order alone; why the other results are missing."""
         reason = f"{needs}; this study has none"
         missing = {key: reason for key in self.rows() if key not in quantities}
         if "S20.gain_per_volt" in missing:
             missing["S20.gain_per_volt"] = "the voltage map is known, see S20.eq8_gain"
         note = {"S20.gain_per_volt": _ABOUT} if "S20.gain_per_volt" in quantities else {}
-        return Outcome(quantities, note, figures=figures, missing=missing)
+        return ExperimentResult(quantities, note, figures=figures, missing=missing)
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`; without a triangle, the gain from the drive voltage too."""

@@ -9,7 +9,7 @@ import numpy as np
 from haselab.rig import RigDescription
 from haselab.safety.feasibility import Drive
 from haselab.study.analysis import Analysis
-from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult, NotPlayedError
 from haselab.study.experiments.steps import open_names
 from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.loops import Loops, design_loops, measured_latency
@@ -44,7 +44,7 @@ class ControllerDesign(Experiment[Control]):
     def play(self, player: Player) -> None:
         """See `Experiment`; the design is made when the closed loops need it."""
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
         dynamics, maps = analysis.need(Dynamics), analysis.need(Maps)
         if not self.study.has("steps"):
@@ -55,7 +55,9 @@ class ControllerDesign(Experiment[Control]):
             np.random.default_rng(_SEED), measured_latency(opened, analysis.rig),
             analysis.repeated(Loops),
         )  # fmt: skip
-        return Outcome(found.quantities, found.notes, figures=found.figures, values=(found,))
+        return ExperimentResult(
+            found.quantities, found.notes, figures=found.figures, values=(found,)
+        )
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

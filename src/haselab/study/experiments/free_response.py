@@ -10,7 +10,7 @@ from haselab.base import Estimate
 from haselab.rig import RigDescription
 from haselab.safety.feasibility import Drive
 from haselab.study.analysis import Analysis
-from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult, NotPlayedError
 from haselab.study.experiments.operating_point import baseline_v, possible_baselines_v
 from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.free import Free, fit_free
@@ -51,7 +51,7 @@ class FreeResponseTest(Experiment[FreeResponse]):
         for name in self.recordings():
             player.release(name, drive_v, s.settle_s, s.record_s, s.frame_rate_hz)
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
         found = fit_free([analysis.observe(name) for name in self.recordings()])
         quantities, missing, notes = found.quantities, {}, found.notes
@@ -61,7 +61,7 @@ class FreeResponseTest(Experiment[FreeResponse]):
             notes = {**notes, _DIFFERENCE: _discussed(quantities, dynamics)}
         except NotPlayedError as reason:
             missing = {_DIFFERENCE: str(reason)}
-        return Outcome(quantities, notes, figures=found.figures, missing=missing)
+        return ExperimentResult(quantities, notes, figures=found.figures, missing=missing)
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

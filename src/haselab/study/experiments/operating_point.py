@@ -12,7 +12,7 @@ from haselab.safety.feasibility import Drive
 from haselab.signals import constant
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
-from haselab.study.experiment import Experiment, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult
 from haselab.study.fits.cycles import Cycles
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import TRIANGLE
@@ -103,7 +103,7 @@ class OperatingPointTest(Experiment[OperatingPoint]):
         # Fit now, at 0 V: if the triangle has no result, the run ends before hours of other trials.
         player.analysis.find(Maps)
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
         static = analysis.need(Static)
         cycles = Cycles.of(analysis.observe(TRIANGLE), self.study, analysis.rig)
@@ -113,7 +113,7 @@ class OperatingPointTest(Experiment[OperatingPoint]):
             analysis.rig, None if repeated is None else repeated.baseline_v,
         )  # fmt: skip
         figures = {"static": {"operating_point": found.figures}}
-        return Outcome(found.quantities, found.notes, figures=figures, values=(found,))
+        return ExperimentResult(found.quantities, found.notes, figures=figures, values=(found,))
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

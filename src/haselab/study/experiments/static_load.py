@@ -9,7 +9,7 @@ import numpy as np
 from haselab.rig import RigDescription
 from haselab.safety.feasibility import Drive
 from haselab.study.analysis import Analysis
-from haselab.study.experiment import Experiment, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult
 from haselab.study.fits.static import Static, fit_static
 from haselab.study.paper.quantity_table import paper_rows
 from haselab.study.player import Player
@@ -52,10 +52,12 @@ class StaticLoadTest(Experiment[StaticLoad]):
         player.hang(_NAME, list(s.masses_kg), s.settle_s, s.frame_rate_hz)
         player.settle(0.0, s.settle_s)
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
         found = fit_static(analysis.observe(_NAME), self.study, analysis.rig)
-        return Outcome(found.quantities, found.notes, figures=found.figures, values=(found,))
+        return ExperimentResult(
+            found.quantities, found.notes, figures=found.figures, values=(found,)
+        )
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

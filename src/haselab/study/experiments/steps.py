@@ -13,7 +13,7 @@ from haselab.safety.feasibility import Drive
 from haselab.signals import constant
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
-from haselab.study.experiment import Experiment, NotPlayedError, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult, NotPlayedError
 from haselab.study.fits.further import further_trials, saturating_reference
 from haselab.study.fits.loops import Loops, loop_saturation
 from haselab.study.fits.maps import Maps
@@ -164,7 +164,7 @@ class StepTest(Experiment[Steps]):
             found[OWN] = replace(pi, controller=own)
         return found
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`; without a design, the open loop and the study's own controller."""
         maps, scale = analysis.need(Maps), analysis.rig.scale_m_per_px
         opened = [analysis.observe(name) for name in open_names(self.study)]
@@ -173,7 +173,7 @@ class StepTest(Experiment[Steps]):
         except NotPlayedError as reason:
             alone = compare_trials(self._without_design(analysis, opened), maps, self.study, scale)
             missing = {key: str(reason) for key in self.rows() if key not in alone.quantities}
-            return Outcome(
+            return ExperimentResult(
                 alone.quantities, alone.notes, figures=alone.figures, values=(alone,),
                 missing=missing,
             )  # fmt: skip
@@ -181,16 +181,13 @@ class StepTest(Experiment[Steps]):
             group: [analysis.observe(name) for name in closed_names(self.study, group)]
             for group in (*_CLOSED, OWN)
         }
-        groups: dict[str, Sequence[Observation]] = {"open loop": opened, "PI": trials["pi"]}
-        if trials["pid"]:
-            groups["PID"] = trials["pid"]
-        if trials[OWN]:
-            groups[OWN] = trials[OWN]
+        closed = {"PI": trials["pi"], "PID": trials["pid"], OWN: trials[OWN]}
+        groups = {"open loop": opened} | {name: seen for name, seen in closed.items() if seen}
         found = compare_trials(groups, maps, self.study, scale)
         further, notes, drawn = further_trials(
-            trials, found.groups["PI"], maps, loops, self.study, scale
+            trials, found.groups.get("PI"), maps, loops, self.study, scale
         )
-        return Outcome(
+        return ExperimentResult(
             {**found.quantities, **further},
             {**found.notes, **notes},
             figures={**found.figures, **drawn},

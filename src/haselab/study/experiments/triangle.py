@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from haselab.rig import RigDescription
+from haselab.runtime.lockin import counted_s
 from haselab.runtime.observer import PARTICLES
-from haselab.runtime.runner import counted_s
 from haselab.safety.feasibility import Drive
 from haselab.signals import constant, triangle
 from haselab.store.session.writer import ExperimentPlan
 from haselab.study.analysis import Analysis, fitting
-from haselab.study.experiment import Experiment, Outcome
+from haselab.study.experiment import Experiment, ExperimentResult
 from haselab.study.experiments.operating_point import baseline_v
 from haselab.study.fits.cycles import Cycles
 from haselab.study.fits.maps import Maps, fit_maps
@@ -66,15 +66,17 @@ class TriangleTest(Experiment[Triangle]):
         drive_v = np.concatenate([lead, self._drive_v()])
         player.play(TRIANGLE, drive_v, self.settings.frame_rate_hz, particles=_SHEET)
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
         cycles = Cycles.of(analysis.observe(TRIANGLE), self.study, analysis.rig)
         maps = fit_maps(cycles, baseline_v(analysis))
         with fitting("Paper's sensing chain"):
             chain = _chain(cycles, maps, analysis)
         if chain is None:
-            return Outcome(maps.quantities, maps.notes, figures=maps.figures, values=(maps,))
-        return Outcome(
+            return ExperimentResult(
+                maps.quantities, maps.notes, figures=maps.figures, values=(maps,)
+            )
+        return ExperimentResult(
             {**maps.quantities, **chain.quantities},
             {**maps.notes, **chain.notes},
             figures={**maps.figures, **chain.figures},

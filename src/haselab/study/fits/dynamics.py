@@ -223,7 +223,7 @@ def _chirp_figure(
     index = (sweep.output_time_s * _UPDATE_HZ).astype(int)
     u = sweep.u[np.minimum(index, sweep.u.size - 1)]
     frame_rate_hz = 1.0 / float(np.median(np.diff(sweep.output_time_s)))
-    measured = estimate_frequency_response(u, sweep.y, frame_rate_hz).answer()
+    measured = estimate_frequency_response(Record.sampled(u, sweep.y, frame_rate_hz)).answer()
     swept = np.asarray(measured["frequency_hz"]) <= stop_hz
     words = ("status", "notes")
     lines = {key: np.asarray(values)[swept] for key, values in measured.items() if key not in words}

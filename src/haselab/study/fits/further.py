@@ -40,7 +40,7 @@ def saturating_reference(steps: Steps) -> np.ndarray[tuple[int], np.dtype[np.flo
 
 def further_trials(
     observed: Mapping[str, Sequence[Observation]],
-    pi: Trials,
+    pi: Trials | None,
     maps: Maps,
     loops: Loops,
     study: Study,
@@ -50,7 +50,7 @@ def further_trials(
 
     Args:
         observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.
-        pi: the paper's trials, whose scatter is used for a single trial.
+        pi: the paper's trials, whose scatter is used for a single trial; None: not played.
         maps: zero strain, strain to voltage.
         loops: the saturation.
         study: the steps.
@@ -65,15 +65,16 @@ def further_trials(
         if not observed.get(group):
             continue
         trials = gather(observed[group], maps.length_m, maps.strain_map, steps)
+        known = trials if pi is None else pi
         rise, error = (
-            _like(trials.metrics.trials, pi.metrics.trials, which)
+            _like(trials.metrics.trials, known.metrics.trials, which)
             for which in ("rise_time_s", "steady_state_error")
         )
         quantities |= {
             f"{row}.rise_{name}": with_camera_resolution(rise, steps, strain_per_px),
             f"{row}.error_{name}": with_camera_resolution(error, steps, strain_per_px),
         }
-        note = _scatter_note(len(trials.strain), len(pi.strain))
+        note = _scatter_note(len(trials.strain), 0 if pi is None else len(pi.strain))
         notes |= {f"{row}.rise_{name}": note, f"{row}.error_{name}": note}
         drawn[group] = {
             "time_s": trials.time_s - steps.zero_s,

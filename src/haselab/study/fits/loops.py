@@ -23,7 +23,7 @@ from haselab.control.reach import reachable
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 from haselab.rig import RigDescription
-from haselab.runtime.runner import lockin_of
+from haselab.runtime.lockin import lockin_of
 from haselab.sensing import latency
 from haselab.study.definition import Study
 from haselab.study.fits.dynamics import Dynamics

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from haselab.base import JsonObject
 from haselab.rig import RigDescription
+from haselab.runtime.lockin import printed_chain_of
 from haselab.runtime.observer import FIDUCIALS
-from haselab.runtime.runner import printed_chain_of
 from haselab.sensing import Lockin, step_latencies
 from haselab.store.session.writer import ExperimentRecord
 from haselab.study.fits.paper_chain import Chain, read_chain

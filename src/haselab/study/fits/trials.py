@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -120,7 +120,7 @@ class Comparison:
 
 
 def compare_trials(
-    observed: dict[str, Sequence[Observation]], maps: Maps, study: Study, scale_m_per_px: float
+    observed: Mapping[str, Sequence[Observation]], maps: Maps, study: Study, scale_m_per_px: float
 ) -> Comparison:
     """Compare open loop and closed loop.
 

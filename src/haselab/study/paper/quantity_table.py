@@ -16,6 +16,7 @@ __all__ = ["paper_rows", "quantities"]
 _PAPER_WN_RAD_S = math.sqrt(26.14)
 _PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
 _PAPER_PI = PidGains(0.85, 1.5)
+_ERROR = "fraction of the step; negative: beyond the reference"
 _CALIBRATED_ONCE = (
     "The interval includes differences between the trials, but not the error of the chip's "
     "calibration, which a run makes once: 0.1 % of capacitance corresponds to 0.008 of a step of "
@@ -109,6 +110,7 @@ def _sensing() -> dict[str, Quantity]:
         "S10.error_printed_chain": Quantity(
             "steady-state error, PI with the paper's sensing chain",
             "",
+            note=_ERROR,
             paper_note="uses the straight line of eq. 5; the other loops use a quadratic map",
         ),
         "S13.residual_first": Quantity(
@@ -354,16 +356,16 @@ def _loops() -> dict[str, Quantity]:
         "S24.error_open": Quantity(
             "steady-state error, open loop",
             "",
-            note="fraction of the step; negative: beyond the reference",
+            note=_ERROR,
         ),
-        "S24.error_closed": Quantity("steady-state error, PI", ""),
+        "S24.error_closed": Quantity("steady-state error, PI", "", note=_ERROR),
         "S24.overshoot_closed": Quantity("overshoot, PI, ringing averaged out", ""),
         "S24.rise_delayed": Quantity(
             "rise time, PI with extra delay",
             "s",
             paper_note="the paper has no such trial",
         ),
-        "S24.error_delayed": Quantity("steady-state error, PI with extra delay", ""),
+        "S24.error_delayed": Quantity("steady-state error, PI with extra delay", "", note=_ERROR),
         "S25.kp": Quantity("PID, proportional gain", ""),
         "S25.ki": Quantity("PID, integral gain", "1/s"),
         "S25.kd": Quantity("PID, derivative gain", "s"),
@@ -372,19 +374,21 @@ def _loops() -> dict[str, Quantity]:
         "S25.gain_margin": Quantity("PID, gain margin", "dB"),
         "S25.rise_pid": Quantity("rise time, PID", "s"),
         "S25.overshoot_pid": Quantity("overshoot, PID, ringing included", ""),
-        "S25.error_pid": Quantity("steady-state error, PID", ""),
+        "S25.error_pid": Quantity("steady-state error, PID", "", note=_ERROR),
         "S25.rise_own": Quantity("rise time, controller of [control] kind", "s"),
         "S25.overshoot_own": Quantity(
             "overshoot, controller of [control] kind, ringing included", ""
         ),
-        "S25.error_own": Quantity("steady-state error, controller of [control] kind", ""),
+        "S25.error_own": Quantity(
+            "steady-state error, controller of [control] kind", "", note=_ERROR
+        ),
         "S26.rise": Quantity("rise time, loop on the chip", "s"),
         "S26.settling": Quantity("settling time, loop on the chip", "s"),
         "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),
         "S26.error": Quantity(
             "steady-state error, loop on the chip",
             "",
-            note=f"fraction of the step; negative: beyond the reference. {_CALIBRATED_ONCE}",
+            note=f"{_ERROR}. {_CALIBRATED_ONCE}",
         ),
         "S26.phase_margin": Quantity("loop on the chip, phase margin", "deg"),
         "S28.rise": Quantity("rise time, miniature bench", "s"),
@@ -393,7 +397,7 @@ def _loops() -> dict[str, Quantity]:
         "S28.error": Quantity(
             "steady-state error, miniature bench",
             "",
-            note=f"fraction of the step; negative: beyond the reference. {_CALIBRATED_ONCE}",
+            note=f"{_ERROR}. {_CALIBRATED_ONCE}",
         ),
         "S28.phase_margin": Quantity(
             "miniature bench, phase margin",

@@ -29,8 +29,10 @@ _COUNTED = {
     "printed_chain_trials": ("S10.rise_printed_chain", "S10.error_printed_chain"),
     "extra_delay_trials": ("S24.rise_delayed", "S24.error_delayed"),
     "saturating_trials": ("S22.saturated_fraction", "S22.recovery_time"),
+    "pi_trials": ("S24.rise_closed", "S24.rise_closed_raw", "S24.error_closed",
+                  "S24.overshoot_closed"),
     "pid_trials": ("S25.rise_pid", "S25.overshoot_pid", "S25.error_pid"),
-}
+}  # fmt: skip
 _ON_CHIP = {"chip": "S26", "miniature": "S28"}  # sections of analysis.json, see `chip_rows`
 
 

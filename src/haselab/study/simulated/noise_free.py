@@ -16,8 +16,8 @@ from haselab.base import JsonObject
 from haselab.rig import Rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
+from haselab.runtime.lockin import lockin_of, printed_chain_of
 from haselab.runtime.observer import Seen
-from haselab.runtime.runner import lockin_of, printed_chain_of
 from haselab.sensing import Lockin
 from haselab.study.definition import Study
 from haselab.study.fits.observe import TRIANGLE, Observation

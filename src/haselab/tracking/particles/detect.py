@@ -37,6 +37,7 @@ _FAINTEST = 0.25  # of the strong dots' median response: faintest dot
 _LEAST_ROUND = 0.5  # ratio of the two curvatures of a dot at its own scale
 _LEAST_COMPACT = 0.3  # the same for a particle, which may touch another; an edge has 0.1
 _SAME_SIZE = 0.6
+_NEIGHBOURS = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
 _EVEN = 0.2  # largest unevenness around a fiducial, relative to its depth
 
 
@@ -71,16 +72,22 @@ def _peaks(
     """
     least = _NOISE_FACTOR * noise / (np.sqrt(2.0 * np.pi) * sigma_px)
     edge = max(1, margin_px)
-    found = np.argwhere(response[edge:-edge, edge:-edge] > least) + edge
-    for radius in (1, max(1, round(radius_px))):  # few pass the first, cheap test
-        around = sliding_window_view(
-            np.pad(response, radius, constant_values=-np.inf), (2 * radius + 1,) * 2
-        )
-        largest = [
-            around[part[:, 0], part[:, 1]].max(axis=(1, 2))
-            for part in np.split(found, range(_AT_ONCE, len(found), _AT_ONCE))
-        ]
-        found = found[response[found[:, 0], found[:, 1]] == np.concatenate(largest)]
+    inner = response[edge:-edge, edge:-edge]
+    height, width = inner.shape
+    highest = inner > least
+    for down, right in _NEIGHBOURS:
+        top, left = edge + down, edge + right
+        highest &= inner >= response[top : top + height, left : left + width]
+    found: NDArray[np.intp] = np.argwhere(highest) + edge
+    radius = max(1, round(radius_px))
+    around = sliding_window_view(
+        np.pad(response, radius, constant_values=-np.inf), (2 * radius + 1,) * 2
+    )
+    largest = [
+        around[part[:, 0], part[:, 1]].max(axis=(1, 2))
+        for part in np.split(found, range(_AT_ONCE, len(found), _AT_ONCE))
+    ]
+    found = found[response[found[:, 0], found[:, 1]] == np.concatenate(largest)]
     order = np.argsort(-response[found[:, 0], found[:, 1]], kind="stable")
     return found[order]
 

@@ -19,7 +19,7 @@ from haselab.study import (
     Chart,
     Curve,
     Experiment,
-    Outcome,
+    ExperimentResult,
     Player,
     Quantity,
 )
@@ -56,7 +56,7 @@ class CreepTest(Experiment[CreepSettings]):
         player.settle(0.0, self.settings.hold_s)
         player.play("creep", drive.values_v, self.settings.frame_rate_hz)
 
-    def fit(self, analysis: Analysis) -> Outcome:
+    def fit(self, analysis: Analysis) -> ExperimentResult:
         """Length after the ramp: l(t) = l_end - a exp(-t / tau)."""
         seen = analysis.observe("creep")
         time_s = seen.frame_time_s - seen.block_start_s[0]
@@ -69,7 +69,7 @@ class CreepTest(Experiment[CreepSettings]):
             raise ResultError(f"No creep can be fitted to [creep]: {error}") from error
         end_m, amplitude_m, tau_s = found
         end_std_m, amplitude_std_m, tau_std_s = np.sqrt(np.diag(covariance))
-        return Outcome(
+        return ExperimentResult(
             quantities={
                 "creep.time_constant": Estimate.normal(tau_s, tau_std_s, "s"),
                 "creep.amplitude": Estimate.normal(amplitude_m, amplitude_std_m, "m"),

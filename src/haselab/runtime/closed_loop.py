@@ -1,0 +1,163 @@
+"""A closed loop while it runs: sensor, watchdog and controller, block by block."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _core
+from haselab.base import SafetyError
+from haselab.controllers import Measurement
+from haselab.runtime.lockin import lockin_of, printed_chain_of
+from haselab.runtime.loop import LoopSettings, RunningController
+from haselab.runtime.observer import Observer
+from haselab.runtime.sensors import (
+    PATIENCE_BLOCKS,
+    CapacitanceSensor,
+    PrintedChainSensor,
+    StrainSensor,
+    VideoSensor,
+)
+from haselab.safety.guarded import GuardedRig
+from haselab.safety.watchdog.loop_model import loop_model
+from haselab.safety.watchdog.loop_watchdog import LoopSample, LoopWatchdog
+
+__all__ = ["ClosedLoop"]
+
+_REACH_POINTS = 1001  # points of the saturation range where the loop's voltages are checked
+
+
+class ClosedLoop:
+    """One closed loop on a rig; the caller puts out `due_v` and passes each block to `step`.
+
+    Args:
+        rig: the bench.
+        camera_recorder: of its camera.
+        carrier: frequency in Hz and peak amplitude in V of the sensing signal.
+        loop: controller and maps.
+        name: of the experiment, for messages.
+    Raises:
+        InputError: The controller does not start.
+        LimitError: The voltage map exceeds the drive limits within the saturation.
+    """
+
+    def __init__(
+        self,
+        rig: GuardedRig,
+        camera_recorder: Observer,
+        carrier: tuple[float, float],
+        loop: LoopSettings,
+        name: str,
+    ) -> None:
+        self._rig, self._loop, self._name = rig, loop, name
+        self._controller = RunningController(loop, rig.description.block_s)
+        self._sensor = _sensor(rig, camera_recorder, carrier[0], loop)
+        self._watchdog = _watchdog(rig, carrier, loop)
+        self._lost = self._outside = 0  # blocks
+        strains = np.linspace(loop.saturation.low, loop.saturation.high, _REACH_POINTS)
+        voltages = [self._voltage(float(strain)) for strain in (*strains, 0.0)]
+        rig.description.drive_limits.check(voltages)
+        self._output_v = self._voltage(0.0)
+        self._waiting = deque([self._output_v] * loop.extra_delay_blocks)
+
+    @property
+    def watches_camera(self) -> bool:
+        """Whether the sensor reads the camera itself."""
+        return self._sensor.watches
+
+    def due_v(self) -> float:
+        """The drive of the next block, in V."""
+        self._waiting.append(self._output_v)
+        return self._waiting.popleft()
+
+    def step(self, codes: NDArray[np.int16], desired: float) -> None:
+        """Compute the drive from a block.
+
+        Args:
+            codes: the block just read.
+            desired: strain; NaN: the loop is still open.
+        Raises:
+            SafetyError: The sensor was lost, the watchdog found a fault, or the controller failed.
+        """
+        sensor, safety = self._sensor, self._rig.safety
+        strain = sensor.strain(codes)
+        self._lost = 0 if strain == strain else self._lost + 1
+        self._outside += not sensor.in_range
+        if self._lost >= PATIENCE_BLOCKS:
+            raise safety.trip(
+                f"No strain in {self._lost} blocks of {self._name!r}. {sensor.lost()}"
+            )
+        if fault := self._watchdog.fault(codes, self._sample(strain, desired)):
+            raise safety.trip(fault)
+        if desired == desired:
+            try:
+                drive = self._controller.step(desired, self._measured(strain))
+            except SafetyError as error:
+                raise safety.trip(str(error)) from error
+            self._output_v = self._output_v if drive is None else self._voltage(drive)
+
+    def note(self, played: int) -> str:
+        """How often the loop left the range in which its strain map was fitted, or an empty text.
+
+        Args:
+            played: number of blocks.
+        """
+        if not self._outside:
+            return ""
+        low_f, high_f = self._loop.strain_map.range_f or (-math.inf, math.inf)
+        return (
+            f"{self._name}: in {self._outside} of {played} blocks the capacitance was outside "
+            f"{low_f:.4g} to {high_f:.4g} F, where the strain map was fitted: their strain is "
+            "extrapolated, the map's band does not hold"
+        )
+
+    def _sample(self, strain: float, desired: float) -> LoopSample:
+        """Collect what the watchdog checks of the block just read."""
+        rig, sensor, age_s = self._rig, self._sensor, None
+        if sensor.frame_time_s is not None:
+            age_s = rig.acquisition.time_s - sensor.frame_time_s
+        return LoopSample(
+            strain, sensor.capacitance_f, rig.present_drive_v, desired, sensor.fresh, age_s
+        )
+
+    def _measured(self, strain: float) -> Measurement:
+        """Collect what a controller gets of the block just read."""
+        farad = self._sensor.capacitance_f
+        return Measurement(
+            strain=strain,
+            capacitance_f=math.nan if farad is None else farad,
+            voltage_v=self._rig.present_drive_v,
+            time_s=self._rig.acquisition.time_s,
+            valid=not math.isnan(strain),
+            in_range=self._sensor.in_range,
+        )
+
+    def _voltage(self, strain: float) -> float:
+        v = self._loop.voltage_map
+        return _core.voltage_from_strain(v.a1_v, v.b1, v.a2_v, v.b2, strain)
+
+
+def _sensor(
+    rig: GuardedRig, camera_recorder: Observer, carrier_hz: float, loop: LoopSettings
+) -> StrainSensor:
+    if loop.video_zero_px is not None:
+        return VideoSensor(camera_recorder, loop.video_zero_px)
+    if loop.printed_chain:
+        return PrintedChainSensor(printed_chain_of(rig.description, carrier_hz), loop.strain_map)
+    return CapacitanceSensor(lockin_of(rig.description, carrier_hz), loop.strain_map)
+
+
+def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:
+    settings, by_video = rig.safety.settings, loop.video_zero_px is not None
+    model = loop_model(
+        rig.description,
+        loop.voltage_map,
+        (loop.saturation.low, loop.saturation.high),
+        (carrier[0], carrier[1] if loop.carrier_v is None else loop.carrier_v),
+        settings.settle_s,
+        None if by_video else loop.strain_map.coefficients,
+    )
+    return LoopWatchdog(model, settings.loop, settings.rating, rig.present_drive_v)

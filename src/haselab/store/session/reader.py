@@ -8,6 +8,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import Closing, InputError
 from haselab.store.session.checksums import check_links

@@ -5,15 +5,19 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Mapping
 
+from haselab.actuators.curling_hasel import CurlingHasel
 from haselab.actuators.dea_stack import DeaStack
 from haselab.actuators.law import ActuatorLaw
+from haselab.actuators.peano_hasel import PeanoHasel
 from haselab.actuators.planar_hasel import PlanarHasel
 from haselab.base import InputError, LimitError
 
 __all__ = ["GROUP", "actuator_kind", "actuator_kinds", "actuator_law"]
 
 GROUP = "haselab.actuators"
-_BUILT_IN: Mapping[str, type[ActuatorLaw]] = {law.kind: law for law in (PlanarHasel, DeaStack)}
+_BUILT_IN: Mapping[str, type[ActuatorLaw]] = {
+    law.kind: law for law in (PlanarHasel, PeanoHasel, CurlingHasel, DeaStack)
+}
 
 
 def actuator_kinds() -> list[str]:

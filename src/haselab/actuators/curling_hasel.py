@@ -72,7 +72,7 @@ class CurlingHasel(ActuatorLaw):
     Example:
         >>> law = CurlingHasel()
         >>> round(1e3 * law.free_length_m, 1)
-        84.1
+        81.0
     """
 
     kind: ClassVar[str] = "curling-hasel"

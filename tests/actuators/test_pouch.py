@@ -91,13 +91,16 @@ def test_the_force_is_half_the_voltage_squared_times_the_slope_of_the_capacitanc
 @given(share=st.floats(0.05, 0.9), place=st.floats(0.0, 1.0))
 @settings(max_examples=30, deadline=None)
 def test_the_arcs_have_the_films_length_and_hold_the_liquid(share, place):
-    """Length and area of two arcs as polygons of 20,000 corners: an error of 1e-8."""
+    """Length and area of two arcs as polygons of 20,000 corners: an error of 1e-8.
+
+    For the longest electrode the rest angle is 0.01 rad, and a - sin(a) cos(a) is rounded to 2e-12.
+    """
     pouch = Pouch(0.02, 0.02 * share)
     stroke_m = place * pouch.longest_stroke_m
     angle = float(pouch.angle_rad(stroke_m))
-    assert float(pouch.stroke_m(angle)) == pytest.approx(stroke_m, abs=1e-15)
+    assert float(pouch.stroke_m(angle)) == pytest.approx(stroke_m, abs=1e-13)
     zipped_m = float(pouch.zipped_m(angle))
-    assert -1e-16 <= zipped_m <= pouch.electrode_m * (1.0 + 1e-12)
+    assert -1e-13 <= zipped_m <= pouch.electrode_m * (1.0 + 1e-12)
     radius_m = (pouch.length_m - zipped_m) / (2.0 * angle)
     at = np.linspace(-angle, angle, 20001)
     x, y = radius_m * np.sin(at), radius_m * (np.cos(at) - math.cos(angle))

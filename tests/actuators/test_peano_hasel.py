@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq, minimize_scalar
 
 from haselab.actuators import ActuatorLaw, CurlingHasel, PeanoHasel, equilibrium_m, law_table
-from haselab.base import InputError
+from haselab.base import InputError, LimitError
 
 KINDS = [PeanoHasel, CurlingHasel]
 H = 1e-5  # of the free length: a fiftieth of the rounding of the film of one pouch
@@ -189,6 +189,11 @@ def test_voltage_shortens_it_and_load_lengthens_it(kind):
     assert rests_m[0] - rests_m[-1] > 0.02 * rests_m[0]
     assert equilibrium_m(law, 0.0, 0.0) == pytest.approx(law.free_length_m, rel=1e-12)
     assert law.free_length_m < rests_m[0]
+
+
+def test_a_film_that_nothing_straightens_is_refused():
+    with pytest.raises(LimitError, match=r"^actuator.restoring_n_per_m = 0.01 is too small to st"):
+        PeanoHasel(restoring_n_per_m=0.01, rounding_m=1e-3)
 
 
 def test_a_law_too_sharp_for_the_table_is_refused():

@@ -15,7 +15,7 @@ from scipy.special import expit, spence
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.pouch import Pouch
-from haselab.base import Limits
+from haselab.base import LimitError, Limits
 
 __all__ = ["PeanoHasel"]
 
@@ -25,7 +25,7 @@ _STEEPEST = 60.0  # ln of (1 - cos) / cos at the end of the electrodes
 _GRID = np.geomspace(1e-9, 40.0, 250)  # of ln(ds/dz) above its first value
 _ITERATIONS = 200
 _CLOSE, _CLOSEST = 1e-10, 1e-13  # last step of Newton's iteration, and of halving
-_SMALL_V = 300.0  # below it a difference of two forces would lose digits
+_SMALL = 0.15  # of half_zipped_v: below it a difference of two forces would lose digits
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -99,7 +99,8 @@ class PeanoHasel(ActuatorLaw):
         leakage_ohm: see `Circuit`.
         breakdown_v_per_m: see `Circuit`.
     Raises:
-        LimitError: a parameter outside its limits, or an electrode too long for the pouch.
+        LimitError: a parameter outside its limits, an electrode too long for the pouch, or a film
+            too soft to straighten.
     Source: Kellaris et al., Extreme Mech. Lett. 29 (2019), 100449; Rothemund, Kirkman and
         Keplinger, PNAS 117 (2020), 16207, for the speed of zipping.
     Example:
@@ -158,7 +159,12 @@ class PeanoHasel(ActuatorLaw):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        Pouch(self.pouch_length_m, self.electrode_length_m)
+        if float(self.elastic_force_n(self.length_limits_m.low)) > 0.0:
+            raise LimitError(
+                f"actuator.restoring_n_per_m = {self.restoring_n_per_m:g} is too small to "
+                f"straighten a film that becomes taut over rounding_m = {self.rounding_m:g}. Raise "
+                "it, or lower actuator.rounding_m."
+            )
 
     @cached_property
     def pouch(self) -> Pouch:
@@ -196,13 +202,12 @@ class PeanoHasel(ActuatorLaw):
     @cached_property
     def free_length_m(self) -> float:
         """Length at which the film's rounded tension and its restoring stiffness balance."""
-        rest_m = self.pouch.rest_m
-        reach_m = 0.5 * self.pouch.longest_stroke_m
+        limits = self.length_limits_m
 
         def force_n(length_m: float) -> float:
-            return float(self.elastic_force_n(self.pouches * length_m))
+            return float(self.elastic_force_n(length_m))
 
-        return self.pouches * float(brentq(force_n, rest_m - reach_m, rest_m + reach_m, xtol=1e-15))
+        return float(brentq(force_n, limits.low, limits.high, xtol=1e-15))
 
     @property
     def length_limits_m(self) -> Limits:
@@ -253,7 +258,7 @@ class PeanoHasel(ActuatorLaw):
         )
         at_rest_n = self._state(length, 0.0).tension_n
         added = np.array(at_rest_n - self._state(length, voltage).tension_n)
-        small = voltage < _SMALL_V
+        small = voltage < _SMALL * self.half_zipped_v
         if small.any():  # integral of the slope over the voltage squared
             squares = voltage[small, None] ** 2 * 0.5 * (_NODES + 1.0)
             slopes = self._state(length[small, None], np.sqrt(squares)).tension_per_pull
@@ -335,8 +340,10 @@ class PeanoHasel(ActuatorLaw):
                 longer = np.where(balance.possible, over_m > 0.0, balance.zipped_m <= 0.0)
                 low[left] = np.where(longer, at, low[left])
                 high[left] = np.where(longer, high[left], at)
-                slack = wanted - balance.pouch_m < -2.0 * self.rounding_m
-                tension_n, _, slope_n = self._tension(balance, wanted - balance.pouch_m)
+                stretch_m = wanted - balance.pouch_m
+                # the logarithm of a slack film's tension misleads Newton
+                slack = ~(np.minimum(stretch_m, balance.stretch_m) > -2.0 * self.rounding_m)
+                tension_n, _, slope_n = self._tension(balance, stretch_m)
                 missing_n = tension_n * balance.steep - balance.needed_n
                 new = at - np.where(slack, missing_n / slope_n, over_m / balance.length_by)
                 inside = (low[left] < new) & (new < high[left]) & (balance.possible | slack)

@@ -15,7 +15,7 @@
 
 #define MOTION_BRANCHES 4
 #define MOTION_LENGTHS 1024
-#define MOTION_VOLTAGES 9
+#define MOTION_VOLTAGES 65
 
 /* An actuator law as numbers on a grid of lengths and voltages, with cubics between the knots. */
 typedef struct {

@@ -1,11 +1,14 @@
 """Physical laws of actuators: energy, capacitance, masses and losses in one object."""
 
+from haselab.actuators.curling_hasel import CurlingHasel
 from haselab.actuators.dea_stack import DeaStack
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, Parameter, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
+from haselab.actuators.peano_hasel import PeanoHasel
 from haselab.actuators.planar_hasel import PlanarHasel
+from haselab.actuators.pouch import Pouch
 from haselab.actuators.registry import ACTUATORS, actuator_law
 from haselab.actuators.response import (
     ADDED_INERTIA,
@@ -24,13 +27,16 @@ __all__ = [
     "ActuatorLaw",
     "ActuatorState",
     "Circuit",
+    "CurlingHasel",
     "DeaStack",
     "Drive",
     "LawTable",
     "Losses",
     "OperatingPoint",
     "Parameter",
+    "PeanoHasel",
     "PlanarHasel",
+    "Pouch",
     "Response",
     "SampledLaw",
     "actuator_law",

@@ -167,7 +167,5 @@ def test_a_session_of_several_experiments_asks_for_one(tmp_path):
             session.append_block(name, np.zeros((100, 2), np.int16), 0.0, 0.0, np.nan)
     found = hl.load(tmp_path)
     for convert in (found.to_pandas, found.to_xarray):
-        with pytest.raises(
-            InputError, match=r"^The session has 2 experiments\. Name one of"
-        ):
+        with pytest.raises(InputError, match=r"^The session has 2 experiments\. Name one of"):
             convert()

@@ -158,3 +158,14 @@ def test_a_session_is_no_table(tmp_path, read):
         pass
     with pytest.raises(InputError, match=r"holds one table for each experiment\. Use hl\.load"):
         read(tmp_path)
+
+
+def test_a_session_of_several_experiments_asks_for_one(tmp_path):
+    plans = [ExperimentPlan(name, "test", 6, {}) for name in ("chirp", "steps")]
+    with SessionWriter(tmp_path / "session.h5", plans, 100, {"rig": {"rate_hz": 1e4}}) as session:
+        for name in ("chirp", "steps"):
+            session.append_block(name, np.zeros((100, 2), np.int16), 0.0, 0.0, np.nan)
+    found = hl.load(tmp_path)
+    for convert in (found.to_pandas, found.to_xarray):
+        with pytest.raises(InputError, match=r"^The session has 2 experiments\. Name one of"):
+            convert()

@@ -50,30 +50,39 @@ class Session:
     path: Path
     experiments: tuple[str, ...]
 
-    def to_pandas(self, experiment: str) -> dict[str, pandas.DataFrame]:
+    def to_pandas(self, experiment: str = "") -> dict[str, pandas.DataFrame]:
         """One experiment as pandas tables.
 
         Args:
-            experiment: its name.
+            experiment: its name; the session's only one need not be named.
         Returns:
             `monitors`, `blocks`, `tracks`, `events`, and `capacitance` and `strain` where the
             session states what they need.
         Raises:
             InputError: no such experiment, or pandas is not installed.
         """
-        return session_tables(self.path, experiment, derived=derived_series)
+        return session_tables(self.path, self._one(experiment), derived=derived_series)
 
-    def to_xarray(self, experiment: str) -> xarray.Dataset:
+    def to_xarray(self, experiment: str = "") -> xarray.Dataset:
         """One experiment as an xarray data set, with units.
 
         Args:
-            experiment: its name.
+            experiment: its name; the session's only one need not be named.
         Returns:
             The monitors over block and sample, the tracks over frame and point, and what follows.
         Raises:
             InputError: no such experiment, or xarray is not installed.
         """
-        return session_dataset(self.path, experiment, derived=derived_series)
+        return session_dataset(self.path, self._one(experiment), derived=derived_series)
+
+    def _one(self, experiment: str) -> str:
+        """The named experiment, or the only one."""
+        if experiment or len(self.experiments) == 1:
+            return experiment or self.experiments[0]
+        raise InputError(
+            f"The session has {len(self.experiments)} experiments. Name one of them: "
+            f"{', '.join(self.experiments)}."
+        )
 
 
 @checked

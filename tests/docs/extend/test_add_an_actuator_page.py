@@ -33,7 +33,7 @@ def shell(make_shell):
     shutil.copytree(PACKAGE, made.folder / PACKAGE.relative_to(ROOT), ignore=ignore)
     before = made.run("haselab twin new --kind dea-strip")
     assert before.returncode == 2
-    assert "No actuator of kind 'dea-strip' is registered" in before.stderr
+    assert "No actuator 'dea-strip' is registered" in before.stderr
     made.run_all(COMMANDS)
     return made
 

@@ -199,7 +199,12 @@ def test_an_idle_usb_device_is_asked_so_that_it_goes_on(
 ) -> None:
     if not polls:
         monkeypatch.setattr(NidaqBoard, "_query_idle", lambda board: None)
-    with served_board(pace=1.0, stall_s=3.0, ahead_blocks=8) as (served, file), opened(file) as b:
+    # blocks of 80 ms: in real time, a thread may wait for 5 ms for Python's lock
+    slow = TwinConfig.model_validate({"acquisition": {"block_samples": 16000}})
+    with (
+        served_board(pace=1.0, stall_s=3.0, ahead_blocks=8, config=slow) as (served, file),
+        opened(file) as b,
+    ):
         b.read()
         end = served.hub.acquired + round(4.5 * file.daq.rate_hz)
         assert served.hub.wait_until(lambda: served.hub._acquired >= end, GUARD_S)

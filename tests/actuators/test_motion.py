@@ -49,20 +49,18 @@ def by_law(config: TwinConfig, voltage_v: np.ndarray, load_n: float) -> np.ndarr
     sampled = SampledLaw(law, 15e3)
     sampled.parameters["step_s"] = 0.2 * STEP_S
     same, edge_s = np.ones(count), STEP_S * np.arange(count + 1)
-    drive = Drive(
-        edge_s, voltage_v, load_n * same, config.load.mass_kg * same, 0.0 * same
-    )
+    drive = Drive(edge_s, voltage_v, load_n * same, config.load.mass_kg * same, 0.0 * same)
     start, _ = sampled.at_rest(0.0, 0.0, 0.0)
     return sampled.respond(drive, edge_s[1:], start).length_m
 
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_the_twin_moves_as_its_law_does(name):
-    """Order 4: what five times as many steps change is below 1e-10 of the length."""
+    """Order 4; the kink where softening begins leaves 1e-9 of the length."""
     config, voltage_v = CONFIGS[name], stepped_v(900)
     expected = by_law(config, voltage_v, 0.3)
     assert np.ptp(expected) > 1e-6
-    np.testing.assert_allclose(on_the_twin(config, voltage_v, 0.3), expected, rtol=1e-10)
+    np.testing.assert_allclose(on_the_twin(config, voltage_v, 0.3), expected, rtol=3e-9)
 
 
 def test_a_wait_of_the_twin_ends_where_its_short_steps_do():

@@ -92,6 +92,7 @@ class ActuatorSection(_Section):
     kind: str = "planar-hasel"
     mass_kg: Annotated[Number, Field(ge=0, le=1e4)] | None = None
     geometry: Geometry = Geometry()
+    parameters: dict[str, Number] = {}  # of the kind's law, by the names of TWIN.toml
 
 
 class StrainMapTable(_Section):

@@ -96,3 +96,9 @@ def test_a_column_of_another_quantity_is_refused(tmp_path):
     np.savetxt(path, monitors().to_numpy(), "%.10g", ",", header="v (V),i (pF)", comments="")
     with pytest.raises(InputError, match=r"column of --i is in pF, but must be in V or A"):
         hl.sense(path, carrier_hz=CARRIER_HZ, rate_hz=RATE_HZ, v="v", i="i")
+
+
+def test_one_column_for_both_monitors_is_refused():
+    data = {"time_s": np.arange(2000) / 2e5, "v": np.sin(np.arange(2000.0))}
+    with pytest.raises(InputError, match=r"^Column 'v' is named for two quantities\. Name another"):
+        hl.sense(data, carrier_hz=2000.0, v="v", i="v")

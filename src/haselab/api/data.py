@@ -140,6 +140,10 @@ def wanted(data: Data, names: Sequence[str], rate_hz: float | None) -> Table:
     Raises:
         InputError: a column that is missing or holds something else, or as of `table`.
     """
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"Column {names[0]!r} is named for two quantities. Name another column for one of them."
+        )
     if isinstance(data, (str, Path)):
         if (file := _session_in(Path(data))) is not None:
             raise _is_session(file)

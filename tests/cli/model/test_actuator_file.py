@@ -434,3 +434,17 @@ def test_a_ragged_covariance_of_a_map_is_one_line(files, tmp_path, capsys, secti
         f"haselab: 1 error(s): {section}.covariance: Input should be 4 rows of 4 numbers, not rows "
         f"of {rows}. Change these values. {actuator}\n"
     )
+
+
+def test_a_model_of_a_length_is_not_designed_for_a_loop_of_strain(tmp_path, capsys):
+    path = tmp_path / "metres.toml"
+    path.write_text(
+        "[drive]\nlow_v = 0.0\nhigh_v = 2.0\n"
+        "voltage_map = {a1_v = 1.324, b1 = 3.124, a2_v = -0.2805, b2 = -26.92}\n"
+        "[model]\ngain = 1.0\nnatural_frequency_rad_s = 32.0\ndamping_ratio = 0.12\n"
+        'rate_hz = 100.0\nloop_delay_s = 0.0075\ninput_unit = "1"\noutput_unit = "m"\n'
+    )
+    code, _, error = run(capsys, "design", path)
+    assert code == 2 and "The output of [model] is in m, but the maps of this file are for" in error
+    path.write_text(path.read_text().replace('output_unit = "m"', 'output_unit = "1"'))
+    assert run(capsys, "design", path)[0] == 0

@@ -334,3 +334,11 @@ def test_a_packed_chunk_that_is_damaged_is_one_line(tmp_path):
         pytest.raises(InputError, match="cannot be read"),
     ):
         list(stream.chunks(100))
+
+
+@pytest.mark.parametrize("names", [["v", "v"], ["v", "1"], ["v", "v [mV]"]])
+def test_one_column_for_two_quantities_is_refused(tmp_path, names):
+    path = tmp_path / "a.csv"
+    path.write_text("v [mV],i\n1,2\n3,4\n5,6\n")
+    with pytest.raises(InputError, match=r"^Column v \[mV\] is named for two quantities\. Name"):
+        open_columns(path, names)

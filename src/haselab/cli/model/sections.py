@@ -88,10 +88,11 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
         given: on the command line.
     Raises:
         InputError: the file has impossible values, or the model's input is a voltage and the limits
-            or the map are those of a strain.
+            or the map are those of a strain, or its output is a length and the maps are of strain.
         ResultError: the drive does not reach zero strain.
     """
-    in_volts = read_origin(path).input_unit == "V"
+    origin = read_origin(path)
+    in_volts = origin.input_unit == "V"
     own = path.suffix.lower() == ".toml"
     known = load_actuator(path) if own else ActuatorTables()
     typed = None if known.controller is None else known.controller.limits
@@ -105,6 +106,13 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
         raise InputError(
             f"The model's input is a voltage, but the default limits {_DEFAULT[0]:g} to "
             f"{_DEFAULT[1]:g} are strains. Give the limits in V with --limits LOW HIGH. {path}"
+        )
+    loop_of_strain = drive.voltage_map is not None or known.sensing.strain_map is not None
+    if origin.output_unit not in ("", "1") and loop_of_strain:
+        raise InputError(
+            f"The output of [model] is in {origin.output_unit}, but the maps of this file are for "
+            "a loop that measures strain. Identify the model again with the strain as output. "
+            f"{path}"
         )
     wanted = Saturation(*(given or _DEFAULT))
     if given is None and typed is not None:

@@ -220,6 +220,11 @@ class ColumnStream(Closing):
     ) -> None:
         self._archive, self._options = archive, options
         self._names = archive.locate_all(names)
+        if len(names) > 1 and len(set(self._names)) < len(names):
+            raise InputError(
+                f"Column {self._names[0]} is named for two quantities. Name another column for one "
+                f"of them: {archive.file}"
+            )
         for name in options.units:
             if archive.locate(name) is None:
                 raise InputError(

@@ -111,7 +111,7 @@ def _sensing() -> dict[str, Quantity]:
             "steady-state error, PI with the paper's sensing chain",
             "",
             note=_ERROR,
-            paper_note="uses the straight line of eq. 5; the other loops use a quadratic map",
+            paper_note="uses the straight line of eq. 5; the other loops use the triangle's map",
         ),
         "S13.residual_first": Quantity(
             "residual strain after the first cycle", "", paper_note="paper: never returns to zero"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,15 +25,21 @@ __all__ = ["motion_of_session"]
 
 Floats = NDArray[np.float64]
 _SAME_S = 1e-7  # times closer than that are one
+_EMPTY = 0.05  # inertia of an empty clamp, of the largest hung mass
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Blocks of an experiment: drive, and what the lock-in found in the window it uses."""
+    """Blocks of an experiment: drive, and what the lock-in found in the samples it uses.
+
+    Args:
+        spans_s: beginnings and ends of the samples that count, from a block's first one.
+            Shape `(S, 2)`.
+    """
 
     start_s: Floats
     drive_v: Floats
-    from_s: Floats
+    spans_s: Floats
     capacitance_f: Floats
     std_f: Floats
     used: NDArray[np.bool_]
@@ -64,30 +71,47 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
     records = [reader.experiment(name) for name in reader.names]
     records = [record for record in records if record.name != "particles"]
     blocks = {r.name: _sensed(reader, r, path, block_s) for r in records if len(r.codes)}
-    drive, windows = _drive(conditions, blocks, (block_s, switch_s), float(rig["amplifier_gain"]))
+    drive = _drive(conditions, blocks.values(), (block_s, switch_s), float(rig["amplifier_gain"]))
     names = tuple(record.name for record in records)
     time_s, length_m, std_m, of_length = _lengths(records, float(rig["scale_m_per_px"]))
     inside = (time_s >= drive.edge_s[0]) & (time_s <= drive.edge_s[-1])
     order = np.argsort(time_s[inside], kind="stable")
     chosen = np.flatnonzero(inside)[order]
-    intervals, farad, std_f, of_block = [], [], [], []
+    none, no = np.zeros(0, dtype=np.int64), np.zeros(0)
+    window, window_of, of_block, farad, std_f = [none], [none], [none], [no], [no]
+    count = 0
     for k, name in enumerate(names):
         if name not in blocks:
             continue
         part = blocks[name]
-        intervals.append(windows[name][part.used])
+        intervals, values = _windows(drive, part)
+        window.append(intervals)
+        window_of.append(values + count)
         farad.append(part.capacitance_f[part.used])
         std_f.append(part.std_f[part.used])
-        of_block.append(np.full(int(part.used.sum()), k))
-    none = np.zeros(0, dtype=np.int64)
-    sensed = np.concatenate([none, *intervals])
-    by_time = np.argsort(sensed, kind="stable")
+        of_block.append(np.full(farad[-1].size, k))
+        count += farad[-1].size
     return MotionRecord(
-        path.name, drive, time_s[chosen], length_m[chosen], std_m[chosen], sensed[by_time],
-        np.concatenate([np.zeros(0), *farad])[by_time],
-        np.concatenate([np.zeros(0), *std_f])[by_time],
-        names, of_length[chosen], np.concatenate([none, *of_block])[by_time],
+        path.name, drive, time_s[chosen], length_m[chosen], std_m[chosen],
+        np.concatenate(window), np.concatenate(window_of), np.concatenate(farad),
+        np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
     )  # fmt: skip
+
+
+def _windows(drive: Drive, blocks: _Blocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Intervals that count for the used blocks, and the index of the block of each."""
+    intervals, values = [], []
+    start_s = blocks.start_s[blocks.used]
+    for low_s, high_s in blocks.spans_s.tolist():
+        at, end = np.searchsorted(
+            drive.edge_s, [start_s + low_s - _SAME_S, start_s + high_s - _SAME_S]
+        )
+        while (left := at < end).any():
+            intervals.append(at[left])
+            values.append(np.flatnonzero(left))
+            at = at + 1
+    none = np.zeros(0, dtype=np.int64)
+    return np.concatenate([none, *intervals]), np.concatenate([none, *values])
 
 
 def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s: float) -> _Blocks:
@@ -95,12 +119,12 @@ def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s
     lockin = Lockin(config)
     sensed = lockin.sense(record.codes)
     middle_s = sensed.time_s - block_s * np.arange(len(record.codes))
-    usual_s = float(np.median(middle_s))
-    plain = np.abs(middle_s - usual_s) < 0.5 / config.rate_hz  # its own model uses other samples
+    # other models than the plain one use other samples
+    plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz
     used = sensed.valid & plain & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_std_f > 0)
-    start_s = record.block_start_s
+    changes = np.flatnonzero(np.diff(np.pad(lockin.counted, 1).astype(np.int8)))
     return _Blocks(
-        start_s, record.drive_v, start_s + (2.0 * usual_s - block_s + 1.0 / config.rate_hz),
+        record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
         sensed.capacitance_f, sensed.capacitance_std_f, used,
     )  # fmt: skip
 
@@ -132,20 +156,21 @@ def _lengths(
 
 def _drive(
     conditions: NDArray[np.void],
-    blocks: dict[str, _Blocks],
+    blocks: Collection[_Blocks],
     timing_s: tuple[float, float],
     gain: float,
-) -> tuple[Drive, dict[str, NDArray[np.int64]]]:
-    """What acted, and the interval in which each block was sensed."""
+) -> Drive:
+    """What acted."""
     block_s, switch_s = timing_s
     changes: list[tuple[float, float]] = [
         (float(row["time_s"]), float(row["drive_v"])) for row in conditions
     ]
     edges = [conditions["time_s"]]
-    for part in blocks.values():
+    for part in blocks:
         changes += [(float(t) + switch_s, float(v))
                     for t, v in zip(part.start_s, part.drive_v, strict=True)]  # fmt: skip
-        edges += [part.start_s, part.start_s + switch_s, part.from_s, part.start_s + block_s]
+        edges += [part.start_s, part.start_s + switch_s, part.start_s + block_s]
+        edges += [part.start_s + at_s for at_s in part.spans_s.ravel().tolist()]
     ramps = _ramp_edges(conditions)
     edge_s = np.sort(np.concatenate([*edges, ramps]))
     edge_s = edge_s[np.append(True, np.diff(edge_s) > _SAME_S)]
@@ -156,11 +181,9 @@ def _drive(
     row = np.searchsorted(conditions["time_s"], middle_s, side="right") - 1
     pull_n = np.interp(middle_s, *_steps(conditions["time_s"], conditions["pull_n"]))
     carrier_v = gain * conditions["carrier_v"][row]
-    drive = Drive(edge_s, gain * drive_v, pull_n, conditions["mass_kg"][row], 0.5 * carrier_v**2)
-    windows = {
-        name: np.searchsorted(edge_s, part.from_s - _SAME_S) for name, part in blocks.items()
-    }
-    return drive, windows
+    # nobody sees how fast an actuator without mass moves
+    mass_kg = np.maximum(conditions["mass_kg"], _EMPTY * conditions["mass_kg"].max())[row]
+    return Drive(edge_s, gain * drive_v, pull_n, mass_kg, 0.5 * carrier_v**2)
 
 
 def _steps(time_s: Floats, values: Floats) -> tuple[Floats, Floats]:

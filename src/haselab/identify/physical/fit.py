@@ -34,6 +34,7 @@ Floats = NDArray[np.float64]
 _LENGTH, _CAPACITANCE = "length", "capacitance"
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
+_USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
 
 
@@ -97,7 +98,7 @@ def fit_actuator(
     records: Sequence[MotionRecord],
     *,
     mass_kg: float,
-    added_inertia_kg: float = 0.0,
+    added_inertia_kg: float | None = None,
     camera_bias_m: float = 2e-6,
 ) -> ActuatorFit:
     """Identify a physical model from records.
@@ -106,7 +107,7 @@ def fit_actuator(
         law: kind of the actuator, and where to start; what it declares as measured stays.
         records: of one actuator.
         mass_kg: hung mass, the scale of an added inertia.
-        added_inertia_kg: where to start with that.
+        added_inertia_kg: where to start with that; None: 5 % of the hung mass.
         camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
             is usual.
     Returns:
@@ -116,6 +117,8 @@ def fit_actuator(
     """
     if not records:
         raise InputError("There is no record of the actuator's motion. Give at least one.")
+    if added_inertia_kg is None:
+        added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
     known = {CAMERA_OFFSET: camera_bias_m}
     misfit = Misfit(records, known=known)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
-from haselab.base import HaselabError
+from haselab.base import HaselabError, LimitError
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import (
     CAMERA_LATENCY,
@@ -23,6 +23,7 @@ from haselab.identify.physical.unknowns import (
 __all__ = ["Misfit", "Modelled", "modelled"]
 
 Floats = NDArray[np.float64]
+_LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
 
 @dataclass(frozen=True)
@@ -54,18 +55,23 @@ def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = Tr
     Raises:
         HaselabError: The law has no equilibrium, is outside its limits, or not smooth.
     """
+    law = unknowns.present_law()
+    added_kg = unknowns.value(ADDED_INERTIA)
+    lightest_kg = float(record.drive.mass_kg.min()) + law.moving_mass_kg + added_kg
+    if lightest_kg < _LIGHTEST * unknowns.mass_kg:
+        raise LimitError(f"{record.name}: {lightest_kg:g} kg move, too few to simulate.")
     names = unknowns.law_names if derivatives else ()
     sampled = SampledLaw(
-        unknowns.present_law(),
+        law,
         _highest_v(record),
         names,
-        added_inertia_kg=unknowns.value(ADDED_INERTIA),
+        added_inertia_kg=added_kg,
     )
     response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY))
     scale = unknowns.value(SENSING_SCALE)
     latency_s = unknowns.value(SENSING_LATENCY)
-    drift = response.drift_f_s[record.sensed]
-    inside = response.capacitance_f[record.sensed] - latency_s * drift
+    drift = record.over_windows(response.drift_f_s)
+    inside = record.over_windows(response.capacitance_f) - latency_s * drift
     length_m = response.length_m + unknowns.value(CAMERA_OFFSET)
     if not derivatives:
         none = np.zeros((0, 0))
@@ -80,7 +86,7 @@ def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = Tr
     capacitance_by = np.empty((inside.size, len(unknowns.names)))
     count = len(unknowns.law_names)
     length_by[:, :count] = response.length_by
-    capacitance_by[:, :count] = scale * response.capacitance_by[record.sensed]
+    capacitance_by[:, :count] = scale * record.over_windows(response.capacitance_by)
     for k, name in enumerate(unknowns.names[count:], start=count):
         length_by[:, k] = np.asarray(columns[name][0])
         capacitance_by[:, k] = np.asarray(columns[name][1])
@@ -102,7 +108,7 @@ def _respond(sampled: SampledLaw, record: MotionRecord, latency_s: float) -> Res
         float(drive.voltage_v[0]), float(drive.ripple_v2[0]), float(drive.load_n[0])
     )
     sensed = np.zeros(drive.voltage_v.size, np.uint8)
-    sensed[record.sensed] = 1
+    sensed[record.window] = 1
     return sampled.respond(drive, times_s, start, sensed=sensed, start_by=start_by)
 
 

@@ -17,15 +17,16 @@ Floats = NDArray[np.float64]
 _STAGES = 3  # before the last one; in each, the noise is assumed a tenth of that before
 _FIRST_SHARE = 0.3  # of the signals' spread: noise of the first stage
 _STEPS = 20  # of one stage
-_LAST_STEPS = 14
+_LAST_STEPS = 40
 _BEND = 3.0  # standard deviations from which a residual counts less, while the start counts
 _DRAWN = 0.7  # widths, of further starts
 _TRIALS = 24  # starts that are compared
 _TRIED = 6  # of them, followed to the end of the first stage
 _EXPLAINED = 0.1  # mean bounded square below which the first stage has explained the records
 _LONGEST = 0.5  # step, in what varies over its width or as a logarithm
-_ENOUGH = 1e-3  # relative decrease that ends a stage
-_DONE = 1e-2  # decrease of chi squared that ends the last one
+_GLIMPSE = 0.1  # of a step, where the second order is measured
+_ENOUGH = 1e-3  # relative decrease to be expected that ends a stage
+_DONE = 1e-2  # decrease of chi squared to be expected that ends the last one
 
 
 @dataclass(frozen=True)
@@ -168,14 +169,28 @@ def _descend(
         if start is not None:
             slope = slope - pull * now.unknowns.distance(start)
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        correlation, slope = normal / np.outer(scale, scale), slope / scale
+        left = float(slope @ np.linalg.lstsq(correlation, slope, rcond=1e-15)[0])
+        if left < (_DONE if start is None else max(_ENOUGH * cost, 1.0)):
+            return now, count, True
         better: tuple[Unknowns, float] | None = None
         while better is None and damping < 1e6:
-            damped = normal / np.outer(scale, scale) + damping * np.eye(scale.size)
-            step = np.linalg.lstsq(damped, slope / scale, rcond=1e-15)[0] / scale
+            damped = correlation + damping * np.eye(scale.size)
+            step = np.linalg.lstsq(damped, slope, rcond=1e-15)[0] / scale
             longest = float(np.abs(np.where(now.unknowns.by_logarithm, step, step / widths)).max())
-            trial = now.unknowns.moved(step * min(1.0, _LONGEST / max(longest, 1e-300)))
-            residuals = misfit.residuals(trial)
+            step *= min(1.0, _LONGEST / max(longest, 1e-300))
+            near = misfit.residuals(now.unknowns.moved(_GLIMPSE * step))
             count += 1
+            residuals = None
+            if near is not None:
+                # residuals of the second order, which bend the step along a curved valley
+                bend = near - now.residuals + _GLIMPSE * (now.jacobian @ step)
+                turn = weighed.T @ bend * (1.0 / _GLIMPSE**2) / scale
+                bent = np.linalg.lstsq(damped, turn, rcond=1e-15)[0] / scale
+                if np.linalg.norm(bent * scale) < np.linalg.norm(step * scale):
+                    trial = now.unknowns.moved(step + bent)
+                    residuals = misfit.residuals(trial)
+                    count += 1
             if residuals is not None and np.isfinite(residuals).all():
                 reached = cost_of(trial, residuals)
                 if reached < cost:
@@ -184,34 +199,10 @@ def _descend(
             damping = max(10.0 * damping, 1e-6)
         if better is None:
             return now, count, True
-        decrease, cost = cost - better[1], better[1]
-        if __import__("os").environ.get("PHDEBUG"):
-            print(
-                noise,
-                count,
-                cost,
-                decrease,
-                damping,
-                "pred",
-                float(
-                    slope
-                    @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[
-                        0
-                    ]
-                    @ (1 / scale)
-                    if False
-                    else (slope / scale)
-                    @ np.linalg.lstsq(normal / np.outer(scale, scale), slope / scale, rcond=1e-15)[
-                        0
-                    ]
-                ),
-                flush=True,
-            )
+        cost = better[1]
         found = misfit.linearised(better[0])
         count += 1
         if found is None:
             return now, count, False
         now, damping = _State(better[0], *found), max(0.1 * damping, 1e-12)
-        if decrease < (_DONE if start is None else _ENOUGH * cost):
-            return now, count, True
     return now, count, False

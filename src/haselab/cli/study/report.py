@@ -12,7 +12,9 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.common import answer_options, emit
 from haselab.cli.model.model_file import read_any_plant, read_posterior
+from haselab.cli.model.stated_margins import controller_doubt, model_doubt
 from haselab.cli.output import OutputRule
+from haselab.models.actuator import ActuatorTables
 from haselab.report import compose_page, read_folder, save_page
 from haselab.report.actuator_page import ActuatorReport, actuator_page, missing_sections
 from haselab.store.actuator_file import read_actuator
@@ -70,6 +72,17 @@ def _report_actuator(path: Path, page_path: Path, as_json: bool) -> None:
         tables,
         read_any_plant(path) if has_model else None,
         read_posterior(path) if has_model else None,
+        {"model": model_doubt(path), "controller": _controller_doubts(tables, path)},
     )
+    doubts = {name: doubt for name, doubt in report.doubts.items() if doubt}
+    for doubt in doubts.values():
+        click.echo(f"haselab: warning: {doubt}", err=True)
     write_text(page_path, actuator_page(report))
-    emit({"report": str(page_path), "missing": missing_sections(report)}, as_json=as_json, out=None)
+    answer = {"report": str(page_path), "missing": missing_sections(report), "doubts": doubts}
+    emit(answer, as_json=as_json, out=None)
+
+
+def _controller_doubts(tables: ActuatorTables, path: Path) -> str:
+    """Margins of all controllers of the file that are not those of its model."""
+    kinds = [] if tables.controller is None else tables.controller.all_kinds
+    return " ".join(doubt for kind in kinds if (doubt := controller_doubt(path, kind)))

@@ -11,6 +11,7 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.cli.common import actuator_option, answer_options
+from haselab.cli.model.stated_margins import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip
@@ -103,6 +104,8 @@ def command(
         play_on_chip(trials, file, rig, out, keep_video, armed_by, as_json)
         return
     plan = planned(load_study(study, quick=quick), actuator)
+    if actuator is not None:
+        warn_doubts(actuator)
     if isinstance(file, TwinFile):
         config = file.configuration(rig)
         limited = _prepared(twin_rig(config, file.seed), plan, actuator)

@@ -14,11 +14,13 @@ from haselab.cli.common import answer_options, emit
 from haselab.cli.model.model_file import read_any_plant, read_posterior
 from haselab.cli.model.stated_margins import controller_doubt, model_doubt
 from haselab.cli.output import OutputRule
+from haselab.cli.study.analyse import check_ends
 from haselab.models.actuator import ActuatorTables
 from haselab.report import compose_page, read_folder, save_page
 from haselab.report.actuator_page import ActuatorReport, actuator_page, missing_sections
 from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
+from haselab.store.session.writer import SessionReader
 
 __all__ = ["command"]
 
@@ -53,6 +55,10 @@ def command(source: Path, as_json: bool, out: Path | None) -> None:
     if _is_actuator(source):
         _report_actuator(source, page_path, as_json)
         return
+    session = source / "session.h5"
+    if session.is_file() and not (source / "results.json").exists():
+        with SessionReader(session, unverified=True) as recorded:
+            check_ends(recorded, session)  # of a run that was interrupted
     page = compose_page(read_folder(source))
     save_page(page, source, page_path)
     drawn = [drawing.plan.name for drawing in page.drawings if drawing.document]

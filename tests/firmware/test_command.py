@@ -121,8 +121,8 @@ def test_build_gives_a_program_for_the_programmer(
 def test_build_takes_the_front_end_of_a_rig_file(
     firmware: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = tmp_path / "mega.toml"
-    rig.write_text(f'kind = "mega"\nrun = "{DATA}"\n[simulator]\n[front_end]\n'
+    rig = tmp_path / "chip.toml"
+    rig.write_text(f'kind = "chip"\nrun = "{DATA}"\n[simulator]\n[front_end]\n'
                    "correction = [1.01, 0.002]\n", encoding="utf-8")  # fmt: skip
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--build-dir", tmp_path)
     assert (code, error) == (0, "")
@@ -133,7 +133,7 @@ def test_build_takes_the_front_end_of_a_rig_file(
     assert (tmp_path / "settings.h").read_text(encoding="ascii") == settings_header(settings)
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--board", "stm32g071")
     assert code == 2
-    assert "only kind 'mega' with board" in error
+    assert "only kind 'chip' with board" in error
 
 
 def test_a_folder_without_a_run_is_reported_in_one_line(

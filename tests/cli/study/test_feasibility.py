@@ -209,7 +209,7 @@ def test_a_study_that_plays_nothing_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["current_limit_a", "rate_limit_v_per_s", "follow"])
 def test_a_limit_without_effect_on_a_microcontroller_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "rig.toml"
-    file = ChipFile.model_construct(kind="mega", port=None)
+    file = ChipFile.model_construct(kind="chip", port=None)
     with pytest.raises(InputError, match=rf"safety\.{name} has no effect on a microcontroller"):
         safety_of(file, {name: 0.05}, path)
     assert "mean current. The microcontroller ramps down" in arming_limits(

@@ -71,7 +71,7 @@ def _chip_file(rig: Path, board: str) -> ChipFile:
     file = load_rig(rig)
     if not isinstance(file, ChipFile) or board != "atmega2560":
         raise InputError(
-            f"--rig has kind {file.kind!r} and --board is {board}, but only kind 'mega' with board "
+            f"--rig has kind {file.kind!r} and --board is {board}, but only kind 'chip' with board "
             f"atmega2560 is supported. Leave one of the options out. {rig}"
         )
     return file
@@ -95,7 +95,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 )  # fmt: skip
 @shared_option(
     "--rig", type=click.Path(path_type=Path),
-    detail="It has kind 'mega'; the program gets its [front_end] and limits. Default: none.",
+    detail="It has kind 'chip'; the program gets its [front_end] and limits. Default: none.",
 )  # fmt: skip
 @answer_options(OutputRule(built=("folder",)))
 def build(

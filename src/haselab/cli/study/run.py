@@ -84,7 +84,7 @@ def command(
     HIGH VOLTAGE WILL BE APPLIED on a real bench. The command first checks the study against the
     [rating] of the rig file; without [rating] there is no check. Then it asks you to acknowledge
     the last trip, if there was one, and to confirm. STUDY is a TOML file; a microcontroller (kind =
-    "mega") needs a study of step trials. The maps, model and controllers found are written to
+    "chip") needs a study of step trials. The maps, model and controllers found are written to
     actuator.toml in the folder of the run; the file of --actuator is not changed. With --actuator,
     a study that only has [steps] plays the controller of the file.
     """

@@ -1,4 +1,4 @@
-"""RIG.toml with `kind = "mega"`: a microcontroller on a serial port, or simulated with the twin."""
+"""RIG.toml with `kind = "chip"`: a microcontroller on a serial port, or simulated with the twin."""
 
 from __future__ import annotations
 
@@ -101,9 +101,9 @@ class SimulatorConfig(PrintableSection):
 
 
 class ChipFile(PrintableSection):
-    """`kind = "mega"`, `run = "DIR"`, and `port` or a table `simulator`."""
+    """`kind = "chip"`, `run = "DIR"`, and `port` or a table `simulator`."""
 
-    kind: Literal["mega"]
+    kind: Literal["chip"]
     name: str = "chip"
     run: str = Field(min_length=1, description="folder of the study whose controller it runs")
     structure: str | None = Field(

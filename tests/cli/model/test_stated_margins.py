@@ -162,3 +162,20 @@ def test_a_model_identified_through_another_voltage_map_is_refused(
     assert error.count("\n") == 1
     code, _, warning = run(capsys, "design", leg)
     assert code == 0 and "was identified through another [drive.voltage_map]" in warning
+
+
+def test_a_run_with_such_a_file_warns_before_it_plays(
+    leg: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed(leg, OTHER)
+    study, rig = tmp_path / "study.toml", tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+    study.write_text(
+        'name = "beyond the limit of the file"\n[triangle]\nlow_v = 0.0\nhigh_v = 2.0\n'
+        "frequency_hz = 0.25\ncycles = 3\nleft_out_cycles = 1\nframe_rate_hz = 100.0\n"
+    )
+    arguments = ("--rig", rig, "--actuator", leg, "--out", tmp_path / "out")
+    code, _, error = run(capsys, "run", study, *arguments)
+    warning, refusal = error.splitlines()
+    assert warning.startswith("haselab: warning: [controller] states a phase margin of")
+    assert code == 2 and "is outside [0, 1.8] V" in refusal

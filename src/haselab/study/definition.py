@@ -192,7 +192,7 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     data = _read(path, quick)
     if "step_trials" in data:
         raise InputError(
-            'The study has a table [step_trials], which needs a rig with kind = "mega". '
+            'The study has a table [step_trials], which needs a rig with kind = "chip". '
             f"Use such a rig, or the table [steps]. {path}"
         )
     return _with_all_parameters(checked_study(data, path), path)

@@ -23,6 +23,7 @@ from haselab.study.definition import StepStudy, Study
 
 __all__ = [
     "check_drives",
+    "check_settings",
     "judge_rig",
     "judge_study",
     "rated_rig",
@@ -48,6 +49,25 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
 def study_masses_kg(study: Study) -> list[float]:
     """All masses that are hung in a study, besides the rig's own."""
     return [mass for experiment in experiments_of(study) for mass in experiment.masses_kg()]
+
+
+def check_settings(study: Study) -> None:
+    """Refuse a study from which no result can come, before anything moves.
+
+    Args:
+        study: what will be played.
+    Raises:
+        InputError: it plays nothing, or an experiment's settings give too little data for its fit.
+    """
+    experiments = experiments_of(study)
+    if not any(experiment.recordings() for experiment in experiments):
+        tables = " and ".join(f"[{experiment.table}]" for experiment in experiments)
+        raise InputError(
+            f"The study plays nothing: it has only {tables}. Add an experiment that is played, "
+            "such as [steps]."
+        )
+    for experiment in experiments:
+        experiment.check()
 
 
 def check_drives(study: Study, rig: RigDescription) -> None:
@@ -130,7 +150,7 @@ def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibilit
         for carrier_v, some in by_carrier.items()
     ]
     together = zip(*(one.checks for one in found), strict=True)
-    return Feasibility(tuple(max(same, key=lambda check: check.requested) for same in together))
+    return Feasibility(tuple(max(same, key=lambda check: check.excess) for same in together))
 
 
 def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating] | None:

@@ -62,6 +62,10 @@ class Triangle(Section):
     def _lasts(self) -> Self:
         if self.cycles / self.frequency_hz > _DAY_S:
             raise ValueError("cycles / frequency_hz must not exceed a day")
+        if self.left_out_cycles >= self.cycles:
+            raise ValueError(
+                f"left_out_cycles = {self.left_out_cycles} must be below cycles = {self.cycles}"
+            )
         return self
 
 

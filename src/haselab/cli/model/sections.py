@@ -23,7 +23,7 @@ __all__ = ["CONTROLLER_KEYS", "MODEL_KEYS", "controller_section", "limits_of", "
 MODEL_KEYS = (
     "gain", "natural_frequency_rad_s", "damping_ratio", "delay_s", "slow_modes", "poles", "zeros",
     "numerator", "denominator", "covariance", "residual_std", "fit_percent", "input", "output",
-    "input_unit", "output_unit", "fitted_to",
+    "input_unit", "output_unit", "fitted_to", "through_voltage_map",
 )  # fmt: skip
 CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",

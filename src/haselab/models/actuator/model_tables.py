@@ -105,7 +105,8 @@ class CovarianceTable(_Table):
 class OriginTable(_Table):
     """Signals and records that a model was fitted to; empty where they are not known.
 
-    Units are SI units, "1" for a pure number; `fitted_to` is `identify.fingerprint` of the outputs.
+    Units are SI units, "1" for a pure number; `fitted_to` is `identify.fingerprint` of the outputs,
+    and `through_voltage_map` has the coefficients of the map that converted the recorded voltage.
     """
 
     input: str = ""
@@ -114,6 +115,7 @@ class OriginTable(_Table):
     output_unit: str = ""
     residual_std: Annotated[Number, Field(ge=0)] = 0.0
     fitted_to: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]] = []
+    through_voltage_map: tuple[Number, Number, Number, Number] | None = None
 
 
 class VoltagePlantTable(_Table):

@@ -36,6 +36,7 @@ __all__ = [
 _Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
 _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
 _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
+_Margin = Annotated[float, Field(strict=True)] | bool  # infinite without a crossover
 # products of two numbers: 1/F^2 squared is large
 _Variance = Annotated[float, Field(strict=True, ge=-1e120, le=1e120, allow_inf_nan=False)]
 
@@ -149,6 +150,11 @@ class VoltageMapTable(_Section):
     strain_high: Number = 0.2
     covariance: _Covariance | None = None
 
+    @property
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """Coefficients of the map: a1_v, b1, a2_v, b2."""
+        return self.a1_v, self.b1, self.a2_v, self.b2
+
     def map(self) -> VoltageMap:
         """The map with these coefficients.
 
@@ -221,6 +227,7 @@ class ControllerSection(_Section):
     parameters: dict[str, Number] = {}
     limits: Limits | None = None
     loop: LoopTable | None = None
+    margins: dict[str, _Margin] = {}
     demands: dict[str, Number | bool] = {}
     alternatives: tuple[ControllerSection, ...] = ()
 

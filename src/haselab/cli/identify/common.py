@@ -20,7 +20,7 @@ from haselab.cli.options import shared_option
 from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
 from haselab.models.actuator import ActuatorTables
-from haselab.pipelines.time_axis import records_of, time_axis
+from haselab.pipelines.time_axis import check_rising, records_of, time_axis
 from haselab.store.columns.reader import check_rate
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table, read_table
@@ -314,14 +314,16 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
             check_rate(given, table.rate_hz, rows, "the file's own rate", file)
     rate_hz = table.rate_hz if given is None else given
     if rate_hz is None and table.time_s is not None:
+        check_rising(table.time_s, file, table.time_name or "time_s")
         raise InputError(
             f"The times in {where} are uneven. Resample the record, or state the rate with "
             f"--rate-hz: {file}"
         )
     if rate_hz is None:
+        why = f" Column {table.not_rising} does not rise everywhere." if table.not_rising else ""
         raise InputError(
-            "The file states no sampling rate. Add --rate-hz, name the column of the times with "
-            f"--time, or add a line '# rate_hz = ...': {file}"
+            f"The file states no sampling rate.{why} Add --rate-hz, name the column of the times "
+            f"with --time, or add a line '# rate_hz = ...': {file}"
         )
     if not 0.0 < rate_hz < float("inf"):
         raise InputError(f"--rate-hz is {rate_hz:g} Hz. Use a rate above 0 Hz.")

@@ -13,6 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 __all__ = [
     "CovarianceTable",
     "EstimateTable",
+    "FingerprintTable",
     "LoopTable",
     "Number",
     "OriginTable",
@@ -102,11 +103,23 @@ class CovarianceTable(_Table):
     ]
 
 
+class FingerprintTable(_Table):
+    """`identify.Fingerprint` of the outputs that a model was fitted to."""
+
+    step: Annotated[Number, Field(ge=0)]
+    hashes: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]]
+
+
+def _known_form(item: Any) -> Any:
+    """A fingerprint; None for that of an older version, which was a list."""
+    return None if isinstance(item, list) else item
+
+
 class OriginTable(_Table):
     """Signals and records that a model was fitted to; empty where they are not known.
 
-    Units are SI units, "1" for a pure number; `fitted_to` is `identify.fingerprint` of the outputs,
-    and `through_voltage_map` has the coefficients of the map that converted the recorded voltage.
+    Units are SI units, "1" for a pure number; `through_voltage_map` has the coefficients of the
+    map that converted the recorded voltage.
     """
 
     input: str = ""
@@ -114,7 +127,7 @@ class OriginTable(_Table):
     input_unit: str = ""
     output_unit: str = ""
     residual_std: Annotated[Number, Field(ge=0)] = 0.0
-    fitted_to: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]] = []
+    fitted_to: Annotated[FingerprintTable | None, BeforeValidator(_known_form)] = None
     through_voltage_map: tuple[Number, Number, Number, Number] | None = None
 
 

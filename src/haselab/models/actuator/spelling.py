@@ -27,7 +27,13 @@ _WRITTEN = {
 }  # fmt: skip
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
 # Their content is checked by whoever reads it, or is written only.
-_NOT_LOOKED_INTO = {"provenance", "model.covariance", "model.linear_models", "controller.demands"}
+_NOT_LOOKED_INTO = {
+    "provenance",
+    "model.covariance",
+    "model.fitted_to",
+    "model.linear_models",
+    "controller.demands",
+}
 
 
 @dataclass(frozen=True)

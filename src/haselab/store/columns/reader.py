@@ -267,6 +267,12 @@ class ColumnStream(Closing):
                 raise
             return  # a column that is only called like one of times
         self._time_factor = 1.0 if unit is None else unit.factor
+        falls = np.flatnonzero(~(np.diff(head) > 0.0))
+        if falls.size and (self._options.time is not None or unit or full == "time_s"):
+            raise InputError(
+                f"Column {full} does not increase after row {falls[0] + 1}. Sort the rows, or "
+                f"remove repeated ones: {self._archive.file}"
+            )
         self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
         if self._times and assumed_seconds(self._archive, full, self._options):

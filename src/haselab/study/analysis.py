@@ -10,14 +10,14 @@ from haselab.base import InputError, ResultError
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
 from haselab.study.experiment import ExperimentResult, NotPlayedError
-from haselab.study.fits.observe import Observation, Source
-from haselab.study.foreign import (
+from haselab.study.experiments.foreign import (
     AnyExperiment,
     check_result,
     foreign,
     refuse_repeated,
     rows_of_experiment,
 )
+from haselab.study.fits.observe import Observation, Source
 from haselab.study.registry import EXPERIMENTS
 
 __all__ = ["Analysis", "experiments_of", "fitting"]

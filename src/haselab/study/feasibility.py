@@ -21,7 +21,7 @@ from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study
-from haselab.study.foreign import declared
+from haselab.study.experiments.foreign import declared
 
 __all__ = [
     "check_drives",

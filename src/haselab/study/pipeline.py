@@ -12,8 +12,8 @@ from haselab.runtime.runner import Runner
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Chart, ExperimentResult, NotPlayedError
+from haselab.study.experiments.foreign import foreign, rows_of_experiment
 from haselab.study.fits.observe import Source
-from haselab.study.foreign import foreign, rows_of_experiment
 from haselab.study.player import Player
 
 __all__ = ["Findings", "investigate"]

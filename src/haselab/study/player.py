@@ -12,7 +12,7 @@ from haselab.runtime.loop import LoopSettings
 from haselab.runtime.runner import Runner
 from haselab.safety.feasibility import Drive
 from haselab.study.analysis import Analysis
-from haselab.study.foreign import AnyExperiment, declared
+from haselab.study.experiments.foreign import AnyExperiment, declared
 
 __all__ = ["UPDATE_HZ", "Player"]
 

@@ -9,7 +9,7 @@ from typing import Any
 from haselab.base import Estimate, Json, JsonObject
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
-from haselab.study.foreign import rows_of_experiment
+from haselab.study.experiments.foreign import rows_of_experiment
 from haselab.study.paper.quantity_table import quantities
 from haselab.study.quantity import Quantity
 from haselab.study.simulated.truth import (

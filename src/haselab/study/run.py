@@ -37,9 +37,9 @@ from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study, checked_study
 from haselab.study.experiment import ExperimentResult
+from haselab.study.experiments.foreign import declared, foreign, refuse_repeated
 from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
-from haselab.study.foreign import declared, foreign, refuse_repeated
 from haselab.study.known import known_values
 from haselab.study.pipeline import Findings, investigate
 from haselab.study.simulated.noise_free import NoiseFreeBench

@@ -18,8 +18,8 @@ from haselab.store.toml import Section
 from haselab.study import Analysis, Experiment, ExperimentResult, Player, Quantity
 from haselab.study.definition import builtin_study
 from haselab.study.experiment import Chart, Curve
+from haselab.study.experiments.foreign import refuse_repeated
 from haselab.study.feasibility import study_drives, study_masses_kg
-from haselab.study.foreign import refuse_repeated
 from haselab.study.pipeline import investigate
 from haselab.study.results import rows_of
 

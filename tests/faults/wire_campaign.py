@@ -390,21 +390,27 @@ LOWEST_V = 4500.0  # that a fault has to meet
 
 
 def outside(
-    folder: Path, name: str, moment: str, forks: Any, helpers: Sequence[tuple[int, str]] = ()
+    folder: Path,
+    name: str,
+    moment: str,
+    forks: Any,
+    helpers: Sequence[tuple[int, str]] = (),
+    *,
+    patient: bool = False,
 ) -> Any:
     """One signal to a program that plays on a served twin through the real drivers.
 
     Args:
         name: of the signal; empty: the program itself is left alone.
-        helpers: guardians that get a signal at the same moment: slot and name of the signal. Then
-            neither the drivers nor the lease may run out, which would end the program as well.
+        helpers: guardians that get a signal at the same moment: slot and name of the signal.
+        patient: drivers and lease do not run out on a busy machine, which would end the program.
     Raises:
         NotStruckError: the program had ended before.
     """
     with Bench(folder, lambda bench: None) as bench:
-        if helpers:
+        if patient:
             bench.be_patient()
-        lease_s = PATIENT_LEASE_S if helpers else LEASE_S
+        lease_s = PATIENT_LEASE_S if patient else LEASE_S
         read, write = os.pipe()
         with (
             (folder / "stderr").open("w") as errors,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study
+from haselab.study.experiments.foreign import declared
 
 __all__ = [
     "check_drives",
@@ -43,12 +45,20 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
         study: what will be played.
         rig: nominal values of the bench.
     """
-    return [drive for experiment in experiments_of(study) for drive in experiment.drives(rig)]
+    return [
+        drive
+        for each in experiments_of(study)
+        for drive in declared(each, "drives", Drive, partial(each.drives, rig))
+    ]
 
 
 def study_masses_kg(study: Study) -> list[float]:
     """All masses that are hung in a study, besides the rig's own."""
-    return [mass for experiment in experiments_of(study) for mass in experiment.masses_kg()]
+    return [
+        mass
+        for each in experiments_of(study)
+        for mass in declared(each, "masses_kg", (int, float), each.masses_kg)
+    ]
 
 
 def check_settings(study: Study) -> None:

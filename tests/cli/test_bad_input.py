@@ -160,7 +160,7 @@ def test_a_fault_in_a_study_is_refused_before_anything_moves(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "kind: Field required"),
+        ("", "the file has no key kind: "),
         ('kind = "robot"', "kind: Input should be 'twin'"),
         ('kind = "twin"\nsed = 1', "sed: no such key"),
         ('kind = "twin"\nseed = -1', "seed: Input should be greater than or equal to 0"),

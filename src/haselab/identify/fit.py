@@ -168,7 +168,7 @@ class Fit(ABC):
         """The numbers with their 95 % intervals and units, as a table of plain text.
 
         Returns:
-            Lines for `print`.
+            What `print` shows. All numbers are in the attributes.
         """
         lines = [f"{type(self).__name__}: {self.status}"]
         if self.parameters:
@@ -176,6 +176,9 @@ class Fit(ABC):
             lines += [head, *(_row(*row) for row in self._rows())]
         lines += [f"{name:{_NAME_WIDTH}s} {value:12.5g}" for name, value in self._qualities()]
         return "\n".join([*lines, *(f"Note: {note}" for note in self.notes)])
+
+    def __str__(self) -> str:
+        return self.summary()
 
     def _repr_html_(self) -> str:
         """The summary as a notebook shows it."""

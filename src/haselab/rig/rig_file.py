@@ -69,7 +69,9 @@ class ReplayFile(PrintableSection):
     """`kind = "replay"`, `session = "DIR/session.h5"`, with its videos beside it."""
 
     kind: Literal["replay"]
-    session: str = Field(min_length=1)
+    session: str = Field(
+        min_length=1, description="recording to play back", examples=["out/run/session.h5"]
+    )
     experiments: tuple[str, ...] = Field((), description="names; empty: all")
 
 

@@ -35,14 +35,14 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json, write_json
-from haselab.study.chip.agreement import (
+from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
+from haselab.study.simulated.agreement import (
     Agreement,
     StepCase,
     agreement_of,
     check_stable,
     predicted_loop,
 )
-from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
 from haselab.study.simulated.truth import twin_of
 
 __all__ = ["build", "command", "flash", "simulate"]

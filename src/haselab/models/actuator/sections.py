@@ -98,8 +98,8 @@ class ActuatorSection(_Section):
 class StrainMapTable(_Section):
     """`[sensing.strain_map]`: capacitance in F to strain, see `StrainMap`."""
 
-    slope_per_f: Number
-    offset: Number
+    slope_per_f: Number = Field(description="strain per capacitance", examples=[1.07e9])
+    offset: Number = Field(description="strain at a capacitance of 0 F", examples=[-0.43])
     curvature_per_f2: Number = 0.0
     cubic_per_f3: Number = 0.0
     covariance: _Covariance | None = None
@@ -142,10 +142,10 @@ class VoltageMapTable(_Section):
 
     _ends = ("strain_low", "strain_high")
 
-    a1_v: Number
-    b1: Number
-    a2_v: Number
-    b2: Number
+    a1_v: Number = Field(description="factor of the first exponential, eq. 4", examples=[1.8])
+    b1: Number = Field(description="exponent of the first, per unit of strain", examples=[0.78])
+    a2_v: Number = Field(description="factor of the second exponential", examples=[-0.81])
+    b2: Number = Field(description="exponent of the second, per unit of strain", examples=[-18.7])
     strain_low: Number = -0.1
     strain_high: Number = 0.2
     covariance: _Covariance | None = None
@@ -205,8 +205,8 @@ class Limits(_Section):
 
     _ends = ("low", "high")
 
-    low: Number
-    high: Number
+    low: Number = Field(description="lowest output, in the unit of the input", examples=[-0.05])
+    high: Number = Field(description="highest output, in the unit of the input", examples=[0.1])
 
 
 class LoopTable(_Section):

@@ -105,7 +105,11 @@ class ChipFile(PrintableSection):
 
     kind: Literal["chip"]
     name: str = "chip"
-    run: str = Field(min_length=1, description="folder of the study whose controller it runs")
+    run: str = Field(
+        min_length=1,
+        description="folder of the study whose controller it runs",
+        examples=["out/reference"],
+    )
     structure: str | None = Field(
         None,
         min_length=1,

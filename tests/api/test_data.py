@@ -37,6 +37,17 @@ SOURCES = {
         index=pd.Timestamp("2026-03-29", tz="Europe/Zurich") + pd.to_timedelta(TIME_S, unit="s"),
     ),
     "frame of nullable numbers": pd.DataFrame({"time_s": TIME_S, "u": U, "y": Y}, dtype="Float64"),
+    "milliseconds by name": {"time_ms": 1e3 * TIME_S, "u": U, "y": Y},
+    "milliseconds in brackets": pd.DataFrame({"Zeit [ms]": 1e3 * TIME_S, "u": U, "y": Y}),
+    "frame with an index in milliseconds": pd.DataFrame(
+        {"u": U, "y": Y}, index=pd.Index(1e3 * TIME_S, name="t [ms]")
+    ),
+    "frame with durations": pd.DataFrame(
+        {"time_ms": pd.to_timedelta(TIME_S, unit="s"), "u": U, "y": Y}
+    ),
+    "data set in milliseconds": xr.Dataset(
+        {"u": ("time", U), "y": ("time", Y)}, {"time": ("time", 1e3 * TIME_S, {"units": "ms"})}
+    ),
     "data set": xr.Dataset({"u": ("time_s", U), "y": ("time_s", Y)}, {"time_s": TIME_S}),
     "table": hl.table({"time_s": TIME_S, "u": U, "y": Y}),
 }
@@ -57,6 +68,24 @@ def test_a_rate_comes_from_the_argument_or_the_attribute():
     assert hl.records(frame, "drive", "out", rate_hz=20.0)[0].input_rate_hz == 20.0
     frame.attrs["rate_hz"] = 30.0
     assert hl.records(frame, "drive", "out")[0].input_rate_hz == 30.0
+
+
+def test_times_in_a_unit_come_out_in_seconds():
+    found = hl.table({"t / min": TIME_S / 60.0, "u": U})
+    assert (found.time_name, sorted(found)) == ("time_s", ["time_s", "u"])
+    np.testing.assert_allclose(found.time_s, TIME_S, rtol=1e-12, atol=1e-12)
+    volts = hl.table({"t [mV]": TIME_S, "u": U})  # no times
+    assert (volts.time_name, volts.rate_hz) == (None, None)
+    with pytest.raises(InputError, match=r"^Column 't \[ticks\]' states the unit 'ticks', which"):
+        hl.records({"t [ticks]": TIME_S, "u": U, "y": Y})
+
+
+@pytest.mark.parametrize("name", ["t", "time_ms"])
+def test_times_that_do_not_rise_are_named(name):
+    twice = np.r_[TIME_S[:20], TIME_S[19:-1]]
+    for times in (TIME_S[::-1], twice):
+        with pytest.raises(InputError, match=rf"no sampling rate. Column {name} does not rise ev"):
+            hl.records({name: times, "u": U, "y": Y})
 
 
 def test_a_gap_in_the_times_begins_a_new_record():

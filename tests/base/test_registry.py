@@ -10,6 +10,7 @@ import pytest
 
 from haselab.actuators import ACTUATORS
 from haselab.base import DeviceError, HaselabError, InputError
+from haselab.base.exits import SignalExit
 from haselab.base.registry import Registry
 from haselab.controllers import CONTROLLERS
 from haselab.rig.instruments.registry import INSTRUMENTS
@@ -68,6 +69,32 @@ def test_what_does_not_load_or_does_not_fit_is_named_with_its_package(
     with pytest.raises(error, match=rf"{start}: {said}.*\. Fix or uninstall the package\.$"):
         registry.find("x")
     assert "x" in registry.packages() and "x" not in registry.usable()
+
+
+@EACH
+@pytest.mark.parametrize("code", [0, None, "no licence"])
+def test_a_package_that_exits_when_it_is_imported_is_named_like_any_other_fault(
+    monkeypatch, tmp_path, registry, error, code
+):
+    (tmp_path / "leaves.py").write_text(f"import sys\nsys.exit({code!r})\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    install(monkeypatch, registry, ("x", "leaves:X"))
+    said = rf"does not load \(RuntimeError: it called sys\.exit\({code!r}\)\)\. Fix or uninstall"
+    with pytest.raises(error, match=said):
+        registry.find("x")
+    assert "x" not in registry.usable()
+
+
+@EACH
+def test_a_signal_during_an_import_still_ends_the_program(monkeypatch, registry, error):
+    install(monkeypatch, registry, ("x", "math:pi"))
+
+    def fault(found, name):
+        raise SignalExit(143)
+
+    monkeypatch.setattr(registry, "_fault", fault)
+    with pytest.raises(SignalExit, match=r"143"):
+        registry.find("x")
 
 
 @EACH

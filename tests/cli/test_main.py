@@ -10,6 +10,7 @@ import pytest
 
 from haselab import __version__
 from haselab.base import DeviceError, InputError, LimitError, ResultError, SafetyError
+from haselab.base.exits import SignalExit
 from haselab.cli import main as entry
 
 
@@ -53,6 +54,23 @@ def test_each_kind_of_error_has_its_exit_code_and_one_line(
     message = captured.err.lstrip("\n")  # click ends the line of the terminal's ^C first
     assert message.startswith("haselab: ")
     assert message.count("\n") == 1
+
+
+def test_code_of_another_package_cannot_end_a_command_as_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command_that_raises(SystemExit(0), monkeypatch)
+    assert run(["design"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "Code of another package called sys.exit(0). Run again with --debug" in error
+    with pytest.raises(RuntimeError, match=r"another package called sys\.exit\(\)"):
+        entry.main(["design", "--debug"])
+
+
+def test_a_signal_keeps_its_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    command_that_raises(SignalExit(143), monkeypatch)
+    assert run(["design"]) == 143
 
 
 def test_a_message_of_several_lines_is_folded_into_one(

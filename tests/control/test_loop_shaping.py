@@ -68,6 +68,9 @@ def test_a_demand_out_of_reach_is_said_in_words():
     design = design_pi(RAD, spec, LATE, rng=np.random.default_rng(1))
     assert design.nominal.margins.stable
     assert any("demanded" in text for text in design.shortfalls)
+    assert str(design) == design.summary()
+    assert str(design).splitlines()[-1].startswith("Demands not met: ")
+    assert len(str(design).splitlines()) <= 12
 
 
 def test_grid_scores_agree_with_the_exact_margins():

@@ -22,7 +22,11 @@ from haselab.study.definition import load_study
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "your-actuator.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^```\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)[0].splitlines()
-FOREIGN = re.findall(r"^```sh\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)[0].splitlines()
+FOREIGN, RECORDED = (
+    block.splitlines()
+    for block in re.findall(r"^```sh\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)
+)
+TABLES = re.findall(r"^```toml\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)
 PERIOD_S, RATE_HZ = 0.01, 100e3
 
 
@@ -177,7 +181,7 @@ def test_files_of_another_program_give_the_same_actuator(
 def test_what_the_page_types_is_enough_for_a_design(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    study, typed = re.findall(r"^```toml\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)
+    _, study, typed = TABLES
     (tmp_path / "steps.toml").write_text(study, encoding="utf-8")
     assert load_study(tmp_path / "steps.toml").steps.own_trials == 3
     path = tmp_path / "typed.toml"
@@ -187,3 +191,22 @@ def test_what_the_page_types_is_enough_for_a_design(
     assert controller["demands"]["phase_margin_deg"] == 60.0
     assert controller["uncertainty"].startswith("no uncertainty")
     assert controller["loop"] == {"rate_hz": 100.0, "measurement_delay_s": 0.0075}
+
+
+@pytest.mark.long
+def test_the_tables_of_a_run_give_the_model_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "records.toml").write_text(TABLES[0], encoding="utf-8")
+    (tmp_path / "rig.toml").write_text('kind = "twin"\n', encoding="utf-8")
+    answers = {line.split()[1]: json.loads(run(capsys, line + " --json")) for line in RECORDED}
+    assert answers["compare"]["status"] == "ok" and answers["compare"]["fit_percent"] > 85.0
+    assert answers["session"]["empty"] == ["particles", "particles-blocks"]
+    read = [
+        tomllib.loads(Path(name).read_text(encoding="utf-8"))
+        for name in ("recorded.toml", "out/records/actuator.toml")
+    ]
+    ours, of_run = (data["model"]["natural_frequency_rad_s"] for data in read)
+    assert ours == pytest.approx(of_run, rel=0.01)
+    assert set(read[0]["provenance"]) == {"sensing", "drive", "model", "controller"}

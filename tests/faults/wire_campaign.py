@@ -48,6 +48,7 @@ def sibling(name: str) -> ModuleType:
 
 wires = sibling("wire_bench")
 campaign, links, Bench, Play = wires.campaign, wires.links, wires.Bench, wires.Play
+LEASE_S, PATIENT_LEASE_S = wires.LEASE_S, wires.PATIENT_LEASE_S
 MOMENTS = campaign.MOMENTS
 
 
@@ -353,7 +354,11 @@ SIGNALS = {
 ENDS_AT_ONCE = ("SIGQUIT", "SIGKILL")
 
 
-def program(folder: Path, socket: Path, moment: str) -> None:
+class NotStruckError(AssertionError):
+    """The program had ended before its moment, as on a machine that is too busy: no fault yet."""
+
+
+def program(folder: Path, socket: Path, moment: str, lease_s: float) -> None:
     """Plays until it is ended; says `there` when the moment is reached."""
     progress = Interruptible(SilentProgress())
 
@@ -374,7 +379,9 @@ def program(folder: Path, socket: Path, moment: str) -> None:
     command += ("guardian", str(folder / "guardian.toml"))
     endless = {RAMP: "ramp", STEP: "step"}.get(moment, "")
     brief = moment == CLOSE
-    play = Play(folder, command, at, endless=endless, brief=brief, progress=progress)
+    play = Play(
+        folder, command, at, endless=endless, brief=brief, progress=progress, lease_s=lease_s
+    )
     with contextlib.closing(links.SharedNumber(folder / "count")) as shown:
         play.run(shown)
 
@@ -383,31 +390,47 @@ LOWEST_V = 4500.0  # that a fault has to meet
 
 
 def outside(
-    folder: Path, name: str, moment: str, forks: Any, helpers: Sequence[tuple[int, str]] = ()
+    folder: Path,
+    name: str,
+    moment: str,
+    forks: Any,
+    helpers: Sequence[tuple[int, str]] = (),
+    *,
+    patient: bool = False,
 ) -> Any:
     """One signal to a program that plays on a served twin through the real drivers.
 
     Args:
         name: of the signal; empty: the program itself is left alone.
         helpers: guardians that get a signal at the same moment: slot and name of the signal.
+        patient: drivers and lease do not run out on a busy machine, which would end the program.
+    Raises:
+        NotStruckError: the program had ended before.
     """
     with Bench(folder, lambda bench: None) as bench:
+        if patient:
+            bench.be_patient()
+        lease_s = PATIENT_LEASE_S if patient else LEASE_S
         read, write = os.pipe()
         with (
             (folder / "stderr").open("w") as errors,
             os.fdopen(read) as words,
             contextlib.closing(links.SharedNumber(folder / "count")) as count,
         ):
-            words_of = ["program", str(folder), str(forks.path), moment]
+            words_of = ["program", str(folder), str(forks.path), moment, str(lease_s)]
             started = forks.start(words_of, write, errors.fileno())
             os.close(write)
             there, *pids = words.readline().split() or [""]
             if there != "there":
                 started.ended()
-                raise AssertionError((folder / "stderr").read_text()[-300:])
+                raise NotStruckError((folder / "stderr").read_text()[-300:])
             acknowledged = round(count.read())
             bench.now()
-            assert moment == ARM or bench.highest_v > LOWEST_V
+            if moment != ARM and bench.highest_v <= LOWEST_V:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(started.pid, signal.SIGTERM)
+                started.ended()
+                raise NotStruckError((folder / "stderr").read_text()[-300:])
             if name in ENDS_AT_ONCE:
                 bench.go_on()
             if name:
@@ -454,7 +477,7 @@ def run(words: list[str]) -> Any:
         for name in DRIVERS:  # imported before the fork
             assert name in sys.modules
         return guardian_process.main(words[1:])
-    return program(Path(words[1]), Path(words[2]), words[3])
+    return program(Path(words[1]), Path(words[2]), words[3], float(words[4]))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import pytest
 
 from haselab.cli.main import main
 from haselab.control import step_metrics
-from haselab.firmware import ChipSettings, settings_header
+from haselab.firmware import ChipSettings, FrontEnd, settings_header
 from haselab.rig.chip import ChipFile, Firmware, find_tool, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
@@ -121,8 +121,8 @@ def test_build_gives_a_program_for_the_programmer(
 def test_build_takes_the_front_end_of_a_rig_file(
     firmware: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = tmp_path / "mega.toml"
-    rig.write_text(f'kind = "mega"\nrun = "{DATA}"\n[simulator]\n[front_end]\n'
+    rig = tmp_path / "chip.toml"
+    rig.write_text(f'kind = "chip"\nrun = "{DATA}"\n[simulator]\n[front_end]\n'
                    "correction = [1.01, 0.002]\n", encoding="utf-8")  # fmt: skip
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--build-dir", tmp_path)
     assert (code, error) == (0, "")
@@ -133,7 +133,22 @@ def test_build_takes_the_front_end_of_a_rig_file(
     assert (tmp_path / "settings.h").read_text(encoding="ascii") == settings_header(settings)
     code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--board", "stm32g071")
     assert code == 2
-    assert "only kind 'mega' with board" in error
+    assert "only kind 'chip' with board" in error
+
+
+def test_a_build_says_which_strains_the_module_does_not_reach(
+    firmware: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    designed = read_design(DATA, "pid", FrontEnd()).limits
+    rig = tmp_path / "chip.toml"
+    rig.write_text(f'kind = "chip"\nrun = "{DATA}"\ndrive_high_v = 1.5\n[simulator]\n')
+    code, text, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--build-dir",
+                            tmp_path, "--json")  # fmt: skip
+    answer = json.loads(text)
+    assert code == 0 and error.count("\n") == 1
+    assert "limited to 0 to 1.5 V" in error
+    assert f"instead of {designed[0]:.4g} to {designed[1]:.4g}" in error
+    assert 0.0 < answer["strain_high"] < designed[1] and answer["strain_low"] == designed[0]
 
 
 def test_a_folder_without_a_run_is_reported_in_one_line(

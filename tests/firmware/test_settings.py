@@ -171,8 +171,24 @@ def test_an_actuator_file_gives_settings_and_its_drive_limits_them(actuator: Pat
     actuator.write_text(text.replace("[drive]", "[drive]\nhigh_v = 1.8"))
     assert read_design(actuator, "pid", FrontEnd()).settings.drive_high_v == 1.8
     actuator.write_text(text.replace("[drive]", "[drive]\nhigh_v = 1.5"))
+    design = read_design(actuator, "pid", FrontEnd())
+    # 1.5 V is at a strain of 0.053738 (test_maps); the search has steps of 1e-4.
+    assert design.limits == (-0.05, 0.1)
+    assert 0.053638 <= design.settings.strain_high <= 0.053738
+    assert design.settings.table_v[-1] <= 1.5
+    actuator.write_text(text.replace("[drive]", "[drive]\nhigh_v = 0.9"))
     with pytest.raises(InputError, match=r"voltage map goes from .* to 1\.79.*a\.toml"):
-        read_design(actuator, "pid", FrontEnd())
+        read_design(actuator, "pid", FrontEnd())  # zero strain is at 1.04 V
+
+
+def test_a_map_that_reaches_exactly_the_highest_drive_is_used(settings: ChipSettings) -> None:
+    """Rounding to single precision is no reason to refuse it: the firmware limits the drive."""
+    highest_v = np.float32(settings.table_v[-1])
+    for end in (0.0, np.inf):
+        beside_v = float(np.nextafter(highest_v, np.float32(end)))
+        assert replace(settings, drive_high_v=beside_v).drive_high_v == beside_v
+    with pytest.raises(InputError, match=r"must rise within"):
+        replace(settings, drive_high_v=float(highest_v) - 1e-4)
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_a_rig_file_names_the_supply_and_the_limits_of_its_module(
 ) -> None:
     path = tmp_path / "miniature.toml"
     path.write_text(
-        'kind = "mega"\nrun = "run"\ndrive_high_v = 1.95\nrise_v_per_s = 7.0\n'
+        'kind = "chip"\nrun = "run"\ndrive_high_v = 1.95\nrise_v_per_s = 7.0\n'
         "[simulator]\nprecondition_v = 2.0\n[simulator.supply]\nripple_v = 2.0\n",
         encoding="utf-8",
     )
@@ -107,4 +107,4 @@ def test_a_rig_file_names_the_supply_and_the_limits_of_its_module(
     assert file.simulator is not None
     assert file.simulator.supply == SupplyModel(ripple_v=2.0)
     assert file.limited(settings) == replace(settings, drive_high_v=1.95, rise_v_per_s=7.0)
-    assert ChipFile(kind="mega", run="run", simulator=file.simulator).limited(settings) == settings
+    assert ChipFile(kind="chip", run="run", simulator=file.simulator).limited(settings) == settings

@@ -410,7 +410,7 @@ def seed_files() -> dict[str, bytes]:
         "twin.toml": TWIN.encode(),
         "rig.toml": b'kind = "twin"\ntwin = "twin.toml"\nseed = 1\n',
         "bench.toml": BENCH.encode(),
-        "mega.toml": b'kind = "mega"\nrun = "."\n[simulator]\nreading = "hz"\nseed = 1\n',
+        "chip.toml": b'kind = "chip"\nrun = "."\n[simulator]\nreading = "hz"\nseed = 1\n',
         "run/model.json": json.dumps(run_model, indent=1).encode(),
         "run/controller.toml": controller.encode(),
         "run/results.json": json.dumps(results).encode(),

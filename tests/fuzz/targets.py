@@ -20,7 +20,7 @@ _RUN = {
 }
 _BENCH = {"rig.toml": "bench.toml"}
 _SESSION = {name: name for name in ("session/session.h5", "session/manifest.json")}
-_MEGA = {"rig.toml": "mega.toml"} | {name.removeprefix("run/"): name for name in _RUN}
+_CHIP = {"rig.toml": "chip.toml"} | {name.removeprefix("run/"): name for name in _RUN}
 
 # name: (arguments, files by the name of their seed where that is another one)
 _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
@@ -46,14 +46,14 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
                         "--duration-s 10",
                         {"twin.toml": "twin.toml"}),
     "run": ("run study.toml --rig rig.toml --quick --out out", {"twin.toml": "twin.toml"}),
-    "run, chip": ("run steps.toml --rig rig.toml --out out", _MEGA),
+    "run, chip": ("run steps.toml --rig rig.toml --out out", _CHIP),
     "reproduce": ("reproduce --twin twin.toml --quick --out out", {}),
     "calibrate": ("calibrate --rig rig.toml --capacitor 1e-9 --capacitor 2e-9,5,0.01 "
                   "--carrier-hz 2000 --carrier-v 0.1 --duration-s 0.1 --out c.toml",
                   {"twin.toml": "twin.toml"}),
     "firmware build": ("firmware build run --build-dir out", _RUN),
     "firmware build, front end": (
-        "firmware build run --build-dir out --rig rig.toml", _RUN | _MEGA
+        "firmware build run --build-dir out --rig rig.toml", _RUN | _CHIP
     ),
     "report": ("report run", _RUN),
     "rig check": ("rig check rig.toml", _BENCH),

@@ -184,7 +184,8 @@ def test_covariance_and_intervals_of_all_parameters_agree(name):
 @pytest.mark.parametrize("name", EVERY)
 def test_each_fit_says_its_numbers_as_text_html_json_and_figure(name):
     fit = fitted(name)
-    lines = fit.summary().splitlines()
+    lines = str(fit).splitlines()
+    assert lines == fit.summary().splitlines()
     assert lines[0] == f"{type(fit).__name__}: ok"
     for parameter, estimate in fit.parameters.items():
         (line,) = [line for line in lines if line.startswith(f"{parameter} ")]

@@ -26,6 +26,9 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 
 def test_a_folder_without_results_says_what_to_do(tmp_path):
+    with pytest.raises(InputError, match=r"neither results\.json nor session\.h5.* --out folder"):
+        write_report(tmp_path)
+    (tmp_path / "session.h5").touch()
     with pytest.raises(InputError, match=r"no results\.json\. Create it with 'haselab analyse"):
         write_report(tmp_path)
 

@@ -69,9 +69,9 @@ def wire(board: str, seed: int, opened: ExitStack) -> Bench:
 def chip(seed: int, opened: ExitStack) -> Bench:
     """The microcontroller in co-simulation: it finds its output itself, and accepts only 0 V."""
     data = Path(__file__).resolve().parents[1] / "firmware" / "data"
-    file = ChipFile.model_validate({"kind": "mega", "run": str(data), "simulator": {"seed": seed}})
+    file = ChipFile.model_validate({"kind": "chip", "run": str(data), "simulator": {"seed": seed}})
     try:
-        rig = opened.enter_context(opened_chip(file, data / "mega.toml", gate := Gate())).rig
+        rig = opened.enter_context(opened_chip(file, data / "chip.toml", gate := Gate())).rig
         gate.permit(gate.interlock.revision)
     except InputError as error:
         pytest.skip(str(error))

@@ -7,7 +7,8 @@ import pytest
 
 from haselab.base import InputError
 from haselab.rig.bench_config import BenchConfig
-from haselab.rig.rig_file import load_rig
+from haselab.rig.chip import ChipFile
+from haselab.rig.rig_file import load_rig, load_rig_to_shut_down
 from haselab.rig.twin.config import load_twin, twin_of_reading
 from haselab.store.toml import toml_text
 
@@ -53,11 +54,15 @@ def test_the_manuals_rig_file_has_no_fault(manual):
         ("drive_high_v = 2.0", "drive_high_v = 20.0", r"daq\.drive_high_v: Input should be less"),
         ("ahead_blocks = 1", "ahead_blocks = -1", r"daq\.ahead_blocks: Input should be greater"),
         ('load = "INF"', 'load = "75"', r"generator\.load: Input should be 'INF' or '50'"),
-        ("highest_v = 3000.0", "", r"supply\.highest_v: Field required"),
+        (
+            "highest_v = 3000.0",
+            "",
+            r"\[supply\] has no key highest_v: .*= 3000\.0",
+        ),
         (
             'kind = "bench"',
             'kind = "lab"',
-            r"kind: Input should be 'twin', 'bench', 'mega' or 'replay'",
+            r"kind: Input should be 'twin', 'bench', 'chip' or 'replay'",
         ),
         ("mass_kg = 0.25", "mass_kg = 0.25\n[stand]\nkind = 'twin'", r"give an address if kind"),
     ],
@@ -68,6 +73,15 @@ def test_a_fault_in_a_bench_is_reported_with_its_place(manual, old, new, reporte
     manual.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=reported):
         load_rig(manual)
+
+
+def test_the_former_kind_of_a_chip_names_the_new_one_but_is_shut_down(tmp_path):
+    rig = tmp_path / "rig.toml"
+    rig.write_text('kind = "mega"\nrun = "."\n[simulator]\n')
+    with pytest.raises(InputError, match=r"kind = 'mega', which is now called 'chip'.*rig\.toml$"):
+        load_rig(rig)
+    file, faults = load_rig_to_shut_down(rig)
+    assert (type(file), faults) == (ChipFile, [])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -125,9 +126,19 @@ class Raises(Spy):
         return super().step(reference, measurement)
 
 
+class Leaves(Spy):
+    """Exits in its third step."""
+
+    def step(self, reference: float, measurement: Measurement) -> float:
+        if len(self.seen) == 2:
+            raise SystemExit(0)
+        return super().step(reference, measurement)
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
+        (lambda: Leaves(0.0), r"Controller 'spy' failed: RuntimeError: it called sys\.exit\(0\)"),
         (lambda: Raises(0.0), "Controller 'spy' failed: ZeroDivisionError: float division"),
         (lambda: Spy(math.nan), "Controller 'spy' returned nan for a strain of"),
         (lambda: Spy(math.inf), "Controller 'spy' returned inf for a strain of"),
@@ -138,7 +149,7 @@ def test_a_controller_that_fails_ends_at_0_v_with_its_name(scene, make, said):
     with pytest.raises(SafetyError, match=said):
         scene.play(make, [0.0] * 20)
     assert scene.twin.output_v == 0.0
-    assert any(said[:40] in what for _, what in scene.session.events())
+    assert any(said[:24] in what for _, what in scene.session.events())
 
 
 def test_a_controller_that_does_not_start_is_refused_before_anything_moves(scene):
@@ -148,6 +159,11 @@ def test_a_controller_that_does_not_start_is_refused_before_anything_moves(scene
     with pytest.raises(InputError, match="Controller 'spy' does not start: OSError: no solver"):
         scene.play(make, [0.0] * 5)
     assert len(scene.session.experiment("x").codes) == 0
+
+
+def test_a_controller_that_exits_at_its_start_is_refused(scene):
+    with pytest.raises(InputError, match=r"'spy' does not start: .*it called sys\.exit\(3\)"):
+        scene.play(lambda: sys.exit(3), [0.0] * 5)
 
 
 def test_a_wild_controller_is_stopped_by_the_watchdog_as_a_pid_is(scene):

@@ -56,7 +56,19 @@ def test_the_carrier_s_current_is_what_the_twin_s_monitor_shows() -> None:
         ({"bandwidth_hz": 1e3}, [0.5], (2000.0, 0.02), r"carrier frequency is 2000 Hz"),
         ({"thickness_m": 1e-4}, [1.0], (2000.0, 0.02), r"field is 51 MV/m in x \(limit 36 MV/m"),
         ({"stretch_high": 2.0}, [1.0], (2000.0, 0.02), r"stretch is 2\.7"),
-        ({}, [2.5], (2000.0, 0.02), r"output beyond the drive limits is 0\.5 V in x"),
+        (
+            {},
+            [2.5],
+            (2000.0, 0.02),
+            r"highest drive voltage is 2\.5 V in x \(limit 2 V\)\. Lower the voltage, or raise the "
+            "limit in the rig file",
+        ),
+        (
+            {},
+            [-0.5],
+            (2000.0, 0.02),
+            r"lowest drive voltage is -0\.5 V in x \(limit 0 V\)\. Raise the voltage, or lower",
+        ),
     ],
 )
 def test_a_study_beyond_the_bench_is_refused(change, drive, carrier, words) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from haselab.base import InputError, LimitError, SafetyError, SilentProgress
+from haselab.base import DeviceError, InputError, LimitError, SafetyError, SilentProgress
 from haselab.cli.main import main
 from haselab.runtime.runner import Runner
 from haselab.safety.armed import armed
@@ -80,6 +80,28 @@ def test_a_zero_that_does_not_work_is_raised_and_latched(
     assert "not at 0 V" in guarded.safety.request().reason
     with pytest.raises(SafetyError, match="acknowledge"), armed(bench.rig):
         pass
+
+
+@pytest.mark.parametrize("code", [0, None, 7])
+def test_a_driver_that_exits_is_a_fault_of_the_bench_which_ends_at_zero(code: int | None) -> None:
+    bench = OwnBench()
+    said = rf"driver 'Board' called sys\.exit\({code}\) in 'write'\. Report the fault"
+    with pytest.raises(DeviceError, match=said), armed(bench.rig) as guarded:
+        guarded.source.write(0.5)
+        bench.board.write = lambda voltage_v: sys.exit(code)  # type: ignore[method-assign]
+        guarded.source.write(0.6)
+    assert bench.amplifier.drive_v == 0.0
+    assert guarded.safety.stage is Stage.TRIPPED
+
+
+def test_a_driver_that_exits_during_the_shutdown_does_not_stop_it() -> None:
+    bench = OwnBench(supply=True)
+    left = pytest.raises(SafetyError, match=r"Output not at 0 V: 100\.1 V remain .* by hand")
+    with left, armed(bench.rig) as guarded:  # the carrier remains, 20 mV times 5000
+        guarded.generator.sine(2000.0, 0.02)
+        guarded.source.write(0.5)
+        bench.generator.off = lambda: sys.exit(0)  # type: ignore[method-assign]
+    assert (bench.amplifier.drive_v, bench.amplifier.supply_v) == (0.0, 0.0)
 
 
 def test_an_output_that_cannot_be_read_is_not_taken_for_zero() -> None:

@@ -175,6 +175,11 @@ def test_there_is_no_interval_beyond_the_record(kind):
         (lambda c, e: (c, e[:-1]), "same length"),
         (lambda c, e: (np.where(c > 1.3e-9, np.nan, c), e), "NaN or infinity"),
         (lambda c, e: (np.full_like(c, 1e-9), e), "1e-09 F throughout"),
+        (lambda c, e: (1e12 * c, e), r"capacitance_f lies in \[.*\] F; .* 500 pF are 500e-12"),
+        (lambda c, e: (-c, e), r"it must be above 0 and at most 0.001 F"),
+        (lambda c, e: (c, 100.0 * e), r"strain lies in .* at most 5 .* in per cent, divide it by"),
+        (lambda c, e: (e - e.min(), c), r"capacitance_f lies in .* Are the two columns swapped\?"),
+        (lambda c, e: (1e-3 * (1.0 + e) / 2.0, c), r"strain lies in .* two columns swapped\?"),
     ],
 )
 def test_columns_that_cannot_be_fitted_are_refused(change, words):

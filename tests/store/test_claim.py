@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from haselab.base import InputError
+from haselab.base import DeviceError, InputError
 from haselab.store.claim import (
     claimed_file,
     claimed_folder,
@@ -189,3 +190,33 @@ def test_a_link_that_leads_nowhere_is_bad_input_with_its_cause(tmp_path):
         claimed_folder(link / "below").__enter__()
     with claimed_folder(link, force=True) as aside:
         assert aside is not None and aside.is_symlink() and link.is_dir()
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        (errno.ENOENT, InputError),
+        (errno.EACCES, InputError),
+        (errno.EROFS, InputError),
+        (errno.ENOSPC, DeviceError),
+        (errno.EIO, DeviceError),
+    ],
+)
+def test_a_place_without_permission_is_bad_input_and_a_failing_disk_is_not(
+    tmp_path, monkeypatch, number, kind
+):
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(kind, match=rf"Cannot write \({os.strerror(number)}\)\..*a\.toml$"):
+        create_exclusively(tmp_path / "a.toml")
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no file can be created in /proc")
+def test_a_file_system_that_permits_no_files_is_bad_input():
+    with (
+        pytest.raises(InputError, match=r"Cannot write .*Choose another folder.* /proc/x$"),
+        claimed_file(Path("/proc/x")),
+    ):
+        raise AssertionError("must not be entered")

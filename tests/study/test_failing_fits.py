@@ -94,7 +94,7 @@ def test_a_run_whose_fit_refuses_its_data_exits_with_3_and_keeps_them(
     monkeypatch.setattr("haselab.study.experiments.triangle.fit_maps", _refuse)
     builtin = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
     short = re.sub(
-        r"(\[triangle\][^[]*?)frequency_hz = [\d.]+", r"\1frequency_hz = 2.0", builtin.read_text()
+        r"(\[triangle\][^[]*?)frequency_hz = [\d.]+", r"\1frequency_hz = 1.0", builtin.read_text()
     )
     (tmp_path / "study.toml").write_text(short)
     (tmp_path / "rig.toml").write_text('kind = "twin"\n')

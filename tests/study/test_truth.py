@@ -16,20 +16,15 @@ import haselab
 
 SOURCE = Path(haselab.__file__).parent
 ROOMS = ("signals", "models", "sensing", "identify", "control", "tracking", "runtime", "report")
-# These play the bench without noise or a loop beside it, or name what was set; they fit nothing.
-TRUTH_TELLERS = {
-    "study/feasibility.py",  # judges a twin by its physics before a run; no analysis imports it
-    "study/simulated/noise_free.py",
-    "study/run.py",
-    "study/simulated/truth.py",
-    "study/chip/loops.py",
-    "study/chip/agreement.py",  # says by which property of the twin a simulated step differs
-}
+SIMULATED = "study/simulated/"  # knows the twin: true parameters, runs without noise
+# These play on the bench, or judge it before a run; they fit nothing.
+PLAYERS = {"study/feasibility.py", "study/run.py", "study/chip/loops.py"}
 
 
 def analysing() -> list[str]:
     files = [path for room in (*ROOMS, "study") for path in (SOURCE / room).rglob("*.py")]
-    return sorted({p.relative_to(SOURCE).as_posix() for p in files} - TRUTH_TELLERS)
+    names = {path.relative_to(SOURCE).as_posix() for path in files} - PLAYERS
+    return sorted(name for name in names if not name.startswith(SIMULATED))
 
 
 def imported(source: str) -> set[str]:

@@ -17,7 +17,9 @@ from haselab.pipelines.examples.data_sets import find_data_set, write_data_set
 from haselab.pipelines.sensing.series import derived_series
 from haselab.pipelines.time_axis import records_of, time_axis
 from haselab.store.columns.reader import rate_of_times, rates_agree
+from haselab.store.columns.selection import TIME_NAMES
 from haselab.store.columns.table import Table, read_every_column, read_table
+from haselab.store.columns.units import parse_unit, split_header
 from haselab.store.export.frames import session_dataset, session_tables
 from haselab.store.session.reader import SessionReader, session_file
 
@@ -34,7 +36,6 @@ else:
 __all__ = ["Data", "Session", "example", "is_uneven", "load", "records", "table", "wanted"]
 
 Floats = NDArray[np.float64]
-_TIMES = ("time_s", "time", "t")
 _SESSION = "session.h5"
 
 
@@ -113,7 +114,7 @@ def table(data: Data, *, rate_hz: float | None = None) -> Table:
             dictionary of columns. Columns that are no numbers are left out.
         rate_hz: rows a second, in Hz, which the times must not contradict. None: from the file or
             the attribute `rate_hz`, or from the times in an index or a column `time_s`, `time` or
-            `t`.
+            `t`, in s or in the unit in its name, such as `time_ms` or `t [ms]`.
     Returns:
         The table.
     Raises:
@@ -218,7 +219,7 @@ def _table(data: Any) -> Table:
         )
     if lengths == {0}:
         raise InputError(f"The columns {', '.join(columns)} have no rows. Give at least one row.")
-    time_name = next((n for n in _TIMES if n in columns and _may_be_times(n, columns[n])), None)
+    time_name = next((n for n in TIME_NAMES if n in columns and _may_be_times(n, columns[n])), None)
     time_s = None if time_name is None else columns[time_name]
     rate_hz = None if time_s is None else rate_of_times(time_s)
     found = Table(columns, rate_hz, time_name=time_name, time_s=time_s)
@@ -248,16 +249,41 @@ def _columns(data: Any) -> tuple[dict[str, Floats], dict[str, str]]:
         )
     found = {str(name): data[name] for name in data.keys()}  # noqa: SIM118
     found |= {str(name): each for name, each in getattr(data, "coords", {}).items()}
+    factors = {name: _seconds(name, values) for name, values in found.items()}
     index = getattr(data, "index", None)
-    if index is not None and (index.name in _TIMES or index.dtype.kind in "mM"):
-        found["time_s"] = index
+    if index is not None and (factor := _seconds(index.name, index)) is not None:
+        found["time_s"], factors["time_s"] = index, factor
     columns, reasons = {}, {}
     for name, values in found.items():
         try:
             columns[name] = _column(f"Column {name}", values)
         except InputError as error:
             reasons[name] = str(error)
+    named = [name for name in columns if _base(name) in TIME_NAMES]
+    for name in sorted(named, key=lambda each: TIME_NAMES.index(_base(each))):
+        factor = factors[name]
+        if factor is not None and _may_be_times(name, columns[name]):
+            if name not in TIME_NAMES or factor != 1.0:
+                columns["time_s"] = columns.pop(name) * factor
+            break
     return columns, reasons
+
+
+def _base(name: str) -> str:
+    """Name of a column without its unit, as columns of times are called."""
+    return split_header(name)[0].casefold()
+
+
+def _seconds(name: object, values: Any) -> float | None:
+    """Factor to s of times in the unit that their name or attribute states; None for others."""
+    text = str(name)
+    unit = split_header(text)[1] or str(getattr(values, "attrs", {}).get("units", ""))
+    if getattr(getattr(values, "dtype", None), "kind", "") in ("m", "M"):
+        return 1.0  # `_column` makes seconds of them
+    if _base(text) not in TIME_NAMES:
+        return None
+    found = parse_unit(unit or "s", f"Column '{text}'")
+    return found.factor if found.si == "s" else None
 
 
 def _column(name: str, values: Any) -> Floats:
@@ -309,7 +335,9 @@ def records(
     if found.rate_hz is not None and not is_uneven(found):
         return [Record.sampled(found[input], found[output], found.rate_hz, hold=hold)]
     if found.time_s is None or found.time_name is None:
-        raise InputError("The data state no sampling rate. Give rate_hz, or a column time_s.")
+        falling = next((name for name in found if _base(name) in TIME_NAMES), None)
+        why = "" if falling is None else f" Column {falling} does not rise everywhere."
+        raise InputError(f"The data state no sampling rate.{why} Give rate_hz, or a column time_s.")
     axis = time_axis(found.time_s, Path("data"), found.time_name)
     kept, _ = records_of(found, (input, output), axis, hold)
     if not kept:

@@ -50,12 +50,21 @@ def checked(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
     @functools.wraps(function)
     def call(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
         kinds = _kinds(owner)
-        for name, value in signature.bind(*args, **kwargs).arguments.items():
-            if name in kinds:
-                _check(name, value, kinds[name])
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:  # perhaps arrays where a record is needed, which is the better reason
+            _check_all(dict(zip(signature.parameters, args, strict=False)), kinds)
+            raise
+        _check_all(given, kinds)
         return function(*args, **kwargs)
 
     return call
+
+
+def _check_all(given: Mapping[str, object], kinds: Mapping[str, Any]) -> None:
+    for name, value in given.items():
+        if name in kinds:
+            _check(name, value, kinds[name])
 
 
 def check_fields(instance: object) -> None:

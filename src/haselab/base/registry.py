@@ -10,6 +10,7 @@ from importlib.metadata import EntryPoint
 from typing import Generic, TypeVar, cast
 
 from haselab.base.errors import HaselabError, InputError
+from haselab.base.exits import no_exit
 
 __all__ = ["Registry"]
 
@@ -79,8 +80,9 @@ class Registry(Generic[T]):
                 "all but one of these packages."
             )
         try:
-            loaded = found[0].load()
-            fault = self._fault(loaded, name)
+            with no_exit():
+                loaded = found[0].load()
+                fault = self._fault(loaded, name)
         except Exception as error:  # another package may raise anything
             fault = f"it does not load ({type(error).__name__}: {error})"
         if fault:

@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.models.actuator import ActuatorTables
 from haselab.store.columns.archive import MissingColumnsError
 from haselab.store.columns.reader import open_archive
 from haselab.store.columns.selection import ColumnOptions
@@ -21,6 +24,7 @@ from haselab.store.columns.units import Unit
 __all__ = [
     "Quantity",
     "advice_on_columns",
+    "check_strain",
     "check_unit",
     "column_option",
     "column_options",
@@ -30,6 +34,8 @@ __all__ = [
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
+_LARGE_STRAIN = 1.0  # twice the length: without a unit, it is more likely per cent
+_FAR = 10.0  # times a known strain; per cent are 100 times
 
 
 @dataclass(frozen=True)
@@ -128,6 +134,54 @@ def check_unit(column: str, unit: Unit | None, quantity: Quantity, file: Path) -
         f"{'' if quantity.si == '1' else f' in {quantity.si} or a multiple of it'}. Name another "
         f"column, or state its unit with --unit: {file}"
     )
+
+
+def check_strain(
+    column: str,
+    values: NDArray[np.float64],
+    unit: Unit | None,
+    file: Path,
+    known: ActuatorTables | None = None,
+) -> None:
+    """Refuse strains without a unit that are probably in per cent.
+
+    Args:
+        column: name of it.
+        values: shape `(N,)`.
+        unit: that it states; None: none, and then it is checked.
+        file: of the column.
+        known: the actuator's file, whose maps say how large its strain is.
+    Raises:
+        InputError: a strain above 1, or 10 times the largest one of a map.
+    """
+    if unit is not None:
+        return
+    size = float(np.abs(values).max())
+    place, largest = "", _LARGE_STRAIN / _FAR
+    for section, strain in _largest_strains(known):
+        if strain < largest:
+            place, largest = section, strain
+    if size <= _FAR * largest:
+        return
+    compared = f", but [{place}] of the actuator file ends at a strain of {largest:.3g}"
+    raise InputError(
+        f"Column {column} reaches {size:.3g} and states no unit"
+        f"{compared if place else f'; as a strain, {size:.3g} times the length'}. Add --unit "
+        f"'{column}=%' if it is in per cent, --unit '{column}=1' if it is a ratio, or name another "
+        f"column: {file}"
+    )
+
+
+def _largest_strains(known: ActuatorTables | None) -> Iterator[tuple[str, float]]:
+    """Section and largest strain of each map of an actuator file."""
+    if known is None:
+        return
+    if known.sensing.strain_map is not None and known.sensing.strain_map.range_f is not None:
+        ends = known.strain_map().strain(known.sensing.strain_map.range_f)
+        yield "sensing.strain_map", float(np.abs(ends).max())
+    if known.drive.voltage_map is not None:
+        to_volt = known.voltage_map()
+        yield "drive.voltage_map", max(abs(to_volt.strain_low), abs(to_volt.strain_high))
 
 
 def note_seconds(name: str, file: Path) -> None:

@@ -15,6 +15,7 @@ import click
 
 from haselab import __version__
 from haselab.base.errors import HaselabError
+from haselab.base.exits import SignalExit
 from haselab.cli.bench.revoke_first import revoke_first
 from haselab.cli.invocation import Invocation
 
@@ -189,6 +190,13 @@ def main(
         sys.exit(_fail(error.format_message(), 2))
     except (KeyboardInterrupt, click.Abort) as stop:
         sys.exit(_fail(" ".join(["Interrupted.", *_notes(stop)]), 130))
+    except SignalExit:
+        raise
+    except SystemExit as stop:  # of another package, where no one expects it
+        if debug:
+            raise RuntimeError("code of another package called sys.exit()") from stop
+        what = f"Code of another package called sys.exit({stop.code!r})."
+        sys.exit(_fail(f"{what} Run again with --debug to see which; uninstall or repair it.", 2))
     except HaselabError as error:
         if debug:
             raise

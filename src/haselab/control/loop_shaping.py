@@ -75,14 +75,17 @@ class Design:
         """Gains, margins and the predicted step, as a table of plain text.
 
         Returns:
-            Lines for `print`.
+            What `print` shows. All numbers are in the attributes.
         """
-        margins, step = self.nominal.margins, self.nominal.step
+        margins, step, gains = self.nominal.margins, self.nominal.step, self.gains
+        derivative = {
+            "kd": (gains.kd, "s"),
+            "derivative_filter_s": (gains.derivative_filter_s, "s"),
+        }
         rows = {
-            "kp": (self.gains.kp, ""),
-            "ki": (self.gains.ki, "1/s"),
-            "kd": (self.gains.kd, "s"),
-            "derivative_filter_s": (self.gains.derivative_filter_s, "s"),
+            "kp": (gains.kp, ""),
+            "ki": (gains.ki, "1/s"),
+            **(derivative if gains.kd else {}),
             "phase_margin_deg": (margins.phase_margin_deg, "deg"),
             "gain_margin_db": (margins.gain_margin_db, "dB"),
             "delay_margin_s": (margins.delay_margin_s, "s"),
@@ -93,7 +96,15 @@ class Design:
             "settling_time_s": (step.settling_time_s, "s"),
         }
         lines = [f"{n:{_NAME_WIDTH}s} {v:12.6g}  {unit}".rstrip() for n, (v, unit) in rows.items()]
-        return "\n".join([*lines, *(f"Demand not met: {text}" for text in self.shortfalls)])
+        if self.plausible is not None:
+            share = 100.0 * self.plausible.share.value
+            lines.append(f"{share:.3g} % of the plausible plants keep the margins.")
+        if self.shortfalls:
+            lines.append(f"Demands not met: {'; '.join(self.shortfalls)}")
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(self.summary())}</pre>"

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from haselab.base import ResultError
 from haselab.control.gains import Saturation
 from haselab.models.maps import VoltageMap
 
 __all__ = ["reachable"]
-
-_POINTS = 1501
 
 
 def reachable(
@@ -36,13 +32,11 @@ def reachable(
     """
     low_v = -math.inf if low_v is None else low_v
     high_v = math.inf if high_v is None else high_v
-    grid = np.linspace(wanted.low, wanted.high, _POINTS)
-    volt = to_volt.voltage_v(grid)
-    inside = grid[(volt >= low_v) & (volt <= high_v)]
-    if not inside.size or not inside[0] < 0.0 < inside[-1]:
+    found = to_volt.reach((wanted.low, wanted.high), low_v, high_v)
+    if found is None or not found[0] < 0.0 < found[1]:
         raise ResultError(
             f"The voltage map has zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
             f"drive is limited to [{low_v:g}, {high_v:g}] V. Change the limits of the drive, or "
             "measure the voltage map again."
         )
-    return Saturation(float(inside[0]), float(inside[-1]))
+    return Saturation(*found)

@@ -33,6 +33,7 @@ _SKEW_S = 125e-6  # from a reading of the voltage to the next of the current
 _OUTPUT_V, _OUTPUT_CODES = 2.048, 4096
 OUTPUT_V_PER_CODE = _OUTPUT_V / _OUTPUT_CODES
 _TABLE_STEPS = 32
+_SINGLE = 1e-6  # relative error of the map in single precision; the firmware limits the drive
 _PARAMETERS = 8  # HS_CONTROLLER_PARAMETERS of core/include/hs_controller.h
 _BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
 _FALLS = 5.0  # largest fall of the level per frame, relative to the fastest drive
@@ -191,13 +192,13 @@ class ChipSettings:
                 f"drive_high_v is {self.drive_high_v:g} V, but it must be above 0 and below the "
                 f"converter's {_OUTPUT_V:g} V. Change drive_high_v."
             )
-        table = self.table_v
-        if not (np.diff(table) > 0.0).all() or table[0] < 0.0 or table[-1] > self.drive_high_v:
+        table, slack_v = self.table_v, _SINGLE * self.drive_high_v
+        ends_v = table[0] + slack_v, table[-1] - slack_v
+        if not (np.diff(table) > 0.0).all() or ends_v[0] < 0.0 or ends_v[1] > self.drive_high_v:
             raise InputError(
                 f"The voltage map goes from {table[0]:g} V to {table[-1]:g} V over the saturation, "
-                f"but it must rise within [0, {self.drive_high_v:g}] V. Set [drive] high_v = "
-                f"{self.drive_high_v:g} in the actuator file, or give narrower --limits, and run "
-                "'haselab design' again."
+                f"but it must rise within [0, {self.drive_high_v:g}] V. Give narrower --limits to "
+                "'haselab design', or measure the voltage map again."
             )
 
     @property

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
-from haselab.identify.fingerprint import fingerprint, share_used
+from haselab.identify.fingerprint import Fingerprint, fingerprint, share_used
 from haselab.identify.noise import fit_percent
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Prediction:
         modelled: Sequence[Floats],
         half_band: Floats | None = None,
         *,
-        fitted_to: ArrayLike = (),
+        fitted_to: Fingerprint | None = None,
     ) -> Prediction:
         """Judge the modelled outputs of some records.
 
@@ -70,11 +70,11 @@ class Prediction:
             measured: outputs of each record. Shape `(M_r,)` each.
             modelled: the same by the model. Shape `(M_r,)` each.
             half_band: half the width of the band, of all records. None: there is no band.
-            fitted_to: fingerprint of the outputs that the model was fitted to; empty: not known.
+            fitted_to: fingerprint of the outputs that the model was fitted to; None: not known.
         Returns:
             Both, with the error between them.
         """
-        used = share_used(measured, fitted_to) if np.size(fitted_to) else math.nan
+        used = math.nan if fitted_to is None else share_used(measured, fitted_to)
         percent = fit_percent(measured, modelled)
         error = np.abs(np.concatenate(list(measured)) - np.concatenate(list(modelled)))
         half = np.zeros(0) if half_band is None else half_band
@@ -168,7 +168,7 @@ class Fit(ABC):
         """The numbers with their 95 % intervals and units, as a table of plain text.
 
         Returns:
-            Lines for `print`.
+            What `print` shows. All numbers are in the attributes.
         """
         lines = [f"{type(self).__name__}: {self.status}"]
         if self.parameters:
@@ -176,6 +176,9 @@ class Fit(ABC):
             lines += [head, *(_row(*row) for row in self._rows())]
         lines += [f"{name:{_NAME_WIDTH}s} {value:12.5g}" for name, value in self._qualities()]
         return "\n".join([*lines, *(f"Note: {note}" for note in self.notes)])
+
+    def __str__(self) -> str:
+        return self.summary()
 
     def _repr_html_(self) -> str:
         """The summary as a notebook shows it."""
@@ -244,6 +247,12 @@ class RecordFit(Fit, Generic[Recorded]):
         """Measured outputs that the fit has used; empty where it does not keep them."""
         return ()
 
+    @property
+    def fingerprint(self) -> Fingerprint | None:
+        """Fingerprint of the outputs that the fit has used; None where it does not keep them."""
+        found = fingerprint(self.fitted_outputs, self.residuals)
+        return found if found.hashes.size else None
+
     @abstractmethod
     def _modelled(self, record: Recorded) -> tuple[Floats, Floats]:
         """Measured and modelled output of a record, initial state and constant fitted to it."""
@@ -266,8 +275,9 @@ class RecordFit(Fit, Generic[Recorded]):
         """
         self._require()
         pairs = [self._modelled(record) for record in several(records)]
-        known = fingerprint(self.fitted_outputs)
-        return Prediction.of([y for y, _ in pairs], [m for _, m in pairs], fitted_to=known)
+        return Prediction.of(
+            [y for y, _ in pairs], [m for _, m in pairs], fitted_to=self.fingerprint
+        )
 
 
 class CurveFit(Fit):

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from haselab.base import checked
+from haselab.identify.fingerprint import Fingerprint
 from haselab.identify.fit import Prediction, several
 from haselab.identify.record import Record
 from haselab.models.plant import Plant
@@ -30,7 +31,7 @@ def predict(
     posterior: PlantPosterior | None = None,
     noise_std: float = 0.0,
     free_start: bool = True,
-    fitted_to: ArrayLike = (),
+    fitted_to: Fingerprint | None = None,
     rng: np.random.Generator,
 ) -> Prediction:
     r"""Simulate records from their inputs and compare the result with their outputs.
@@ -46,7 +47,7 @@ def predict(
         posterior: of the model's parameters; None: no band.
         noise_std: root mean square of the residuals of the fit, in the unit of the output.
         free_start: fit initial state and constant; False: the record starts at 0 in steady state.
-        fitted_to: fingerprint of the outputs that the model was fitted to; empty: not known.
+        fitted_to: fingerprint of the outputs that the model was fitted to; None: not known.
         rng: random generator of the plants.
     Returns:
         The prediction.

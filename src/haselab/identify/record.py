@@ -62,7 +62,10 @@ class Record:
     output_time_s: Floats
     input_before: float | None = 0.0
     hold: str = "zero"
-    made_by: ClassVar[str] = "Make records of columns with haselab.records(data, input, output)."
+    made_by: ClassVar[str] = (
+        "Make records of two arrays with haselab.records({'u': u, 'y': y}, rate_hz=100), or of a "
+        "file with haselab.records(path, input, output)."
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)

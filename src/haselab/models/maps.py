@@ -12,6 +12,7 @@ from haselab.base import InputError, LimitError
 __all__ = ["LinearMap", "VoltageMap"]
 
 Floats = NDArray[np.float64]
+_REACH_POINTS = 1501
 _ITERATIONS = 60
 
 
@@ -69,6 +70,28 @@ class VoltageMap:
         """
         ends = self.slope_v([strain_low, strain_high])
         return bool(ends[0] * ends[1] > 0.0)
+
+    def reach(
+        self, strains: tuple[float, float], low_v: float, high_v: float
+    ) -> tuple[float, float] | None:
+        """Narrow a range of strains to those whose voltage is within limits.
+
+        Args:
+            strains: lowest and highest strain; they stay where the map is within the limits.
+            low_v: lowest voltage, in V.
+            high_v: highest voltage, in V.
+        Returns:
+            Lowest and highest strain; None if no voltage is within the limits.
+        Example:
+            >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+            >>> low, high = eq4.reach((-0.05, 0.1), 0.0, 1.6)
+            >>> low, round(high, 4)
+            (-0.05, 0.0692)
+        """
+        grid = np.linspace(*strains, _REACH_POINTS)
+        volt = self.voltage_v(grid)
+        inside = grid[(volt >= low_v) & (volt <= high_v)]
+        return (float(inside[0]), float(inside[-1])) if inside.size else None
 
     def strain(self, voltage_v: ArrayLike) -> Floats:
         """Strain at which the map gives a voltage, within `[strain_low, strain_high]`.

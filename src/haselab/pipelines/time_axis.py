@@ -13,7 +13,7 @@ from haselab.base import InputError
 from haselab.identify.record import Record
 from haselab.store.columns.table import Table
 
-__all__ = ["TimeAxis", "records_of", "time_axis"]
+__all__ = ["TimeAxis", "check_rising", "records_of", "time_axis"]
 
 Floats = NDArray[np.float64]
 _FEW_MISSING = 3  # rows whose input is interpolated
@@ -46,6 +46,25 @@ class TimeAxis:
         return float(np.std(self.time_s - self.number / self.rate_hz))
 
 
+def check_rising(time_s: NDArray[np.float64], file: Path, name: str) -> None:
+    """Refuse times that do not increase.
+
+    Args:
+        time_s: column of times. Shape `(N,)`.
+        file: where they are from, for the message.
+        name: of the column.
+    Raises:
+        InputError: a step that is not above 0.
+    """
+    steps = np.diff(time_s)
+    if not (steps > 0.0).all():
+        at = int(np.flatnonzero(~(steps > 0.0))[0])
+        raise InputError(
+            f"Column {name} does not increase after row {at + 1} (step of {steps[at]:g} s). Sort "
+            f"the rows, or remove repeated ones: {file}"
+        )
+
+
 def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
     """Find the rate and the row numbers of recorded times.
 
@@ -60,14 +79,9 @@ def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
     """
     if time_s.size < 2:
         raise InputError(f"Column {name} has {time_s.size} times. Record longer: {file}")
+    check_rising(time_s, file, name)
     steps = np.diff(time_s)
     usual_s = float(np.median(steps))
-    if not (steps > 0.0).all():
-        at = int(np.flatnonzero(~(steps > 0.0))[0])
-        raise InputError(
-            f"Column {name} does not increase after row {at + 1} (step of {steps[at]:g} s). Sort "
-            f"the rows, or remove repeated ones: {file}"
-        )
     since_s = time_s - time_s[0]
     number = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / usual_s), 1.0))])
     for _ in range(3):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -64,12 +64,14 @@ class ActuatorReport:
         tables: the same, checked.
         plant: of `[model]`; None: there is no model yet.
         posterior: parameters of the plant with their covariance; None: there is none.
+        doubts: by section, why its numbers are not those of this actuator.
     """
 
     sections: Mapping[str, Any]
     tables: ActuatorTables
     plant: Plant | RationalModel | None = None
     posterior: PlantPosterior | None = None
+    doubts: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ class _Part:
     title: str
     rows: list[Row]
     missing: str
+    doubt: str
     svg: str
     caption: str
 
@@ -121,7 +124,11 @@ def actuator_page(report: ActuatorReport) -> str:
             with figure_style():
                 svg = inline_svg(to_svg(draw_chart(chart), name.replace(".", "-"), chart.title))
         rows = list(_rows_of(report, name))
-        parts.append(_Part(name, title, rows, absent.get(name, ""), svg, caption))
+        parts.append(
+            _Part(
+                name, title, rows, absent.get(name, ""), report.doubts.get(name, ""), svg, caption
+            )
+        )
     provenance = dict(_provenance(report.sections.get("provenance")))
     simulated = any(origin.get("simulated") is True for origin in provenance.values())
     about = report.tables.actuator

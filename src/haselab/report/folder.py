@@ -93,6 +93,11 @@ def read_folder(folder: Path) -> RunFolder:
         raise InputError(f"The folder does not exist. Name the --out folder of a run: {folder}")
     results = folder / "results.json"
     if not results.is_file():
+        if not (folder / "session.h5").exists():
+            raise InputError(
+                "The folder is not that of a run: it has neither results.json nor session.h5. Name "
+                f"the --out folder of a run: {folder}"
+            )
         raise InputError(
             f"The folder has no results.json. Create it with 'haselab analyse {folder}': {folder}"
         )

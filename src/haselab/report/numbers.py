@@ -10,6 +10,7 @@ __all__ = ["ABSENT", "interval_text", "number_text", "value_text"]
 
 ABSENT = "—"
 _SIGNIFICANT = 5
+_MOST_ITEMS, _FIRST_ITEMS = 16, 3  # of a list
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -95,6 +96,8 @@ def value_text(value: Any) -> str:
     Example:
         >>> value_text([6, 8]), value_text(None), value_text("stable")
         ('6 to 8', '—', 'stable')
+        >>> value_text(list(range(256)))
+        '256 values: 0, 1, 2, …'
     """
     if value is None:
         return ABSENT
@@ -110,6 +113,8 @@ def value_text(value: Any) -> str:
             return f"{shown} {interval} {value.get('unit', '')}".rstrip()
         return "; ".join(f"{name} {value_text(item)}" for name, item in value.items())
     if isinstance(value, (list, tuple)):
+        if len(value) > _MOST_ITEMS:
+            return f"{len(value)} values: {value_text(value[:_FIRST_ITEMS])}, …"
         joint = " to " if len(value) == 2 else ", "
         return joint.join(value_text(item) for item in value)
     return str(value)

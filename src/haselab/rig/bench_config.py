@@ -88,7 +88,9 @@ class AmplifierConfig(PrintableSection):
     """High-voltage amplifier, which has only analogue inputs and outputs."""
 
     name: str = Field(
-        min_length=1, description="make and number; calibrations are valid only for this one"
+        min_length=1,
+        description="make and number; calibrations are valid only for this one",
+        examples=["TREK 50/12 no. 1"],
     )
     gain: float = Field(5000.0, gt=0)
     volt_per_monitor_volt: float = Field(5000.0, gt=0)
@@ -116,10 +118,12 @@ class StandConfig(PrintableSection):
 class SpecimenConfig(PrintableSection):
     """The actuator in the bench, measured with calipers and a balance."""
 
-    shell_width_m: float = Field(gt=0)
-    shell_thickness_m: float = Field(gt=0)
+    shell_width_m: float = Field(gt=0, description="width without load", examples=[0.05])
+    shell_thickness_m: float = Field(
+        gt=0, description="thickness without load and liquid", examples=[0.0012]
+    )
     lateral_stretch: float = Field(1.0, gt=0)
-    mass_kg: float = Field(ge=0, le=20)
+    mass_kg: float = Field(ge=0, le=20, description="hung mass", examples=[0.25])
 
 
 class BenchConfig(PrintableSection):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from haselab.base import DeviceError
+from haselab.base.exits import no_exit
 
 __all__ = ["load_driver", "quietly"]
 
@@ -39,7 +40,8 @@ def quietly(act: Callable[[], object]) -> Exception | None:
     back afterwards.
     """
     try:
-        act()
+        with no_exit():
+            act()
     except Exception as error:
         return error
     return None

@@ -39,6 +39,7 @@ __all__ = [
 ]
 
 MAX_SEED = 2**63 - 1
+_FORMER_CHIP = "mega"  # kind of a microcontroller in rig files of earlier versions
 
 
 class TwinFile(PrintableSection):
@@ -68,14 +69,16 @@ class ReplayFile(PrintableSection):
     """`kind = "replay"`, `session = "DIR/session.h5"`, with its videos beside it."""
 
     kind: Literal["replay"]
-    session: str = Field(min_length=1)
+    session: str = Field(
+        min_length=1, description="recording to play back", examples=["out/run/session.h5"]
+    )
     experiments: tuple[str, ...] = Field((), description="names; empty: all")
 
 
 class _Kind(BaseModel):
     """The key that determines the other contents of the file."""
 
-    kind: Literal["twin", "bench", "mega", "replay"]
+    kind: Literal["twin", "bench", "chip", "replay"]
 
 
 class _DaqSection(BaseModel):
@@ -105,7 +108,7 @@ RigFile = TwinFile | BenchConfig | ChipFile | ReplayFile
 _KINDS: dict[str, type[TwinFile] | type[BenchConfig] | type[ChipFile] | type[ReplayFile]] = {
     "twin": TwinFile,
     "bench": BenchConfig,
-    "mega": ChipFile,
+    "chip": ChipFile,
     "replay": ReplayFile,
 }
 
@@ -122,6 +125,11 @@ def load_rig(path: Path) -> RigFile:
             range.
     """
     data = read_toml(path, "rig file")
+    if data.get("kind") == _FORMER_CHIP:
+        raise InputError(
+            f"The rig file has kind = {_FORMER_CHIP!r}, which is now called 'chip'. Write kind = "
+            f'"chip" instead. {path}'
+        )
     return validated(_KINDS[validated(_Kind, data, path).kind], data, path)
 
 
@@ -141,6 +149,8 @@ def load_rig_to_shut_down(path: Path) -> tuple[RigFile | BenchOutputs, list[tupl
         DeviceError: No section can be used, because of the drivers.
     """
     data = read_toml(path, "rig file")
+    if data.get("kind") == _FORMER_CHIP:  # an older file must shut its bench down as well
+        data["kind"] = "chip"
     kind = validated(_Kind, data, path).kind
     if kind != "bench":
         return validated(_KINDS[kind], data, path), []

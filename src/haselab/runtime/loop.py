@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from haselab.base import InputError, SafetyError
+from haselab.base.exits import no_exit
 from haselab.control import Saturation
 from haselab.controllers import ChosenController, ControllerSetting, Measurement
 from haselab.models.actuator.strain_map import StrainMap
@@ -54,8 +55,9 @@ class RunningController:
         self._name, limits = loop.controller.kind.name, loop.saturation
         self._low, self._high = limits.low, limits.high
         try:
-            self._controller = loop.controller.make()
-            self._controller.start(ControllerSetting(period_s, limits.low, limits.high))
+            with no_exit():
+                self._controller = loop.controller.make()
+                self._controller.start(ControllerSetting(period_s, limits.low, limits.high))
         except Exception as error:  # code of another package may raise anything
             raise InputError(
                 f"Controller {self._name!r} does not start: {type(error).__name__}: {error}. "
@@ -75,7 +77,8 @@ class RunningController:
             SafetyError: The controller failed, or returned something that is not a number.
         """
         try:
-            drive = float(self._controller.step(reference, measurement))
+            with no_exit():
+                drive = float(self._controller.step(reference, measurement))
         except Exception as error:
             raise SafetyError(
                 f"Controller {self._name!r} failed: {type(error).__name__}: {error}. Fix it and "

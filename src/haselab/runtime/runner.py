@@ -319,7 +319,7 @@ class Runner:
         controller = self._rig.controller
         if controller is None:
             raise InputError(
-                "This rig has no built-in controller. Use a rig with kind = 'mega', or close the "
+                "This rig has no built-in controller. Use a rig with kind = 'chip', or close the "
                 "loop in the program."
             )
         controller.strain_limits.check(reference[~np.isnan(reference)])

@@ -77,11 +77,12 @@ class Check:
 
     Args:
         name: of the quantity.
-        where: experiment in which it is largest.
+        where: experiment in which it is worst.
         requested: the number.
         allowed: its limit; `requested` must not exceed it.
         unit: of both.
         advice: what to do if it does.
+        lower: the limit is the lowest allowed number; `requested` must not be below it.
     """
 
     name: str
@@ -90,15 +91,21 @@ class Check:
     allowed: float
     unit: str
     advice: str
+    lower: bool = False
 
     @property
     def ok(self) -> bool:
         """Whether the number is within its limit; an unknown number (NaN) passes."""
-        return not self.requested > self.allowed
+        return not self.excess > 0.0
+
+    @property
+    def excess(self) -> float:
+        """How far the number is beyond its limit; negative if it is within."""
+        return (self.allowed - self.requested) if self.lower else self.requested - self.allowed
 
     @property
     def fault(self) -> str:
-        """The number and its limit, for a number that is too high."""
+        """The number and its limit, for a number that is beyond it."""
         limit = f"limit {self.allowed:.4g} {self.unit}".strip()
         if math.isinf(self.requested):
             return f"{self.name} is infinite in {self.where} ({limit})"
@@ -190,10 +197,9 @@ def judge(
     charge_s = farad * jump_v / left_a if left_a > 0.0 else math.inf
     rise_s = max(charge_s, jump_v / rating.slew_v_per_s)
     rise_s += 3.0 / (2.0 * math.pi * rating.bandwidth_hz)
-    low, high = rig.drive_limits.low, rig.drive_limits.high
-    beyond_v = max(
-        max(float(d.values_v.max()) - high, low - float(d.values_v.min()), 0.0) for d in drives
-    )
+    limits = rig.drive_limits
+    highest_v, highest_in = _largest(drives, [float(d.values_v.max()) for d in drives])
+    lowest_v, lowest_in = _largest(drives, [-float(d.values_v.min()) for d in drives])
     current_a = ripple_a + farad * jump_v / rig.block_s
     slew_v_s = 2.0 * math.pi * carrier_hz * ripple_v
     field_v_m = (peak_v + ripple_v) / rating.thickness_m
@@ -201,7 +207,10 @@ def judge(
     lower = "Lower the voltage"
     endless = "" if left_a > 0.0 else "The carrier alone needs all of the amplifier's current. "
     return Feasibility((
-        Check("output beyond the drive limits", peaks_in, beyond_v, 0.0, "V", f"{lower}."),
+        Check("highest drive voltage", highest_in, highest_v, limits.high, "V",
+              f"{lower}, or raise the limit in {limits.high_source}."),
+        Check("lowest drive voltage", lowest_in, -lowest_v, limits.low, "V",
+              f"Raise the voltage, or lower the limit in {limits.low_source}.", lower=True),
         Check("peak current", jumps_in, 1e3 * current_a, 1e3 * rating.current_limit_a, "mA",
               "Lower the carrier or the steps, or use a stronger amplifier."),
         Check("time of an update", jumps_in, 1e3 * rise_s, 1e3 * rating.settle_s, "ms",

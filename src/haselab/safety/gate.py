@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from haselab.base import DeviceError, JsonObject, SafetyError
+from haselab.base.exits import SignalExit
 from haselab.rig.drivers import quietly
 from haselab.safety.interlock import Interlock, InterlockBusyError, interlock_folder
 
@@ -240,7 +241,29 @@ class Gate:
         arguments: tuple[Any, ...],
         named: JsonObject,
     ) -> Any:
-        """Check one call of a driver's method, then make it under the output lock."""
+        """Check one call of a driver's method, then make it under the output lock.
+
+        Raises:
+            DeviceError: The driver called `sys.exit()`, which must not end the program.
+        """
+        try:
+            return self._call(instrument, name, method, arguments, named)
+        except SignalExit:
+            raise
+        except SystemExit as stop:
+            raise DeviceError(
+                f"The driver {type(instrument._driver).__name__!r} called sys.exit({stop.code!r}) "
+                f"in {name!r}. Report the fault to the authors of the driver."
+            ) from stop
+
+    def _call(
+        self,
+        instrument: _Instrument,
+        name: str,
+        method: Callable[..., Any],
+        arguments: tuple[Any, ...],
+        named: JsonObject,
+    ) -> Any:
         if isinstance(instrument, _Companion):
             try:
                 return method(*arguments, **named)

@@ -29,12 +29,20 @@ _HOST_CHECKS = frozenset(  # checks of blocks and deadlines, which a microcontro
 class RatingSection(Section):
     """[rating] of RIG.toml: what amplifier and actuator withstand, see `Rating`."""
 
-    current_limit_a: float = Field(gt=0)
-    slew_v_per_s: float = Field(gt=0)
-    bandwidth_hz: float = Field(gt=0)
-    capacitance_f: float = Field(gt=0)
-    thickness_m: float = Field(gt=0)
-    breakdown_v_per_m: float = Field(gt=0)
+    current_limit_a: float = Field(
+        gt=0, description="largest output current of the amplifier", examples=[0.012]
+    )
+    slew_v_per_s: float = Field(gt=0, description="slew rate of the amplifier", examples=[350e6])
+    bandwidth_hz: float = Field(gt=0, description="bandwidth of the amplifier", examples=[6000.0])
+    capacitance_f: float = Field(
+        gt=0, description="capacitance of actuator and cable at the largest strain", examples=[1e-9]
+    )
+    thickness_m: float = Field(
+        gt=0, description="thickness of the dielectric at that strain", examples=[1.2e-4]
+    )
+    breakdown_v_per_m: float = Field(
+        gt=0, description="dielectric strength of the actuator", examples=[40e6]
+    )
     field_margin: float = Field(0.9, gt=0, le=1)
     stretch_high: float = Field(math.inf, gt=1)
     stretch: float = Field(math.nan)

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
+from haselab.base.exits import SignalExit
+
 __all__ = ["OrderlyEnd"]
 
 _NAMES = ("SIGTERM", "SIGHUP", "SIGINT")  # Windows has no SIGHUP
@@ -19,7 +21,7 @@ _waiting: list[int] = []  # signals that arrived while the end of a block ran
 class OrderlyEnd:
     """A context in which a signal that would kill the program ends the `with` block instead.
 
-    SIGTERM and SIGHUP raise `SystemExit` with 128 plus their number in the running code, Ctrl-C
+    SIGTERM and SIGHUP raise `SignalExit` with 128 plus their number in the running code, Ctrl-C
     raises `KeyboardInterrupt` as usual. A signal that arrives after `__exit__` was called is raised
     at its end, so that nothing interrupts or skips the shutdown to 0 V. Only signals with their
     default action are handled, and that action is restored: a program with its own handlers keeps
@@ -97,4 +99,4 @@ def _is_ending(frame: FrameType | None) -> bool:
 
 
 def _stop(number: int) -> BaseException:
-    return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+    return KeyboardInterrupt() if number == signal.SIGINT else SignalExit(128 + number)

@@ -28,6 +28,9 @@ _TURN = 0.15  # of the range: smaller reversals do not start a new branch
 _FOLDS = 10  # groups of cycles, each left out once
 _SEGMENTS = 16  # of a record that is checked for drift
 _HOUR_S = 3600.0
+_LARGEST_F = 1e-3  # above the capacitance of any actuator
+_LARGEST_STRAIN = 5.0  # above the actuation strain of any elastomer
+_SMALLEST_STRAIN = 1e-7  # span that no camera resolves
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,8 @@ def fit_strain_map(
     Returns:
         The map with its band and the range of the record. With one cycle it has no covariance.
     Raises:
-        InputError: fewer than 32 samples, unequal lengths, NaN, a constant capacitance,
-            an unknown kind, a coverage outside (0, 1).
+        InputError: fewer than 32 samples, unequal lengths, NaN, a constant capacitance, values
+            that cannot be F or strain, an unknown kind, a coverage outside (0, 1).
         ResultError: the strain does not rise with the capacitance.
     Source: reference study, row S15, for the line; Efron, The Jackknife (1982), for the covariance.
     Example:
@@ -185,6 +188,23 @@ def _columns(capacitance_f: ArrayLike, strain: ArrayLike) -> tuple[Floats, Float
     return c, e
 
 
+def _check_plausible(c: Floats, e: Floats) -> None:
+    """Refuse capacitances that are not in F, strains in per cent, and swapped columns."""
+    fits = e.min() > 0.0 and e.max() <= _LARGEST_F
+    swapped = " The strain looks like a capacitance in F. Are the two columns swapped?"
+    if not (c.min() > 0.0 and c.max() <= _LARGEST_F):
+        raise InputError(
+            f"capacitance_f lies in [{c.min():.3g}, {c.max():.3g}] F; it must be above 0 and at "
+            f"most {_LARGEST_F:g} F.{swapped if fits else ' Give it in F: 500 pF are 500e-12.'}"
+        )
+    if not (np.abs(e).max() <= _LARGEST_STRAIN and np.ptp(e) >= _SMALLEST_STRAIN):
+        raise InputError(
+            f"strain lies in [{e.min():.3g}, {e.max():.3g}]; it must change by "
+            f"{_SMALLEST_STRAIN:g} or more and be at most {_LARGEST_STRAIN:g} (1 is twice the "
+            f"length).{swapped if fits else ' If it is in per cent, divide it by 100.'}"
+        )
+
+
 def _checked(capacitance_f: ArrayLike, strain: ArrayLike, coverage: float) -> tuple[Floats, Floats]:
     c, e = _columns(capacitance_f, strain)
     if np.ptp(c) == 0.0:
@@ -192,6 +212,7 @@ def _checked(capacitance_f: ArrayLike, strain: ArrayLike, coverage: float) -> tu
             f"capacitance_f is {c[0]:g} F throughout; it must change. Record "
             "while the actuator moves."
         )
+    _check_plausible(c, e)
     if not 0.0 < coverage < 1.0:
         raise InputError(f"coverage = {coverage:g} is outside (0, 1). Use for example 0.95.")
     return c, e

@@ -25,11 +25,12 @@ __all__ = [
 _MOST_PREVIOUS = 10_000
 _LOG = "guardian.log"  # only appended to, by any program
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
+_NOT_PERMITTED = (errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS)
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def _unwritable(path: Path, error: OSError) -> HaselabError:
-    """Make the error for a path that cannot be created: bad input if its name is the cause."""
+    """Make the error for a path that cannot be created: bad input if another one can."""
     why = error.strerror or str(error)
     if error.errno in _BAD_PATH:
         return InputError(
@@ -38,9 +39,8 @@ def _unwritable(path: Path, error: OSError) -> HaselabError:
         )
     if error.errno in _FULL:
         return DeviceError(f"Cannot write ({why}). Free disk space. {path}")
-    return DeviceError(
-        f"Cannot write ({why}). Choose another folder, or change its permissions. {path}"
-    )
+    kind = InputError if error.errno in _NOT_PERMITTED else DeviceError
+    return kind(f"Cannot write ({why}). Choose another folder, or change its permissions. {path}")
 
 
 def _make_parents(folder: Path) -> list[Path]:
@@ -72,7 +72,8 @@ def claimed_file(path: Path) -> Iterator[None]:
     Args:
         path: of a file that does not exist; a pipe or a device is not touched.
     Raises:
-        InputError: the path exists, or another program has just created it.
+        InputError: the path exists, another program has just created it, or no file can be created
+            there.
         DeviceError: the disk refuses.
     """
     if path.exists() and not is_occupied(path):
@@ -125,7 +126,7 @@ def create_exclusively(path: Path) -> None:
     """Create an empty file that does not exist; a pipe or a device is not touched.
 
     Raises:
-        InputError: it exists.
+        InputError: it exists, or no file can be created there.
         DeviceError: the disk refuses.
     """
     try:

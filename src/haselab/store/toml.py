@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError, JsonObject
+from haselab.store.keys import describe_key
 from haselab.store.text_file import parse_toml, read_text
 
 __all__ = ["PrintableSection", "Section", "read_toml", "toml_text", "validated"]
@@ -132,26 +133,47 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
     except ValidationError as error:
         count = error.error_count()
         shown = error.errors(include_url=False)[:_MOST_SHOWN]
-    prefix = f"{section}." if section else ""
     faults = "; ".join(
-        f"{prefix}{'.'.join(str(part)[:60] for part in fault['loc']) or 'file'}: "
+        _missing(model, fault, data, section)
+        if fault["type"] == "missing"
+        else f"{_path(section, fault['loc']) or 'file'}: "
         f"{_said(model, fault, data)}{_got(fault['input'])}"
         for fault in shown
     )
     more = f"; and {count - len(shown)} more" if count > len(shown) else ""
-    raise InputError(f"{count} error(s): {faults}{more}. Change these values. {source}")
+    advice = "" if all(fault["type"] == "missing" for fault in shown) else " Change these values."
+    raise InputError(f"{count} error(s): {faults}{more}.{advice} {source}")
+
+
+def _path(section: str, parts: Sequence[Any]) -> str:
+    return ".".join([*([section] if section else []), *(str(part)[:60] for part in parts)])
+
+
+def _missing(model: type[BaseModel], fault: Any, data: Any, section: str) -> str:
+    """Name a missing key or table, what it means, and an example."""
+    *inside, name = fault["loc"]
+    path = _path(section, inside)
+    table = _table_of(model, inside, data)
+    field = None if table is None else table.model_fields.get(name)
+    place = f"[{path}]" if path else "the file"
+    if field is None:
+        return f"{place} has no key {name}"
+    chosen = (each.model_of({}) for each in field.metadata if hasattr(each, "model_of"))
+    kind: Any = next(chosen, field.annotation)
+    if _is_model(kind):
+        keys = ", ".join(key for key, each in kind.model_fields.items() if each.is_required())
+        what = (kind.__doc__ or "").strip().partition("\n")[0].rstrip(".")
+        needs = f"; it needs the keys {keys}" if keys else ""
+        return f"{place} has no table [{_path(path, [name])}]: {what}{needs}"
+    advice = describe_key(name, field).advice
+    return f"{place} has no key {name}" + (f": {advice}" if advice else "")
 
 
 def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
-    """Describe an error, with the valid keys of the table or the valid values of a key."""
-    kind = fault["type"]
-    if kind not in ("extra_forbidden", "missing"):
+    """Describe an error, with the valid keys of the table."""
+    if fault["type"] != "extra_forbidden":
         return str(fault["msg"])
     table = _table_of(model, fault["loc"][:-1], data)
-    if kind == "missing":
-        field = None if table is None else table.model_fields.get(fault["loc"][-1])
-        words = () if field is None else _words(field.annotation)
-        return f"{fault['msg']}; use one of {', '.join(words)}" if words else str(fault["msg"])
     keys = [] if table is None else sorted(table.model_fields)
     if 0 < len(keys) <= _MOST_KEYS:
         return f"no such key; the keys are {', '.join(keys)}"
@@ -175,13 +197,6 @@ def _table_of(model: type[BaseModel], path: Sequence[Any], data: Any) -> Any:
         if table is None:
             return None
     return table
-
-
-def _words(annotation: Any) -> tuple[str, ...]:
-    """The valid values of a key with a choice of words; empty for other keys."""
-    if typing.get_origin(annotation) is not typing.Literal:
-        return ()
-    return tuple(f'"{word}"' for word in typing.get_args(annotation))
 
 
 def _is_model(kind: object) -> bool:

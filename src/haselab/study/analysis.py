@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
-from haselab.base import HaselabError, InputError, ResultError
+from haselab.base import InputError, ResultError
 from haselab.rig import RigDescription
 from haselab.study.definition import Study
-from haselab.study.experiment import Experiment, ExperimentResult, NotPlayedError
+from haselab.study.experiment import ExperimentResult, NotPlayedError
+from haselab.study.experiments.foreign import (
+    AnyExperiment,
+    check_result,
+    foreign,
+    refuse_repeated,
+    rows_of_experiment,
+)
 from haselab.study.fits.observe import Observation, Source
 from haselab.study.registry import EXPERIMENTS
 
-__all__ = ["Analysis", "AnyExperiment", "experiments_of", "fitting", "foreign"]
+__all__ = ["Analysis", "experiments_of", "fitting"]
 
-AnyExperiment = Experiment[Any]
 Value = TypeVar("Value")
 
 
@@ -28,7 +34,9 @@ def experiments_of(study: Study) -> tuple[AnyExperiment, ...]:
     tables = ("operating_point", *study.tables)
     names = [name for name in EXPERIMENTS.packages() if name in tables]
     found = [cast("type[AnyExperiment]", EXPERIMENTS.find(name)).of(study) for name in names]
-    return tuple(experiment for experiment in found if experiment is not None)
+    experiments = tuple(experiment for experiment in found if experiment is not None)
+    refuse_repeated("result", [key for one in experiments for key in rows_of_experiment(one)])
+    return experiments
 
 
 class Analysis:
@@ -141,7 +149,7 @@ class Analysis:
         try:
             with fitting(experiment.title), foreign(experiment, "fit"):
                 found = experiment.fit(self)
-            _check_rows(experiment, found)
+            check_result(experiment, found)
         except NotPlayedError as reason:
             self._outcomes[experiment.table] = reason
             raise
@@ -150,45 +158,6 @@ class Analysis:
         self._outcomes[experiment.table] = found
         self._fitted(found)
         return found
-
-
-def _check_rows(experiment: AnyExperiment, found: ExperimentResult) -> None:
-    """Refuse results for which the report has no row.
-
-    Raises:
-        ResultError: the message names them.
-    """
-    unnamed = sorted({*found.quantities, *found.missing} - set(experiment.rows()))
-    if unnamed:
-        raise ResultError(
-            f"The experiment [{experiment.table}] returns {', '.join(unnamed)}, but its method "
-            "'rows' does not list them. Add a Quantity for each."
-        )
-
-
-@contextlib.contextmanager
-def foreign(experiment: AnyExperiment, doing: str) -> Iterator[None]:
-    """Run code of another package; report any failure as that package's, not as a bug of haselab.
-
-    Args:
-        experiment: whose code runs.
-        doing: "play" or "fit".
-    Raises:
-        ResultError: replaces an error that is not one of haselab's.
-    """
-    try:
-        yield
-    except HaselabError:
-        raise
-    except Exception as error:
-        package = type(experiment).__module__.partition(".")[0]
-        if package == __name__.partition(".")[0]:
-            raise
-        raise ResultError(
-            f"The method '{doing}' of the experiment [{experiment.table}], package {package!r}, "
-            f"failed: {type(error).__name__}: {error}. The recorded data are kept. Run again with "
-            "--debug for the traceback."
-        ) from error
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ConfigDict, create_model, model_validator
+from pydantic import ConfigDict, Field, create_model, model_validator
 
 from haselab.base import InputError
 from haselab.controllers import CONTROLLERS
@@ -40,13 +40,15 @@ __all__ = [
 REFERENCE_STUDY = "hasel-iros2018"  # only its results are compared with the paper
 _STUDIES = Path(__file__).parent / "studies"
 
+_name: Any = Field(description="title of the report", examples=["one triangle"])
+
 Table = TypeVar("Table", bound=Section)
 
 
 class _Head(Section):
     """The tables that every study has, whatever it plays."""
 
-    name: str
+    name: str = _name
     sensing: Sensing = Sensing()
     operating_point: OperatingPoint = OperatingPoint()
 
@@ -155,7 +157,7 @@ class Study(_Head):
 class StepStudy(Section):
     """Step trials alone, for a rig that closes its own loop."""
 
-    name: str
+    name: str = _name
     step_trials: StepTrials
 
 
@@ -192,7 +194,7 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     data = _read(path, quick)
     if "step_trials" in data:
         raise InputError(
-            'The study has a table [step_trials], which needs a rig with kind = "mega". '
+            'The study has a table [step_trials], which needs a rig with kind = "chip". '
             f"Use such a rig, or the table [steps]. {path}"
         )
     return _with_all_parameters(checked_study(data, path), path)
@@ -236,7 +238,8 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
             "The study has no experiment. Add at least one of the tables "
             f"{', '.join(f'[{name}]' for name in kinds)}. {source}"
         )
-    return validated(Study, data, source)
+    validated(file_model(data), data, source)  # whose messages know the keys of each table
+    return Study.model_validate(data)
 
 
 def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:

@@ -152,6 +152,14 @@ class Experiment(ABC, Generic[Settings]):
             rig: nominal values of the bench.
         """
 
+    def check(self) -> None:
+        """Refuse settings with which `fit` cannot have a result; called before anything moves.
+
+        Raises:
+            InputError: such a setting, and what to change.
+        """
+        return
+
     def masses_kg(self) -> tuple[float, ...]:
         """Masses that are hung in the experiment, besides the rig's own."""
         return ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,11 @@ from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study
+from haselab.study.experiments.foreign import declared
 
 __all__ = [
     "check_drives",
+    "check_settings",
     "judge_rig",
     "judge_study",
     "rated_rig",
@@ -42,12 +45,39 @@ def study_drives(study: Study, rig: RigDescription) -> list[Drive]:
         study: what will be played.
         rig: nominal values of the bench.
     """
-    return [drive for experiment in experiments_of(study) for drive in experiment.drives(rig)]
+    return [
+        drive
+        for each in experiments_of(study)
+        for drive in declared(each, "drives", Drive, partial(each.drives, rig))
+    ]
 
 
 def study_masses_kg(study: Study) -> list[float]:
     """All masses that are hung in a study, besides the rig's own."""
-    return [mass for experiment in experiments_of(study) for mass in experiment.masses_kg()]
+    return [
+        mass
+        for each in experiments_of(study)
+        for mass in declared(each, "masses_kg", (int, float), each.masses_kg)
+    ]
+
+
+def check_settings(study: Study) -> None:
+    """Refuse a study from which no result can come, before anything moves.
+
+    Args:
+        study: what will be played.
+    Raises:
+        InputError: it plays nothing, or an experiment's settings give too little data for its fit.
+    """
+    experiments = experiments_of(study)
+    if not any(experiment.recordings() for experiment in experiments):
+        tables = " and ".join(f"[{experiment.table}]" for experiment in experiments)
+        raise InputError(
+            f"The study plays nothing: it has only {tables}. Add an experiment that is played, "
+            "such as [steps]."
+        )
+    for experiment in experiments:
+        experiment.check()
 
 
 def check_drives(study: Study, rig: RigDescription) -> None:
@@ -130,7 +160,7 @@ def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibilit
         for carrier_v, some in by_carrier.items()
     ]
     together = zip(*(one.checks for one in found), strict=True)
-    return Feasibility(tuple(max(same, key=lambda check: check.requested) for same in together))
+    return Feasibility(tuple(max(same, key=lambda check: check.excess) for same in together))
 
 
 def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, Rating] | None:

@@ -33,6 +33,12 @@ _FOUND: Mapping[type, tuple[str, ...]] = {  # sections by the type of the findin
     Dynamics: ("model",),
     Loops: ("controller",),
 }
+# Keys of a model and a design that are removed from the file that the run started from.
+_OF_AN_OLDER_MODEL = (
+    "poles", "zeros", "numerator", "denominator", "slow_modes", "delay_s", "fit_percent",
+    "fitted_to", "input_unit", "output_unit",
+)  # fmt: skip
+_OF_AN_OLDER_DESIGN = ("name", "predicted", "plausible", "uncertainty")
 _START = """\
 # Findings of a study about its actuator, in SI units. Use it with haselab design, compare, firmware
 # and run. Your own comments and keys are kept.
@@ -198,7 +204,7 @@ def write_design(
             "drive.voltage_map": voltage_map_section(maps.voltage_map),
         }
     if dynamics is not None:
-        sections["model"] = _model(dynamics, loops)
+        sections["model"] = _model(dynamics, loops, maps)
     if loops is not None:
         sections["controller"] = _controllers(loops, study.control)
     if drive_limits is not None:
@@ -213,15 +219,20 @@ def sections_found(found: Findings) -> list[str]:
     return [name for kind, names in _FOUND.items() if found.find(kind) for name in names]
 
 
-def _model(dynamics: Dynamics, loops: Loops | None) -> Mapping[str, object]:
+def _model(dynamics: Dynamics, loops: Loops | None, maps: Maps | None) -> Mapping[str, object]:
     setting = None if loops is None else loops.setting
+    to_volt = None if maps is None else maps.voltage_map
     return {
+        **dict.fromkeys(_OF_AN_OLDER_MODEL),
         "input": "strain",
         "output": "strain",
         **dynamics.plant.to_dict(),
         "rate_hz": None if setting is None else setting.rate_hz,
         "loop_delay_s": None if setting is None else setting.measurement_delay_s,
         "residual_std": dynamics.residual_std,
+        "through_voltage_map": None
+        if to_volt is None
+        else (to_volt.a1_v, to_volt.b1, to_volt.a2_v, to_volt.b2),
         "covariance": dynamics.posterior.to_dict(),
     }
 
@@ -260,4 +271,4 @@ def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:
         if control.kind in (table["kind"] for table in tables):
             own["name"] = "own"
         tables.append(own | {key: tables[0][key] for key in ("limits", "loop")})
-    return tables[0] | {"alternatives": tables[1:]}
+    return {**dict.fromkeys(_OF_AN_OLDER_DESIGN), **tables[0], "alternatives": tables[1:]}

@@ -9,9 +9,10 @@ from typing import Any, TypeVar, cast
 from haselab.base import Estimate
 from haselab.rig import RigDescription
 from haselab.runtime.runner import Runner
-from haselab.study.analysis import Analysis, foreign
+from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Chart, ExperimentResult, NotPlayedError
+from haselab.study.experiments.foreign import foreign, rows_of_experiment
 from haselab.study.fits.observe import Source
 from haselab.study.player import Player
 
@@ -99,7 +100,8 @@ def investigate(
         except NotPlayedError as missing:
             reason = str(missing)
         if reason:
-            outcomes.append(ExperimentResult(missing=dict.fromkeys(experiment.rows(), reason)))
+            unfound = dict.fromkeys(rows_of_experiment(experiment), reason)
+            outcomes.append(ExperimentResult(missing=unfound))
     return Findings(
         quantities=_joined([part.quantities for part in outcomes]),
         notes=_joined_notes([part.notes for part in outcomes]),

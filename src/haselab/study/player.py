@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import LimitError
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.runner import Runner
-from haselab.study.analysis import Analysis, AnyExperiment
+from haselab.safety.feasibility import Drive
+from haselab.study.analysis import Analysis
+from haselab.study.experiments.foreign import AnyExperiment, declared
 
 __all__ = ["UPDATE_HZ", "Player"]
 
@@ -30,7 +34,8 @@ class Player:
     def __init__(self, runner: Runner, experiment: AnyExperiment, analysis: Analysis) -> None:
         self._runner, self._name, self.analysis = runner, experiment.table, analysis
         self.rig = analysis.rig
-        drives = [np.append(0.0, drive.values_v) for drive in experiment.drives(self.rig)]
+        listed = declared(experiment, "drives", Drive, partial(experiment.drives, self.rig))
+        drives = [np.append(0.0, drive.values_v) for drive in listed]
         self._low_v = min((float(values.min()) for values in drives), default=0.0)
         self._high_v = max((float(values.max()) for values in drives), default=0.0)
         self._jump_v = max((float(np.abs(np.diff(v)).max()) for v in drives if v.size > 1),

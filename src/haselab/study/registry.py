@@ -21,8 +21,14 @@ class ExperimentClass(Protocol):
 
 def _fault(kind: object, name: str) -> str:
     """Return what is wrong with the class of an entry point, or an empty text."""
-    table = getattr(kind, "table", None)
-    return "" if table == name else f"its attribute table is {table!r}"
+    table, settings = getattr(kind, "table", None), getattr(kind, "settings_type", None)
+    if table != name:
+        return f"its attribute table is {table!r}"
+    if not (isinstance(settings, type) and issubclass(settings, Section)):
+        return f"its attribute settings_type is {settings!r}, not a class derived from Section"
+    missing = sorted(getattr(kind, "__abstractmethods__", ()))
+    missing += [each for each in ("title", "of", "gives") if not hasattr(kind, each)]
+    return f"it has no {', '.join(missing)}" if missing else ""
 
 
 EXPERIMENTS: Registry[type[ExperimentClass]] = Registry(

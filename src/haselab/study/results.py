@@ -9,6 +9,7 @@ from typing import Any
 from haselab.base import Estimate, Json, JsonObject
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
+from haselab.study.experiments.foreign import rows_of_experiment
 from haselab.study.paper.quantity_table import quantities
 from haselab.study.quantity import Quantity
 from haselab.study.simulated.truth import (
@@ -129,7 +130,7 @@ def rows_of(study: Study) -> dict[str, Quantity]:
     """
     found: dict[str, Quantity] = dict(quantities()) if study.is_reference else {}
     for experiment in experiments_of(study):
-        found |= experiment.rows()
+        found |= rows_of_experiment(experiment)
     if study.is_reference:
         return found
     return {key: row for key, row in found.items() if not row.reference_only}

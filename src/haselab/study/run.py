@@ -37,6 +37,7 @@ from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study, checked_study
 from haselab.study.experiment import ExperimentResult
+from haselab.study.experiments.foreign import declared, foreign, refuse_repeated
 from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
 from haselab.study.known import known_values
@@ -170,8 +171,15 @@ def run_study(
     sensing = study.sensing
     lockin = lockin_of(rig.description, sensing.carrier_hz)
     experiments = experiments_of(study)
-    planned = [plan for experiment in experiments for plan in experiment.plans()]
-    progress.start(sum(experiment.seconds(rig.description) for experiment in experiments))
+    planned = [
+        plan for each in experiments for plan in declared(each, "plans", ExperimentPlan, each.plans)
+    ]
+    refuse_repeated("recording", [plan.name for plan in planned])
+    seconds = 0.0
+    for each in experiments:
+        with foreign(each, "seconds", InputError):
+            seconds += float(each.seconds(rig.description))
+    progress.start(seconds)
     header = session_header(study, rig.description, options)
     with recording(rig, options, header, planned) as (session, observer):
 

@@ -23,59 +23,79 @@ __all__ = [
 
 LEAST_LOADS = 7  # of the static test: the fit needs six besides the lightest, its reference
 _DAY_S = 86400.0
-_volt = Field(ge=-100, le=100)
-_frames = Field(gt=0, le=1e5)
+
+
+def _frames(examples: float) -> Any:
+    return Field(gt=0, le=1e5, description="frames a second of the camera", examples=[examples])
 
 
 class Sensing(Section):
     """The sensing signal, and the scales of eqs. 2 and 3 (row D11b)."""
 
-    carrier_hz: float = Field(2000.0, gt=0, le=1e6)
-    carrier_v: float = Field(0.02, gt=0, le=1)
-    reactance_scale: float = Field(2.5e3, gt=0)
-    capacitance_scale: float = Field(10.0, gt=0)
+    carrier_hz: float = Field(2000.0, gt=0, le=1e6, description="frequency of the carrier")
+    carrier_v: float = Field(
+        0.02, gt=0, le=1, description="amplitude of the carrier at the amplifier's input"
+    )
+    reactance_scale: float = Field(
+        2.5e3, gt=0, description="factor of eq. 2, for relative capacitances"
+    )
+    capacitance_scale: float = Field(
+        10.0, gt=0, description="factor of eq. 3, for relative capacitances"
+    )
 
 
 class OperatingPoint(Section):
-    """Row S18; the hung mass is the rig's."""
+    """Baseline voltage; the hung mass is the rig's (row S18)."""
 
     baseline_v: float | None = Field(
         None,
         ge=-100,
         le=100,
-        description="drive voltage of zero strain, in V at the DAQ output; default: the one that "
-        "centres the strain in the longest linear region",
+        description="drive of zero strain; if left out, the voltage that centres the strain in the "
+        "longest linear region, or else the middle of the triangle",
     )
 
 
 class Triangle(Section):
-    """Rows S13 to S15."""
+    """Slow triangles of voltage (rows S13 to S15)."""
 
-    low_v: float = _volt
-    high_v: float = _volt
-    frequency_hz: float = Field(ge=1e-4, le=25)
-    cycles: int = Field(ge=2, le=1000)
-    left_out_cycles: int = Field(ge=0, le=1000)
-    frame_rate_hz: float = _frames
+    low_v: float = Field(ge=-100, le=100, description="lowest drive", examples=[0.0])
+    high_v: float = Field(ge=-100, le=100, description="highest drive", examples=[2.0])
+    frequency_hz: float = Field(ge=1e-4, le=25, description="triangles a second", examples=[0.25])
+    cycles: int = Field(ge=2, le=1000, description="number of triangles", examples=[5])
+    left_out_cycles: int = Field(
+        ge=0, le=1000, description="first triangles that the maps are not fitted to", examples=[1]
+    )
+    frame_rate_hz: float = _frames(100.0)
 
     @model_validator(mode="after")
     def _lasts(self) -> Self:
         if self.cycles / self.frequency_hz > _DAY_S:
             raise ValueError("cycles / frequency_hz must not exceed a day")
+        if self.left_out_cycles >= self.cycles:
+            raise ValueError(
+                f"left_out_cycles = {self.left_out_cycles} must be below cycles = {self.cycles}"
+            )
         return self
 
 
 class StaticLoad(Section):
-    """Rows S16 and S17."""
+    """Masses hung at 0 V (rows S16 and S17)."""
 
-    masses_kg: tuple[float, ...] = Field(max_length=1000)
-    settle_s: float = Field(gt=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
+    masses_kg: tuple[float, ...] = Field(
+        max_length=1000,
+        description=f"masses in the order of hanging, at least {LEAST_LOADS} different ones",
+        examples=[[0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]],
+    )
+    settle_s: float = Field(
+        gt=0, le=_DAY_S, description="wait after each mass, before its frames", examples=[60.0]
+    )
+    frame_rate_hz: float = _frames(100.0)
     pieces: int | None = Field(
         None,
         ge=1,
         le=6,
-        description="straight segments of the load curve; default: chosen by BIC",
+        description="straight segments of the load curve; if left out, chosen by BIC",
     )
 
     @field_validator("masses_kg", mode="after")
@@ -87,58 +107,79 @@ class StaticLoad(Section):
 
 
 class FreeResponse(Section):
-    """Row S19."""
+    """The mass lifted and dropped at the baseline voltage (row S19)."""
 
-    trials: int = Field(ge=1, le=1000)
-    settle_s: float = Field(gt=0, le=_DAY_S)
-    record_s: float = Field(gt=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
+    trials: int = Field(ge=1, le=1000, description="number of drops", examples=[2])
+    settle_s: float = Field(
+        gt=0, le=_DAY_S, description="time for which the mass is held up", examples=[40.0]
+    )
+    record_s: float = Field(
+        gt=0, le=_DAY_S, description="recorded time after the drop", examples=[8.0]
+    )
+    frame_rate_hz: float = _frames(200.0)
 
 
 class Chirp(Section):
-    """Row S20."""
+    """A chirp about the baseline voltage (row S20)."""
 
-    amplitude_v: float = Field(gt=0, le=100)
-    start_hz: float = Field(gt=0, le=1e4)
-    stop_hz: float = Field(gt=0, le=1e4)
-    duration_s: float = Field(ge=0.01, le=_DAY_S)
-    hold_s: float = Field(gt=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
+    amplitude_v: float = Field(
+        gt=0, le=100, description="amplitude about the baseline voltage", examples=[0.6]
+    )
+    start_hz: float = Field(gt=0, le=1e4, description="first frequency", examples=[0.1])
+    stop_hz: float = Field(gt=0, le=1e4, description="last frequency", examples=[10.0])
+    duration_s: float = Field(
+        ge=0.01, le=_DAY_S, description="duration of the chirp", examples=[10.0]
+    )
+    hold_s: float = Field(
+        gt=0, le=_DAY_S, description="wait at the baseline voltage before it", examples=[40.0]
+    )
+    frame_rate_hz: float = _frames(200.0)
 
 
 class Steps(Section):
-    """Rows S21 to S25."""
+    """Steps of strain in open loop and, with controllers, in closed loop (rows S21 to S25)."""
 
-    step: float = Field(description="desired strain")
-    zero_s: float = Field(gt=1, le=_DAY_S)
-    step_s: float = Field(gt=1, le=_DAY_S)
-    rest_s: float = Field(ge=0, le=_DAY_S)
-    frame_rate_hz: float = _frames
-    open_trials: int = Field(ge=1, le=1000)
-    pi_trials: int = Field(ge=0, le=1000)
-    pid_trials: int = Field(ge=0, le=1000)
+    step: float = Field(description="desired strain after the step", examples=[0.04])
+    zero_s: float = Field(
+        gt=1, le=_DAY_S, description="time at zero strain before the step", examples=[15.0]
+    )
+    step_s: float = Field(gt=1, le=_DAY_S, description="time after the step", examples=[25.0])
+    rest_s: float = Field(
+        ge=0, le=_DAY_S, description="wait at 0 V before each trial", examples=[60.0]
+    )
+    frame_rate_hz: float = _frames(20.0)
+    open_trials: int = Field(ge=1, le=1000, description="trials in open loop", examples=[2])
+    pi_trials: int = Field(ge=0, le=1000, description="trials with the PI", examples=[2])
+    pid_trials: int = Field(ge=0, le=1000, description="trials with the PID", examples=[2])
     printed_chain_trials: int = Field(
-        0, ge=0, le=100, description="with the PI and the paper's sensing chain"
+        0, ge=0, le=100, description="trials with the PI and the paper's sensing chain"
     )
     printed_chain_carrier_v: float = Field(
-        0.1, gt=0, le=1, description="of these trials; steps of the output leak into the carrier"
+        0.1,
+        gt=0,
+        le=1,
+        description="amplitude of the carrier in these trials; updates of the output leak into a "
+        "smaller one",
     )
     extra_delay_trials: int = Field(
         0,
         ge=0,
         le=100,
-        description="with a PI for outputs delayed by extra_delay_blocks",
+        description="trials with a PI designed for outputs delayed by extra_delay_blocks",
     )
-    extra_delay_blocks: int = Field(1, ge=1, le=10)
+    extra_delay_blocks: int = Field(1, ge=1, le=10, description="delay of their outputs, in blocks")
     saturating_trials: int = Field(
-        0, ge=0, le=100, description="with the PI, to saturating_step first, then to step"
+        0, ge=0, le=100, description="trials with the PI, to saturating_step first, then to step"
     )
-    saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain")
+    saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain in these trials")
     own_trials: int = Field(
-        2, ge=1, le=1000, description="with the controller of [control] kind, if there is one"
+        2,
+        ge=1,
+        le=1000,
+        description="trials with the controller of [control], if it has a kind",
     )
     feedback: Literal["capacitance", "video"] = Field(
-        "capacitance", description="source of the strain for the closed loops"
+        "capacitance", description="what the closed loops measure the strain by"
     )
 
 
@@ -146,23 +187,30 @@ _LOOP_KEYS = {"kind", "parameters", "saturation_low", "saturation_high"}
 
 
 class Control(Section):
-    """Rows S21, S22, S25; `kind` adds a controller of any registered kind to the paper's.
+    """Gains of the PI and limits of all controllers (rows S21, S22, S25).
 
-    With `kind`, the other keys of the table are the parameters of that kind.
+    With `kind`, which adds a controller of any registered kind, the other keys of the table are the
+    parameters of that kind.
     """
 
     kind: str | None = Field(
         None,
         min_length=1,
         max_length=64,
-        description="registered kind of the controller for own_trials",
+        description="registered kind of a controller for own_trials",
     )
-    parameters: dict[str, float] = Field({}, description="of that controller")
-    kp: float = Field(0.85, ge=0, description="printed, for the printed plant gain")
-    ki: float = Field(1.5, ge=0)
-    plant_gain: float = Field(0.5, gt=0, description="printed static gain, eq. 8")
-    saturation_low: float = -0.05
-    saturation_high: float = 0.1
+    parameters: dict[str, float] = Field({}, description="parameters of that controller, by name")
+    kp: float = Field(0.85, ge=0, description="proportional gain for a plant of gain plant_gain")
+    ki: float = Field(1.5, ge=0, description="integral gain for a plant of gain plant_gain, in 1/s")
+    plant_gain: float = Field(
+        0.5, gt=0, description="static gain of the plant that kp and ki belong to"
+    )
+    saturation_low: float = Field(
+        -0.05, description="lowest output of the controllers, as a strain"
+    )
+    saturation_high: float = Field(
+        0.1, description="highest output of the controllers, as a strain"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -175,14 +223,22 @@ class Control(Section):
 
 
 class StepTrials(Section):
-    """Step trials with a controller that is already designed: row S24, on the chip."""
+    """Steps by a controller that is already on the microcontroller (row S26)."""
 
-    step: float = Field(ge=-0.5, le=0.5, description="desired strain, not 0")
-    zero_s: float = Field(gt=1, le=3600)
-    step_s: float = Field(gt=1, le=3600)
-    rest_s: float = Field(ge=0, le=86400)
-    frame_rate_hz: float = Field(gt=0, le=1e4)
-    trials: int = Field(ge=1, le=1000)
+    step: float = Field(
+        ge=-0.5, le=0.5, description="desired strain after the step, not 0", examples=[0.04]
+    )
+    zero_s: float = Field(
+        gt=1, le=3600, description="time at zero strain before the step", examples=[6.0]
+    )
+    step_s: float = Field(gt=1, le=3600, description="time after the step", examples=[6.0])
+    rest_s: float = Field(
+        ge=0, le=86400, description="wait at 0 V before each trial", examples=[2.0]
+    )
+    frame_rate_hz: float = Field(
+        gt=0, le=1e4, description="frames a second of the camera", examples=[100.0]
+    )
+    trials: int = Field(ge=1, le=1000, description="number of trials", examples=[3])
 
     @model_validator(mode="after")
     def _is_a_step(self) -> Self:

@@ -14,7 +14,7 @@ from haselab.rig.instruments.nidaq.link import key_of
 from haselab.safety.interlock import Interlock
 
 RIG = 'kind = "bench"\n[daq]\nserial_number = "3DA5AA11"\n'
-CHIP = 'kind = "mega"\nport = "{}/ttyACM0"\n'
+CHIP = 'kind = "chip"\nport = "{}/ttyACM0"\n'
 
 
 @pytest.fixture(autouse=True)
@@ -28,13 +28,13 @@ def _write(folder: Path, text: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("kind", ["bench", "mega"])
+@pytest.mark.parametrize("kind", ["bench", "chip", "mega"])
 def test_the_permission_is_revoked_at_once(kind: str, tmp_path: Path) -> None:
-    """The permission of the interlock that the drivers themselves use."""
+    """The permission of the interlock that the drivers use; "mega" is the former name of a chip."""
     key = key_of("3DA5AA11") if kind == "bench" else key_of_port(f"{tmp_path}/ttyACM0")
     interlock = Interlock(key)
     before = interlock.revision
-    text = RIG if kind == "bench" else CHIP.format(tmp_path.as_posix())
+    text = RIG if kind == "bench" else CHIP.format(tmp_path.as_posix()).replace("chip", kind)
     assert revoke_first(["rig", "safe", "--json", _write(tmp_path, text)])
     assert interlock.revision != before
     assert "rig safe" in interlock.reason
@@ -56,8 +56,8 @@ def test_no_other_command_revokes(arguments: list[str], tmp_path: Path) -> None:
         "[daq]\nserial_number = 5",
         "\x00",
         "[daq]\nserial_number='x'",
-        "kind='mega'",
-        "kind='mega'\nport=3",
+        "kind='chip'",
+        "kind='chip'\nport=3",
     ],
 )
 def test_a_file_that_names_no_device_is_left_to_the_command(text: str, tmp_path: Path) -> None:

@@ -394,6 +394,27 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
         ("--time", "z"),
         "Column z has no times",
     ),
+    "times that fall": (
+        "t [s];u;y\n3;1;2\n2;3;1\n1;2;2\n",
+        (),
+        "Column t [s] does not increase after row 1 (step of -1 s). Sort the rows",
+    ),
+    "times that occur twice": (
+        "time_s;u;y\n1;1;2\n2;3;1\n2;2;2\n3;1;1\n",
+        (),
+        "Column time_s does not increase after row 2 (step of 0 s). Sort the rows",
+    ),
+    "perhaps times": (
+        "t;u;y\n1;1;2\n2;3;1\n2;2;2\n",
+        (),
+        "no sampling rate. Column t does not rise everywhere. Add --rate-hz",
+    ),
+    "two columns of one name": ("t;u;y;y\n1;1;2;3\n", (), "2 columns y: columns 3, 4. Use the num"),
+    "one name in two units": (
+        "t;u [mV];u [V];y\n1;1;2;3\n",
+        (),
+        "2 columns u (u [mV], u [V]). Use the full name",
+    ),
     "units in cells": ("u;y\n1 V;2 mm\n2 V;3 mm\n3 V;4 mm\n", (), "Column u has '1 V' in line 2"),
     "workbook": ("PK", (), "Export the data as CSV"),
 }
@@ -430,6 +451,16 @@ def test_a_column_t_that_does_not_rise_is_no_time(tmp_path, capsys):
     assert "states no sampling rate" in capsys.readouterr().err
     for command in ("arx", "transfer"):
         assert code_of("identify", command, path, "--rate-hz", 400) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("times", [TIME_S[::-1], np.repeat(TIME_S[::2], 2)])
+def test_sense_refuses_times_that_do_not_rise(tmp_path, capsys, times):
+    path = tmp_path / "a.csv"
+    path.write_text("time_s,v_monitor_v,i_monitor_v\n" + rows(times, V, I))
+    assert code_of("sense", path, "--carrier-hz", 2000, "--out", tmp_path / "o.csv") == 2
+    error = capsys.readouterr().err
+    assert "Column time_s does not increase after row 1. Sort the rows, or remove" in error
+    assert error.count("\n") == 1
 
 
 def test_a_rate_that_contradicts_a_foreign_time_column_is_refused(tmp_path, capsys):

@@ -15,7 +15,7 @@ from haselab.cli.main import main
 from haselab.pipelines.sensing.series import derived_series
 from haselab.store.columns.table import read_table
 from haselab.store.export.frames import session_dataset, session_tables
-from haselab.store.session.writer import ExperimentPlan, SessionWriter
+from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 
 RATE_HZ, CARRIER_HZ, VOLT, SAMPLES, BLOCKS = 50e3, 2000.0, 1e-4, 500, 12
 CAPACITANCE_F, RESISTANCE_OHM, SCALE = 1.2e-9, 8e3, 2e-4
@@ -118,6 +118,32 @@ def test_one_experiment_is_exported_with_its_series(session, tmp_path, capsys):
         "step-1-strain",
     }  # fmt: skip
     check_capacitance(read_table(out / "step-1-capacitance.csv", ["capacitance_f"]))
+
+
+def test_strains_have_a_common_zero_and_the_mean_drive_until_the_next_frame(session, tmp_path):
+    out = tmp_path / "csv"
+    assert code_of("session", "export", session, "--to", "csv", "--zero-length-m", "0.02", "--out",
+                   out) == 0  # fmt: skip
+    found = np.genfromtxt(out / "step-1-strain.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(found["strain"], found["length_m"] / 0.02 - 1.0)
+    np.testing.assert_allclose(found["strain"][:2], [0.0, 0.02], atol=1e-12)
+    np.testing.assert_allclose(found["voltage_v"], [0.0, 0.1, 0.2, 0.3, 0.4], atol=1e-12)
+
+
+def test_a_late_output_is_averaged_between_frames(session):
+    with SessionReader(session) as reader:
+        reader.header["rig"] = {**reader.header["rig"], "switch_sample": 125}  # 2.5 of 10 ms
+        voltage_v = derived_series(reader, "step-1")["strain"]["voltage_v"]
+    np.testing.assert_allclose(voltage_v, [0.0, 0.075, 0.175, 0.275, 0.375], atol=1e-12)
+
+
+def test_a_table_without_rows_is_named_and_not_written(session, tmp_path, capsys):
+    out = tmp_path / "csv"
+    assert code_of("session", "export", session, "--to", "csv", "--out", out, "--json") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["empty"] == ["bare-tracks"]
+    assert "nothing was recorded for them: bare-tracks" in printed.err
+    assert not (out / "bare-tracks.csv").exists() and (out / "bare.csv").exists()
 
 
 def test_matlab_gets_series_as_structs_and_the_names_of_experiments(session, tmp_path):

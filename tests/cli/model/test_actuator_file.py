@@ -1,6 +1,7 @@
 """One actuator.toml through init, identify, design and compare, as a user runs them."""
 
 import json
+import re
 import tomllib
 
 import numpy as np
@@ -170,10 +171,11 @@ def rewritten(path, first, **how):
     [
         {"fmt": "%.17g", "delimiter": ",", "header": "# exported\n# again\ntime_s,u,y"},
         {"fmt": "%.12g", "delimiter": ";", "header": "time_s;u;y (%)", "factor": 100.0},
+        {"fmt": "%.6g", "delimiter": ",", "header": "time_s,u,y"},
         {"fmt": "%.9g", "delimiter": ",", "header": "time_s,u,y", "rows": slice(0, 600)},
         {"fmt": "%.9g", "delimiter": ",", "header": "time_s,u,y", "rows": slice(333, 453)},
     ],
-    ids=["preamble and digits", "percent", "half", "a tenth of it"],
+    ids=["preamble and digits", "percent", "six digits", "half", "a tenth of it"],
 )
 @pytest.mark.parametrize("form", ["toml", "json"])
 def test_a_record_of_the_fit_is_known_by_its_samples(known, tmp_path, capsys, how, form):
@@ -205,9 +207,22 @@ def test_a_record_that_contains_the_one_of_the_fit_has_its_share(known, tmp_path
     both = tmp_path / "both.csv"
     np.savetxt(both, rows, "%.9g", ",", header="time_s,u,y", comments="")
     code, text, _ = run(capsys, "compare", actuator, both, "--json")
-    # 256 hashes below the limit in each half: 4 standard deviations of a binomial share
-    assert json.loads(text)["used_for_fit"] == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(512))
+    # 256 hashes below the limit in each half, 0.78 of them well inside their cells: 4 standard
+    # deviations of a binomial share
+    assert json.loads(text)["used_for_fit"] == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(400))
     assert code == 3
+
+
+def test_the_fingerprint_of_an_older_version_is_not_used(known, tmp_path, capsys):
+    actuator, first, _ = known
+    old = tmp_path / "old.toml"
+    text = actuator.read_text()
+    a, b = text.index("[model.fitted_to]"), text.index("[", text.index("hashes =") + 10)
+    hashes = re.search(r"hashes = (\[.*?\])", text, re.DOTALL)[1]
+    old.write_text(text[:a].replace("[model]\n", f"[model]\nfitted_to = {hashes}\n") + text[b:])
+    code, text, error = run(capsys, "compare", old, first, "--json")
+    assert code == 0 and json.loads(text)["used_for_fit"] is None
+    assert "warning: the model does not state the samples that it was fitted to" in error
 
 
 def test_a_prediction_worse_than_the_mean_is_not_ok(known, tmp_path, capsys):

@@ -42,7 +42,7 @@ def folder(tmp_path: Path) -> Path:
     (place / "chip-steps.toml").write_text(toml_text(steps.model_dump(mode="json")))
     config = twin_of_reading("hz").model_dump(mode="json")
     (place / "twin.toml").write_text(toml_text(config))
-    rig = {"kind": "mega", "run": "..", "simulator": {"twin": "twin.toml", "precondition_v": 2.0}}
+    rig = {"kind": "chip", "run": "..", "simulator": {"twin": "twin.toml", "precondition_v": 2.0}}
     (place / "chip.toml").write_text(toml_text(rig))
     return tmp_path
 

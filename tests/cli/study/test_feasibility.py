@@ -14,6 +14,7 @@ from click.testing import CliRunner
 
 from haselab.base import InputError, LimitError, SafetyError
 from haselab.cli.bench.arming import Operator, armed_rig
+from haselab.cli.main import main
 from haselab.cli.study.feasibility import command
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import ChipFile
@@ -25,8 +26,8 @@ from haselab.safety.guardian.client import guardian_command
 from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import ArmingRequest
 from haselab.study import definition
-from haselab.study.definition import builtin_study
-from haselab.study.feasibility import judge_rig, judge_study, rating_of_twin
+from haselab.study.definition import builtin_study, load_study
+from haselab.study.feasibility import check_settings, judge_rig, judge_study, rating_of_twin
 
 STUDY = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 
@@ -154,10 +155,61 @@ def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) ->
     assert stop.value.__notes__ == ["Nothing was energised."]
 
 
+TRIANGLE = """\
+name = "maps"
+[triangle]
+low_v = 0.0
+high_v = 2.0
+frequency_hz = 0.5
+cycles = 3
+left_out_cycles = 1
+frame_rate_hz = 100.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        # On each edge of 2 cycles 0.12 V at 2 V/s, so 0.12 s: 12 frames at 100 Hz, 6 at 50 Hz.
+        ("frame_rate_hz = 100.0", "frame_rate_hz = 50.0",
+         "The triangle gives only 6 frames on each edge within 0.06 V of the baseline of 1 V"),
+        ("[triangle]", "[operating_point]\nbaseline_v = 2.1\n[triangle]",
+         "only 0 frames on each edge within 0.06 V of the baseline of 2.1 V"),
+        ("left_out_cycles = 1", "left_out_cycles = 3",
+         "left_out_cycles = 3 must be below cycles = 3"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("run", [True, False])
+def test_a_triangle_without_a_result_is_refused_before_anything_moves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, words: str, run: bool
+) -> None:
+    study, rig = tmp_path / "study.toml", tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+    assert TRIANGLE.count(old) == 1
+    study.write_text(TRIANGLE.replace(old, new))
+    verb = ["run"] if run else ["plan", "feasibility"]
+    with pytest.raises(SystemExit) as stop:
+        main([*verb, str(study), "--rig", str(rig), "--out", str(tmp_path / "out")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and words in error and error.count("\n") == 1
+    assert str(study) in error and not (tmp_path / "out").exists()
+
+
+def test_a_triangle_with_just_enough_frames_is_feasible(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(TRIANGLE)
+    check_settings(load_study(tmp_path / "study.toml"))
+
+
+def test_a_study_that_plays_nothing_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text('name = "a"\n[control]\nkind = "open-loop"\n')
+    with pytest.raises(InputError, match=r"plays nothing: it has only \[control\]\. Add an exper"):
+        check_settings(load_study(tmp_path / "study.toml"))
+
+
 @pytest.mark.parametrize("name", ["current_limit_a", "rate_limit_v_per_s", "follow"])
 def test_a_limit_without_effect_on_a_microcontroller_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "rig.toml"
-    file = ChipFile.model_construct(kind="mega", port=None)
+    file = ChipFile.model_construct(kind="chip", port=None)
     with pytest.raises(InputError, match=rf"safety\.{name} has no effect on a microcontroller"):
         safety_of(file, {name: 0.05}, path)
     assert "mean current. The microcontroller ramps down" in arming_limits(

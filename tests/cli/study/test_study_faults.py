@@ -54,7 +54,7 @@ def test_a_study_above_the_voltage_limit_is_refused(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text('kind = "twin"\n')
     command = ["run", str(tmp_path / "study.toml"), "--rig", str(tmp_path / "rig.toml")]
     ended(haselab(*command, "--quick", "--out", str(tmp_path / "out")), 2,
-          "output beyond the drive limits is 0.5 V in triangle")  # fmt: skip
+          "highest drive voltage is 2.5 V in triangle (limit 2 V)")  # fmt: skip
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="file size limits are POSIX's")
@@ -66,7 +66,8 @@ def test_a_full_disk_keeps_what_was_recorded(tmp_path: Path) -> None:
     ended(haselab(*_QUICK, "--out", str(tmp_path), start=limit), 4, "disk is full")
     with SessionReader(tmp_path / "session.h5") as session:
         assert len(session.experiment("triangle").codes) >= 10
-    ended(haselab("analyse", str(tmp_path)), 2, "triangle was cut short")
+    for command in ("analyse", "report"):
+        ended(haselab(command, str(tmp_path)), 2, "triangle was cut short")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX's")

@@ -117,6 +117,14 @@ def test_stress_in_kpa_or_mpa_is_reported(factor: float) -> None:
     assert not any("kPa" in note for note in fit_hyperelastic(STRETCH, STRESS_PA, "gent").notes)
 
 
+def test_a_strain_above_one_is_noted() -> None:
+    doubt = "per cent, divide it by 100."
+    large = fit_voltage_map(10.0 * STRAIN, 1000.0 * VOLTS)
+    assert large.notes[-1] == f"The strain reaches 1.4 times the length. If it is in {doubt}"
+    assert fit_capacitance_map(CAPACITANCE, 10.0 * STRAIN).notes[-1].endswith(doubt)
+    assert not any(doubt in note for note in fit_voltage_map(STRAIN, 1000.0 * VOLTS).notes)
+
+
 def test_strain_in_other_units_is_refused() -> None:
     assert "strain reaches 13.9998;" in refusal(fit_voltage_map, 100.0 * STRAIN, 1000.0 * VOLTS)
     assert "divide it by 100" in refusal(fit_voltage_map, 40.0 + STRAIN, 1000.0 * VOLTS)

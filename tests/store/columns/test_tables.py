@@ -128,7 +128,7 @@ def test_a_structure_of_an_old_mat_file_is_opened(tmp_path):
         ("time_s,u,y\n0,1,2\n0.100000,1,0.000284,0.001784\n0.2,1,2\n", r"Line 3 has 4 cells"),
         ("time_s,u,y\n0,1,2\n0.01,1,0e-2,7\n0.02,1,2\n", r"decimal comma"),
         ("# rate_hz = 50\ntime_s,u,y\n0,1,2\n0.01,2,2\n0.02,3,2\n0.03,4,1\n", r"50 Hz.*100 rows"),
-        ("u (mV),y\nV,V\n1,2\n2,3\n", r"unit mV in its header, but V in the row below"),
+        ("u (mV),y\nV,V\n1,2\n2,3\n", r"unit mV in its header, but V in the row of units"),
     ],
 )
 def test_a_file_that_contradicts_itself_is_refused(tmp_path, text, words):

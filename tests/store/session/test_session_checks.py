@@ -135,6 +135,29 @@ def test_one_bit_of_a_killed_session_is_refused(killed, dataset, row, what):
 
 
 @posix
+@pytest.mark.parametrize("kept", [8, 24, 400, 848])
+def test_a_slot_that_was_cut_while_it_was_written_is_left_out(killed, kept):
+    """The system writes page by page, so the number and the row may be there without the end."""
+    with open_unsealed(killed) as file:
+        slots = file["tail"][:]
+        place = int(slots["sequence"].argmax())
+    newest = slots[place]
+    assert newest["row"] == 136
+    newest["sequence"] += 1
+    newest["row"] += 1
+    start = place_of(killed, "tail", (place + 1) % len(slots))
+    data = bytearray(killed.read_bytes())
+    data[start : start + kept] = newest.tobytes()[:kept]
+    killed.write_bytes(data)
+    assert verify(killed) == ("", [])
+    with SessionReader(killed) as session:
+        assert len(session.experiment("chirp").codes) == 137
+    assert recover(killed).blocks == {"chirp": 137}
+    with SessionReader(killed) as session:
+        assert len(session.experiment("chirp").codes) == 137
+
+
+@posix
 def test_a_killed_session_is_known_as_one_before_hdf5_sees_it(killed):
     assert is_session(killed)
     assert session_experiments(killed) == ["chirp"]

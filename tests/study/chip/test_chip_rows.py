@@ -45,7 +45,7 @@ def test_the_recording_is_that_of_run(run: Any, name: str) -> None:
     assert simulator["precondition_v"] == 2.0
     assert bool(simulator["supply"]) == (name == "miniature")
     place = run.folder / "firmware"
-    assert load_rig(place / f"{name}.toml").kind == "mega"
+    assert load_rig(place / f"{name}.toml").kind == "chip"
     assert load_step_study(place / f"{name}-steps.toml").step_trials.trials == 1
 
 

@@ -21,7 +21,7 @@ REASON = "'haselab rig safe' was called"
 
 def _bench_key(file: dict[str, Any]) -> str:
     """The same as `DaqInstrument.key_of` and `chip.key_of_port`, without importing drivers."""
-    if file.get("kind") == "mega":
+    if file.get("kind") in ("chip", "mega"):  # as load_rig_to_shut_down
         return f"chip {Path(file['port']).resolve()}"
     if file["daq"].get("kind", "nidaq") != "nidaq":
         raise ValueError("the key of another driver is not known without importing it")

@@ -399,7 +399,7 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
         raise InputError(
             f"The rig has kind {file.kind!r}, which cannot energise anything outside the program "
             "that runs it. Stop that program with Ctrl-C. 'rig safe' needs kind = 'bench', or "
-            f"'mega' with a port. {rig}"
+            f"'chip' with a port. {rig}"
         )
     click.echo(
         "Revoking the permission and commanding 0 V. If this does not finish, switch the "

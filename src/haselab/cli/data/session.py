@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,10 @@ def command() -> None:
     "--derived/--recorded-only", default=True, show_default=True,
     help="Export capacitance and strain of each experiment too, where they can be computed.",
 )  # fmt: skip
+@shared_option(
+    "--zero-length-m", type=Real(1e-6, 10.0),
+    detail="Adds the column strain to each table of strains. Default: none.",
+)  # fmt: skip
 @answer_options(
     OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),
     "A file, or a folder of tables.  [required]",
@@ -51,6 +56,7 @@ def _export(
     form: str,
     experiments: tuple[str, ...],
     derived: bool,
+    zero_length_m: float | None,
     unverified: bool,
     as_json: bool,
     out: Path | None,
@@ -66,16 +72,25 @@ def _export(
         form,
         out,
         experiments=experiments,
-        derived=derived_series if derived else nothing_derived,
+        derived=partial(derived_series, zero_length_m=zero_length_m)
+        if derived
+        else nothing_derived,
         unverified=unverified,
     )
     warn_unverified(done.doubt, session)
     for why in done.unreadable.values():
         click.echo(f"haselab: left out: {why}", err=True)
+    if done.empty:
+        click.echo(
+            f"haselab: not written, because nothing was recorded for them: {', '.join(done.empty)}",
+            err=True,
+        )
     answer: dict[str, Any] = {
         "files": [str(path) for path in done.files],
         "experiments": done.experiments,
     }
+    if done.empty:
+        answer["empty"] = done.empty
     if done.doubt:
         answer["unverified"] = True
     if done.unreadable:

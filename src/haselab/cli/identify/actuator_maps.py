@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.cli.actuator_file import save_section
-from haselab.cli.columns import check_unit
+from haselab.cli.columns import check_strain, check_unit
 from haselab.cli.identify.common import CAPACITANCE, STRAIN, read_valid
 from haselab.identify.statics.voltage_map import VoltageMapFit
+from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
 from haselab.sensing.strain import fit_strain_map
@@ -49,6 +50,7 @@ def read_pairs(
     capacitance_column: str | None,
     strain_column: str | None,
     columns: ColumnOptions,
+    known: ActuatorTables | None = None,
 ) -> Pairs:
     """Read capacitances and strains from one file, or from two with the same clock.
 
@@ -57,11 +59,12 @@ def read_pairs(
         capacitance_column: that the user named, or None.
         strain_column: that the user named, or None.
         columns: what the user states about the columns.
+        known: the actuator's file, with which strains are compared.
     Returns:
         Both; rows outside the other file's times are left out.
     Raises:
-        InputError: a column is missing, its unit belongs to another quantity, or the times of the
-            files hardly overlap.
+        InputError: a column is missing, its unit belongs to another quantity, strains without a
+            unit are probably in per cent, or the times of the files hardly overlap.
     """
     file, strain_file = files[0], files[-1]
     name = CAPACITANCE.column(file, capacitance_column)
@@ -79,7 +82,9 @@ def read_pairs(
         capacitance = table[name][inside]
         strain = np.interp(time_s[inside], known_s, other[strain_name])
     unit = table.units[name]
-    check_unit(strain_name, other.units[strain_name], STRAIN, strain_file)
+    strain_unit = other.units[strain_name]
+    check_unit(strain_name, strain_unit, STRAIN, strain_file)
+    check_strain(strain_name, other[strain_name], strain_unit, strain_file, known)
     in_farads = name == "capacitance_f" if unit is None else unit.si == "F"
     return Pairs(capacitance, strain, name, in_farads)
 

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError, JsonObject, ResultError
 from haselab.cli.actuator_file import load_actuator
-from haselab.cli.columns import Quantity, advice_on_columns, check_unit, note_units
+from haselab.cli.columns import Quantity, advice_on_columns, check_strain, check_unit, note_units
 from haselab.cli.common import REAL, emit
 from haselab.cli.options import shared_option
 from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
-from haselab.pipelines.time_axis import records_of, time_axis
+from haselab.models.actuator import ActuatorTables
+from haselab.pipelines.time_axis import check_rising, records_of, time_axis
 from haselab.store.columns.reader import check_rate
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table, read_table
@@ -126,7 +127,7 @@ def read_record(
 def read_columns(file: Path, names: Sequence[str], columns: ColumnOptions) -> Table:
     """Read columns and check that their values fit the units in their names."""
     table = read_valid(file, names, columns)
-    _check_units(table, names)
+    _check_units(table, names, file)
     return table
 
 
@@ -242,7 +243,10 @@ def read_valid(
 
 
 def read_quantities(
-    file: Path, wanted: Mapping[Quantity, str | None], columns: ColumnOptions
+    file: Path,
+    wanted: Mapping[Quantity, str | None],
+    columns: ColumnOptions,
+    known: ActuatorTables | None = None,
 ) -> tuple[NDArray[np.float64], ...]:
     """Read columns of quantities, in SI units and in the order of `wanted`.
 
@@ -250,22 +254,27 @@ def read_quantities(
         file: the file.
         wanted: the column that the user named for each quantity, or None.
         columns: what the user states about the columns.
+        known: the actuator's file, with which strains are compared.
     Returns:
         Values of each. Shape `(N,)`.
     Raises:
-        InputError: a column is missing, or its unit belongs to another quantity.
+        InputError: a column is missing, its unit belongs to another quantity, or strains without
+            a unit are probably in per cent.
     """
     names = {quantity: quantity.column(file, given) for quantity, given in wanted.items()}
     table = read_valid(file, list(names.values()), columns, [each.option for each in names])
     for quantity, name in names.items():
         check_unit(name, table.units[name], quantity, file)
+        if quantity is STRAIN:
+            check_strain(name, table[name], table.units[name], file, known)
     return tuple(table[name] for name in names.values())
 
 
-def _check_units(table: Table, names: Sequence[str]) -> None:
+def _check_units(table: Table, names: Sequence[str], file: Path) -> None:
     """Refuse a column whose name states a unit that its values cannot have."""
     for name, other in zip(names, reversed(names), strict=True):
         if name.endswith("strain"):
+            check_strain(name, table[name], table.units[name], file)
             plausible_strain(table[name], other, table[other])
         elif name.endswith("_v"):
             plausible_voltage(table[name])
@@ -305,14 +314,16 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
             check_rate(given, table.rate_hz, rows, "the file's own rate", file)
     rate_hz = table.rate_hz if given is None else given
     if rate_hz is None and table.time_s is not None:
+        check_rising(table.time_s, file, table.time_name or "time_s")
         raise InputError(
             f"The times in {where} are uneven. Resample the record, or state the rate with "
             f"--rate-hz: {file}"
         )
     if rate_hz is None:
+        why = f" Column {table.not_rising} does not rise everywhere." if table.not_rising else ""
         raise InputError(
-            "The file states no sampling rate. Add --rate-hz, name the column of the times with "
-            f"--time, or add a line '# rate_hz = ...': {file}"
+            f"The file states no sampling rate.{why} Add --rate-hz, name the column of the times "
+            f"with --time, or add a line '# rate_hz = ...': {file}"
         )
     if not 0.0 < rate_hz < float("inf"):
         raise InputError(f"--rate-hz is {rate_hz:g} Hz. Use a rate above 0 Hz.")

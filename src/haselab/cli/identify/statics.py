@@ -256,10 +256,9 @@ def voltage_map(
     The map is eq. 4, a sum of two exponentials. FILE holds the columns of strain and voltage, in
     order of time.
     """
-    if actuator is not None:
-        load_actuator(actuator, to_write=True)
+    known = None if actuator is None else load_actuator(actuator, to_write=True)
     strain, voltage_v = read_quantities(
-        file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns
+        file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns, known
     )
     fit = fit_voltage_map(strain, voltage_v)
     give(fit, [file], as_json, out)
@@ -296,10 +295,9 @@ def capacitance_map(
     The map is eq. 5, a straight line. FILE holds the columns of capacitance and strain. The slope
     is per F for a capacitance in F, and per unit of relative capacitance otherwise.
     """
-    if actuator is not None:
-        load_actuator(actuator, to_write=True)
+    known = None if actuator is None else load_actuator(actuator, to_write=True)
     files = [file] if strain_file is None else [file, strain_file]
-    pairs = read_pairs(files, capacitance_column, strain_column, columns)
+    pairs = read_pairs(files, capacitance_column, strain_column, columns, known)
     fit = fit_capacitance_map(pairs.capacitance, pairs.strain)
     more: dict[str, object] = {}
     if actuator is not None and fit.succeeded:

@@ -193,7 +193,7 @@ def transfer(
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     give(found, files, as_json, out, more)
     if actuator is not None:
-        _save(actuator, fit, (modelled, output), units, files)
+        _save(actuator, fit, (modelled, output), units, files, options["through_voltage_map"])
     save_plot(plot, lambda: fit.chart((source, output)))
 
 
@@ -203,6 +203,7 @@ def _save(
     names: tuple[str, str],
     units: tuple[str, str],
     files: tuple[Path, ...],
+    through_map: bool,
 ) -> None:
     """Write [model] of the actuator file."""
     if isinstance(fit, NonlinearFit):
@@ -211,6 +212,8 @@ def _save(
             f"out --nonlinear, or write the model with --out. {actuator}"
         )
     section = model_section(fit, names, units)
+    used = load_actuator(actuator).drive.voltage_map if through_map else None
+    section["through_voltage_map"] = None if used is None else used.coefficients
     save_section(actuator, "model", section, files, MODEL_KEYS)
 
 

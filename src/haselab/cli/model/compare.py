@@ -27,6 +27,7 @@ from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_origin, read_posterior
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.identify.fingerprint import Fingerprint
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import predict
 from haselab.identify.record import Record
@@ -71,8 +72,9 @@ def command(
     MODEL is an actuator file or a model.json. The command reports the fit in percent, the rms error
     and the share of samples inside the 95 % band. It first estimates the initial state and the
     offset of each record, unless --at-rest is given. Samples that were used for the fit are
-    recognised by their values, also in a part of a record and in another format: used_for_fit is
-    their share, and the exit code is 3 from 5 % on, or if the prediction is worse than the mean.
+    recognised by their values, also in a part of a record, in another format and with fewer digits:
+    used_for_fit is their share, and the exit code is 3 from 5 % on, or if the prediction is worse
+    than the mean.
     """
     plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
     through = model if through_voltage_map else None
@@ -89,10 +91,10 @@ def command(
             posterior=posterior,
             noise_std=origin.residual_std,
             free_start=not at_rest,
-            fitted_to=origin.fitted_to,
+            fitted_to=_fingerprint(origin),
             rng=np.random.default_rng(seed),
         )
-    if not origin.fitted_to:
+    if origin.fitted_to is None:
         click.echo(
             "haselab: warning: the model does not state the samples that it was fitted to. Whether "
             f"this record is new was not checked. {model}",
@@ -104,6 +106,11 @@ def command(
     save_plot(plot, lambda: prediction_chart(prediction, _times(records), title))
     if prediction.status != "ok":
         raise ResultError(f"{prediction.status}. {' '.join(map(str, files))}")
+
+
+def _fingerprint(origin: OriginTable) -> Fingerprint | None:
+    known = origin.fitted_to
+    return None if known is None else Fingerprint(known.step, np.array(known.hashes, np.uint64))
 
 
 def _check_units(

@@ -29,6 +29,7 @@ from haselab.cli.model.sections import (
     controller_section,
     limits_of,
 )
+from haselab.cli.model.stated_margins import model_doubt
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import (
@@ -106,6 +107,8 @@ def command(
     if loop["structure"] not in ("pi", "pid"):
         _judge(model, out, loop, as_json, plot)
         return
+    if model.suffix.lower() == ".toml" and (doubt := model_doubt(model)):
+        click.echo(f"haselab: warning: {doubt}", err=True)
     posterior = read_posterior(model)
     plant = read_any_plant(model)
     demands = _demands(model, spec)

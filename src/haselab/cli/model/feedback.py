@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
-from haselab.base import InputError
+from haselab.base import HaselabError, InputError
+from haselab.base.exits import no_exit
 from haselab.cli.actuator_file import load_actuator
 from haselab.control import LinearController, PidGains
 from haselab.controllers import CONTROLLERS, LinearisableController
@@ -47,12 +50,30 @@ def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearCon
     """
     if held.kind in ("pi", "pid"):
         return PidGains(**held.parameters)
-    controller = CONTROLLERS.find(held.kind).choose(held.parameters).make()
+    chosen = CONTROLLERS.find(held.kind).choose(held.parameters)
+    with _named_failures(held.kind):
+        controller = chosen.make()
     if not isinstance(controller, LinearisableController):
         raise InputError(
             f"Controllers of kind {held.kind!r} have no method linear_feedback, so their margins "
             "cannot be computed. Add it to the class (docs/extend/add-a-controller.md), or test "
             "the loop on the twin with: haselab run STUDY.toml --rig RIG.toml --actuator A.toml"
         )
-    numerator, denominator = controller.linear_feedback(1.0 / rate_hz)
-    return LinearController(tuple(numerator), tuple(denominator), rate_hz)
+    with _named_failures(held.kind):
+        numerator, denominator = map(tuple, controller.linear_feedback(1.0 / rate_hz))
+    return LinearController(numerator, denominator, rate_hz)
+
+
+@contextlib.contextmanager
+def _named_failures(kind: str) -> Iterator[None]:
+    """Report any failure of a controller's own code as that controller's."""
+    try:
+        with no_exit():
+            yield
+    except HaselabError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"Controller {kind!r} failed: {type(error).__name__}: {error}. Fix the controller, or "
+            "change its parameters."
+        ) from error

@@ -11,12 +11,12 @@ import click
 from matplotlib.figure import Figure
 
 from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
-from haselab.cli.actuator_file import load_run
 from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
+from haselab.cli.model.stated_margins import controller_doubt, model_doubt, warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.control import PidGains
-from haselab.firmware import FrontEnd
+from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
 from haselab.report import write_report
 from haselab.report.analysis import Section
@@ -35,14 +35,14 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json, write_json
-from haselab.study.chip.agreement import (
+from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
+from haselab.study.simulated.agreement import (
     Agreement,
     StepCase,
     agreement_of,
     check_stable,
     predicted_loop,
 )
-from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
 from haselab.study.simulated.truth import twin_of
 
 __all__ = ["build", "command", "flash", "simulate"]
@@ -71,7 +71,7 @@ def _chip_file(rig: Path, board: str) -> ChipFile:
     file = load_rig(rig)
     if not isinstance(file, ChipFile) or board != "atmega2560":
         raise InputError(
-            f"--rig has kind {file.kind!r} and --board is {board}, but only kind 'mega' with board "
+            f"--rig has kind {file.kind!r} and --board is {board}, but only kind 'chip' with board "
             f"atmega2560 is supported. Leave one of the options out. {rig}"
         )
     return file
@@ -95,7 +95,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 )  # fmt: skip
 @shared_option(
     "--rig", type=click.Path(path_type=Path),
-    detail="It has kind 'mega'; the program gets its [front_end] and limits. Default: none.",
+    detail="It has kind 'chip'; the program gets its [front_end] and limits. Default: none.",
 )  # fmt: skip
 @answer_options(OutputRule(built=("folder",)))
 def build(
@@ -113,14 +113,29 @@ def build(
     RUN is an actuator file or the folder of a run, with the maps, limits and gains to compile in.
     `haselab firmware simulate` measures how much stack and processor time the firmware uses.
     """
-    load_run(run)  # warns of misspelled keys
+    for doubt in (model_doubt(run), controller_doubt(run, structure)):
+        if doubt:
+            raise InputError(doubt)
     file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
-    settings = read_design(run, structure, front_end, source).settings
-    if file is not None:
-        settings = file.limited(settings)
+    design = read_design(run, structure, front_end, source)
+    settings = design.settings if file is None else file.limited(design.settings)
+    _say_narrowed(settings, design.limits, run)
     built = build_firmware(settings, folder, board)
-    emit({**_sizes(built), "hex": str(built.hex)}, as_json=as_json, out=out)
+    limits = {"strain_low": settings.strain_low, "strain_high": settings.strain_high}
+    emit({**_sizes(built), **limits, "hex": str(built.hex)}, as_json=as_json, out=out)
+
+
+def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Path) -> None:
+    """Warn of a chip whose output does not reach the limits of the design."""
+    low, high = settings.strain_low, settings.strain_high
+    if (low, high) != designed:
+        click.echo(
+            f"haselab: warning: the chip's output is limited to 0 to {settings.drive_high_v:g} V, "
+            f"so the controller's output is limited to strains of {low:.4g} to {high:.4g} instead "
+            f"of {designed[0]:.4g} to {designed[1]:.4g}: {run}",
+            err=True,
+        )
 
 
 @command.command("simulate")
@@ -184,8 +199,10 @@ def simulate(
     """
     refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")
+    warn_doubts(run, structure)
     design = read_design(run, structure, FrontEnd(), source)
     settings, zero_m = design.settings, design.zero_length_m
+    _say_narrowed(settings, design.limits, run)
     config = _twin(run, options["reading"], options["twin"])
     before, after = options["step"]
     precondition_v = options["precondition"]

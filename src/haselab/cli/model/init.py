@@ -65,10 +65,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
     detail="planar-hasel, peano-hasel, curling-hasel, dea-stack or your own.",
 )  # fmt: skip
 @click.option("--mass-kg", type=REAL, help="Write the hung mass in kg. Default: as a comment.")
-@click.option(
-    "--zero-length-m", type=POSITIVE,
-    help="Write the length at zero strain in m. Default: as a comment.",
-)  # fmt: skip
+@shared_option("--zero-length-m", type=POSITIVE, detail="Default: as a comment.")
 @click.option(
     "--low-v",
     type=REAL,

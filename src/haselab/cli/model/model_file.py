@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -42,6 +42,8 @@ __all__ = [
 ]
 
 MAT_NAME = "model"
+
+_Checked = TypeVar("_Checked", bound=PolesTable)
 _RATE_HZ, _DELAY_S = 100.0, 0.01  # defaults for the loop
 _SAME = 1e-3  # relative difference of responses: a file rounded by hand has fewer digits
 
@@ -60,10 +62,10 @@ def read_model(path: Path) -> RationalModel:
     if isinstance(data, dict) and "numerator" in data:
         return RationalModel.from_dict(validated(RationalTable, data, path).model_dump())
     plant = _plant_of(data, path)
-    table = validated(PolesTable, plant, path)
+    table = _checked(PolesTable, plant, path)
     poles, zeros, slow = table.poles or [], table.zeros or [], table.slow_modes
     if not zeros and len(poles) in (0, 2 + len(slow)):
-        return RationalModel.from_plant(_plant(validated(PlantTable, plant, path)))
+        return RationalModel.from_plant(_plant(_checked(PlantTable, plant, path)))
     fast = [complex(*pole) for pole in poles[: len(poles) - len(slow)]]
     model = RationalModel.from_poles(
         fast, [complex(*zero) for zero in zeros], table.gain, table.delay_s
@@ -83,7 +85,7 @@ def _data(path: Path) -> Any:
     if "numerator" in model:
         return model
     loop = {name: model[name] for name in ("rate_hz", "loop_delay_s") if name in model}
-    return {"plant": {"natural_frequency_rad_s": None, **model}, **loop}
+    return {"plant": model, **loop}
 
 
 def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
@@ -128,7 +130,7 @@ def _scalar(field: Any, path: Path) -> float:
 
 def read_plant(path: Path) -> Plant:
     """Read the plant of a model.json."""
-    return _plant(validated(PlantTable, _plant_of(_data(path), path), path))
+    return _plant(_checked(PlantTable, _plant_of(_data(path), path), path))
 
 
 def read_any_plant(path: Path) -> Plant | RationalModel:
@@ -137,9 +139,9 @@ def read_any_plant(path: Path) -> Plant | RationalModel:
         data = _data(path)
         if not (isinstance(data, dict) and "numerator" in data):
             plant = _plant_of(data, path)
-            table = validated(PolesTable, plant, path)
+            table = _checked(PolesTable, plant, path)
             if not table.zeros and len(table.poles or []) in (0, 2, 2 + len(table.slow_modes)):
-                return _plant(validated(PlantTable, plant, path))
+                return _plant(_checked(PlantTable, plant, path))
     model = read_model(path)
     try:
         return model.to_plant()
@@ -229,13 +231,18 @@ def read_loop(path: Path) -> dict[str, float]:
     return validated(LoopTable, _data(path), path).model_dump(exclude_none=True)
 
 
+def _checked(model: type[_Checked], plant: Any, path: Path) -> _Checked:
+    """Check a plant, whose table in an actuator file is [model]."""
+    return validated(model, plant, path, "model" if path.suffix.lower() == ".toml" else "")
+
+
 def _plant(table: PlantTable) -> Plant:
     return Plant.from_dict(table.model_dump())
 
 
 def _plant_of(data: Any, path: Path) -> dict[str, Any]:
     plant = data.get("plant", data) if isinstance(data, dict) else None
-    if not isinstance(plant, dict) or "natural_frequency_rad_s" not in plant:
+    if not isinstance(plant, dict) or "gain" not in plant:
         found = ", ".join(list(data)[:8]) if isinstance(data, dict) else type(data).__name__
         raise InputError(
             f"The model has the keys {found[:200] or 'none'}, but must have an object `plant` with "

@@ -14,7 +14,6 @@ from haselab.cli.model.model_file import read_origin
 from haselab.control import Design, Saturation
 from haselab.control.reach import reachable
 from haselab.control.stability.plausible import PlausibleMargins
-from haselab.identify.fingerprint import fingerprint
 from haselab.identify.transfer.fit import TransferFit
 from haselab.models.actuator import ActuatorTables
 
@@ -23,7 +22,7 @@ __all__ = ["CONTROLLER_KEYS", "MODEL_KEYS", "controller_section", "limits_of", "
 MODEL_KEYS = (
     "gain", "natural_frequency_rad_s", "damping_ratio", "delay_s", "slow_modes", "poles", "zeros",
     "numerator", "denominator", "covariance", "residual_std", "fit_percent", "input", "output",
-    "input_unit", "output_unit", "fitted_to",
+    "input_unit", "output_unit", "fitted_to", "through_voltage_map",
 )  # fmt: skip
 CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
@@ -57,7 +56,7 @@ def model_section(
     simple = fit.structure.poles == 2 and not fit.structure.zeros
     resonance = ("natural_frequency_rad_s", "damping_ratio")
     roots = {} if simple else {"poles": list(fit.poles), "zeros": list(fit.zeros)}
-    residuals = np.concatenate(fit.residuals)
+    residuals, known = np.concatenate(fit.residuals), fit.fingerprint
     return {
         "input": names[0],
         "input_unit": units[0],
@@ -74,7 +73,7 @@ def model_section(
         "fit_percent": fit.fit_percent,
         "residual_std": float(np.sqrt(np.mean(residuals**2))),
         "covariance": fit.posterior.to_dict(),
-        "fitted_to": fingerprint(fit.fitted_outputs).tolist(),
+        "fitted_to": None if known is None else known.to_dict(),
     }
 
 

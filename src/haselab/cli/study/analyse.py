@@ -23,7 +23,7 @@ from haselab.study.chip.trials import is_chip_session
 from haselab.study.folder import write_findings
 from haselab.study.run import analyse_session
 
-__all__ = ["command"]
+__all__ = ["check_ends", "command"]
 
 
 def _own_folder(parameters: Mapping[str, Any]) -> Path | None:
@@ -40,8 +40,15 @@ def _own_folder(parameters: Mapping[str, Any]) -> Path | None:
     return session.parent if own.exists() and session.samefile(own) else None
 
 
-def _check_ends(session: SessionReader, path: Path) -> None:
-    """Refuse a recording that was cut short: half a trial must not count as a whole one."""
+def check_ends(session: SessionReader, path: Path) -> None:
+    """Refuse a recording that was cut short: half a trial must not count as a whole one.
+
+    Args:
+        session: the recording.
+        path: of it.
+    Raises:
+        InputError: an experiment has no end.
+    """
     events = [what.partition(" ")[::2] for _, what in session.events()]
     ended = {name for verb, name in events if verb == "end"}
     cut = [name for verb, name in events if verb == "start" and name not in ended]
@@ -79,7 +86,7 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
     path = session_file(session)
     with SessionReader(path, unverified=unverified) as recorded:
         warn_unverified(recorded.doubt, path)
-        _check_ends(recorded, path)
+        check_ends(recorded, path)
         doubt = recorded.doubt
         if is_chip_session(recorded.header):
             analyse_on_chip(recorded, target, as_json)

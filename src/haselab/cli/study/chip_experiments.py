@@ -97,7 +97,7 @@ class ChipExperiments:
         steps = step_study_of(self._study, quick=self._quick)
         write_text(place / "chip-steps.toml", toml_text(steps.model_dump(mode="json")))
         rig = {
-            "kind": "mega",
+            "kind": "chip",
             "run": "..",
             "simulator": {
                 "twin": "twin.toml",
@@ -228,7 +228,7 @@ def _write_miniature(folder: Path, steps: StepStudy) -> MiniatureDesign:
     design = design_miniature(found.tables, supply, FrontEnd().gain)
     write_sections(place / MINIATURE / ACTUATOR, design.sections)
     rig = {
-        "kind": "mega",
+        "kind": "chip",
         "name": "miniature bench",
         "run": MINIATURE,
         "drive_high_v": design.drive_high_v,

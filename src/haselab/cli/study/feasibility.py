@@ -20,7 +20,6 @@ from haselab.cli.study.run import planned
 from haselab.rig.rig_file import load_rig
 from haselab.safety.feasibility import Feasibility
 from haselab.store.folder import write_json
-from haselab.study.definition import load_study
 from haselab.study.feasibility import judge_study, rated_rig
 
 __all__ = ["command"]
@@ -29,7 +28,7 @@ __all__ = ["command"]
 def _page(found: Feasibility) -> str:
     lines = [f"{'':32s} {'requested':>10s} {'limit':>10s}        in"]
     for c in found.checks:
-        word = "" if c.ok else "TOO HIGH. " + c.advice
+        word = "" if c.ok else f"TOO {'LOW' if c.lower else 'HIGH'}. {c.advice}"
         value = "unknown" if math.isnan(c.requested) else f"{c.requested:.4g}"
         value = "infinite" if math.isinf(c.requested) else value
         row = f"{c.name:32s} {value:>10s} {c.allowed:10.4g} {c.unit:5s}  {c.where}  {word}"
@@ -58,7 +57,7 @@ def command(
     of the bench. It does not connect to any instrument and applies no voltage. The exit code is 2
     if the bench cannot play the study. STUDY is a TOML file.
     """
-    plan = planned(load_study(study, quick=quick), actuator)
+    plan = planned(study, actuator, quick=quick)
     file = load_rig(rig)
     rated = rated_rig(file, plan, rig)
     if rated is None:

@@ -12,11 +12,15 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.common import answer_options, emit
 from haselab.cli.model.model_file import read_any_plant, read_posterior
+from haselab.cli.model.stated_margins import controller_doubt, model_doubt
 from haselab.cli.output import OutputRule
+from haselab.cli.study.analyse import check_ends
+from haselab.models.actuator import ActuatorTables
 from haselab.report import compose_page, read_folder, save_page
 from haselab.report.actuator_page import ActuatorReport, actuator_page, missing_sections
 from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
+from haselab.store.session.writer import SessionReader
 
 __all__ = ["command"]
 
@@ -51,6 +55,10 @@ def command(source: Path, as_json: bool, out: Path | None) -> None:
     if _is_actuator(source):
         _report_actuator(source, page_path, as_json)
         return
+    session = source / "session.h5"
+    if session.is_file() and not (source / "results.json").exists():
+        with SessionReader(session, unverified=True) as recorded:
+            check_ends(recorded, session)  # of a run that was interrupted
     page = compose_page(read_folder(source))
     save_page(page, source, page_path)
     drawn = [drawing.plan.name for drawing in page.drawings if drawing.document]
@@ -70,6 +78,17 @@ def _report_actuator(path: Path, page_path: Path, as_json: bool) -> None:
         tables,
         read_any_plant(path) if has_model else None,
         read_posterior(path) if has_model else None,
+        {"model": model_doubt(path), "controller": _controller_doubts(tables, path)},
     )
+    doubts = {name: doubt for name, doubt in report.doubts.items() if doubt}
+    for doubt in doubts.values():
+        click.echo(f"haselab: warning: {doubt}", err=True)
     write_text(page_path, actuator_page(report))
-    emit({"report": str(page_path), "missing": missing_sections(report)}, as_json=as_json, out=None)
+    answer = {"report": str(page_path), "missing": missing_sections(report), "doubts": doubts}
+    emit(answer, as_json=as_json, out=None)
+
+
+def _controller_doubts(tables: ActuatorTables, path: Path) -> str:
+    """Margins of all controllers of the file that are not those of its model."""
+    kinds = [] if tables.controller is None else tables.controller.all_kinds
+    return " ".join(doubt for kind in kinds if (doubt := controller_doubt(path, kind)))

@@ -11,6 +11,7 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.cli.common import actuator_option, answer_options
+from haselab.cli.model.stated_margins import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip
@@ -32,6 +33,7 @@ from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
 from haselab.study.definition import Study, load_step_study, load_study
+from haselab.study.feasibility import check_settings
 from haselab.study.known import with_known
 
 __all__ = ["command", "planned", "rig_file"]
@@ -82,7 +84,7 @@ def command(
     HIGH VOLTAGE WILL BE APPLIED on a real bench. The command first checks the study against the
     [rating] of the rig file; without [rating] there is no check. Then it asks you to acknowledge
     the last trip, if there was one, and to confirm. STUDY is a TOML file; a microcontroller (kind =
-    "mega") needs a study of step trials. The maps, model and controllers found are written to
+    "chip") needs a study of step trials. The maps, model and controllers found are written to
     actuator.toml in the folder of the run; the file of --actuator is not changed. With --actuator,
     a study that only has [steps] plays the controller of the file.
     """
@@ -102,7 +104,9 @@ def command(
         armed_by = operator if file.port is not None else None
         play_on_chip(trials, file, rig, out, keep_video, armed_by, as_json)
         return
-    plan = planned(load_study(study, quick=quick), actuator)
+    plan = planned(study, actuator, quick=quick)
+    if actuator is not None:
+        warn_doubts(actuator)
     if isinstance(file, TwinFile):
         config = file.configuration(rig)
         limited = _prepared(twin_rig(config, file.seed), plan, actuator)
@@ -118,23 +122,29 @@ def command(
         execute_on(plan, bench, file.model_dump(mode="json"), out, keep_video, as_json, known)
 
 
-def planned(study: Study, actuator: Path | None) -> Study:
-    """Add the content of an actuator file to a study, see `with_known`.
+def planned(path: Path, actuator: Path | None, *, quick: bool) -> Study:
+    """Read a study, and add the content of an actuator file to it, see `with_known`.
 
     Args:
-        study: as its file says.
+        path: of the study.
         actuator: the actuator file; None: there is none.
+        quick: apply the changes of a quick run.
     Returns:
         The study that is played.
     Raises:
-        InputError: the file cannot be used.
+        InputError: a file cannot be used, or no result can come from the study.
     """
-    if actuator is None:
-        return study
+    study = load_study(path, quick=quick)
+    if actuator is not None:
+        try:
+            study = with_known(study, load_actuator(actuator))
+        except InputError as error:
+            raise InputError(f"{error} {actuator}") from None
     try:
-        return with_known(study, load_actuator(actuator))
+        check_settings(study)
     except InputError as error:
-        raise InputError(f"{error} {actuator}") from None
+        raise InputError(f"{error} {path}") from None
+    return study
 
 
 def _prepared(rig: Rig, study: Study, actuator: Path | None) -> Rig:

@@ -100,7 +100,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
         >>> fit.status, low < 4.923e6 < high
         ('ok', True)
     """
-    c, e = _checked(relative_capacitance, strain)
+    c, e, doubts = _checked(relative_capacitance, strain)
     if trend(c, e) == 0:
         reason = "no result: the strain does not depend on the capacitance; check the columns"
         return CapacitanceMapFit(status=reason, x=c, strain=e)
@@ -121,7 +121,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
         "slope": Estimate.normal(slope, spread[0], ""),
         "offset": Estimate.normal(offset, spread[1], ""),
     }
-    notes = () if cells.both else (_ONE_EDGE,)
+    notes = doubts if cells.both else (_ONE_EDGE, *doubts)
     larger = max(covariances, key=lambda part: float(part[0, 0]))
     return CapacitanceMapFit(
         status="ok",
@@ -135,13 +135,14 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
     )
 
 
-def _checked(relative_capacitance: ArrayLike, strain: ArrayLike) -> tuple[Floats, Floats]:
+def _checked(
+    relative_capacitance: ArrayLike, strain: ArrayLike
+) -> tuple[Floats, Floats, tuple[str, ...]]:
     c, e = paired(
         "relative_capacitance", relative_capacitance, "strain", strain, least=8,
         record="record a triangle test",
     )  # fmt: skip
-    plausible_strain(e, "relative_capacitance", c)
-    return c, e
+    return c, e, plausible_strain(e, "relative_capacitance", c)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ __all__ = ["paired", "plausible_strain", "plausible_stretch", "plausible_voltage
 Floats = NDArray[np.float64]
 _LONGEST = 30.0  # stretch: above the break of any elastomer
 _LARGEST_STRAIN = 5.0  # larger than the actuation strain of any elastomer
+_LARGE_STRAIN = 1.0
+_LARGE = "The strain reaches {:.3g} times the length. If it is in per cent, divide it by 100."
 _SMALLEST_STRAIN = 1e-7  # span that no camera or gauge of such a test resolves
 _HIGHEST_V = 1e5
 _KILOVOLTS_V = 20.0  # span below which volts of an amplifier's output could be kilovolts
@@ -74,20 +76,22 @@ def plausible_stretch(stretch: Floats, other: str, values: Floats) -> None:
     raise InputError(f"{got} (1 is the natural length). Give stretch, not strain.{hint}")
 
 
-def plausible_strain(strain: Floats, other: str, values: Floats) -> None:
+def plausible_strain(strain: Floats, other: str, values: Floats) -> tuple[str, ...]:
     """Refuse a column that cannot be strain: per cent, millimetres, a swapped column.
 
     Args:
         strain: column that should be the strain. Shape `(N,)`.
         other: name of the other column.
         values: that column. Shape `(N,)`.
+    Returns:
+        A note where the strain is so large that it may be per cent, or nothing.
     Raises:
         InputError: a magnitude above 5, or a span below 1e-7.
     """
     size, span = float(np.abs(strain).max()), float(np.ptp(strain))
     swapped = size > _LARGEST_STRAIN or span < _SMALLEST_STRAIN
     if not swapped:
-        return
+        return () if size <= _LARGE_STRAIN else (_LARGE.format(size),)
     fits = np.abs(values).max() <= 1.0 and np.ptp(values) >= 100.0 * _SMALLEST_STRAIN
     hint = f"{other} looks like strain. Are the two columns swapped?"
     if size > _LARGEST_STRAIN:

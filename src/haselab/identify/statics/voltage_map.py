@@ -194,8 +194,7 @@ def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats, t
     e, v = paired(
         "strain", strain, "voltage_v", voltage_v, least=8, record="record a triangle test"
     )
-    plausible_strain(e, "voltage_v", v)
-    return e, v, plausible_voltage(v)
+    return e, v, (*plausible_strain(e, "voltage_v", v), *plausible_voltage(v))
 
 
 def _describe(

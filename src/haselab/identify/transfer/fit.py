@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
-from haselab.identify.fingerprint import fingerprint
 from haselab.identify.fit import Prediction, RecordFit, several
 from haselab.identify.frequency.steady_tone import steady_tone_hz
 from haselab.identify.noise import coloured_covariance, fit_percent
@@ -208,7 +207,7 @@ class TransferFit(RecordFit[Record]):
             several(records),
             posterior=None if np.isinf(self.covariance).any() else self.posterior,
             noise_std=float(np.std(np.concatenate(self.residuals))),
-            fitted_to=fingerprint(self.fitted_outputs),
+            fitted_to=self.fingerprint,
             rng=np.random.default_rng(1),
         )
 
@@ -230,6 +229,7 @@ class TransferFit(RecordFit[Record]):
     def answer(self) -> JsonObject:
         """The result under its public JSON keys."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
+        known = self.fingerprint
         return {
             **{key: self.parameters.get(key) for key in keys},
             "poles": list(self.poles),
@@ -242,7 +242,7 @@ class TransferFit(RecordFit[Record]):
             "status": self.status,
             "notes": list(self.notes),
             "covariance": covariance_table(self.parameters, self.covariance),
-            "fitted_to": fingerprint(self.fitted_outputs),
+            "fitted_to": None if known is None else known.to_dict(),
             "other_minima": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
                 for r in self.other_minima

@@ -13,6 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 __all__ = [
     "CovarianceTable",
     "EstimateTable",
+    "FingerprintTable",
     "LoopTable",
     "Number",
     "OriginTable",
@@ -52,14 +53,16 @@ class _Table(BaseModel):
 
 
 class _SlowModeTable(_Table):
-    gain: _Quantity
-    time_constant_s: _Duration
+    gain: _Quantity = Field(description="static gain of the slow branch", examples=[0.7])
+    time_constant_s: _Duration = Field(
+        description="time constant of the slow branch", examples=[4.8]
+    )
 
 
 class PolesTable(_Table):
     """A model by its gain, poles and zeros, with parallel slow branches."""
 
-    gain: _Quantity
+    gain: _Quantity = Field(description="static gain, output over input", examples=[0.8])
     delay_s: Annotated[_Delay, BeforeValidator(_delay)] = 0.0
     slow_modes: list[_SlowModeTable] = Field([], max_length=_MOST_MODES)
     poles: list[_Pair] | None = Field(None, max_length=_MOST_FACTORS)
@@ -69,8 +72,10 @@ class PolesTable(_Table):
 class PlantTable(PolesTable):
     """A resonance with parallel slow branches."""
 
-    natural_frequency_rad_s: _Frequency
-    damping_ratio: _Damping
+    natural_frequency_rad_s: _Frequency = Field(
+        description="natural frequency of the resonance", examples=[28.0]
+    )
+    damping_ratio: _Damping = Field(description="damping ratio of the resonance", examples=[0.15])
 
 
 class LoopTable(_Table):
@@ -93,19 +98,44 @@ class RationalTable(_Table):
 class CovarianceTable(_Table):
     """Parameters of a model with their covariance, see `PlantPosterior`; null: not identifiable."""
 
-    names: Annotated[list[str], Field(min_length=1, max_length=_MOST_FACTORS)]
-    logarithmic: Annotated[list[bool], Field(max_length=_MOST_FACTORS)]
-    values: Annotated[list[Number | None], Field(max_length=_MOST_FACTORS)]
-    matrix: Annotated[
-        list[Annotated[list[Number | None], Field(max_length=_MOST_FACTORS)]],
-        Field(max_length=_MOST_FACTORS),
-    ]
+    names: list[str] = Field(
+        min_length=1,
+        max_length=_MOST_FACTORS,
+        description="parameters, in the order of values and matrix",
+        examples=[["gain", "damping_ratio"]],
+    )
+    logarithmic: list[bool] = Field(
+        max_length=_MOST_FACTORS,
+        description="for each parameter, whether the matrix is about its logarithm",
+        examples=[[False, True]],
+    )
+    values: list[Number | None] = Field(
+        max_length=_MOST_FACTORS, description="value of each parameter", examples=[[0.8, 0.15]]
+    )
+    matrix: list[Annotated[list[Number | None], Field(max_length=_MOST_FACTORS)]] = Field(
+        max_length=_MOST_FACTORS,
+        description="covariance of the parameters, row by row",
+        examples=[[[1e-4, 0.0], [0.0, 1e-3]]],
+    )
+
+
+class FingerprintTable(_Table):
+    """`identify.Fingerprint` of the outputs that a model was fitted to."""
+
+    step: Annotated[Number, Field(ge=0)]
+    hashes: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]]
+
+
+def _known_form(item: Any) -> Any:
+    """A fingerprint; None for that of an older version, which was a list."""
+    return None if isinstance(item, list) else item
 
 
 class OriginTable(_Table):
     """Signals and records that a model was fitted to; empty where they are not known.
 
-    Units are SI units, "1" for a pure number; `fitted_to` is `identify.fingerprint` of the outputs.
+    Units are SI units, "1" for a pure number; `through_voltage_map` has the coefficients of the
+    map that converted the recorded voltage.
     """
 
     input: str = ""
@@ -113,7 +143,8 @@ class OriginTable(_Table):
     input_unit: str = ""
     output_unit: str = ""
     residual_std: Annotated[Number, Field(ge=0)] = 0.0
-    fitted_to: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]] = []
+    fitted_to: Annotated[FingerprintTable | None, BeforeValidator(_known_form)] = None
+    through_voltage_map: tuple[Number, Number, Number, Number] | None = None
 
 
 class VoltagePlantTable(_Table):

@@ -36,6 +36,7 @@ __all__ = [
 _Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
 _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
 _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
+_Margin = Annotated[float, Field(strict=True)] | bool  # infinite without a crossover
 # products of two numbers: 1/F^2 squared is large
 _Variance = Annotated[float, Field(strict=True, ge=-1e120, le=1e120, allow_inf_nan=False)]
 
@@ -98,8 +99,8 @@ class ActuatorSection(_Section):
 class StrainMapTable(_Section):
     """`[sensing.strain_map]`: capacitance in F to strain, see `StrainMap`."""
 
-    slope_per_f: Number
-    offset: Number
+    slope_per_f: Number = Field(description="strain per capacitance", examples=[1.07e9])
+    offset: Number = Field(description="strain at a capacitance of 0 F", examples=[-0.43])
     curvature_per_f2: Number = 0.0
     cubic_per_f3: Number = 0.0
     covariance: _Covariance | None = None
@@ -142,13 +143,18 @@ class VoltageMapTable(_Section):
 
     _ends = ("strain_low", "strain_high")
 
-    a1_v: Number
-    b1: Number
-    a2_v: Number
-    b2: Number
+    a1_v: Number = Field(description="factor of the first exponential, eq. 4", examples=[1.8])
+    b1: Number = Field(description="exponent of the first, per unit of strain", examples=[0.78])
+    a2_v: Number = Field(description="factor of the second exponential", examples=[-0.81])
+    b2: Number = Field(description="exponent of the second, per unit of strain", examples=[-18.7])
     strain_low: Number = -0.1
     strain_high: Number = 0.2
     covariance: _Covariance | None = None
+
+    @property
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """Coefficients of the map: a1_v, b1, a2_v, b2."""
+        return self.a1_v, self.b1, self.a2_v, self.b2
 
     def map(self) -> VoltageMap:
         """The map with these coefficients.
@@ -200,8 +206,8 @@ class Limits(_Section):
 
     _ends = ("low", "high")
 
-    low: Number
-    high: Number
+    low: Number = Field(description="lowest output, in the unit of the input", examples=[-0.05])
+    high: Number = Field(description="highest output, in the unit of the input", examples=[0.1])
 
 
 class LoopTable(_Section):
@@ -222,6 +228,7 @@ class ControllerSection(_Section):
     parameters: dict[str, Number] = {}
     limits: Limits | None = None
     loop: LoopTable | None = None
+    margins: dict[str, _Margin] = {}
     demands: dict[str, Number | bool] = {}
     alternatives: tuple[ControllerSection, ...] = ()
 

@@ -22,12 +22,18 @@ _WRITTEN = {
     "sensing": ("date", "amplifier", "rate_hz", "scale_std_s", "stray_s", "offsets_v", "residual",
                 "reference"),
     "model": (*PlantTable.model_fields, *RationalTable.model_fields, "fit_percent", "input_unit",
-              "output_unit", "fitted_to", "linear_models"),
-    "controller": ("margins", "predicted", "plausible", "uncertainty"),
+              "output_unit", "fitted_to", "through_voltage_map", "linear_models"),
+    "controller": ("predicted", "plausible", "uncertainty"),
 }  # fmt: skip
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
 # Their content is checked by whoever reads it, or is written only.
-_NOT_LOOKED_INTO = {"provenance", "model.covariance", "model.linear_models", "controller.demands"}
+_NOT_LOOKED_INTO = {
+    "provenance",
+    "model.covariance",
+    "model.fitted_to",
+    "model.linear_models",
+    "controller.demands",
+}
 
 
 @dataclass(frozen=True)

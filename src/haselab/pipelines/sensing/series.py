@@ -20,6 +20,7 @@ from haselab.study.fits.observe import gauge_length
 __all__ = ["DEFAULT_REQUEST", "derived_series"]
 
 Columns = dict[str, NDArray[Any]]
+_SWITCH, _SCALE = ("rig", "switch_sample"), "scale_m_per_px"
 _CARRIERS = (("study", "sensing", "carrier_hz"), ("sensing", "carrier_hz"))
 _NAMES = (
     "time_s", "capacitance_f", "capacitance_std_f", "resistance_ohm", "relative_capacitance",
@@ -32,26 +33,31 @@ DEFAULT_REQUEST = Request(
 )  # fmt: skip
 
 
-def derived_series(reader: SessionReader, experiment: str) -> Mapping[str, Columns]:
+def derived_series(
+    reader: SessionReader, experiment: str, *, zero_length_m: float | None = None
+) -> Mapping[str, Columns]:
     """Compute capacitance and strain of one experiment of a session.
 
     Args:
         reader: of the session, open.
         experiment: its name.
+        zero_length_m: length at zero strain; adds the column `strain`.
     Returns:
         `capacitance` (time_s, capacitance_f, capacitance_std_f, resistance_ohm,
         relative_capacitance, valid; one row per block) if the session states its carrier, and
-        `strain` (time_s, length_px, strain_from_start and, if the scale is known, length_m; one
-        row per frame) if the frames show both rows of fiducials.
+        `strain` (time_s, length_px, strain_from_start; if the scale is known, length_m; if there
+        are blocks, voltage_v, the mean drive voltage until the next frame; strain; one row per
+        frame) if the frames show both rows of fiducials.
     Raises:
-        InputError: no such experiment, or its data cannot be read.
+        InputError: no such experiment, its data cannot be read, or a zero length for a session
+            without scale.
     """
     record = reader.experiment(experiment)
     found: dict[str, Columns] = {}
     if len(record.codes) and any(reader.states(*keys) for keys in _CARRIERS):
         found["capacitance"] = _capacitance(reader, record)
     if record.tracks.ndim == 2 and record.tracks.shape[1] == FIDUCIALS and record.tracks.size:
-        found["strain"] = _strain(record.tracks, record.frame_time_s, reader.header)
+        found["strain"] = _strain(reader, record, zero_length_m)
     return found
 
 
@@ -70,13 +76,36 @@ def _capacitance(reader: SessionReader, record: ExperimentRecord) -> Columns:
     return {name: np.asarray(columns[name]) for name in _NAMES} | {"valid": sensed.valid}
 
 
-def _strain(tracks: NDArray[np.void], time_s: NDArray[np.float64], header: Any) -> Columns:
+def _strain(
+    reader: SessionReader, record: ExperimentRecord, zero_length_m: float | None
+) -> Columns:
     """Distance of the rows of fiducials, and its change since the first frame that shows them."""
-    length_px = gauge_length(tracks, 1.0)
+    length_px = gauge_length(record.tracks, 1.0)
     good = np.flatnonzero(np.isfinite(length_px))
     start_px = length_px[good[0]] if good.size else np.nan
-    columns = {"time_s": time_s, "length_px": length_px}
-    scale = header.get("rig", {}).get("scale_m_per_px")
-    if isinstance(scale, float):
-        columns["length_m"] = length_px * scale
-    return columns | {"strain_from_start": length_px / start_px - 1.0}
+    columns = {"time_s": record.frame_time_s}
+    if record.drive_v.size and len(record.frame_time_s) > 1 and reader.states(*_SWITCH):
+        delay_s = reader.stated(*_SWITCH) / reader.stated("rig", "rate_hz")
+        columns["voltage_v"] = _mean_voltage(record, delay_s)
+    columns["length_px"] = length_px
+    if zero_length_m is not None or isinstance(reader.header.get("rig", {}).get(_SCALE), float):
+        columns["length_m"] = length_px * reader.stated("rig", _SCALE)
+    columns["strain_from_start"] = length_px / start_px - 1.0
+    if zero_length_m is not None:
+        columns["strain"] = columns["length_m"] / zero_length_m - 1.0
+    return columns
+
+
+def _mean_voltage(record: ExperimentRecord, delay_s: float) -> NDArray[np.float64]:
+    """Mean of the drive from each frame to the next, as a model with a held input expects it.
+
+    Args:
+        record: the experiment.
+        delay_s: from the start of a block until its output takes effect.
+    """
+    switch_s, drive_v = record.block_start_s + delay_s, record.drive_v
+    from_s = np.append(record.frame_time_s, 2.0 * record.frame_time_s[-1] - record.frame_time_s[-2])
+    volt_s = np.append(0.0, np.cumsum(np.diff(switch_s) * drive_v[:-1]))
+    block = np.clip(np.searchsorted(switch_s, from_s, side="right") - 1, 0, None)
+    sums = volt_s[block] + (from_s - switch_s[block]) * drive_v[block]
+    return np.asarray(np.diff(sums) / np.diff(from_s))

@@ -27,7 +27,9 @@ class TwinCameraConfig(_Stamped):
     """The camera of a served twin."""
 
     kind: Literal["twin"]
-    address: str = Field(min_length=1, description="host:port of the twin")
+    address: str = Field(
+        min_length=1, description="host:port of the twin", examples=["127.0.0.1:31763"]
+    )
     timed: bool = Field(
         False, description="frames arrive late and are timed like those of a real camera"
     )
@@ -108,5 +110,5 @@ class FolderConfig(CameraConfig):
     """A folder of images or a video file as a camera; its frames follow the blocks' time."""
 
     kind: Literal["folder"]
-    path: str = Field(min_length=1, description="of the folder or the file")
+    path: str = Field(min_length=1, description="folder of images, or a video", examples=["frames"])
     repeat: bool = Field(False, description="start again after the last frame")

@@ -10,12 +10,13 @@ from haselab.base import InputError
 from haselab.firmware import ChipSettings, ControllerStep, FrontEnd
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.sections import ControllerSection
+from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 from haselab.rig.chip.own_step import controller_step
 from haselab.store.actuator_file import read_run
 from haselab.store.toml import validated
 
-__all__ = ["ChipDesign", "read_design"]
+__all__ = ["ChipDesign", "read_design", "strains_within"]
 
 _NO_GAINS = {"kp": 0.0, "ki": 0.0}
 _HIGHEST_DRIVE_V = 1.9  # of the microcontroller's output, whose converter reaches 2.048 V
@@ -29,11 +30,14 @@ class ChipDesign:
         tables: the actuator file.
         settings: settings to compile in.
         path: of the actuator file or the run, for messages.
+        limits: of the controller's output, as designed. Those of the settings are narrower if the
+            microcontroller's output does not reach them.
     """
 
     tables: ActuatorTables
     settings: ChipSettings
     path: Path
+    limits: tuple[float, float]
 
     @property
     def plant(self) -> Plant:
@@ -77,13 +81,15 @@ def read_design(
             none.
     Returns:
         The settings, with continuous-time gains that are stepped at the microcontroller's rate. The
-        drive is limited by `[drive] high_v` and the highest field.
+        drive is limited by `[drive] high_v`, the highest field and the microcontroller's output,
+        and the controller's output to the strains that this drive reaches.
     Raises:
         InputError: Something is missing or not valid, or the kind has no C step.
     """
     tables = validated(ActuatorTables, read_run(path), path)
     try:
-        return ChipDesign(tables, _settings(tables, kind, front_end, source), path)
+        settings, limits = _settings(tables, kind, front_end, source)
+        return ChipDesign(tables, settings, path, limits)
     except InputError as error:
         text = str(error)
         raise InputError(text if str(path) in text else f"{text} {path}") from None
@@ -91,7 +97,8 @@ def read_design(
 
 def _settings(
     tables: ActuatorTables, kind: str | None, front_end: FrontEnd, source: Path | None
-) -> ChipSettings:
+) -> tuple[ChipSettings, tuple[float, float]]:
+    """Settings, and the limits of the controller as designed."""
     controller, step = _controller(tables, kind, source)
     volt, strain = tables.voltage_map(), tables.strain_map()
     limits = controller.limits
@@ -104,20 +111,39 @@ def _settings(
         )
     gains = _NO_GAINS if step is not None else _gains(controller)
     _, high_v = tables.drive_ends_v()
-    return ChipSettings(
+    high_v = _HIGHEST_DRIVE_V if high_v is None else min(_HIGHEST_DRIVE_V, high_v)
+    designed = (limits.low, limits.high)
+    settings = ChipSettings(
         gains["kp"],
         gains["ki"],
         gains.get("kd", 0.0),
         gains.get("derivative_filter_s", 0.0),
-        limits.low,
-        limits.high,
+        *strains_within(designed, volt, high_v),
         (volt.a1_v, volt.b1, volt.a2_v, volt.b2),
         strain.coefficients,
         front_end,
-        drive_high_v=_HIGHEST_DRIVE_V if high_v is None else min(_HIGHEST_DRIVE_V, high_v),
+        drive_high_v=high_v,
         own=step,
         usable_f=None if strain.range_f is None else strain.usable_f,
     )
+    return settings, designed
+
+
+def strains_within(
+    limits: tuple[float, float], to_volt: VoltageMap, high_v: float
+) -> tuple[float, float]:
+    """Narrow the limits of a controller's output to what a microcontroller's output reaches.
+
+    Args:
+        limits: lowest and highest strain.
+        to_volt: strain to drive voltage.
+        high_v: highest drive, in V; the lowest is 0.
+    Returns:
+        The narrower limits; unchanged if these would exclude zero strain, which `ChipSettings`
+        refuses.
+    """
+    found = to_volt.reach(limits, 0.0, high_v)
+    return limits if found is None or not found[0] <= 0.0 <= found[1] else found
 
 
 def _controller(

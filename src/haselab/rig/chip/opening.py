@@ -1,4 +1,4 @@
-"""RIG.toml with `kind = "mega"`: a microcontroller on a serial port, or simulated with the twin."""
+"""RIG.toml with `kind = "chip"`: a microcontroller on a serial port, or simulated with the twin."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from pydantic import Field, model_validator
 
 from haselab.base import LimitError
 from haselab.firmware import ChipSettings, FrontEnd
+from haselab.models.maps import VoltageMap
 from haselab.rig import Camera, Frames, Gate, Rig
 from haselab.rig.bench_config import CameraField, SpecimenConfig
 from haselab.rig.cameras.opening import open_camera
 from haselab.rig.chip.calibrate import calibrated_firmware
 from haselab.rig.chip.chip_bench import ChipBench, describe_chip
-from haselab.rig.chip.design import read_design
+from haselab.rig.chip.design import read_design, strains_within
 from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
@@ -100,11 +101,15 @@ class SimulatorConfig(PrintableSection):
 
 
 class ChipFile(PrintableSection):
-    """`kind = "mega"`, `run = "DIR"`, and `port` or a table `simulator`."""
+    """`kind = "chip"`, `run = "DIR"`, and `port` or a table `simulator`."""
 
-    kind: Literal["mega"]
+    kind: Literal["chip"]
     name: str = "chip"
-    run: str = Field(min_length=1, description="folder of the study whose controller it runs")
+    run: str = Field(
+        min_length=1,
+        description="folder of the study whose controller it runs",
+        examples=["out/reference"],
+    )
     structure: str | None = Field(
         None,
         min_length=1,
@@ -147,13 +152,20 @@ class ChipFile(PrintableSection):
     def limited(self, settings: ChipSettings) -> ChipSettings:
         """Apply the limits of this bench's high-voltage module to settings.
 
+        Returns:
+            The settings; the controller's output is limited to the strains that are reached.
         Raises:
-            InputError: The voltage map needs more than the module reaches.
+            InputError: The voltage map does not rise within what the module reaches.
         """
         high, rise = self.drive_high_v, self.rise_v_per_s
+        high = settings.drive_high_v if high is None else high
+        limits = (settings.strain_low, settings.strain_high)
+        low, top = strains_within(limits, VoltageMap(*settings.voltage_map), high)
         return replace(
             settings,
-            drive_high_v=settings.drive_high_v if high is None else high,
+            strain_low=low,
+            strain_high=top,
+            drive_high_v=high,
             rise_v_per_s=settings.rise_v_per_s if rise is None else rise,
         )
 

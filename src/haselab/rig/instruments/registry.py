@@ -23,6 +23,7 @@ from pydantic import GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
 from haselab.base import DeviceError, HaselabError
+from haselab.base.exits import no_exit
 from haselab.base.registry import Registry
 from haselab.rig.instruments.instrument import (
     CameraInstrument,
@@ -116,7 +117,8 @@ def reported_faults(config: InstrumentConfig) -> Iterator[None]:
         DeviceError: The driver raised an exception that is not one of haselab's.
     """
     try:
-        yield
+        with no_exit():
+            yield
     except HaselabError:
         raise
     except Exception as error:

@@ -22,19 +22,20 @@ __all__ = [
 class InstrumentConfig(PrintableSection):
     """A section that describes one instrument; its key `kind` chooses the driver."""
 
-    kind: str
+    kind: str = Field(description="driver; `haselab doctor` lists those that are installed")
 
 
 class ExposureConfig(PrintableSection):
     """Section `exposure`: the line on which a camera signals its exposures."""
 
-    input: str = Field(min_length=1, description="terminal of the board, such as PFI0")
+    input: str = Field(min_length=1, description="terminal of the board", examples=["PFI0"])
     counter: str = Field("ctr1", min_length=1, description="a free counter")
     edge: Literal["rising", "falling"] = Field("rising", description="edge that begins an exposure")
     duration_s: float = Field(
         gt=0,
         le=10,
-        description="of an exposure; same as camera.exposure_s",
+        description="duration of an exposure; the same as camera.exposure_s",
+        examples=[0.001],
     )
     line: str | None = Field(
         None, min_length=1, description="output of an aravis camera for the signal, such as Line2"
@@ -103,7 +104,7 @@ class GeneratorConfig(InstrumentConfig):
 class SupplyConfig(InstrumentConfig):
     """Section `supply`: a high-voltage supply."""
 
-    highest_v: float = Field(gt=0, le=10e3)
+    highest_v: float = Field(gt=0, le=10e3, description="highest output", examples=[3000.0])
     tolerance_v: float = Field(50.0, gt=0, description="of the supply's own meter")
 
 

@@ -26,9 +26,10 @@ from pathlib import Path
 from types import FrameType
 
 from haselab.base import HaselabError
+from haselab.base.exits import no_exit
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.instruments.devices import DaqConnection
-from haselab.rig.instruments.registry import daq_of
+from haselab.rig.instruments.registry import daq_of, reported_faults
 from haselab.rig.rig_file import load_rig
 from haselab.safety.guardian.heartbeat import SILENT_S, Heartbeat
 from haselab.safety.guardian.make_safe import make_safe
@@ -183,9 +184,10 @@ def main(words: list[str]) -> str:
         if not isinstance(file, BenchConfig):
             raise ValueError(f"kind is {file.kind!r}, but a guardian needs kind = 'bench'. {path}")
         for each in file.instruments():  # drivers load slowly
-            with contextlib.suppress(Exception):  # `shut_down` reports what is missing
+            with contextlib.suppress(Exception), no_exit():  # `shut_down` reports what is missing
                 each.instrument.check_driver()
-        link = daq_of(file.daq).connect(file.daq)
+        with reported_faults(file.daq):
+            link = daq_of(file.daq).connect(file.daq)
     except (HaselabError, ValueError) as error:
         _say(f"failed {' '.join(str(error).split())}")
         return str(error)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Archive, MissingColumnsError, Take, positive
+from haselab.store.columns.labview import labview_header
 from haselab.store.columns.text_layout import (
     HEAD_BYTES,
     TextLayout,
@@ -57,6 +58,10 @@ class CsvArchive(Archive):
         lines = top.splitlines()[: layout.first_line]
         rates = _RATE_LINE.findall("\n".join(line.strip() for line in lines))
         self._rate_hz = positive(rates[-1]) if rates else None
+        self._units = layout.units
+        labview = labview_header(lines, layout.delimiter, layout.names)
+        if labview is not None:
+            self._units, self._rate_hz = labview.units, labview.rate_hz
         self._names = _distinct(layout.names, layout.cells)
         self._read_bytes = 0
 
@@ -104,20 +109,20 @@ class CsvArchive(Archive):
         return split_header(full)[0]
 
     def unit_text(self, full: str) -> str:
-        """From the row of units below the header, else from the header."""
+        """From the row of units below or above the header, else from the header."""
         place = self._names.index(full)
-        units = self._layout.units
         header = super().unit_text(full)
-        below = units[place].strip("[]() ") if place < len(units) else ""
+        below = self._units[place].strip("[]() ") if place < len(self._units) else ""
         if header and below and parse_unit(header, full) != parse_unit(below, full):
             raise InputError(
                 f"Column '{full}' has the unit {header} in its header, but {below} in the row "
-                f"below. State the true one with --unit '{self.plain_name(full)}=UNIT': {self.file}"
+                "of units. State the true one with --unit "
+                f"'{self.plain_name(full)}=UNIT': {self.file}"
             )
         return below or header
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
-        """From a line like `# rate_hz = 400` above the header."""
+        """From a line like `# rate_hz = 400` above the header, or from LabVIEW's Delta_X."""
         del names
         return self._rate_hz
 
@@ -253,6 +258,11 @@ class _Rows:
 
     def _row(self, line: str, number: int) -> list[float]:
         cells = split_cells(line.rstrip("\r").partition("#")[0], self._layout.delimiter)
+        if cells[0] == "Channels":
+            raise InputError(
+                f"Line {number} begins another segment of a LabVIEW file. Split the file into its "
+                f"segments, which are separate records: {self._file}"
+            )
         width = self._layout.cells  # 0: no row of numbers was found
         if width and any(cell.strip() for cell in cells[width:]):
             raise InputError(

@@ -23,7 +23,6 @@ from haselab.store.columns.archive import (
     plain_reader,
     positive,
 )
-from haselab.store.columns.units import is_unit
 from haselab.store.session.opening import is_session, open_session
 
 __all__ = ["Hdf5Archive", "chunked_reader"]
@@ -229,7 +228,7 @@ class Hdf5Archive(MemberArchive):
             value = self._sets[full].attrs.get(key)
             if isinstance(value, bytes):
                 value = value.decode("utf-8", errors="replace")
-            if isinstance(value, str) and is_unit(value):
+            if isinstance(value, str) and value.strip():
                 return value
         return super().unit_text(full)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import Closing, InputError
+from haselab.base.exits import no_exit
 from haselab.base.registry import Registry
 from haselab.store.columns.archive import Archive
 from haselab.store.columns.selection import (
@@ -109,7 +110,8 @@ def open_archive(path: Path | str) -> Archive:
     opener = FORMATS.find(kind)  # which imports it now: `haselab sense` must start fast
     opened = contextlib.ExitStack()
     try:
-        return opener(file, opened)
+        with no_exit():
+            return opener(file, opened)
     except InputError:
         opened.close()
         raise
@@ -237,12 +239,13 @@ class ColumnStream(Closing):
         self._time_factor = 1.0
         self.rows_read = 0
         try:
-            self.rate_hz = archive.rate_hz(self._names)
-            if self.rate_hz is None and use_times:
-                self._use_times()
-            elif self.rate_hz is not None:
-                self._check_stated_rate(self.rate_hz)
-            self.rows = archive.rows(self._all_names)
+            with no_exit():
+                self.rate_hz = archive.rate_hz(self._names)
+                if self.rate_hz is None and use_times:
+                    self._use_times()
+                elif self.rate_hz is not None:
+                    self._check_stated_rate(self.rate_hz)
+                self.rows = archive.rows(self._all_names)
         except InputError:
             raise
         except Exception as error:
@@ -267,6 +270,12 @@ class ColumnStream(Closing):
                 raise
             return  # a column that is only called like one of times
         self._time_factor = 1.0 if unit is None else unit.factor
+        falls = np.flatnonzero(~(np.diff(head) > 0.0))
+        if falls.size and (self._options.time is not None or unit or full == "time_s"):
+            raise InputError(
+                f"Column {full} does not increase after row {falls[0] + 1}. Sort the rows, or "
+                f"remove repeated ones: {self._archive.file}"
+            )
         self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
         if self._times and assumed_seconds(self._archive, full, self._options):
@@ -313,7 +322,8 @@ class ColumnStream(Closing):
             InputError: damaged, a cell that is no number, no rows, or uneven times.
         """
         try:
-            yield from self._pieces(rows)
+            with no_exit():
+                yield from self._pieces(rows)
         except InputError:
             raise
         except Exception as error:

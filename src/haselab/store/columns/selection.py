@@ -11,13 +11,14 @@ from haselab.store.columns.units import Unit, parse_unit
 
 __all__ = [
     "AS_THE_FILE_STATES",
+    "TIME_NAMES",
     "ColumnOptions",
     "assumed_seconds",
     "stated_unit",
     "time_column",
 ]
 
-_TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiempo", "tempo")
+TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiempo", "tempo")
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = 
     if exact is not None:
         return None if exact in used else exact
     plain = [(full, archive.plain_name(full).casefold()) for full in archive.names]
-    for name in _TIME_NAMES:
+    for name in TIME_NAMES:
         found = [full for full, base in plain if base == name and full not in used]
         if len(found) == 1 and _is_time(archive, found[0], options):
             return found[0]

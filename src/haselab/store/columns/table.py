@@ -18,6 +18,7 @@ from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
     ColumnOptions,
     assumed_seconds,
+    stated_unit,
     time_column,
 )
 from haselab.store.columns.units import Unit
@@ -47,6 +48,7 @@ class Table:
         time_name: column of the times, if there is one.
         assumed_seconds: no unit of these times is stated anywhere: they are taken as seconds.
         time_s: its values. Shape `(N,)`.
+        not_rising: column that is called like one of times, but does not rise; empty: none.
     """
 
     columns: Mapping[str, Floats]
@@ -56,6 +58,7 @@ class Table:
     time_name: str | None = None
     time_s: Floats | None = None
     assumed_seconds: bool = False
+    not_rising: str = ""
 
     def __getitem__(self, name: str) -> Floats:
         if name not in self.columns:
@@ -165,13 +168,13 @@ def read_table(
         values = {name: _finite(name, column[kept], archive.file) for name, column in whole.items()}
         left_out = int(np.count_nonzero(~kept))
         rate_hz = None if left_out else stream.rate_hz
-        time_name, time_s = None, None
-        if rate_hz is None:
-            time_name, time_s = _times(archive, kept, options)
-            rate_hz = None if time_s is None else rate_of_times(time_s)
+        name, time_s = _times(archive, kept, options) if rate_hz is None else (None, None)
+        if time_s is not None:
+            rate_hz = rate_of_times(time_s)
+        time_name, not_rising = (None, name or "") if time_s is None else (name, "")
         units = dict(zip(wanted, stream.units, strict=True))
         assumed = time_name is not None and assumed_seconds(archive, time_name, options)
-    return Table(values, rate_hz, left_out, units, time_name, time_s, assumed)
+    return Table(values, rate_hz, left_out, units, time_name, time_s, assumed, not_rising)
 
 
 def _valid_rows(archive: Archive, wanted: Sequence[str], rows: int) -> NDArray[np.bool_]:
@@ -203,7 +206,7 @@ def _column(
 def _times(
     archive: Archive, kept: NDArray[np.bool_], options: ColumnOptions
 ) -> tuple[str | None, Floats | None]:
-    """Read the column of times; return None if there is none of finite numbers."""
+    """Read the column of times; no values if it does not rise, no name if it has no numbers."""
     name = time_column(archive, options)
     if name is None:
         return None, None
@@ -216,8 +219,9 @@ def _times(
             )
         return None, None
     time_s = np.asarray(times[kept], dtype=np.float64)
-    if options.time is None and name != "time_s" and not (np.diff(time_s) > 0.0).all():
-        return None, None  # a column that is only called like one of times, such as t
+    surely = options.time is not None or name == "time_s" or stated_unit(archive, name, options)
+    if not surely and not (np.diff(time_s) > 0.0).all():
+        return name, None  # a column that is only called like one of times, such as t
     return name, time_s
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Member, MemberArchive, Read, positive
-from haselab.store.columns.units import is_unit
 
 __all__ = ["TdmsArchive"]
 
@@ -81,7 +80,7 @@ class TdmsArchive(MemberArchive):
     def unit_text(self, full: str) -> str:
         """The channel's property `unit_string`, else what its name states."""
         unit = str(self._channels[full].properties.get("unit_string") or "")
-        return unit if is_unit(unit) else super().unit_text(full)
+        return unit.strip() or super().unit_text(full)
 
 
 def _member(channel: Any) -> Member:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from haselab.base import InputError
+from haselab.store.columns.labview import without_tags
 from haselab.store.columns.units import is_unit
 
 __all__ = ["HEAD_BYTES", "TextLayout", "is_number", "layout_of", "split_cells"]
@@ -105,7 +106,7 @@ def layout_of(head: bytes, file: Path, *, whole: bool) -> TextLayout:
     lines = [line.rstrip("\r") for line in text.split(newline)]
     if not whole and len(lines) > 1:
         lines.pop()
-    lines = _some(lines)
+    lines = without_tags(_some(lines))
     guesses = [guess for each in _DELIMITERS if (guess := _guess(lines, each)) is not None]
     guesses = [each for each in guesses if each.delimiter or each.share >= _LEAST_SHARE]
     best = max(guesses, key=lambda guess: guess.rank, default=None)

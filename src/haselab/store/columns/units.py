@@ -12,35 +12,58 @@ __all__ = ["Unit", "is_unit", "parse_unit", "split_header"]
 
 _PREFIXES = {"f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "": 1.0,
              "k": 1e3, "M": 1e6, "G": 1e9}  # fmt: skip
-_WITH_PREFIX = ("V", "A", "F", "s", "Hz", "m", "N", "Pa", "Ω", "C", "J", "W")
+_WITH_PREFIX = ("V", "A", "F", "s", "Hz", "m", "N", "Pa", "Ω", "C", "J", "W", "H")
 _OTHER = {
-    "1": ("1", 1.0), "-": ("1", 1.0), "a.u.": ("1", 1.0), "%": ("1", 0.01), "cm": ("m", 0.01),
+    "1": ("1", 1.0), "-": ("1", 1.0), "a.u.": ("1", 1.0), "%": ("1", 0.01), "‰": ("1", 1e-3),
+    "ppm": ("1", 1e-6), "mm/mm": ("1", 1.0), "µm/m": ("1", 1e-6), "cm": ("m", 0.01),
     "g": ("kg", 1e-3), "kg": ("kg", 1.0), "mg": ("kg", 1e-6), "min": ("s", 60.0),
     "h": ("s", 3600.0), "rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "°": ("rad", math.pi / 180.0),
     "deg": ("rad", math.pi / 180.0), "rad/s": ("rad/s", 1.0), "1/s": ("1/s", 1.0),
-    "m/s": ("m/s", 1.0), "mm/s": ("m/s", 1e-3), "V/m": ("V/m", 1.0), "kV/mm": ("V/m", 1e6),
-    "V/µm": ("V/m", 1e6), "MV/m": ("V/m", 1e6), "V/s": ("V/s", 1.0), "N/m": ("N/m", 1.0),
-    "N/mm": ("N/m", 1e3), "N/mm²": ("Pa", 1e6), "N/m²": ("Pa", 1.0), "bar": ("Pa", 1e5),
-    "mbar": ("Pa", 100.0), "°C": ("°C", 1.0), "K": ("K", 1.0), "m²": ("m²", 1.0),
+    "m/s": ("m/s", 1.0), "mm/s": ("m/s", 1e-3), "m/s²": ("m/s²", 1.0),
+    "mm/s²": ("m/s²", 1e-3), "V/m": ("V/m", 1.0),
+    "kV/mm": ("V/m", 1e6), "V/µm": ("V/m", 1e6), "MV/m": ("V/m", 1e6), "V/s": ("V/s", 1.0),
+    "kV/s": ("V/s", 1e3), "V²": ("V²", 1.0), "mV²": ("V²", 1e-6), "kV²": ("V²", 1e6),
+    "N/m": ("N/m", 1.0), "N/mm": ("N/m", 1e3), "Nm": ("Nm", 1.0), "mNm": ("Nm", 1e-3),
+    "N/mm²": ("Pa", 1e6), "N/m²": ("Pa", 1.0), "bar": ("Pa", 1e5), "mbar": ("Pa", 100.0),
+    "psi": ("Pa", 6894.757293168), "°C": ("°C", 1.0), "K": ("K", 1.0), "m²": ("m²", 1.0),
+    "mm²": ("m²", 1e-6), "cm²": ("m²", 1e-4),
 }  # fmt: skip
 _WORDS = {
-    "volt": "V", "volts": "V", "millivolt": "mV", "kilovolt": "kV", "amp": "A", "amps": "A",
-    "ampere": "A", "amperes": "A", "sec": "s", "secs": "s", "second": "s", "seconds": "s",
-    "sekunden": "s", "msec": "ms", "usec": "µs", "ohm": "Ω", "ohms": "Ω", "kohm": "kΩ",
-    "farad": "F", "newton": "N", "meter": "m", "metre": "m", "hertz": "Hz", "percent": "%",
-    "pct": "%", "prozent": "%", "degrees": "deg", "au": "a.u.", "arb. units": "a.u.", "s/s": "Hz",
-    "n/mm2": "N/mm²", "n/mm^2": "N/mm²", "n/m2": "N/m²", "v/um": "V/µm", "none": "1",
-    "sequence": "1", "samples": "1",
+    "volt": "V", "volts": "V", "millivolt": "mV", "millivolts": "mV", "kilovolt": "kV",
+    "kilovolts": "kV", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A", "sec": "s",
+    "secs": "s", "second": "s", "seconds": "s", "sekunden": "s", "msec": "ms", "usec": "µs",
+    "millisecond": "ms", "milliseconds": "ms", "microseconds": "µs", "mins": "min",
+    "minute": "min", "minutes": "min", "minuten": "min", "hr": "h", "hrs": "h", "hour": "h",
+    "hours": "h", "stunden": "h", "farad": "F",
+    "farads": "F", "picofarad": "pF", "picofarads": "pF", "nanofarad": "nF", "nanofarads": "nF",
+    "newton": "N", "newtons": "N", "meter": "m", "meters": "m", "metre": "m", "metres": "m",
+    "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
+    "micron": "µm", "microns": "µm", "pascal": "Pa", "hertz": "Hz", "percent": "%",
+    "per cent": "%", "pct": "%", "prozent": "%", "permille": "‰", "microstrain": "µm/m",
+    "m/m": "1", "degree": "deg", "degrees": "deg", "degc": "°C",
+    "min.": "min", "sec.": "s", "au": "a.u.", "arb. units": "a.u.", "s/s": "Hz", "v/v": "1",
+    "µε": "µm/m", "um/m": "µm/m", "n/mm2": "N/mm²", "n/m2": "N/m²", "v/um": "V/µm", "none": "1",
+    "sequence": "1", "samples": "1", "dimensionless": "1", "arbitrary": "a.u.",
+    "code": "1", "counts": "1",
 }  # fmt: skip
 # Endings of names, as in voltage_kv. Those of SI units are the default, so they state nothing.
 _ENDINGS = {
     "mv": "mV", "uv": "µV", "kv": "kV", "ma": "mA", "ua": "µA", "na": "nA", "ms": "ms", "us": "µs",
     "ns": "ns", "pf": "pF", "nf": "nF", "uf": "µF", "mm": "mm", "um": "µm", "cm": "cm",
-    "kpa": "kPa", "khz": "kHz", "percent": "%", "pct": "%",
+    "kpa": "kPa", "kn": "kN", "khz": "kHz", "minutes": "min", "hours": "h",
+    "percent": "%", "pct": "%", "permille": "‰", "ppm": "ppm",
 }  # fmt: skip
+_AMBIGUOUS = "mpa"  # an ending that is milli or mega, and not to be taken as the default
+_SPELLINGS = (("μ", "µ"), ("Ω", "Ω"), ("Ohms", "Ω"), ("Ohm", "Ω"), ("ohms", "Ω"), ("ohm", "Ω"),
+              ("^2", "²"), ("·", ""), ("*", ""))  # fmt: skip
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\[\]]*)\]|\((?P<round>[^()]*)\))\s*$")
 _STROKE = re.compile(r"^(?P<name>.+?)\s*(?:/|,|\s+in\s)\s*(?P<unit>[^/,\s]+)$")
-_LOOKS_LIKE_ONE = re.compile(r"[fpnuµmkg]?(v|a|f|s|hz|m|n|pa|ohm|c|g)", re.IGNORECASE)
+_LOOKS_LIKE_ONE = re.compile(r"[fpnuµmkg]?(v|a|f|s|hz|m|n|pa|ohm|c|g)(\^\d)?", re.IGNORECASE)
+_STATED = re.compile(r"[^\s\d]{1,8}(\^-?\d)?")  # in square brackets
+_KNOWN = (
+    f"{', '.join(_WITH_PREFIX)} and g with a prefix from f to G (such as kV, mV, µA or uA, pF, mm, "
+    "ms), %, ‰, min, h, cm, bar, °, °C, V², mm², N/mm², V/m, m/s, or 1 for a pure number"
+)
 
 
 @dataclass(frozen=True)
@@ -87,7 +110,9 @@ def is_unit(text: str) -> bool:
 
 
 def _find(text: str) -> Unit | None:
-    plain = text.strip().replace("μ", "µ").replace("Ω", "Ω").replace("Ohm", "Ω")
+    plain = text.strip()
+    for written, symbol in _SPELLINGS:
+        plain = plain.replace(written, symbol)
     if plain in _UNITS:
         return _UNITS[plain]
     lower = plain.lower()
@@ -117,8 +142,8 @@ def parse_unit(text: str, where: str) -> Unit:
     unit = _find(text)
     if unit is None:
         raise InputError(
-            f"{where} states the unit '{text.strip()}', which is unknown or ambiguous. Use V, "
-            "mV, kV, A, mA, s, ms, F, pF, m, mm, N, Pa, %, or 1 for a pure number."
+            f"{where} states the unit '{text.strip()}', which is unknown or ambiguous. Use "
+            f"{_KNOWN}."
         )
     return unit
 
@@ -141,12 +166,13 @@ def split_header(header: str) -> tuple[str, str]:
     if match := _BRACKETS.match(text):
         unit = match["square"] if match["square"] is not None else match["round"]
         stated = bool(_find(unit)) or bool(_LOOKS_LIKE_ONE.fullmatch(unit.strip()))
-        if stated or (match["square"] is not None and re.fullmatch(r"[^\s\d]{1,8}", unit.strip())):
+        if stated or (match["square"] is not None and _STATED.fullmatch(unit.strip())):
             return match["name"].strip() or text, unit.strip()
         return text, ""
     if (match := _STROKE.match(text)) and match["unit"] in _UNITS and match["unit"] not in "1-":
         return match["name"].strip(), match["unit"]
     name, _, ending = text.rpartition("_")
-    if name and (ending in _ENDINGS or (ending in _UNITS and len(ending) > 1)):
+    known = ending in _ENDINGS or ending == _AMBIGUOUS or (ending in _UNITS and len(ending) > 1)
+    if name and known:
         return name, _ENDINGS.get(ending, ending)
     return text, ""

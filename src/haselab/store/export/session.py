@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,7 @@ class _Source:
         rate_hz: samples per second and channel.
         experiments: the name of each on its way out.
         derived: gives the series that follow from an experiment, by name.
+        empty: names of the tables that were left out because they have no rows.
     """
 
     path: Path
@@ -62,6 +63,7 @@ class _Source:
     rate_hz: float
     experiments: dict[str, str]
     derived: Derived
+    empty: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -73,12 +75,14 @@ class Exported:
         experiments: the name of each in these files.
         doubt: why their numbers are not verified; empty where they are.
         unreadable: experiments that were left out, and why.
+        empty: tables of csv and parquet that were not written because they have no rows.
     """
 
     files: list[Path]
     experiments: dict[str, str]
     doubt: str
     unreadable: dict[str, str]
+    empty: list[str]
 
 
 def nothing_derived(reader: SessionReader, name: str) -> Mapping[str, Columns]:
@@ -144,7 +148,7 @@ def export_session(
             for file in files:
                 file.unlink(missing_ok=True)
             raise
-        return Exported(files, new_names, reader.doubt, unreadable)
+        return Exported(files, new_names, reader.doubt, unreadable, source.empty)
 
 
 def _keep_only(reader: SessionReader, wanted: Sequence[str], path: Path) -> None:
@@ -181,6 +185,15 @@ def _names_of(reader: SessionReader, form: str) -> dict[str, str]:
 
 
 def _tables(source: _Source) -> Iterator[Table]:
+    """The tables that have rows."""
+    for table in _all_tables(source):
+        if all(column.size for column in next(table.chunks()).values()):
+            yield table
+        else:
+            source.empty.append(table.name)
+
+
+def _all_tables(source: _Source) -> Iterator[Table]:
     yield event_table(source.reader)
     for name, table in source.experiments.items():
         yield from tables_of(source.reader, name, table, source.volt_per_code, source.rate_hz)

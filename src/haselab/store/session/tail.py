@@ -2,8 +2,9 @@
 
 Blocks reach their dataset in compressed chunks of 0.1 s. Until then they are in the dataset `tail`,
 a ring of slots of fixed size at a fixed position in the file. A slot is written with one system
-call, so it survives the end of the process. Its number is stored before and after the data: if the
-last one is missing, the write was interrupted; if both agree, the checksum must match.
+call; once that has returned, it survives the end of the process. Its number is stored before and
+after the data: if the last one is missing, the process was killed during the call; if both agree,
+the checksum must match.
 """
 
 from __future__ import annotations
@@ -149,11 +150,18 @@ class TailReader:
                 self._slots = np.memmap(path, tail.dtype, "r", int(offset), shape)
 
     def newest(self, experiment: int) -> int:
-        """The highest row of an experiment in the ring; -1: none."""
-        if self._slots is None:
+        """The highest row of an experiment in the ring; -1: none.
+
+        A slot whose write was not finished does not count, although its row may be in the file: the
+        system writes page by page, and the writer may be killed between two pages.
+        """
+        slots = self._slots
+        if slots is None:
             return -1
-        ours = self._slots["row"][self._slots["experiment"] == experiment]
-        return int(ours.max()) if ours.size else -1
+        ours = slots["experiment"] == experiment
+        if "end" in (slots.dtype.names or ()):  # not in a session of format 1
+            ours &= slots["sequence"] == slots["end"]
+        return int(slots["row"][ours].max()) if ours.any() else -1
 
     def rows(self, experiment: int, first: int) -> NDArray[Any]:
         """Complete slots of an experiment, in order, from a row on without a gap.

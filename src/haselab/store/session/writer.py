@@ -54,6 +54,9 @@ if sys.platform != "win32":
 __all__ = ["ExperimentPlan", "ExperimentRecord", "QueueRule", "SessionReader", "SessionWriter"]
 
 _RESERVE_BYTES = 8_000_000  # kept free, so that the file can be finished
+# A kill may cut a write between two pages of the system's cache. HDF5 keeps its own records, which
+# have checksums, and the slots' numbers within such pages, so that they are written or not.
+_PAGE_BYTES = 4096
 _SPARE_CHUNKS = 3  # of the tail, beside those that wait: one is filled, one packed, one torn
 
 
@@ -132,7 +135,9 @@ class SessionWriter:
             try:
                 # v110: readable by HDF5 1.10 and later, and by others while it is being written.
                 # The file is empty and belongs to this process: "w" deletes nothing.
-                self._file = h5py.File(path, "w", libver=("v110", "v110"))
+                self._file = h5py.File(
+                    path, "w", libver=("v110", "v110"), fs_strategy="page", fs_page_size=_PAGE_BYTES
+                )
             except OSError as error:
                 raise self._failed(error) from None
             undo.callback(self._file.close)

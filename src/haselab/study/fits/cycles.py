@@ -14,10 +14,10 @@ from haselab.study.definition import Study
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.resolution import POSITION_PX, with_resolution
 
-__all__ = ["Cycles", "drive_at", "repeatability"]
+__all__ = ["LEAST_FRAMES", "NEAR_V", "Cycles", "drive_at", "repeatability"]
 
-_NEAR_V = 0.06  # around a voltage, where length is linear in voltage
-_LEAST_FRAMES = 8
+NEAR_V = 0.06  # around a voltage, where length is linear in voltage
+LEAST_FRAMES = 8  # near a voltage, on each edge
 
 Floats = NDArray[np.float64]
 
@@ -81,11 +81,11 @@ class Cycles:
         found = []
         rising = np.gradient(ramp_v) > 0.0
         for edge in (rising, ~rising):
-            near = edge & (np.abs(ramp_v - drive_v) < _NEAR_V)
-            if near.sum() < _LEAST_FRAMES:
+            near = edge & (np.abs(ramp_v - drive_v) < NEAR_V)
+            if near.sum() < LEAST_FRAMES:
                 raise ResultError(
                     f"Only {int(near.sum())} frames are near the baseline of {drive_v:g} V, but "
-                    f"{_LEAST_FRAMES} are needed. Record faster, or a triangle that crosses the "
+                    f"{LEAST_FRAMES} are needed. Record faster, or a triangle that crosses the "
                     "baseline."
                 )
             line = np.polynomial.Polynomial.fit(ramp_v[near] - drive_v, length_m[near], 1)

@@ -1,1 +1,1 @@
-"""Knowledge about a simulated bench: true parameters and noise-free results."""
+"""Knowledge about a simulated bench: true parameters, noise-free results, simulated steps."""

@@ -15,7 +15,11 @@ class KeysightConfig(GeneratorConfig):
     """Keysight 33500B over VISA."""
 
     kind: Literal["keysight33500"] = "keysight33500"
-    address: str = Field(min_length=1, description="VISA: TCPIP::host::5025::SOCKET, ...::INSTR")
+    address: str = Field(
+        min_length=1,
+        description="VISA address, ending in SOCKET or INSTR",
+        examples=["TCPIP::192.168.1.5::5025::SOCKET"],
+    )
     serial_number: str | None = Field(None, description="third field of *IDN?")
     channel: Literal[1, 2] = 1
     load: Literal["INF", "50"] = "INF"

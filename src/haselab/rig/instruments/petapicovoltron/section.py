@@ -15,6 +15,6 @@ class PetaPicoVoltronConfig(SupplyConfig):
     """High-voltage supply of the Peta-Pico-Voltron family on a serial port."""
 
     kind: Literal["petapicovoltron"] = "petapicovoltron"
-    port: str = Field(min_length=1, description="/dev/ttyACM0, COM3, ...")
+    port: str = Field(min_length=1, description="serial port", examples=["/dev/ttyACM0"])
     serial_number: str | None = Field(None, description="reply to QName")
     timeout_s: float = Field(1.0, gt=0, le=30)

@@ -1,4 +1,4 @@
-"""`haselab run --rig mega.toml`: the chip behind the same runtime, session file and report."""
+"""`haselab run --rig chip.toml`: the chip behind the same runtime, session file and report."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from haselab.sensing import sense_quadrature
 from haselab.store.session.writer import SessionReader
 
 DATA = Path(__file__).resolve().parent / "data"
-MEGA = f"""
-kind = "mega"
+CHIP_RIG = f"""
+kind = "chip"
 run = "{DATA}"
 structure = "pid"
 [simulator]
@@ -385,10 +385,10 @@ def played(tmp_path_factory: pytest.TempPathFactory, cosim_program: Path) -> Pat
     """The folder of a run on the chip."""
     del cosim_program  # skips where the tools are missing
     folder = tmp_path_factory.mktemp("chip")
-    (folder / "mega.toml").write_text(MEGA, encoding="utf-8")
+    (folder / "chip.toml").write_text(CHIP_RIG, encoding="utf-8")
     (folder / "steps.toml").write_text(STEPS, encoding="utf-8")
     code = command(
-        "run", folder / "steps.toml", "--rig", folder / "mega.toml", "--out", folder / "out"
+        "run", folder / "steps.toml", "--rig", folder / "chip.toml", "--out", folder / "out"
     )
     assert code == 0
     return folder / "out"
@@ -425,17 +425,17 @@ def test_the_recording_alone_gives_the_same_numbers(played: Path, tmp_path: Path
     ("change", "reported"),
     [
         ("[simulator]", "either port or a table simulator"),
-        (f'run = "{DATA}"', "run: Field required"),
+        (f'run = "{DATA}"', "the file has no key run: folder"),
     ],
 )
 def test_a_rig_file_without_what_it_needs_is_one_line(
     change: str, reported: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = MEGA.replace(change, "").replace('reading = "hz"\nseed = 3\n', "")
-    (tmp_path / "mega.toml").write_text(text, encoding="utf-8")
+    text = CHIP_RIG.replace(change, "").replace('reading = "hz"\nseed = 3\n', "")
+    (tmp_path / "chip.toml").write_text(text, encoding="utf-8")
     (tmp_path / "steps.toml").write_text(STEPS, encoding="utf-8")
     out = tmp_path / "out"
-    code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "mega.toml", "--out", out)
+    code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "chip.toml", "--out", out)
     assert code == 2
     said = capsys.readouterr().err
     assert reported in said
@@ -446,9 +446,9 @@ def test_a_rig_file_without_what_it_needs_is_one_line(
 def test_a_whole_study_is_refused_on_a_chip_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "mega.toml").write_text(MEGA, encoding="utf-8")
+    (tmp_path / "chip.toml").write_text(CHIP_RIG, encoding="utf-8")
     study = DATA.parents[2] / "src/haselab/study/studies/hasel-iros2018.toml"
-    code = command("run", study, "--rig", tmp_path / "mega.toml", "--out", tmp_path / "out")
+    code = command("run", study, "--rig", tmp_path / "chip.toml", "--out", tmp_path / "out")
     assert code == 2
     assert "no table [step_trials]" in capsys.readouterr().err
     (tmp_path / "twin.toml").write_text('kind = "twin"', encoding="utf-8")
@@ -456,18 +456,18 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
     code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "twin.toml", "--out",
                    tmp_path / "out")  # fmt: skip
     assert code == 2
-    assert 'which needs a rig with kind = "mega"' in capsys.readouterr().err
+    assert 'which needs a rig with kind = "chip"' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("text", "wrong", "reported"),
     [
-        (MEGA + "[front_end]\ncorrection = [0.0, 0.0]\n", STEPS, "must be between 0.1 and 10"),
-        (MEGA + "[front_end]\ncarrier_high_v = inf\n", STEPS, "front_end.carrier_high_v"),
-        (MEGA + 'twin = "x.toml"\n', STEPS, "either twin or reading"),
-        (MEGA, STEPS.replace("step = 0.03", "step = 0.0"), "step must not be 0"),
-        (MEGA, STEPS.replace("step = 0.03", "step = nan"), "step_trials.step"),
-        (MEGA, STEPS.replace("step = 0.03", "step = 0.3"), "desired strain = 0.3 is outside"),
+        (CHIP_RIG + "[front_end]\ncorrection = [0.0, 0.0]\n", STEPS, "must be between 0.1 and 10"),
+        (CHIP_RIG + "[front_end]\ncarrier_high_v = inf\n", STEPS, "front_end.carrier_high_v"),
+        (CHIP_RIG + 'twin = "x.toml"\n', STEPS, "either twin or reading"),
+        (CHIP_RIG, STEPS.replace("step = 0.03", "step = 0.0"), "step must not be 0"),
+        (CHIP_RIG, STEPS.replace("step = 0.03", "step = nan"), "step_trials.step"),
+        (CHIP_RIG, STEPS.replace("step = 0.03", "step = 0.3"), "desired strain = 0.3 is outside"),
     ],
 )
 def test_what_cannot_be_played_is_one_line_before_anything_is_armed(
@@ -475,10 +475,10 @@ def test_what_cannot_be_played_is_one_line_before_anything_is_armed(
     cosim_program: Path,
 ) -> None:  # fmt: skip
     del cosim_program
-    (tmp_path / "mega.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "chip.toml").write_text(text, encoding="utf-8")
     (tmp_path / "steps.toml").write_text(wrong, encoding="utf-8")
     out = tmp_path / "out"
-    code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "mega.toml", "--out", out)
+    code = command("run", tmp_path / "steps.toml", "--rig", tmp_path / "chip.toml", "--out", out)
     assert code == 2
     assert reported in capsys.readouterr().err
     assert not (out / "session.h5").exists()
@@ -489,10 +489,10 @@ def test_ctrl_c_in_a_terminal_stops_the_chip_before_it_ends(
 ) -> None:
     """A terminal sends it to the whole group; the simulation must keep running to be stopped."""
     del cosim_program
-    (tmp_path / "mega.toml").write_text(MEGA, encoding="utf-8")
+    (tmp_path / "chip.toml").write_text(CHIP_RIG, encoding="utf-8")
     steps = STEPS.replace("zero_s = 6.0", "zero_s = 600.0")
     (tmp_path / "steps.toml").write_text(steps, encoding="utf-8")
-    line = [sys.executable, "-m", "haselab.cli", "run", "steps.toml", "--rig", "mega.toml", "--out",
+    line = [sys.executable, "-m", "haselab.cli", "run", "steps.toml", "--rig", "chip.toml", "--out",
             "out"]  # fmt: skip
     with subprocess.Popen(
         line, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -13,14 +13,14 @@ from haselab.control import PidGains
 from haselab.firmware import FrontEnd
 from haselab.rig.chip import read_design
 from haselab.rig.twin.config import Load, Shell, TwinConfig, twin_of_reading
-from haselab.study.chip.agreement import (
+from haselab.study.chip.loops import FAST, LoopRun, StepPlan, desktop_loop
+from haselab.study.simulated.agreement import (
     Agreement,
     StepCase,
     agreement_of,
     check_stable,
     predicted_loop,
 )
-from haselab.study.chip.loops import FAST, LoopRun, StepPlan, desktop_loop
 
 DATA = Path(__file__).resolve().parents[2] / "firmware" / "data"
 

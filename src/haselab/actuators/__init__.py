@@ -12,6 +12,7 @@ from haselab.actuators.pouch import Pouch
 from haselab.actuators.registry import ACTUATORS, actuator_law
 from haselab.actuators.response import (
     ADDED_INERTIA,
+    GRAVITY_M_S2,
     Drive,
     Response,
     SampledLaw,
@@ -23,6 +24,7 @@ from haselab.actuators.table import LawTable, law_table
 __all__ = [
     "ACTUATORS",
     "ADDED_INERTIA",
+    "GRAVITY_M_S2",
     "VACUUM_F_PER_M",
     "ActuatorLaw",
     "ActuatorState",

@@ -47,6 +47,7 @@ class Parameter:
         high: largest permitted value.
         description: short text for people.
         fitted: whether `identify actuator` estimates it; False: measured otherwise.
+        inverse_square: see `parameter`.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Parameter:
     high: float
     description: str
     fitted: bool = True
+    inverse_square: bool = False
 
 
 def parameter(
@@ -67,6 +69,7 @@ def parameter(
     description: str,
     key: str = "",
     fitted: bool = True,
+    inverse_square: bool = False,
 ) -> AnyValue:
     """A field of a law with its unit and limits.
 
@@ -79,6 +82,8 @@ def parameter(
         key: in TWIN.toml; empty: the name of the field in the table `actuator`.
         fitted: whether `identify actuator` estimates it; False: measured otherwise, such as a
             width, or without effect on motion and capacitance.
+        inverse_square: whether the forces are nearly linear in its inverse square, as in that of a
+            locking stretch; False: it is varied by its logarithm.
     Returns:
         The dataclass field.
     """
@@ -89,6 +94,7 @@ def parameter(
         "high": high,
         "description": description,
         "fitted": fitted,
+        "inverse_square": inverse_square,
     }
     field: AnyValue = dataclasses.field(default=default, metadata={_KEY: about})
     return field

@@ -66,7 +66,8 @@ class PlanarHasel(ActuatorLaw):
     shear_modulus_pa: float = parameter(15.6e3, unit="Pa", low=0.0, high=1e7,
         description="of the shell", key="shell.shear_modulus_pa")
     locking_stretch: float = parameter(3.92, unit="", low=1.5, high=50.0,
-        description="at which the chains are straight", key="shell.locking_stretch")
+        description="at which the chains are straight", key="shell.locking_stretch",
+        inverse_square=True)
     length_m: float = parameter(0.0624, unit="m", low=0.01, high=0.2,
         description="between clamps, unstretched", key="shell.length_m")
     shell_width_m: float = parameter(

@@ -29,6 +29,7 @@ from haselab.base import InputError, LimitError
 
 __all__ = [
     "ADDED_INERTIA",
+    "GRAVITY_M_S2",
     "Drive",
     "Response",
     "SampledLaw",
@@ -38,6 +39,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 ADDED_INERTIA = "load.added_inertia_kg"
+GRAVITY_M_S2 = 9.81
 _LONGEST_STEP_S = 2.5e-3
 _CORES = os.cpu_count() or 1
 _COLUMNS_EACH = 8  # for fewer columns another thread does not pay

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from haselab.actuators import GRAVITY_M_S2
 from haselab.rig import Rig
 
-__all__ = ["GRAVITY_M_S2", "Conditions"]
-
-GRAVITY_M_S2 = 9.81
+__all__ = ["Conditions"]
 
 
 class _Recorder(Protocol):

@@ -12,6 +12,7 @@ from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import actuator_option, answer_options, unverified_option, warn_unverified
 from haselab.cli.identify.common import give
+from haselab.cli.plot import save_plot
 from haselab.identify.physical import ActuatorFit, fit_actuator
 from haselab.models.actuator.sections import ActuatorSection
 from haselab.pipelines.motion import motion_of_session
@@ -26,7 +27,7 @@ __all__ = ["actuator"]
 )
 @actuator_option("Read [actuator], write [model.physical].")
 @unverified_option
-@answer_options()
+@answer_options(plot=True)
 def actuator(
     sessions: tuple[Path, ...],
     actuator: Path | None,
@@ -34,11 +35,13 @@ def actuator(
     unverified: bool,
     as_json: bool,
     out: Path | None,
+    plot: Path | None,
 ) -> None:
-    """Identify the physical model of an actuator from whole sessions.
+    """Identify a physical model from everything recorded.
 
-    Lengths and capacitances of all experiments of each SESSION are compared with one simulated
-    motion. The kind and what was measured otherwise, such as a width, come from [actuator].
+    SESSION... are folders of runs or their session.h5, all of one actuator. Lengths and
+    capacitances of all experiments are compared with one simulated motion. The kind, what was
+    measured otherwise, such as a width, and where to start come from [actuator].
     """
     if actuator is None:
         raise InputError(
@@ -56,6 +59,7 @@ def actuator(
     fit = fit_actuator(law, records, mass_kg=mass_kg)
     files = [session_file(session) for session in sessions]
     give(fit, files, as_json, out)
+    save_plot(plot, fit.chart)
     if fit.succeeded:
         save_section(actuator, "model", {"physical": _section(fit)}, files)
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import ADDED_INERTIA, ActuatorLaw
-from haselab.base import Estimate, InputError, JsonObject
-from haselab.base.chart import Chart
+from haselab.actuators import ADDED_INERTIA, GRAVITY_M_S2, ActuatorLaw, OperatingPoint, linearise
+from haselab.base import Estimate, InputError, JsonObject, LimitError
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import Fit
 from haselab.identify.noise import coloured_covariance, whiteness_p
 from haselab.identify.physical.misfit import Misfit
@@ -35,6 +35,9 @@ _LENGTH, _CAPACITANCE = "length", "capacitance"
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
+_SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
+_WHITE = 1e-3  # probability of the residuals under white noise
+_POINTS = 5  # voltages of the linear models
 _WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
 
 
@@ -43,10 +46,10 @@ class ActuatorFit(Fit):
     """One physical model of an actuator.
 
     Args:
-        status: "ok", or why there is no result.
+        status: "ok"; what the model does not explain; or why there is no result.
         parameters: by the names of TWIN.toml, and of the instruments.
-        covariance: of `parameters`, in their order.
-        residuals: lengths, then capacitances, over their standard deviations, of each record.
+        covariance: of `parameters`, in their order. It grows by what the model does not explain.
+        residuals: over their standard deviations, one array for each of `channels`.
         notes: remarks for the user, one sentence each.
         law: with the estimated parameters.
         kind: of the actuator.
@@ -56,6 +59,10 @@ class ActuatorFit(Fit):
         length_noise_m: from differences of neighbours, which a slow misfit does not change.
         capacitance_noise_f: likewise.
         evaluations: of the model, until it was found.
+        chi_squared_ratio: mean square of the residuals over their standard deviations.
+        residual_whiteness_p: probability of the less probable channel under white noise.
+        channels: experiment and channel of each array of residuals.
+        linear_models: at the hung mass and some voltages up to the highest that acted.
     """
 
     law: ActuatorLaw | None = None
@@ -69,6 +76,14 @@ class ActuatorFit(Fit):
     evaluations: int = 0
     chi_squared_ratio: float = float("nan")
     residual_whiteness_p: float = float("nan")
+    channels: tuple[tuple[str, str], ...] = ()
+    linear_models: tuple[OperatingPoint, ...] = ()
+    mass_kg: float = float("nan")
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there are parameters, with or without a model error."""
+        return bool(self.parameters)
 
     def answer(self) -> JsonObject:
         """See `Fit`."""
@@ -76,6 +91,16 @@ class ActuatorFit(Fit):
             "kind": self.kind,
             "parameters": self.parameters,
             "not_identifiable": list(self.not_identifiable),
+            "linear_models": [
+                {
+                    "voltage_v": point.voltage_v,
+                    "mass_kg": self.mass_kg,
+                    "gain": point.gain_m_per_v,
+                    "poles": _pairs(point.poles),
+                    "zeros": _pairs(point.zeros),
+                }
+                for point in self.linear_models
+            ],
             "residual_rms": {
                 "length_m": self.length_rms_m,
                 "capacitance_f": self.capacitance_rms_f,
@@ -84,13 +109,31 @@ class ActuatorFit(Fit):
                 "length_m": self.length_noise_m,
                 "capacitance_f": self.capacitance_noise_f,
             },
+            "residual_whiteness_p": self.residual_whiteness_p,
             "evaluations": self.evaluations,
             "status": self.status,
         }
 
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
-        """See `Fit`."""
-        raise NotImplementedError
+        """Root mean square of the residuals over the noise, experiment by experiment.
+
+        Args:
+            names: not used; the axes are the experiments.
+        Returns:
+            Bars of lengths and of capacitances.
+        Raises:
+            ResultError: the fit has no result.
+        """
+        self._require()
+        experiments = list(dict.fromkeys(name for name, _ in self.channels))
+        curves = []
+        for channel in (_LENGTH, _CAPACITANCE):
+            found = {name: _rms([part]) for (name, of), part in zip(
+                self.channels, self.residuals, strict=True) if of == channel}  # fmt: skip
+            x = np.array([experiments.index(name) for name in found], dtype=np.float64)
+            curves.append(Curve(x, np.array(list(found.values())), channel, "bars"))
+        panel = Panel("", "residual / noise (rms)", curves, ticks=experiments)
+        return Chart(f"Residuals of the {self.kind}", [panel])
 
 
 def fit_actuator(
@@ -211,34 +254,95 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
     units = {about.key: about.unit for about in unknowns.law.described()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
               "sensing.latency_s": "s", "sensing.scale": ""}  # fmt: skip
+    slopes = unknowns.slopes
     parameters, weak = {}, []
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
-        if unknowns.by_logarithm[k]:
-            if std[k] > _WEAK or not np.abs(found.jacobian[:, k]).any():
+        if unknowns.by_logarithm[k] or unknowns.by_inverse_square[k]:
+            share = std[k] * abs(slopes[k]) / unknowns.values[k]
+            if share > _WEAK or not np.abs(found.jacobian[:, k]).any():
                 weak.append(name)
-            parameters[name] = Estimate.lognormal(unknowns.values[k], std[k], unit)
+            parameters[name] = Estimate.lognormal(unknowns.values[k], share, unit)
         else:
             parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
-    slopes = unknowns.slopes
     lengths = _channel(segments, _LENGTH, found.residuals)
     capacitances = _channel(segments, _CAPACITANCE, found.residuals)
     std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])
     std_f = misfit.capacitance_factor * _typical([r.capacitance_std_f for r in misfit.records])
+    length_noise, capacitance_noise = _neighbours(lengths), _neighbours(capacitances)
+    whiteness = min(whiteness_p(lengths), whiteness_p(capacitances))
+    excess = {
+        "lengths": _rms(lengths) / length_noise,
+        "capacitances": _rms(capacitances) / capacitance_noise,
+    }
+    status = _status(excess, whiteness, converged=found.converged)
+    if status.startswith(_NO_RESULT):
+        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=count)
+    law = unknowns.present_law()
     return ActuatorFit(
-        status="ok" if found.converged else "the search did not converge",
+        status=status,
         parameters=parameters,
         covariance=covariance * np.outer(slopes, slopes),
-        residuals=(*lengths, *capacitances),
+        residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),
+        channels=tuple((part.experiment, part.channel) for part in segments if part.experiment),
         length_rms_m=std_m * _rms(lengths),
-        length_noise_m=std_m * _neighbours(lengths),
+        length_noise_m=std_m * length_noise,
         capacitance_rms_f=std_f * _rms(capacitances),
-        capacitance_noise_f=std_f * _neighbours(capacitances),
-        residual_whiteness_p=min(whiteness_p(lengths), whiteness_p(capacitances)),
-        law=unknowns.present_law(),
-        kind=unknowns.law.kind,
+        capacitance_noise_f=std_f * capacitance_noise,
+        residual_whiteness_p=whiteness,
+        law=law,
+        kind=law.kind,
+        mass_kg=unknowns.mass_kg,
         added_inertia_kg=unknowns.value(ADDED_INERTIA),
+        linear_models=_linear_models(law, unknowns, misfit.records),
         not_identifiable=tuple(weak),
         evaluations=count,
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
+
+
+_NO_RESULT = ("the search", "the records")
+
+
+def _status(excess: dict[str, float], whiteness: float, *, converged: bool) -> str:
+    """ "ok", a model error, or why there is no result; rms over noise is given per channel."""
+    if not converged:
+        return "the search did not converge; start nearer, by [actuator.parameters]"
+    largest = max(excess, key=lambda name: np.nan_to_num(excess[name]))
+    ratio = float(np.nan_to_num(excess[largest]))
+    if ratio > _GROSS:
+        return (
+            f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
+            "noise. Check the mass, the units and that all records are of one actuator"
+        )
+    if ratio > _SLIGHT and whiteness < _WHITE:
+        return (
+            f"model error: the {largest} are off by {ratio:.3g} times the noise, and the "
+            "intervals are wider for it"
+        )
+    return "ok"
+
+
+def _pairs(values: NDArray[np.complex128]) -> list[list[float]]:
+    return [[float(value.real), float(value.imag)] for value in values]
+
+
+def _linear_models(
+    law: ActuatorLaw, unknowns: Unknowns, records: Sequence[MotionRecord]
+) -> tuple[OperatingPoint, ...]:
+    """At the hung mass, for motion within the lengths that were reached."""
+    highest_v = max(float(np.abs(record.drive.voltage_v).max()) for record in records)
+    longest_m = max((float(r.length_m.max()) for r in records if r.length_m.size), default=None)
+    inertia_kg = unknowns.mass_kg + unknowns.value(ADDED_INERTIA)
+    found = []
+    for voltage_v in np.linspace(0.0, highest_v, _POINTS).tolist():
+        try:
+            found.append(
+                linearise(
+                    law, voltage_v, unknowns.mass_kg * GRAVITY_M_S2, inertia_kg,
+                    longest_m=longest_m,
+                )
+            )  # fmt: skip
+        except LimitError:
+            break
+    return tuple(found)

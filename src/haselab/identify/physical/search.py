@@ -24,6 +24,8 @@ _TRIALS = 24  # starts that are compared
 _TRIED = 6  # of them, followed to the end of the first stage
 _EXPLAINED = 0.1  # mean bounded square below which the first stage has explained the records
 _LONGEST = 0.5  # step, in what varies over its width or as a logarithm
+_FIRST_DAMPING = 1e-4  # of the normal equations, scaled to a diagonal of 1
+_DAMPING = 1e-7  # the same of the last stage
 _GLIMPSE = 0.1  # of a step, where the second order is measured
 _ENOUGH = 1e-3  # relative decrease to be expected that ends a stage
 _DONE = 1e-2  # decrease of chi squared to be expected that ends the last one
@@ -158,7 +160,8 @@ def _descend(
         away = float((pull * unknowns.distance(start) ** 2).sum())
         return _bounded(residuals, noise) + away
 
-    damping, cost, count = 1e-4, cost_of(now.unknowns, now.residuals), 0
+    damping = _DAMPING if start is None else _FIRST_DAMPING
+    cost, count = cost_of(now.unknowns, now.residuals), 0
     for _ in range(most):
         weights = np.ones(now.residuals.size)
         if start is not None:
@@ -196,7 +199,7 @@ def _descend(
                 if reached < cost:
                     better = trial, reached
                     continue
-            damping = max(10.0 * damping, 1e-6)
+            damping *= 10.0
         if better is None:
             return now, count, True
         cost = better[1]

@@ -69,7 +69,8 @@ def _shares_of(name: str) -> tuple[str, ...]:
 class Unknowns:
     """Names, scales and values of what a fit estimates.
 
-    Positive parameters of the law vary by their logarithm, all others by their value.
+    Positive parameters of the law vary by their logarithm or by their inverse square, all others
+    by their value.
 
     Args:
         law: to start from; parameters that are not estimated stay those of this law.
@@ -100,13 +101,22 @@ class Unknowns:
     def by_logarithm(self) -> NDArray[np.bool_]:
         """Which of them vary by their logarithm. Shape `(P,)`."""
         linear = {ADDED_INERTIA, *INSTRUMENTS} - {SENSING_SCALE}
-        return np.array([name not in linear for name in self.names])
+        return np.array([name not in linear for name in self.names]) & ~self.by_inverse_square
+
+    @property
+    def by_inverse_square(self) -> NDArray[np.bool_]:
+        """Which of them vary by their inverse square. Shape `(P,)`."""
+        marked = {about.key for about in self.law.described() if about.inverse_square}
+        return np.array([name in marked for name in self.names])
 
     @property
     def widths(self) -> Floats:
         """How far the start may be off, in what varies. Shape `(P,)`."""
         widths = {ADDED_INERTIA: _INERTIA_WIDTH * self._inertia_kg, **_WIDTHS}
-        return np.array([widths.get(name, _WIDTH) for name in self.names])
+        found = np.array([widths.get(name, _WIDTH) for name in self.names])
+        inverse = self.by_inverse_square
+        found[inverse] *= 2.0 / self.values[inverse] ** 2
+        return found
 
     @property
     def _inertia_kg(self) -> float:
@@ -115,7 +125,8 @@ class Unknowns:
     @property
     def slopes(self) -> Floats:
         """Change of the values per change of what varies. Shape `(P,)`."""
-        return np.where(self.by_logarithm, self.values, 1.0)
+        found = np.where(self.by_logarithm, self.values, 1.0)
+        return np.where(self.by_inverse_square, -0.5 * self.values**3, found)
 
     def value(self, name: str) -> float:
         """Value of one of them; an instrument's default where it is not estimated."""
@@ -129,17 +140,21 @@ class Unknowns:
         Args:
             step: changes. Shape `(P,)`.
         """
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             values = np.where(
                 self.by_logarithm, self.values * np.exp(np.minimum(step, 50.0)), self.values + step
             )
+            squared = 1.0 / (self.values**-2.0 + step)
+            values = np.where(self.by_inverse_square, np.sqrt(squared), values)
         return Unknowns(self.law, self.names, values, self.mass_kg)
 
     def distance(self, other: Unknowns) -> Floats:
         """What varies here minus there, of the same names. Shape `(P,)`."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.log(self.values / other.values)
-        return np.where(self.by_logarithm, ratio, self.values - other.values)
+            inverse = self.values**-2.0 - other.values**-2.0
+        found = np.where(self.by_logarithm, ratio, self.values - other.values)
+        return np.where(self.by_inverse_square, inverse, found)
 
     def without(self, names: Sequence[str]) -> Unknowns:
         """Keep some of them at their present values."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _twin
+from haselab.actuators import GRAVITY_M_S2
 from haselab.base import LimitError, Limits, SafetyError
 from haselab.rig import Frames, Rig, RigDescription
 from haselab.rig.twin.camera import TwinCamera
@@ -18,7 +19,6 @@ from haselab.rig.twin.config import TwinConfig
 
 __all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench", "rig_of"]
 
-GRAVITY_M_S2 = 9.81
 _CARRIER_HIGH_V = 1.0  # at the input of the amplifier
 _CLAMP_KG = 0.02  # the lower clamp itself
 _SLOWEST_FRAMES_HZ = 0.01  # a lower frame rate is a mistake

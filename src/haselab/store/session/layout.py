@@ -170,7 +170,8 @@ def create_root(file: h5py.File, plans: list[ExperimentPlan], header: Mapping[st
     file.attrs["default"] = "experiments"
     events = file.create_dataset("events", (0,), EVENT, maxshape=(None,), chunks=(64,))
     events.make_scale("events")
-    file.create_dataset("conditions", (0,), CONDITION, maxshape=(None,), chunks=(256,))
+    acted = file.create_dataset("conditions", (0,), CONDITION, maxshape=(None,), chunks=(256,))
+    acted.make_scale("conditions")
     entry = file.create_group("experiments")
     entry.attrs["NX_class"] = "NXentry"
     if plans:

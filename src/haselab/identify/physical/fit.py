@@ -26,7 +26,7 @@ from haselab.identify.noise import coloured_covariance, whiteness_p
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.search import Found, refine, search
-from haselab.identify.physical.unknowns import CAMERA_OFFSET, Unknowns
+from haselab.identify.physical.unknowns import CAMERA_OFFSET, SENSING_SCALE, Unknowns
 
 __all__ = ["ActuatorFit", "fit_actuator"]
 
@@ -36,8 +36,10 @@ _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
+_SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _WHITE = 1e-3  # probability of the residuals under white noise
 _POINTS = 5  # voltages of the linear models
+_UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
 _WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
 
 
@@ -53,7 +55,8 @@ class ActuatorFit(Fit):
         notes: remarks for the user, one sentence each.
         law: with the estimated parameters.
         kind: of the actuator.
-        not_identifiable: names of parameters that these records do not determine.
+        not_identifiable: names of parameters that these records do not determine, or whose values
+            the search had not settled.
         length_rms_m: of the residuals of the lengths.
         capacitance_rms_f: of those of the capacitances.
         length_noise_m: from differences of neighbours, which a slow misfit does not change.
@@ -258,6 +261,8 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
     parameters, weak = {}, []
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
+        if abs(found.left[k]) > _UNSETTLED * std[k]:
+            weak.append(name)
         if unknowns.by_logarithm[k] or unknowns.by_inverse_square[k]:
             share = std[k] * abs(slopes[k]) / unknowns.values[k]
             if share > _WEAK or not np.abs(found.jacobian[:, k]).any():
@@ -276,6 +281,12 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
         "capacitances": _rms(capacitances) / capacitance_noise,
     }
     status = _status(excess, whiteness, converged=found.converged)
+    scale = unknowns.value(SENSING_SCALE)
+    if abs(scale - 1.0) > _SCALE and not status.startswith(_NO_RESULT):
+        status = (
+            f"the records contradict each other: the capacitances are {scale:.3g} times those that "
+            "the forces need. Check the mass, the amplifier's gain and the calibration"
+        )
     if status.startswith(_NO_RESULT):
         return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=count)
     law = unknowns.present_law()
@@ -295,7 +306,7 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
         mass_kg=unknowns.mass_kg,
         added_inertia_kg=unknowns.value(ADDED_INERTIA),
         linear_models=_linear_models(law, unknowns, misfit.records),
-        not_identifiable=tuple(weak),
+        not_identifiable=tuple(dict.fromkeys(weak)),
         evaluations=count,
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
@@ -306,15 +317,16 @@ _NO_RESULT = ("the search", "the records")
 
 def _status(excess: dict[str, float], whiteness: float, *, converged: bool) -> str:
     """ "ok", a model error, or why there is no result; rms over noise is given per channel."""
-    if not converged:
-        return "the search did not converge; start nearer, by [actuator.parameters]"
     largest = max(excess, key=lambda name: np.nan_to_num(excess[name]))
     ratio = float(np.nan_to_num(excess[largest]))
     if ratio > _GROSS:
         return (
             f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
-            "noise. Check the mass, the units and that all records are of one actuator"
+            "noise. Check the mass, the units and that all records are of one actuator, or start "
+            "nearer, by [actuator.parameters]"
         )
+    if not converged:
+        return "the search did not converge; start nearer, by [actuator.parameters]"
     if ratio > _SLIGHT and whiteness < _WHITE:
         return (
             f"model error: the {largest} are off by {ratio:.3g} times the noise, and the "

@@ -28,7 +28,8 @@ _FIRST_DAMPING = 1e-4  # of the normal equations, scaled to a diagonal of 1
 _DAMPING = 1e-7  # the same of the last stage
 _GLIMPSE = 0.1  # of a step, where the second order is measured
 _ENOUGH = 1e-3  # relative decrease to be expected that ends a stage
-_DONE = 1e-2  # decrease of chi squared to be expected that ends the last one
+_NEAR = 4.0  # decrease to be expected, in the same, above which nothing was found
+_DONE = 1e-2  # the same of the last one, in the mean square of the residuals
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,15 @@ class Found:
         unknowns: at the smallest misfit.
         residuals: over their standard deviations. Shape `(N,)`.
         jacobian: of the model over the standard deviations. Shape `(N, P)`.
-        converged: whether no better values were found nearby.
+        left: step of Gauss and Newton that remains, of what varies. Shape `(P,)`.
+        converged: whether it is hardly expected to lower the misfit.
         evaluations: of the model.
     """
 
     unknowns: Unknowns
     residuals: Floats
     jacobian: Floats
+    left: Floats
     converged: bool
     evaluations: int
 
@@ -75,8 +78,8 @@ def search(misfit: Misfit, start: Unknowns) -> Found | None:
         noise = max(1.0, 0.1 * noise)
         now, used, _ = _descend(misfit, now, start, noise, _STEPS)
         count += used
-    now, used, converged = _descend(misfit, now, None, 1.0, _LAST_STEPS)
-    return Found(now.unknowns, now.residuals, now.jacobian, converged, count + used)
+    now, used, _ = _descend(misfit, now, None, 1.0, _LAST_STEPS)
+    return _found(now, count + used)
 
 
 def refine(misfit: Misfit, found: Found) -> Found | None:
@@ -92,8 +95,19 @@ def refine(misfit: Misfit, found: Found) -> Found | None:
     if again is None:
         return None
     now = _State(found.unknowns, *again)
-    now, used, converged = _descend(misfit, now, None, 1.0, _LAST_STEPS)
-    return Found(now.unknowns, now.residuals, now.jacobian, converged, used + 1)
+    now, used, _ = _descend(misfit, now, None, 1.0, _LAST_STEPS)
+    return _found(now, used + 1)
+
+
+def _found(now: _State, evaluations: int) -> Found:
+    scale = np.maximum(np.linalg.norm(now.jacobian, axis=0), 1e-150)
+    left = np.linalg.lstsq(now.jacobian / scale, now.residuals, rcond=1e-12)[0]
+    expected = float(np.sum((now.jacobian @ (left / scale)) ** 2))
+    usual = float(np.mean(now.residuals**2))
+    return Found(
+        now.unknowns, now.residuals, now.jacobian, left / scale,
+        expected < _NEAR * max(1.0, usual), evaluations,
+    )  # fmt: skip
 
 
 def _first_stage(misfit: Misfit, start: Unknowns, noise: float) -> tuple[_State | None, int]:
@@ -174,7 +188,8 @@ def _descend(
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         correlation, slope = normal / np.outer(scale, scale), slope / scale
         left = float(slope @ np.linalg.lstsq(correlation, slope, rcond=1e-15)[0])
-        if left < (_DONE if start is None else max(_ENOUGH * cost, 1.0)):
+        done = _DONE * max(1.0, cost / now.residuals.size)
+        if left < (done if start is None else max(_ENOUGH * cost, 1.0)):
             return now, count, True
         better: tuple[Unknowns, float] | None = None
         while better is None and damping < 1e6:

@@ -140,21 +140,20 @@ class Unknowns:
         Args:
             step: changes. Shape `(P,)`.
         """
+        logarithm, inverse = self.by_logarithm, self.by_inverse_square
+        values = self.values + step
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            values = np.where(
-                self.by_logarithm, self.values * np.exp(np.minimum(step, 50.0)), self.values + step
-            )
-            squared = 1.0 / (self.values**-2.0 + step)
-            values = np.where(self.by_inverse_square, np.sqrt(squared), values)
+            values[logarithm] = self.values[logarithm] * np.exp(np.minimum(step[logarithm], 50.0))
+            values[inverse] = (self.values[inverse] ** -2.0 + step[inverse]) ** -0.5
         return Unknowns(self.law, self.names, values, self.mass_kg)
 
     def distance(self, other: Unknowns) -> Floats:
         """What varies here minus there, of the same names. Shape `(P,)`."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.log(self.values / other.values)
-            inverse = self.values**-2.0 - other.values**-2.0
-        found = np.where(self.by_logarithm, ratio, self.values - other.values)
-        return np.where(self.by_inverse_square, inverse, found)
+        logarithm, inverse = self.by_logarithm, self.by_inverse_square
+        found = self.values - other.values
+        found[logarithm] = np.log(self.values[logarithm] / other.values[logarithm])
+        found[inverse] = self.values[inverse] ** -2.0 - other.values[inverse] ** -2.0
+        return found
 
     def without(self, names: Sequence[str]) -> Unknowns:
         """Keep some of them at their present values."""

@@ -26,7 +26,7 @@ _DAY_S = 86400.0
 
 
 def _frames(examples: float) -> Any:
-    return Field(gt=0, le=1e5, description="frames a second of the camera", examples=[examples])
+    return Field(gt=0, le=1e5, description="frames per second of the camera", examples=[examples])
 
 
 class Sensing(Section):
@@ -61,10 +61,13 @@ class Triangle(Section):
 
     low_v: float = Field(ge=-100, le=100, description="lowest drive", examples=[0.0])
     high_v: float = Field(ge=-100, le=100, description="highest drive", examples=[2.0])
-    frequency_hz: float = Field(ge=1e-4, le=25, description="triangles a second", examples=[0.25])
+    frequency_hz: float = Field(ge=1e-4, le=25, description="triangles per second", examples=[0.25])
     cycles: int = Field(ge=2, le=1000, description="number of triangles", examples=[5])
     left_out_cycles: int = Field(
-        ge=0, le=1000, description="first triangles that the maps are not fitted to", examples=[1]
+        ge=0,
+        le=1000,
+        description="triangles at the start that the fits of the maps leave out",
+        examples=[1],
     )
     frame_rate_hz: float = _frames(100.0)
 
@@ -158,8 +161,8 @@ class Steps(Section):
         0.1,
         gt=0,
         le=1,
-        description="amplitude of the carrier in these trials; updates of the output leak into a "
-        "smaller one",
+        description="amplitude of the carrier in these trials; a smaller one is disturbed by the "
+        "updates of the output",
     )
     extra_delay_trials: int = Field(
         0,
@@ -179,7 +182,7 @@ class Steps(Section):
         description="trials with the controller of [control], if it has a kind",
     )
     feedback: Literal["capacitance", "video"] = Field(
-        "capacitance", description="what the closed loops measure the strain by"
+        "capacitance", description="sensor of the closed loops: self-sensing or the camera"
     )
 
 
@@ -236,7 +239,7 @@ class StepTrials(Section):
         ge=0, le=86400, description="wait at 0 V before each trial", examples=[2.0]
     )
     frame_rate_hz: float = Field(
-        gt=0, le=1e4, description="frames a second of the camera", examples=[100.0]
+        gt=0, le=1e4, description="frames per second of the camera", examples=[100.0]
     )
     trials: int = Field(ge=1, le=1000, description="number of trials", examples=[3])
 

@@ -40,7 +40,7 @@ def test_a_reading_beside_a_twin_is_refused(reading: str, twin: Path, tmp_path: 
 def test_a_rig_file_without_a_kind_names_the_kinds(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text('reading = "hz"\n')
-    with pytest.raises(InputError, match='has no key kind: "twin" or "bench" or "mega"'):
+    with pytest.raises(InputError, match='has no key kind: "twin" or "bench" or "chip"'):
         load_rig(path)
 
 

@@ -234,8 +234,8 @@ def _first_block(rig: Rig) -> bytes:
     "--live",
     is_flag=True,
     help="Apply HIGH VOLTAGE too: the sensing signal, a step to 10 % of the drive range (1 kV at "
-    "2 V x 5000) and 10 % of the supply's limit; on a microcontroller, closed loop at zero strain "
-    "for 0.5 s. Keep clear. Requires --yes.",
+    "2 V x 5000) and 10 % of the supply's highest voltage, but at least 100 V; on a "
+    "microcontroller, closed loop at zero strain for 0.5 s. Keep clear. Requires --yes.",
 )
 @shared_option(
     "--yes", is_flag=True,
@@ -382,8 +382,9 @@ def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -
 
     IN AN EMERGENCY, PRESS THE EMERGENCY STOP FIRST. The command revokes the permission of whichever
     program on this computer uses the bench. That program stays at 0 V until you arm the bench again
-    and acknowledge the reason. Other benches are not affected. With --bench, this command cannot
-    reach the outputs: it revokes the permission and waits up to 5 s for the program to command 0 V.
+    and acknowledge the reason. Other benches are not affected, except those that use the same
+    generator or supply. With --bench, this command cannot reach the outputs: it revokes the
+    permission and waits up to 5 s for the program to command 0 V.
     """
     if (rig is None) == (bench is None):
         raise InputError(f"{_NOTHING} Then give either a rig file or --bench KEY.")

@@ -360,8 +360,8 @@ class _Out:
 )  # fmt: skip
 @shared_option(
     "--blank-s", type=REAL, callback=_not_negative,
-    detail="The step is at the start of each block; 0: there are no steps. Default: search each "
-    "block for a step, or use the times that a session states.",
+    detail="The output steps at the start of each block; 0: the output does not step. Default: "
+    "search each block for a step, or use the times that a session states.",
 )  # fmt: skip
 @_option("--volt-per-monitor-volt", "Default: 5000, or the session's.")
 @_option("--ampere-per-monitor-volt", "Default: 0.002, or the session's.")

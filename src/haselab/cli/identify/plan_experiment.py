@@ -68,7 +68,7 @@ _BLOCK_DIGITS = 6
 )  # fmt: skip
 @click.option(
     "--systematic", type=REAL, default=0.05, show_default=True,
-    help="Set the error of the models themselves, as a share of the output's range.",
+    help="Set the rms error of the models themselves, relative to the output's standard deviation.",
 )  # fmt: skip
 @answer_options(None, "A CSV file of the drive signal: time_s, drive_v. Default: none.", plot=True)
 def command(

@@ -93,11 +93,10 @@ def _between(
 )  # fmt: skip
 @click.option(
     "--electrode-natural", type=REAL,
-    help="Fit electrodes too; they have no stress at this stretch. Default: no electrodes.",
+    help="Fit the spring of bonded electrodes too, which is free of force at this stretch. "
+    "Default: no electrodes.",
 )  # fmt: skip
-@click.option(
-    "--electrode-stiffening", is_flag=True, help="Fit a cubic term of the electrodes too."
-)
+@click.option("--electrode-stiffening", is_flag=True, help="Fit a cubic term of this spring too.")
 @click.option(
     "--at-stretch", type=REAL, multiple=True,
     help="Compute the stress at this stretch. Repeat the option for more. Default: none.",

@@ -72,9 +72,9 @@ def command(
     MODEL is an actuator file or a model.json. The command reports the fit in percent, the rms error
     and the share of samples inside the 95 % band. It first estimates the initial state and the
     offset of each record, unless --at-rest is given. Samples that were used for the fit are
-    recognised by their values, also in a part of a record, in another format and with fewer digits:
-    used_for_fit is their share, and the exit code is 3 from 5 % on, or if the prediction is worse
-    than the mean.
+    recognised by their values, also in a part of a record, in another format and with fewer digits.
+    Their share is used_for_fit. The exit code is 3 if this share is above 5 %, or if the prediction
+    is worse than the mean of the record.
     """
     plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
     through = model if through_voltage_map else None

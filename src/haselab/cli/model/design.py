@@ -62,8 +62,8 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @shared_option(
     "--controller", "--structure", "structure", default="pid", show_default=True,
-    detail="pi: as published; pid: with the derivative of the filtered measurement. For any other "
-    "registered kind, only the margins are computed, with the parameters of the file.",
+    detail="pi: as in the paper; pid: with the derivative of the filtered measurement. For any "
+    "other registered kind, only the margins are computed, with the parameters of the file.",
 )  # fmt: skip
 @loop_options
 @click.option(

@@ -190,12 +190,12 @@ def simulate(
 ) -> None:
     """Simulate the firmware in a step experiment.
 
-    The microcontroller, in co-simulation, and two loops on the desktop, at 100 Hz and at 1 kHz,
-    control the same twin. RUN is an actuator file or the folder of a run, whose report then shows
-    all three. The desktop loop at 1 kHz has the delay and the limits of the microcontroller. All
-    three are calibrated with one reference capacitor first. For a PI or PID, the chip's step is
-    compared with the step that [model] predicts. If they differ by more than the design covers, the
-    command says why and exits with code 3.
+    RUN is an actuator file or the folder of a run. Three loops control the same twin: the
+    microcontroller in co-simulation, and two loops on the desktop at 100 Hz and 1 kHz. The one at
+    1 kHz has the delay and the limits of the microcontroller. All three are first calibrated with a
+    reference capacitor. The report of a run then shows them. For a PI or PID, the simulated step of
+    the microcontroller is compared with the step that [model] predicts. If they differ by more than
+    the design covers, the command names the cause and exits with code 3.
     """
     refuse_two_twins(options["reading"], options["twin"])
     refuse_linked_folders(run, "firmware", "figures")

@@ -22,9 +22,7 @@ __all__ = ["actuator"]
 
 
 @click.command("actuator")
-@click.argument(
-    "sessions", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SESSION..."
-)
+@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @actuator_option("Read [actuator], write [model.physical].")
 @unverified_option
 @answer_options(plot=True)
@@ -39,7 +37,7 @@ def actuator(
 ) -> None:
     """Identify a physical model from everything recorded.
 
-    SESSION... are folders of runs or their session.h5, all of one actuator. Lengths and
+    SESSIONS are folders of runs or their session.h5, all of one actuator. Lengths and
     capacitances of all experiments are compared with one simulated motion. The kind, what was
     measured otherwise, such as a width, and where to start come from [actuator].
     """

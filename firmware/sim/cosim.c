@@ -165,7 +165,7 @@ static void step_plant(bench *b)
     }
     ++b->slots;
     if (b->track_every && b->slots % b->track_every == 0) {
-        printf("track %llu %.9g %.9g\n", (unsigned long long)b->avr->cycle, b->plant.length_m,
+        printf("track %llu %.9g %.9g\n", (unsigned long long)b->avr->cycle, b->plant.motion.length_m,
                b->plant.amp_v);
     }
 }
@@ -540,7 +540,7 @@ int main(int argc, char **argv)
                (unsigned long long)b.avr->cycle, (unsigned long long)b.asleep, b.resets, b.crashes,
                b.conversions, b.short_slots,
                b.lowest_sp > b.avr->ramend ? 0 : b.avr->ramend - b.lowest_sp, b.code, b.enable,
-               b.plant.length_m, b.plant.amp_v, b.plant.broken);
+               b.plant.motion.length_m, b.plant.amp_v, b.plant.broken);
         fflush(stdout);
     }
     return 0;

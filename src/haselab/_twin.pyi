@@ -10,11 +10,16 @@ class Bench:
     def __init__(
         self,
         values: Mapping[str, float],
-        ab: NDArray[np.float64],
-        prony_g: NDArray[np.float64],
-        prony_s: NDArray[np.float64],
+        motion: NDArray[np.void],
         length_m: float,
         seed: int,
+        low_m: float,
+        step_m: float,
+        step_v: float,
+        elastic_n: NDArray[np.float64],
+        gap_m: NDArray[np.float64],
+        capacitance_f: NDArray[np.float64],
+        pull_n_v2: NDArray[np.float64],
     ) -> None: ...
     def acquire(
         self,
@@ -36,17 +41,6 @@ class Bench:
     def elastic_force(self, length_m: float) -> float: ...
     def capacitance(self, length_m: float, voltage_v: float = 0.0) -> float: ...
     def gap(self, length_m: float) -> float: ...
-    def set_law(
-        self,
-        low_m: float,
-        step_m: float,
-        step_v: float,
-        substeps: int,
-        elastic_n: NDArray[np.float64],
-        gap_m: NDArray[np.float64],
-        capacitance_f: NDArray[np.float64],
-        pull_n_v2: NDArray[np.float64],
-    ) -> None: ...
     @property
     def addresses(self) -> tuple[int, int]: ...
     @property

@@ -103,6 +103,7 @@ def test_a_capacitance_that_depends_on_the_voltage_keeps_energy_and_charge_consi
 
 
 def test_the_planar_law_has_the_numbers_of_the_c_twin():
+    """A table of 1,024 lengths with cubics between them: 1e-6 of a value."""
     config = TwinConfig.model_validate(
         {"mullins": {"share": 0.3, "stretch": 1.2}, "electrodes": {"stiffening": 2.0}}
     )
@@ -110,12 +111,12 @@ def test_the_planar_law_has_the_numbers_of_the_c_twin():
     for length_m in np.linspace(0.9, 2.2, 27) * law.free_length_m:
         softening = law.losses.softening(1.0)  # the bench is new
         assert bench.elastic_force(length_m) == pytest.approx(
-            float(law.elastic_force_n(length_m) * softening), rel=1e-12, abs=1e-13
+            float(law.elastic_force_n(length_m) * softening), rel=1e-6, abs=1e-6
         )
         assert bench.capacitance(length_m) == pytest.approx(
-            float(law.capacitance_f(length_m)), rel=1e-13
+            float(law.capacitance_f(length_m)), rel=1e-6
         )
-        assert bench.gap(length_m) == pytest.approx(float(law.gap_m(length_m)), rel=1e-13)
+        assert bench.gap(length_m) == pytest.approx(float(law.gap_m(length_m)), rel=1e-6)
 
 
 def test_the_planar_law_and_twin_toml_have_the_same_defaults_and_limits():

@@ -30,6 +30,9 @@ class Memory:
     def event(self, time_s, what):
         pass
 
+    def condition(self, *given):
+        pass
+
     def start(self, name, rate_hz, mass_kg, part="", particles=""):
         pass
 

@@ -1,33 +1,52 @@
 """Physical laws of actuators: energy, capacitance, masses and losses in one object."""
 
+from haselab.actuators.curling_hasel import CurlingHasel
 from haselab.actuators.dea_stack import DeaStack
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, Parameter, parameter
 from haselab.actuators.losses import Circuit, Losses
-from haselab.actuators.motion import ActuatorState, advance, rates, simulate
+from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
+from haselab.actuators.peano_hasel import PeanoHasel
 from haselab.actuators.planar_hasel import PlanarHasel
+from haselab.actuators.pouch import Pouch
 from haselab.actuators.registry import ACTUATORS, actuator_law
-from haselab.actuators.table import LawTable, law_table, motion_substeps
+from haselab.actuators.response import (
+    ADDED_INERTIA,
+    GRAVITY_M_S2,
+    Drive,
+    Response,
+    SampledLaw,
+    motion_parameters,
+    with_parameters,
+)
+from haselab.actuators.table import LawTable, law_table
 
 __all__ = [
     "ACTUATORS",
+    "ADDED_INERTIA",
+    "GRAVITY_M_S2",
     "VACUUM_F_PER_M",
     "ActuatorLaw",
     "ActuatorState",
     "Circuit",
+    "CurlingHasel",
     "DeaStack",
+    "Drive",
     "LawTable",
     "Losses",
     "OperatingPoint",
     "Parameter",
+    "PeanoHasel",
     "PlanarHasel",
+    "Pouch",
+    "Response",
+    "SampledLaw",
     "actuator_law",
-    "advance",
     "equilibrium_m",
     "law_table",
     "linearise",
-    "motion_substeps",
+    "motion_parameters",
     "parameter",
     "rates",
-    "simulate",
+    "with_parameters",
 ]

@@ -61,18 +61,19 @@ class DeaStack(ActuatorLaw):
 
     # fmt: off
     layers: float = parameter(
-        50.0, unit="", low=1.0, high=1e5, description="number of dielectric layers")
+        50.0, unit="", low=1.0, high=1e5, description="number of dielectric layers", fitted=False)
     layer_thickness_m: float = parameter(
         0.7e-3, unit="m", low=1e-6, high=1e-2, description="undeformed")
     side_m: float = parameter(
-        0.025, unit="m", low=1e-3, high=0.3, description="of the square cross-section")
+        0.025, unit="m", low=1e-3, high=0.3, description="of the square cross-section",
+        fitted=False)
     shear_modulus_pa: float = parameter(
         15e3, unit="Pa", low=1.0, high=1e8, description="of the elastomer")
     extension_limit: float = parameter(
         80.0, unit="", low=5.0, high=1e6, description="J_m of Gent's law; a large one is neo-Hooke")
     permittivity: float = parameter(3.0, unit="", low=1.0, high=1e3, description="relative")
     density_kg_m3: float = parameter(
-        1000.0, unit="kg/m^3", low=1.0, high=1e5, description="of the elastomer")
+        1000.0, unit="kg/m^3", low=1.0, high=1e5, description="of the elastomer", fitted=False)
     damping_n_s_per_m: float = parameter(
         2.0, unit="N s/m", low=1e-6, high=1e4, description="linear damper")
     branch_share: tuple[float, ...] = parameter(
@@ -80,11 +81,11 @@ class DeaStack(ActuatorLaw):
     branch_relaxation_s: tuple[float, ...] = parameter(
         (0.1, 3.0), unit="s", low=1e-3, high=1e6, description="of each branch")
     series_ohm: float = parameter(
-        5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes")
+        5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes", fitted=False)
     leakage_ohm: float = parameter(
-        2e10, unit="ohm", low=1e6, high=1e18, description="of the dielectric")
+        2e10, unit="ohm", low=1e6, high=1e18, description="of the dielectric", fitted=False)
     breakdown_v_per_m: float = parameter(
-        60e6, unit="V/m", low=1e5, high=1e10, description="field that destroys it")
+        60e6, unit="V/m", low=1e5, high=1e10, description="field that destroys it", fitted=False)
     # fmt: on
 
     @property

@@ -46,6 +46,8 @@ class Parameter:
         low: smallest permitted value.
         high: largest permitted value.
         description: short text for people.
+        fitted: whether `identify actuator` estimates it; False: measured otherwise.
+        inverse_square: see `parameter`.
     """
 
     name: str
@@ -54,6 +56,8 @@ class Parameter:
     low: float
     high: float
     description: str
+    fitted: bool = True
+    inverse_square: bool = False
 
 
 def parameter(
@@ -64,6 +68,8 @@ def parameter(
     high: float,
     description: str,
     key: str = "",
+    fitted: bool = True,
+    inverse_square: bool = False,
 ) -> AnyValue:
     """A field of a law with its unit and limits.
 
@@ -74,10 +80,22 @@ def parameter(
         high: largest permitted value.
         description: short text for people.
         key: in TWIN.toml; empty: the name of the field in the table `actuator`.
+        fitted: whether `identify actuator` estimates it; False: measured otherwise, such as a
+            width, or without effect on motion and capacitance.
+        inverse_square: whether the forces are nearly linear in its inverse square, as in that of a
+            locking stretch; False: it is varied by its logarithm.
     Returns:
         The dataclass field.
     """
-    about = {"key": key, "unit": unit, "low": low, "high": high, "description": description}
+    about = {
+        "key": key,
+        "unit": unit,
+        "low": low,
+        "high": high,
+        "description": description,
+        "fitted": fitted,
+        "inverse_square": inverse_square,
+    }
     field: AnyValue = dataclasses.field(default=default, metadata={_KEY: about})
     return field
 

@@ -87,7 +87,7 @@ def _next_rest_m(
     turned = _net_force_n(law, grid, voltage_v, load_n, longest_m) * pushed <= 0.0
     if not turned.any():
         return None
-    k = int(np.argmax(turned))
+    k = max(1, int(np.argmax(turned)))  # at the start the sign may be one of rounding
     near, far = float(grid[k - 1]), float(grid[k])
     for _ in range(80):
         middle = 0.5 * (near + far)

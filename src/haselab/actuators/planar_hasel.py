@@ -66,15 +66,17 @@ class PlanarHasel(ActuatorLaw):
     shear_modulus_pa: float = parameter(15.6e3, unit="Pa", low=0.0, high=1e7,
         description="of the shell", key="shell.shear_modulus_pa")
     locking_stretch: float = parameter(3.92, unit="", low=1.5, high=50.0,
-        description="at which the chains are straight", key="shell.locking_stretch")
+        description="at which the chains are straight", key="shell.locking_stretch",
+        inverse_square=True)
     length_m: float = parameter(0.0624, unit="m", low=0.01, high=0.2,
         description="between clamps, unstretched", key="shell.length_m")
     shell_width_m: float = parameter(
-        0.0498, unit="m", low=0.005, high=0.3, description="unstretched", key="shell.width_m")
+        0.0498, unit="m", low=0.005, high=0.3, description="unstretched", key="shell.width_m",
+        fitted=False)
     shell_thickness_m: float = parameter(1.2e-3, unit="m", low=1e-4, high=1e-2,
-        description="unstretched, without oil", key="shell.thickness_m")
+        description="unstretched, without oil", key="shell.thickness_m", fitted=False)
     shell_lateral_stretch: float = parameter(3.0, unit="", low=1.0, high=5.0,
-        description="fixed by the clamps", key="shell.lateral_stretch")
+        description="fixed by the clamps", key="shell.lateral_stretch", fitted=False)
     electrode_stiffness_n_per_m: float = parameter(150.0, unit="N/m", low=0.0, high=1e5,
         description="of the gel", key="electrodes.stiffness_n_per_m")
     electrode_stiffening: float = parameter(0.1, unit="", low=0.0, high=100.0,
@@ -92,22 +94,22 @@ class PlanarHasel(ActuatorLaw):
     softening_transition: float = parameter(
         0.02, unit="", low=0.001, high=1.0, description="of the transition", key="mullins.width")
     oil_volume_m3: float = parameter(0.6e-6, unit="m^3", low=0.0, high=1e-4,
-        description="of the liquid dielectric", key="dielectric.oil_volume_m3")
+        description="of the liquid dielectric", key="dielectric.oil_volume_m3", fitted=False)
     permittivity: float = parameter(
         3.0, unit="", low=1.0, high=100.0, description="relative", key="dielectric.permittivity")
     capacitance_exponent: float = parameter(3.33, unit="", low=1.0, high=4.0,
         description="d ln C / d ln length", key="dielectric.capacitance_exponent")
     series_ohm: float = parameter(5e3, unit="ohm", low=0.0, high=1e8,
-        description="of the electrodes", key="dielectric.series_ohm")
+        description="of the electrodes", key="dielectric.series_ohm", fitted=False)
     leakage_ohm: float = parameter(2e10, unit="ohm", low=1e6, high=1e18,
-        description="of the dielectric", key="dielectric.leakage_ohm")
+        description="of the dielectric", key="dielectric.leakage_ohm", fitted=False)
     charge_share: float = parameter(0.0, unit="", low=0.0, high=1.0,
         description="of the voltage that acts late", key="dielectric.relaxation_share")
     charge_relaxation_s: float = parameter(
         5.7, unit="s", low=0.01, high=1e4, description="of that part",
         key="dielectric.relaxation_s")
     breakdown_v_per_m: float = parameter(40e6, unit="V/m", low=1e5, high=1e18,
-        description="field that destroys it", key="dielectric.breakdown_v_per_m")
+        description="field that destroys it", key="dielectric.breakdown_v_per_m", fitted=False)
     # fmt: on
 
     @property

@@ -24,6 +24,8 @@ ACTUATORS: Registry[type[ActuatorLaw]] = Registry(
     "haselab.actuators",
     {
         "planar-hasel": "haselab.actuators.planar_hasel:PlanarHasel",
+        "peano-hasel": "haselab.actuators.peano_hasel:PeanoHasel",
+        "curling-hasel": "haselab.actuators.curling_hasel:CurlingHasel",
         "dea-stack": "haselab.actuators.dea_stack:DeaStack",
     },
     _fault,

@@ -1,8 +1,7 @@
-"""Sample a law on a grid, which the compiled twin interpolates."""
+"""Sample a law on a grid, which the compiled motion interpolates."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +10,17 @@ from numpy.typing import NDArray
 from haselab.actuators.law import ActuatorLaw
 from haselab.base import InputError
 
-__all__ = ["LawTable", "law_table", "motion_substeps"]
+__all__ = ["LawTable", "law_table", "law_values"]
 
 Floats = NDArray[np.float64]
-LENGTHS = 1024  # TWIN_LENGTHS of native/twin/twin.h
-VOLTAGES = 9  # TWIN_VOLTAGES
+LENGTHS = 1024  # MOTION_LENGTHS of native/motion/motion.h
+VOLTAGES = 65  # MOTION_VOLTAGES
 _SAME = 1e-9  # relative difference below which the voltage has no effect
-_INTERPOLATED = 1e-6  # largest error between the knots, of the largest value
-_PHASE = 0.1  # of the fastest motion in a substep, rad
-_MOST_SUBSTEPS = 100
+_INTERPOLATED = 1e-6  # largest error between two lengths, of the largest value
+_WITH_VOLTAGE = 2e-5  # the same where the voltage has an effect on the capacitance
+_BETWEEN_VOLTAGES = 1e-3  # the same between two voltages
+_EVERY = 8  # row is checked between its lengths, and length between the voltages
+_MIDDLE = np.array([-1.0, 9.0, 9.0, -1.0]) / 16.0  # of a cubic through four knots
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,18 @@ class LawTable:
     capacitance_f: Floats
     pull_n_v2: Floats
 
+    def arrays(self) -> tuple[float, float, float, Floats, Floats, Floats, Floats]:
+        """All values, in the order that the compiled code takes them."""
+        return (
+            self.low_m,
+            self.step_m,
+            self.step_v,
+            self.elastic_n,
+            self.gap_m,
+            self.capacitance_f,
+            self.pull_n_v2,
+        )
+
 
 def _rows(law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats) -> tuple[Floats, Floats]:
     """Differential capacitance, and force over voltage squared, whose limit at 0 V is finite."""
@@ -51,6 +64,21 @@ def _rows(law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats) -> tuple[Floa
     acting_v = np.maximum(voltages_v, 1.0)
     pull = np.stack([law.electric_force_n(lengths_m, v) / v**2 for v in acting_v])
     return capacitance, pull
+
+
+def law_values(
+    law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Elastic force, differential capacitance, and electric force over the voltage squared.
+
+    Args:
+        law: to evaluate.
+        lengths_m: Shape `(L,)`.
+        voltages_v: Shape `(V,)`.
+    Returns:
+        Shapes `(L,)`, `(V, L)` and `(V, L)`.
+    """
+    return law.elastic_force_n(lengths_m), *_rows(law, lengths_m, voltages_v)
 
 
 def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
@@ -89,7 +117,9 @@ def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
         pull_n_v2=np.ascontiguousarray(pull[:used]),
     )
     _check_values(law, table)
-    _check_smooth(law, table, lengths_m)
+    _check_lengths(law, table, lengths_m)
+    if used > 1:
+        _check_voltages(law, table, lengths_m)
     return table
 
 
@@ -108,50 +138,52 @@ def _check_values(law: ActuatorLaw, table: LawTable) -> None:
             )
 
 
-def _check_smooth(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
-    """Compare the cubic interpolation with the law, midway between the knots."""
+def _check_lengths(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
+    """Compare the cubic interpolation with the law, midway between the lengths."""
     middles_m = 0.5 * (lengths_m[1:-2] + lengths_m[2:-1])
-    weights = np.array([-1.0, 9.0, 9.0, -1.0]) / 16.0
-    highest_v = table.step_v * (table.capacitance_f.shape[0] - 1) or 1.0
-    capacitance, pull = _rows(law, middles_m, np.array([highest_v]))
-    for name, knots, exact in (
-        ("elastic force", table.elastic_n, law.elastic_force_n(middles_m)),
-        ("gap", table.gap_m, law.gap_m(middles_m)),
-        ("capacitance", table.capacitance_f[-1], capacitance[0]),
-        ("electric force", table.pull_n_v2[-1], pull[0]),
+    rows = np.arange(table.capacitance_f.shape[0], dtype=np.float64)
+    voltages_v = table.step_v * rows[::-_EVERY]
+    capacitance, pull = _rows(law, middles_m, voltages_v)
+    single = voltages_v.size == 1
+    squares, limit = (1.0, _INTERPOLATED) if single else (voltages_v[:, None] ** 2, _WITH_VOLTAGE)
+    for name, knots, exact, most in (
+        ("elastic force", table.elastic_n, law.elastic_force_n(middles_m), _INTERPOLATED),
+        ("gap", table.gap_m, law.gap_m(middles_m), _INTERPOLATED),
+        ("capacitance", table.capacitance_f[::-_EVERY], capacitance, limit),
+        ("electric force", squares * table.pull_n_v2[::-_EVERY], squares * pull, limit),
     ):
-        found = np.lib.stride_tricks.sliding_window_view(knots, 4) @ weights
-        error = float(np.abs(found - exact).max() / np.abs(knots).max())
-        if not error < _INTERPOLATED:
-            raise InputError(
-                f"The {name} of the law {law.kind} is not smooth: interpolation between {LENGTHS} "
-                f"lengths has a relative error of {error:.2g}, and at most {_INTERPOLATED:g} is "
-                "accepted. Remove steps and kinks from the law, or narrow length_limits_m."
-            )
+        found = np.lib.stride_tricks.sliding_window_view(knots, 4, axis=-1) @ _MIDDLE
+        _require(law, name, f"{LENGTHS} lengths", found, exact, knots, most)
 
 
-def motion_substeps(law: ActuatorLaw, table: LawTable, step_s: float, mass_kg: float) -> int:
-    """Compute the number of substeps needed to resolve the fastest motion.
+def _check_voltages(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
+    """Compare the cubic interpolation with the law, midway between the voltages."""
+    voltages_v = table.step_v * np.arange(VOLTAGES, dtype=np.float64)
+    middles_v = 0.5 * (voltages_v[1:-2] + voltages_v[2:-1])
+    capacitance, pull = _rows(law, lengths_m[::_EVERY], middles_v)
+    between, squares = middles_v[:, None] ** 2, voltages_v[:, None] ** 2
+    for name, knots, exact, largest in (
+        ("capacitance", table.capacitance_f, capacitance, table.capacitance_f),
+        ("electric force", table.pull_n_v2, between * pull, squares * table.pull_n_v2),
+    ):
+        found = np.lib.stride_tricks.sliding_window_view(knots[:, ::_EVERY], 4, axis=0) @ _MIDDLE
+        found = found * between if name == "electric force" else found
+        _require(law, name, f"{VOLTAGES} voltages", found, exact, largest, _BETWEEN_VOLTAGES)
 
-    Args:
-        law: of the actuator.
-        table: of it.
-        step_s: one mechanical step.
-        mass_kg: smallest mass that will move, without the actuator's own.
-    Returns:
-        Number of substeps, at least 1.
-    Raises:
-        InputError: The actuator is too stiff for its mass.
-    """
-    losses = law.losses
-    taut = (1.0 + sum(losses.branch_share)) * (1.0 + losses.softening_share)
-    stiffness = float(np.abs(np.gradient(table.elastic_n, table.step_m)).max()) * taut
-    omega = math.sqrt(stiffness / (mass_kg + law.moving_mass_kg))
-    wanted = math.ceil(omega * step_s / _PHASE)
-    if wanted > _MOST_SUBSTEPS:
+
+def _require(
+    law: ActuatorLaw,
+    name: str,
+    grid: str,
+    found: Floats,
+    exact: Floats,
+    knots: Floats,
+    limit: float,
+) -> None:
+    error = float(np.abs(found - exact).max() / np.abs(knots).max())
+    if not error < limit:
         raise InputError(
-            f"The {law.kind} moves with up to {omega:.3g} rad/s at {mass_kg:g} kg, and the twin "
-            f"follows at most {_PHASE * _MOST_SUBSTEPS / step_s:.3g} rad/s. Give it more moving "
-            "mass or narrower length limits, or raise acquisition.rate_hz."
+            f"The {name} of the law {law.kind} is not smooth: interpolation between {grid} has a "
+            f"relative error of {error:.2g}, and at most {limit:g} is accepted. Remove steps and "
+            "kinks from the law, or narrow length_limits_m."
         )
-    return max(1, wanted)

@@ -199,6 +199,11 @@ class _Memory:
     def event(self, time_s: float, what: str) -> None:
         del time_s, what
 
+    def condition(
+        self, time_s: float, drive_v: float, carrier_v: float, pull_n: float, mass_kg: float
+    ) -> None:
+        del time_s, drive_v, carrier_v, pull_n, mass_kg
+
 
 class Runner:
     """Plays drives and closes loops on a bench. Use it in a `with` block, which ends at 0 V.

@@ -35,7 +35,6 @@ __all__ = [
     "warn_misspelled",
 ]
 
-_WITHOUT_LAW = "peano-hasel"  # a kind that `init` names and no twin simulates
 _WARNED = "haselab.misspelled"  # in the context of the command
 
 
@@ -93,7 +92,7 @@ def unknown_kind(kind: object) -> list[str]:
     Returns:
         One sentence; nothing for a known kind.
     """
-    known = [*ACTUATORS.packages(), _WITHOUT_LAW]
+    known = ACTUATORS.packages()
     if not isinstance(kind, str) or kind in known:
         return []
     return [f"[actuator] kind {kind!r} is unknown; the known kinds are {', '.join(known)}."]

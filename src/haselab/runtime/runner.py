@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from haselab.base import DeviceError, HaselabError, InputError, Progress, SafetyError
 from haselab.rig import Rig
 from haselab.runtime.closed_loop import ClosedLoop
+from haselab.runtime.conditions import Conditions
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Observer
 from haselab.safety.armed import arm_simulated
@@ -42,6 +43,11 @@ class Recorder(Protocol):
 
     def event(self, time_s: float, what: str) -> None:
         """Record that something happened."""
+
+    def condition(
+        self, time_s: float, drive_v: float, carrier_v: float, pull_n: float, mass_kg: float
+    ) -> None:
+        """Record what acts on the actuator from a time on, outside the blocks."""
 
 
 def _left(found: str, error: BaseException | None) -> str:
@@ -88,6 +94,7 @@ class Runner:
         self._camera_recorder = camera_recorder
         self._progress = progress
         self._carrier = (carrier_hz, carrier_v)
+        self._conditions = Conditions(session, self._rig)
         self._missed = self._rig.missed_outputs
         self._missed_row = 0  # blocks in a row with skipped outputs
         self._at_zero = False  # whether 0 V was read back at the end
@@ -115,6 +122,7 @@ class Runner:
                 self._rig.check_idle()
                 self._safety.heartbeat(_SETUP_S)  # instruments are set up, still at 0 V
             self._rig.generator.sine(*self._carrier)
+            self._conditions.carrier(self._carrier[1])
             self._entered = True
             return self
         except BaseException as error:
@@ -277,6 +285,7 @@ class Runner:
         self._note(f"controller {name}: {loop.controller.summary()}")
         if loop.carrier_v is not None:
             self._rig.generator.sine(self._carrier[0], loop.carrier_v)
+            self._conditions.carrier(loop.carrier_v)
         self._camera_recorder.start(name, frame_rate_hz, mass_kg)
         for k, desired in enumerate(reference):
             codes = self._block(
@@ -288,6 +297,7 @@ class Runner:
         self._end(name)
         if loop.carrier_v is not None:
             self._rig.generator.sine(*self._carrier)
+            self._conditions.carrier(self._carrier[1])
 
     def follow(
         self, name: str, reference: NDArray[np.float64], frame_rate_hz: float, mass_kg: float
@@ -342,14 +352,17 @@ class Runner:
         self._begin(name)
         self.rest()
         self._rig.generator.off()
+        self._conditions.carrier(0.0)
         for k, mass_kg in enumerate(masses_kg):
-            self._rig.stand.hang(mass_kg)
+            with self._conditions.hanging(mass_kg):
+                self._rig.stand.hang(mass_kg)
             self._rig.stand.wait(settle_s)
             self._camera_recorder.start(name, frame_rate_hz, mass_kg, f"-{k}")
             self._rig.stand.wait((_STATIC_FRAMES + 1) / frame_rate_hz)
             self._camera_recorder.finish()
             self._progress.advance(settle_s, name)
         self._rig.generator.sine(*self._carrier)
+        self._conditions.carrier(self._carrier[1])
         self._event(f"end {name}")
 
     def release(self, name: str, drive_v: float, settle_s: float, record_s: float,
@@ -367,7 +380,9 @@ class Runner:
         self._rig.description.drive_limits.check(drive_v)
         self._begin(name)
         self._rig.source.write(drive_v)
-        self._rig.stand.lift()
+        self._conditions.drive(drive_v)
+        with self._conditions.lifting():
+            self._rig.stand.lift()
         self._rig.stand.wait(settle_s)
         self._camera_recorder.start(name, frame_rate_hz, mass_kg)
         rest = round(0.1 / self._rig.description.block_s)
@@ -376,6 +391,7 @@ class Runner:
         for k in range(blocks):
             if k == rest:
                 self._rig.stand.drop()
+                self._conditions.dropped()
                 self._event(f"drop {name}")
             self._block(name, k, drive_v, float("nan"))
         self._end(name)
@@ -390,16 +406,20 @@ class Runner:
             LimitError: The drive is outside its limits.
         """
         self._rig.source.write(drive_v)
+        self._conditions.drive(drive_v)
         self._rig.stand.wait(duration_s)
 
     def rest(self) -> None:
         """Set the drive to 0 V at once; the sensing signal stays on."""
         self._rig.source.zero()
+        self._conditions.drive(0.0)
 
     def load(self, mass_kg: float) -> None:
         """Hang a mass at 0 V with the sensing signal off, then restore the signal."""
-        self._rig.stand.hang(mass_kg)  # switches everything off first
+        with self._conditions.hanging(mass_kg):
+            self._rig.stand.hang(mass_kg)  # switches everything off first
         self._rig.generator.sine(*self._carrier)
+        self._conditions.carrier(self._carrier[1])
 
     def _block(
         self, name: str, index: int, output_v: float, desired: float, *, look: bool = True

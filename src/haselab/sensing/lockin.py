@@ -74,6 +74,7 @@ class Lockin:
         plan = make_plan(config)
         self._native = plan.native
         self._weights = plan.weights
+        self._counted = plan.counted
         scale_s, stray_s = config.admittance_scale_s, config.stray_s
         self._impedance = _sense.Impedance(
             scale_s.real,
@@ -89,6 +90,11 @@ class Lockin:
     def middle_s(self) -> float:
         """Mean time of the counted samples, from a block's first sample, in s."""
         return float(self._weights.middle_s[0])
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """Samples of a block that count, shape `(block_samples,)`."""
+        return self._counted.copy()
 
     def step(self, block: NDArray[Any]) -> tuple[float, float, bool]:
         """Process one block in a loop, by the C core.

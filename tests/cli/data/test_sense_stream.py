@@ -358,8 +358,10 @@ def test_updates_at_known_times_cost_no_accuracy(tmp_path):
     std, other = (columns["capacitance_std_f"][both] for columns in (ours, theirs))
     # At worst the 15 carrier periods after the update count, and 19 of 20 without that knowledge.
     assert np.median(std / other) < 1.05 * np.sqrt(19 / 15)
-    far = (ours["capacitance_f"] - theirs["capacitance_f"])[both] / np.hypot(std, other)
-    assert np.sqrt(np.mean(far**2)) < 1.0  # the same samples: less than independent errors
+    # Other samples count, so the middles differ, by up to 1 ms of the motion.
+    there = np.interp(theirs["time_s"], ours["time_s"] - 7.0, ours["capacitance_f"])
+    far = (there - theirs["capacitance_f"])[both] / np.hypot(std, other)
+    assert np.sqrt(np.mean(far**2)) < 0.6  # the same samples: less than independent errors
 
 
 @pytest.mark.parametrize(

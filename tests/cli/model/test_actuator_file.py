@@ -363,8 +363,8 @@ def test_a_read_only_file_is_refused_before_the_work(files, capsys, command):
     ("old", "new", "said"),
     [
         ('kind = "planar-hasel"', 'kind = "unicorn"',
-         "[actuator] kind 'unicorn' is unknown; the known kinds are planar-hasel, dea-stack, "
-         "peano-hasel."),
+         "[actuator] kind 'unicorn' is unknown; the known kinds are planar-hasel, peano-hasel, "
+         "curling-hasel, dea-stack."),
         ("[mine]", "[contorller]", "[contorller] has no effect; did you mean [controller]?"),
         ("[mine]", "[Modle]", "[Modle] has no effect; did you mean [model]?"),
     ],

@@ -161,18 +161,10 @@ def trajectory_error(config: TwinConfig, voltage_v: float, load_n: float) -> tup
         ),
     ],
 )
-def test_motion_is_that_of_the_equations_and_converges_with_the_step(voltage_v, load_n, sections):
-    """The step is of first order: an error below omega dt of the motion, 5 times less at dt / 5."""
-    config = config_of(**sections)
-    fast = {"rate_hz": 1e6, "skew_s": 0.0, "output_delay_s": 0.0}
-    fine = config_of(**sections, acquisition=fast)
-    error_m, range_m = trajectory_error(config, voltage_v, load_n)
-    oracle = Oracle(config)
-    x = oracle.rest_length_m(load_n, voltage_v)
-    stiffness = (oracle.elastic_n(x + 1e-5) - oracle.elastic_n(x - 1e-5)) / 2e-5
-    omega = np.sqrt(1.54 * stiffness / oracle.mass_kg)  # with all branches taut
-    assert error_m < omega * STEP_S * range_m
-    assert trajectory_error(fine, voltage_v, load_n)[0] == pytest.approx(error_m / 5, rel=0.15)
+def test_motion_is_that_of_the_equations(voltage_v, load_n, sections):
+    """Order 4 in steps of 2.5 ms, and the law's table: 5e-6 of the motion."""
+    error_m, range_m = trajectory_error(config_of(**sections), voltage_v, load_n)
+    assert error_m < 5e-6 * range_m
 
 
 @pytest.mark.parametrize("voltage_v", [0.0, 5000.0, 9000.0])
@@ -184,17 +176,17 @@ def test_static_length_balances_load_field_and_shell(voltage_v, mass_kg):
     # The slowest branch creeps with 3.4 s (1 + 0.5 k / k_total), at most 15 s where the field
     # takes most of the stiffness k: after 400 s, e^-26 of it is left.
     lengths = moved(config, load_n, voltage_v, 400.0)
-    assert lengths[-1] == pytest.approx(oracle.rest_length_m(load_n, voltage_v), rel=1e-9)
+    # The table's error between its lengths is below 1e-7 of the force.
+    assert lengths[-1] == pytest.approx(oracle.rest_length_m(load_n, voltage_v), rel=1e-8)
 
 
 def test_elastic_force_is_the_derivative_of_the_energy():
     config = config_of()
     bench, oracle = native_bench(config, 0), Oracle(config)
     for length_m in np.linspace(0.9, 2.2, 14) * oracle.rest_m:
-        # The oracle's fourth-order difference of step 1e-3 is good to (1e-3)^4 of the fifth
-        # derivative over the first: 1e-10; rounding of W / h: 1e-12.
+        # The table is good to 1e-7 here, the oracle's fourth-order difference to 1e-10.
         assert bench.elastic_force(length_m) == pytest.approx(
-            oracle.elastic_n(length_m), rel=1e-8, abs=1e-9
+            oracle.elastic_n(length_m), rel=2e-7, abs=2e-8
         )
 
 
@@ -202,14 +194,14 @@ def test_the_virgin_shell_is_stiffer_and_loses_it_for_good():
     config = config_of(mullins={"share": 0.2, "stretch": 1.3, "width": 0.01})
     bench, soft = native_bench(config, 0), Oracle(config)
     length_m = 1.1 * soft.rest_m
-    assert bench.elastic_force(length_m) == pytest.approx(1.2 * soft.elastic_n(length_m), rel=1e-8)
+    assert bench.elastic_force(length_m) == pytest.approx(1.2 * soft.elastic_n(length_m), rel=2e-7)
     bench.move(np.array([0.0]), 1, 6.0, lengths := np.empty(20000))
     reached = lengths.max() / soft.rest_m
     assert reached > 1.5
     bench.move(np.array([0.0]), 1, 0.0, lengths)  # back again
     lost = 0.2 / (1 + np.exp((reached - 1.3) / 0.01))
     assert bench.elastic_force(length_m) == pytest.approx(
-        (1 + lost) * soft.elastic_n(length_m), rel=1e-8
+        (1 + lost) * soft.elastic_n(length_m), rel=2e-7
     )
 
 
@@ -224,7 +216,7 @@ def test_capacitance_is_the_plate_formula_at_rest_and_a_power_law_beyond():
     for stretch in (0.9, 1.3, 1.8):
         length_m = stretch * oracle.rest_m
         assert bench.capacitance(length_m) == pytest.approx(
-            oracle.capacitance_f(length_m), rel=1e-12
+            oracle.capacitance_f(length_m), rel=1e-7
         )
 
 
@@ -374,7 +366,7 @@ def test_acquisition_and_motion_alone_are_the_same_mechanics():
     lengths, codes = np.empty((2, 1000)), np.empty((20000, 2), dtype=np.int16)
     both[0].acquire(0.0, 0.0, 0, 1.5, codes, lengths[0])
     both[1].move(np.zeros(1), 1, 1.5, lengths[1])
-    np.testing.assert_array_equal(*lengths)
+    np.testing.assert_allclose(*lengths, rtol=2e-7)  # steps of 0.1 ms beside such of 2.5 ms
     assert both[0].time_s == pytest.approx(both[1].time_s, rel=1e-12)
 
 

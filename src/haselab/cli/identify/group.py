@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from haselab.cli.identify.actuator import actuator
 from haselab.cli.identify.arx import arx, subspace
 from haselab.cli.identify.hysteresis import creep, hysteresis
 from haselab.cli.identify.model_comparison import verdict
@@ -25,6 +26,7 @@ def command() -> None:
 
 
 for _method in (
+    actuator,
     transfer,
     arx,
     subspace,

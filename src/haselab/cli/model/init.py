@@ -23,7 +23,7 @@ _PAGE = """\
 
 [actuator]
 name = {name}
-kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
+kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
 {mass}  # kg, hung mass
 
 [actuator.geometry]
@@ -62,7 +62,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, dea-stack, ...
 @click.argument("name")
 @shared_option(
     "--kind", default="planar-hasel", show_default=True, metavar="KIND",
-    detail="planar-hasel, peano-hasel, dea-stack or your own.",
+    detail="planar-hasel, peano-hasel, curling-hasel, dea-stack or your own.",
 )  # fmt: skip
 @click.option("--mass-kg", type=REAL, help="Write the hung mass in kg. Default: as a comment.")
 @shared_option("--zero-length-m", type=POSITIVE, detail="Default: as a comment.")

@@ -7,9 +7,9 @@ not listed here are kept unchanged.
 from __future__ import annotations
 
 import operator
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
@@ -86,6 +86,21 @@ class Geometry(_Section):
     gap_m: _Length | None = None  # thickness of the dielectric
 
 
+def _by_full_name(values: Any) -> Any:
+    """`shell.length_m = 0.06` is a table in TOML, and a list has one value per branch."""
+    if isinstance(values, dict):
+        found: dict[str, Any] = {}
+        for name, value in values.items():
+            parts = _by_full_name(value)
+            if isinstance(parts, dict):
+                dot = "." if isinstance(value, dict) else ""
+                found |= {f"{name}{dot}{key}": part for key, part in parts.items()}
+            else:
+                found[name] = value
+        return found
+    return {f"[{k}]": part for k, part in enumerate(values)} if isinstance(values, list) else values
+
+
 class ActuatorSection(_Section):
     """Kind and geometry of the actuator."""
 
@@ -93,6 +108,8 @@ class ActuatorSection(_Section):
     kind: str = "planar-hasel"
     mass_kg: Annotated[Number, Field(ge=0, le=1e4)] | None = None
     geometry: Geometry = Geometry()
+    # of the kind's law, by the names of TWIN.toml
+    parameters: Annotated[dict[str, Number], BeforeValidator(_by_full_name)] = {}
 
 
 class StrainMapTable(_Section):

@@ -156,7 +156,8 @@ def build_cosim(folder: Path) -> Path:
         )
     folder.mkdir(parents=True, exist_ok=True)
     program = folder / "cosim"
-    sources = [str(root / "firmware" / "sim" / "cosim.c"), str(root / "native" / "twin" / "twin.c")]
+    parts = ("firmware/sim/cosim.c", "native/twin/twin.c", "native/motion/motion.c")
+    sources = [str(root / part) for part in parts]
     _run([compiler, "-std=gnu99", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{root / 'native'}",
           *sources, "-lsimavr", "-lelf", "-lm", "-o", str(program)], "cc")  # fmt: skip
     return program

@@ -6,23 +6,19 @@ import math
 import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _twin
+from haselab.actuators import GRAVITY_M_S2
 from haselab.base import LimitError, Limits, SafetyError
 from haselab.rig import Frames, Rig, RigDescription
 from haselab.rig.twin.camera import TwinCamera
-from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig
-
-if TYPE_CHECKING:
-    from haselab.actuators import ActuatorLaw, PlanarHasel
+from haselab.rig.twin.config import TwinConfig
 
 __all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench", "rig_of"]
 
-GRAVITY_M_S2 = 9.81
 _CARRIER_HIGH_V = 1.0  # at the input of the amplifier
 _CLAMP_KG = 0.02  # the lower clamp itself
 _SLOWEST_FRAMES_HZ = 0.01  # a lower frame rate is a mistake
@@ -45,89 +41,28 @@ def native_bench(
     """Create the C bench of a configuration, unloaded and relaxed at its free length.
 
     Args:
-        config: of the bench; a law other than the built-in one is sampled into a table.
+        config: of the bench; its law is sampled into a table.
         seed: of the monitors' noise.
         noise: False switches the noise off.
         breakdown_v_per_m: replaces that of the law.
     Raises:
-        InputError: The twin cannot integrate the law, see `law_table` and `motion_substeps`.
+        InputError: The twin cannot integrate the law, see `law_table` and `motion_parameters`.
     """
-    law = config.law
-    losses, circuit = law.losses, law.circuit
-    planar = config.kind == PLANAR_HASEL
-    shell = _planar_values(config.planar_hasel) if planar else _tabled_values(law)
+    from haselab.actuators import law_table, motion_parameters  # see TwinConfig.law
+
+    law, daq, amplifier = config.law, config.acquisition, config.amplifier
+    circuit = law.circuit
     values = {
-        **shell,
         **_instruments(config, noise),
-        "free_length_m": law.free_length_m,
-        "mullins": losses.softening_share,
-        "mullins_stretch": losses.softening_stretch,
-        "mullins_width": losses.softening_transition,
-        "damping_n_s_m": losses.damping_n_s_per_m,
-        "inertia_kg": config.load.mass_kg + config.load.added_inertia_kg + law.moving_mass_kg,
         "series_ohm": circuit.series_ohm,
         "leakage_ohm": circuit.leakage_ohm,
-        "relaxation_share": losses.charge_share,
-        "relaxation_s": losses.charge_relaxation_s,
         "breakdown_v_m": breakdown_v_per_m or circuit.breakdown_v_per_m,
     }
-    coefficients = config.planar_hasel.series_coefficients_pa if planar else np.zeros(5)
-    bench = _twin.Bench(
-        values,
-        coefficients,
-        np.array(losses.branch_share, dtype=float),
-        np.array(losses.branch_relaxation_s, dtype=float),
-        law.free_length_m,
-        seed,
-    )
-    if not planar:
-        _set_table(bench, law, config)
-    return bench
-
-
-def _planar_values(law: PlanarHasel) -> dict[str, float]:
-    """Geometry and stiffness of the law that is built into native/twin/twin.c."""
-    return {
-        "area_m2": law.area_m2,
-        "length_m": law.length_m,
-        "lateral_stretch": law.lateral_stretch,
-        "electrode_n_m": law.electrode_stiffness_n_per_m,
-        "electrode_cubic": law.electrode_stiffening,
-        "capacitance_f": law.free_capacitance_f,
-        "capacitance_exponent": law.capacitance_exponent,
-        "thickness_m": law.free_gap_m,
-    }
-
-
-def _tabled_values(law: ActuatorLaw) -> dict[str, float]:
-    """The same fields for a law given by a table."""
-    unused = dict.fromkeys(("electrode_n_m", "electrode_cubic", "capacitance_exponent"), 0.0)
-    return unused | {
-        "area_m2": law.area_m2,
-        "length_m": law.free_length_m,
-        "lateral_stretch": law.lateral_stretch,
-        "capacitance_f": float(law.capacitance_f(law.free_length_m)),
-        "thickness_m": float(law.gap_m(law.free_length_m)),
-    }
-
-
-def _set_table(bench: _twin.Bench, law: ActuatorLaw, config: TwinConfig) -> None:
-    from haselab.actuators import law_table, motion_substeps  # see TwinConfig.law
-
-    daq, amplifier = config.acquisition, config.amplifier
     highest_v = max(daq.drive_high_v, -daq.drive_low_v) + _CARRIER_HIGH_V
     table = law_table(law, amplifier.gain * (1.0 + amplifier.gain_error) * highest_v)
-    lightest_kg = _CLAMP_KG + config.load.added_inertia_kg
-    bench.set_law(
-        table.low_m,
-        table.step_m,
-        table.step_v,
-        motion_substeps(law, table, _SUB / daq.rate_hz, lightest_kg),
-        table.elastic_n,
-        table.gap_m,
-        table.capacitance_f,
-        table.pull_n_v2,
-    )
+    motion = motion_parameters(law)
+    motion["inertia_kg"] += config.load.mass_kg + config.load.added_inertia_kg
+    return _twin.Bench(values, motion, law.free_length_m, seed, *table.arrays())
 
 
 def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:

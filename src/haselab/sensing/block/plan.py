@@ -49,11 +49,13 @@ class BlockPlan:
     Args:
         native: plan for the C code.
         weights: of each choice; the first is the planned one.
+        counted: samples that the planned choice uses. Shape `(block_samples,)`.
         local_normal: normal matrix of a full segment over cosine, sine, 1 and sample / segment.
     """
 
     native: _sense.Plan
     weights: Weights
+    counted: NDArray[np.bool_]
     local_normal: Floats
 
 
@@ -126,7 +128,8 @@ def make_plan(config: LockinConfig, *, alone: bool = False, vectors: int = 512) 
         vectors=vectors,
     )
     weights = Weights(*(np.array(column) for column in zip(*(c[1:] for c in choices), strict=True)))
-    return BlockPlan(native, weights, _normal(cosine, sine, np.arange(m) / m))
+    counted = np.repeat(choices[0].native["used"][0, : starts.size].astype(bool), sizes)
+    return BlockPlan(native, weights, counted, _normal(cosine, sine, np.arange(m) / m))
 
 
 def _check(config: LockinConfig, segment: int, least: float) -> None:

@@ -10,7 +10,7 @@ import hashlib
 import json
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -24,6 +24,7 @@ __all__ = [
     "STATIC",
     "check_links",
     "compare",
+    "condition_check",
     "event_check",
     "frame_checks",
     "read_settings",
@@ -80,6 +81,11 @@ def compare(stated: NDArray[Any], found: NDArray[Any], first: int, what: str) ->
 def event_check(row: int, time_s: float, what: bytes) -> int:
     """CRC-32 of an event: of its row, its time and its text."""
     return zlib.crc32(what, zlib.crc32(struct.pack("<Qd", row, time_s)))
+
+
+def condition_check(row: int, values: Sequence[float]) -> int:
+    """CRC-32 of a condition: of its row and its values."""
+    return zlib.crc32(struct.pack(f"<Q{len(values)}d", row, *values))
 
 
 def write_settings(settings: Mapping[str, Any]) -> bytes:

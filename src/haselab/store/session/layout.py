@@ -19,6 +19,7 @@ from haselab.store.session.tail import TailReader, block_checks
 __all__ = [
     "BLOCK",
     "BLOCK_ORDER",
+    "CONDITION",
     "EVENT",
     "FORMAT",
     "FORMATS",
@@ -33,6 +34,7 @@ __all__ = [
     "create_experiment",
     "create_root",
     "read_blocks",
+    "read_conditions",
     "read_events",
     "read_experiment",
     "settings_of",
@@ -45,6 +47,13 @@ FORMATS = ("haselab session 1", FORMAT)  # 1 has no checksums
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
 # `check`: see session_checks and session_tail.
 EVENT = np.dtype([("time_s", "f8"), ("what", "S96"), ("check", "u4")])
+# What acts on the actuator outside the blocks, from a time on; the pull changes in a straight line.
+CONDITION = np.dtype(
+    [
+        ("time_s", "f8"), ("drive_v", "f8"), ("carrier_v", "f8"), ("pull_n", "f8"),
+        ("mass_kg", "f8"), ("check", "u4"),
+    ]
+)  # fmt: skip
 BLOCK = np.dtype([("drive_v", "f8"), ("reference", "f8"), ("start_s", "f8"), ("check", "u4")])
 FRAME = np.dtype([("time_s", "f8"), ("mass_kg", "f8"), ("check", "u4")])
 TRACK = np.dtype(
@@ -161,6 +170,8 @@ def create_root(file: h5py.File, plans: list[ExperimentPlan], header: Mapping[st
     file.attrs["default"] = "experiments"
     events = file.create_dataset("events", (0,), EVENT, maxshape=(None,), chunks=(64,))
     events.make_scale("events")
+    acted = file.create_dataset("conditions", (0,), CONDITION, maxshape=(None,), chunks=(256,))
+    acted.make_scale("conditions")
     entry = file.create_group("experiments")
     entry.attrs["NX_class"] = "NXentry"
     if plans:
@@ -347,6 +358,15 @@ def read_experiment(
 def settings_of(group: h5py.Group) -> tuple[JsonObject, bool]:
     """Settings of an experiment, and whether they match their checksum."""
     return read_settings(bytes(np.ravel(group["settings"][()])[0]))
+
+
+def read_conditions(file: h5py.File) -> NDArray[np.void]:
+    """Rows of `CONDITION`; none in files that were written without them."""
+    if "conditions" not in file:
+        return np.zeros(0, CONDITION)
+    rows = file["conditions"][:]
+    torn = bool(len(rows) and not rows[-1].tobytes().strip(b"\0"))  # killed while writing
+    return np.asarray(rows[: len(rows) - torn])
 
 
 def read_events(file: h5py.File) -> list[tuple[float, str]]:

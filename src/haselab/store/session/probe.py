@@ -19,6 +19,7 @@ from haselab.store.session.checksums import (
     STATIC,
     check_links,
     compare,
+    condition_check,
     event_check,
     frame_checks,
     static_digest,
@@ -29,6 +30,7 @@ from haselab.store.session.layout import (
     FORMATS,
     FRAME_ORDER,
     HDF5_ERRORS,
+    read_conditions,
     settings_of,
     whole_rows,
 )
@@ -107,6 +109,13 @@ def _verify_events(file: h5py.File) -> None:
             raise ValueError(f"event {k} does not match its checksum")
 
 
+def _verify_conditions(file: h5py.File) -> None:
+    for k, row in enumerate(read_conditions(file)):
+        *values, stated = row.tolist()
+        if condition_check(k, values) != stated:
+            raise ValueError(f"condition {k} does not match its checksum")
+
+
 def _read_all(group: h5py.Group) -> None:
     """Read every dataset of an experiment of format 1, whose rows carry no checksum."""
     for data in group.values():
@@ -174,6 +183,7 @@ def verify(path: Path) -> tuple[str, list[str]]:
             problems.attempt(_verify_blocks, name, group, tail)
             problems.attempt(_verify_frames, name, group)
         problems.attempt(_verify_events, file)
+        problems.attempt(_verify_conditions, file)
         tail.close()
     return "", problems.found
 

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import Closing, InputError
 from haselab.store.session.checksums import check_links
@@ -17,6 +19,7 @@ from haselab.store.session.layout import (
     BlockRows,
     ExperimentRecord,
     read_blocks,
+    read_conditions,
     read_events,
     read_experiment,
 )
@@ -154,6 +157,22 @@ class SessionReader(Closing):
             with _TURN:
                 self._file["events"].id.refresh()
                 return read_events(self._file)
+        except HDF5_ERRORS as error:
+            raise self._damaged(error) from None
+
+    def conditions(self) -> NDArray[np.void]:
+        """What acted on the actuator outside the blocks, in the order of time.
+
+        Returns:
+            Fields `time_s`, `drive_v` and `carrier_v` before the amplifier, `pull_n`, which changes
+            in a straight line from row to row, and `mass_kg`. Shape `(N,)`; empty in sessions
+            that were recorded without them.
+        Raises:
+            InputError: they cannot be read.
+        """
+        try:
+            with _TURN:
+                return read_conditions(self._file)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 

@@ -18,9 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, JsonObject
-from haselab.store.session.checksums import STATIC, event_check, frame_checks, static_digest
+from haselab.store.session.checksums import (
+    STATIC,
+    condition_check,
+    event_check,
+    frame_checks,
+    static_digest,
+)
 from haselab.store.session.layout import (
     BLOCK,
+    CONDITION,
     EVENT,
     FRAME,
     HDF5_ERRORS,
@@ -30,6 +37,7 @@ from haselab.store.session.layout import (
     Sampling,
     create_experiment,
     create_root,
+    read_conditions,
     read_events,
     read_experiment,
     settings_text,
@@ -335,6 +343,27 @@ class SessionWriter:
         if self._queue.patience_s > 0.0:
             self._jobs.settle()
 
+    def condition(
+        self, time_s: float, drive_v: float, carrier_v: float, pull_n: float, mass_kg: float
+    ) -> None:
+        """Record what acts on the actuator from a time on, outside the blocks.
+
+        Args:
+            time_s: on the clock of the acquisition.
+            drive_v: before the amplifier.
+            carrier_v: peak amplitude before the amplifier.
+            pull_n: load at the moving end.
+            mass_kg: that moves with it, hung or lifted.
+        """
+        values = time_s, drive_v, carrier_v, pull_n, mass_kg
+
+        def write() -> None:
+            count = self._file["conditions"].shape[0]
+            row = (*values, condition_check(count, values))
+            self._extend("conditions", np.array([row], CONDITION))
+
+        self._put(write, always=True)
+
     # ---- in the thread ----------------------------------------------------------------------
 
     def _extend(self, dataset: str, rows: NDArray[Any]) -> None:
@@ -386,6 +415,11 @@ class SessionWriter:
         """Time in s and text of each event so far."""
         self._drain()
         return read_events(self._file)
+
+    def conditions(self) -> NDArray[np.void]:
+        """See `SessionReader.conditions`."""
+        self._drain()
+        return read_conditions(self._file)
 
     @property
     def most_waiting(self) -> int:

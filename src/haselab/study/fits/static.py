@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.actuators import GRAVITY_M_S2
 from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.statics.hyperelastic import HyperelasticFit, fit_hyperelastic
 from haselab.identify.statics.regions import Region, RegionsFit, find_regions
@@ -17,8 +18,6 @@ from haselab.study.fits.resolution import POSITION_PX, with_resolution
 from haselab.study.tables import LEAST_LOADS
 
 __all__ = ["GRAVITY_M_S2", "Static", "fit_static"]
-
-GRAVITY_M_S2 = 9.81
 
 
 Floats = NDArray[np.float64]

@@ -92,6 +92,11 @@ class NoiseFreeBench:
         if verb == "drop":
             self._recordings.setdefault(name, _Recording()).drop_s = time_s
 
+    def condition(
+        self, time_s: float, drive_v: float, carrier_v: float, pull_n: float, mass_kg: float
+    ) -> None:
+        """See `haselab.runtime.runner.Recorder`; nothing here needs it."""
+
     def complete_settings(self, name: str, settings: JsonObject) -> None:
         """Store the settings that were really used."""
         self._settings[name] = settings

@@ -1,0 +1,145 @@
+/* Takes: what acts on an actuator, interval by interval. Gives: its lengths and mean capacitances. */
+#include "motion/record.h"
+
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+/* Where nobody looks and nothing swings any more, only slow creep is left: long steps follow it. A
+ * swing of that speed decays by the same number of steps, without growing. */
+#define SLOW_M_S 1e-4
+#define LONG_PHASE 0.6
+#define LONG_STEP_S 0.05
+
+/* Weights of Hermite's cubic at a share of a step of dt: lengths and speeds of both ends. */
+typedef struct {
+    double from_m, from_m_s, to_m, to_m_s;
+} ends;
+
+static ends hermite(double t, double dt)
+{
+    const double u = 1.0 - t;
+    const ends e = {u * u * (1.0 + 2.0 * t), u * u * t * dt, t * t * (1.0 + 2.0 * u),
+                    -t * t * u * dt};
+    return e;
+}
+
+static ends hermite_slope(double t, double dt)
+{
+    const double bump = 6.0 * t * (1.0 - t) / dt;
+    const ends e = {-bump, 1.0 - t * (4.0 - 3.0 * t), bump, t * (3.0 * t - 2.0)};
+    return e;
+}
+
+static double blend(const ends *e, const motion_state *a, const motion_state *b)
+{
+    return e->from_m * a->length_m + e->from_m_s * a->speed_m_s + e->to_m * b->length_m +
+           e->to_m_s * b->speed_m_s;
+}
+
+/* The step from a to b that was just made. */
+typedef struct {
+    const motion_state *a, *b;
+    double start_s, dt;
+} step;
+
+static void blend_rows(const ends *e, const motion_tangent *t, const double *kept, double *out)
+{
+    const int32_t n = t->columns;
+    int32_t j;
+    for (j = 0; j < n; ++j) {
+        out[j] = e->from_m * kept[j] + e->from_m_s * kept[n + j] + e->to_m * t->rows[j] +
+                 e->to_m_s * t->rows[n + j];
+    }
+}
+
+static int32_t sample(const step *now, const motion_tangent *t, const motion_record *record,
+                      const motion_output *output, int32_t next, double until_s)
+{
+    for (; next < record->times && record->time_s[next] <= until_s; ++next) {
+        const double share = (record->time_s[next] - now->start_s) / now->dt;
+        const ends e = hermite(share, now->dt), slope = hermite_slope(share, now->dt);
+        output->length_m[next] = blend(&e, now->a, now->b);
+        output->speed_m_s[next] = blend(&slope, now->a, now->b);
+        if (t != NULL) {
+            blend_rows(&e, t, output->kept, output->length_by + (int64_t)next * t->columns);
+        }
+    }
+    return next;
+}
+
+/* Adds the integral of the capacitance over the step by Simpson's rule. */
+static void integrate(const motion_law *law, const step *now, const motion_tangent *t,
+                      double volt, const motion_output *output, int32_t interval)
+{
+    static const double at[3] = {0.0, 0.5, 1.0}, weight[3] = {1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0};
+    int i;
+    for (i = 0; i < 3; ++i) {
+        const ends e = hermite(at[i], now->dt);
+        const double length_m = blend(&e, now->a, now->b), share = now->dt * weight[i];
+        output->mean_f[interval] += share * motion_capacitance(law, length_m, volt);
+        if (t != NULL) {
+            double *by = output->mean_by + (int64_t)interval * t->columns;
+            double *rows = output->kept + 2 * t->columns;
+            int32_t j;
+            const motion_capacitance_slopes c =
+                motion_capacitance_by(law, t, length_m, volt, by, share);
+            blend_rows(&e, t, output->kept, rows);
+            for (j = 0; j < t->columns; ++j) {
+                by[j] += share * c.per_m * rows[j];
+                if (t->kind[j] == MOTION_VOLTAGE_SCALE) {
+                    by[j] += share * c.per_v * volt;
+                }
+            }
+        }
+    }
+}
+
+void motion_play(const motion_law *law, const motion_parameters *p, motion_state *s,
+                 motion_tangent *tangent, const motion_record *record, const motion_output *output)
+{
+    motion_parameters moving = *p;
+    int32_t k, next = 0;
+    for (k = 0; k < record->intervals; ++k) {
+        const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
+        const double volt = record->input[k].volt;
+        double before_f, at_s = from_s;
+        int32_t j;
+        moving.inertia_kg = p->inertia_kg + record->mass_kg[k];
+        output->mean_f[k] = output->drift_f_s[k] = 0.0;
+        before_f = motion_capacitance(law, s->length_m, volt);
+        if (tangent != NULL) {
+            memset(output->mean_by + (int64_t)k * tangent->columns, 0,
+                   (size_t)tangent->columns * sizeof(double));
+        }
+        while (at_s < to_s) {
+            const int unseen = !record->sensed[k] &&
+                               (next >= record->times || record->time_s[next] > to_s);
+            const motion_state start = *s;
+            step now = {&start, s, at_s, 0.0};
+            double until_s;
+            moving.phase = unseen && fabs(s->speed_m_s) < SLOW_M_S ? LONG_PHASE : p->phase;
+            moving.step_s = moving.phase > p->phase ? LONG_STEP_S : p->step_s;
+            now.dt = (to_s - at_s) / (double)motion_steps(law, &moving, s, to_s - at_s);
+            until_s = to_s - at_s - now.dt > 1e-9 * now.dt ? at_s + now.dt : to_s;
+            if (tangent != NULL) {
+                const size_t n = (size_t)tangent->columns;
+                memcpy(output->kept, tangent->rows, 2 * n * sizeof(double));
+            }
+            motion_step(law, &moving, s, tangent, &record->input[k], now.dt);
+            next = sample(&now, tangent, record, output, next, until_s);
+            if (record->sensed[k]) {
+                integrate(law, &now, tangent, volt, output, k);
+            }
+            at_s = until_s;
+        }
+        if (record->sensed[k]) {
+            const double after_f = motion_capacitance(law, s->length_m, volt);
+            output->drift_f_s[k] = (after_f - before_f) / (to_s - from_s);
+            output->mean_f[k] /= to_s - from_s;
+            for (j = 0; tangent != NULL && j < tangent->columns; ++j) {
+                output->mean_by[(int64_t)k * tangent->columns + j] /= to_s - from_s;
+            }
+        }
+    }
+}

@@ -1,0 +1,84 @@
+"""`haselab identify actuator`: one physical model from everything that was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import click
+
+from haselab.actuators import ACTUATORS, ActuatorLaw, with_parameters
+from haselab.base import InputError, LimitError
+from haselab.cli.actuator_file import load_actuator, save_section
+from haselab.cli.common import actuator_option, answer_options, unverified_option, warn_unverified
+from haselab.cli.identify.common import give
+from haselab.cli.plot import save_plot
+from haselab.identify.physical import ActuatorFit, fit_actuator
+from haselab.models.actuator.sections import ActuatorSection
+from haselab.pipelines.motion import motion_of_session
+from haselab.store.session.reader import SessionReader, session_file
+
+__all__ = ["actuator"]
+
+
+@click.command("actuator")
+@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@actuator_option("Read [actuator], write [model.physical].")
+@unverified_option
+@answer_options(plot=True)
+def actuator(
+    sessions: tuple[Path, ...],
+    actuator: Path | None,
+    *,
+    unverified: bool,
+    as_json: bool,
+    out: Path | None,
+    plot: Path | None,
+) -> None:
+    """Identify a physical model from everything recorded.
+
+    SESSIONS are folders of runs or their session.h5, all of one actuator. Lengths and
+    capacitances of all experiments are compared with one simulated motion. The kind, what was
+    measured otherwise, such as a width, and where to start come from [actuator].
+    """
+    if actuator is None:
+        raise InputError(
+            "The kind of the actuator is not known. Name its file with --actuator A.toml; 'haselab "
+            "init' writes one."
+        )
+    tables = load_actuator(actuator, to_write=True)
+    law = _law(tables.actuator, actuator)
+    records = []
+    for session in sessions:
+        with SessionReader(session, unverified=unverified) as reader:
+            warn_unverified(reader.doubt, session)
+            records.append(motion_of_session(reader, session))
+    mass_kg = max(float(record.drive.mass_kg[0]) for record in records)
+    fit = fit_actuator(law, records, mass_kg=mass_kg)
+    files = [session_file(session) for session in sessions]
+    give(fit, files, as_json, out)
+    save_plot(plot, fit.chart)
+    if fit.succeeded:
+        save_section(actuator, "model", {"physical": _section(fit)}, files)
+
+
+def _law(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
+    """The kind's law with the parameters that the file states."""
+    section = section or ActuatorSection()
+    law = ACTUATORS.find(section.kind)()
+    try:
+        return with_parameters(law, section.parameters)
+    except (InputError, LimitError) as error:
+        raise InputError(f"[actuator.parameters]: {error} {path}") from error
+
+
+def _section(fit: ActuatorFit) -> Mapping[str, object]:
+    """`[model.physical]`: estimates with their covariance."""
+    names = list(fit.parameters)
+    return {
+        "kind": fit.kind,
+        "parameters": {name: estimate.value for name, estimate in fit.parameters.items()},
+        "std": {name: estimate.std for name, estimate in fit.parameters.items()},
+        "not_identifiable": list(fit.not_identifiable),
+        "covariance": {"names": names, "matrix": fit.covariance.tolist()},
+    }

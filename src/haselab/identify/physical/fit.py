@@ -1,0 +1,360 @@
+r"""Identify one physical model of an actuator jointly from all its experiments.
+
+Lengths and capacitances of all records are compared with one simulated motion. With residuals $r$
+over their standard deviations and their derivatives $J$ by the parameters, the estimate minimises
+$r^\top r$, and its covariance is
+
+$\Sigma = (J^\top J)^{-1}$
+
+where the standard deviations are those of the residuals themselves, channel by channel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.actuators import ADDED_INERTIA, GRAVITY_M_S2, ActuatorLaw, OperatingPoint, linearise
+from haselab.base import Estimate, InputError, JsonObject, LimitError
+from haselab.base.chart import Chart, Curve, Panel
+from haselab.identify.fit import Fit
+from haselab.identify.noise import coloured_covariance, whiteness_p
+from haselab.identify.physical.misfit import Misfit
+from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.search import Found, refine, search
+from haselab.identify.physical.unknowns import CAMERA_OFFSET, SENSING_SCALE, Unknowns
+
+__all__ = ["ActuatorFit", "fit_actuator"]
+
+Floats = NDArray[np.float64]
+_LENGTH, _CAPACITANCE = "length", "capacitance"
+_ROUNDS = 3  # of the noise's estimate
+_SAME_NOISE = 0.02
+_USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
+_SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
+_SCALE = 0.2  # largest error of the capacitance that a calibration can have
+_WHITE = 1e-3  # probability of the residuals under white noise
+_POINTS = 5  # voltages of the linear models
+_UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
+_WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorFit(Fit):
+    """One physical model of an actuator.
+
+    Args:
+        status: "ok"; what the model does not explain; or why there is no result.
+        parameters: by the names of TWIN.toml, and of the instruments.
+        covariance: of `parameters`, in their order. It grows by what the model does not explain.
+        residuals: over their standard deviations, one array for each of `channels`.
+        notes: remarks for the user, one sentence each.
+        law: with the estimated parameters.
+        kind: of the actuator.
+        not_identifiable: names of parameters that these records do not determine, or whose values
+            the search had not settled.
+        length_rms_m: of the residuals of the lengths.
+        capacitance_rms_f: of those of the capacitances.
+        length_noise_m: from differences of neighbours, which a slow misfit does not change.
+        capacitance_noise_f: likewise.
+        evaluations: of the model, until it was found.
+        chi_squared_ratio: mean square of the residuals over their standard deviations.
+        residual_whiteness_p: probability of the less probable channel under white noise.
+        channels: experiment and channel of each array of residuals.
+        linear_models: at the hung mass and some voltages up to the highest that acted.
+    """
+
+    law: ActuatorLaw | None = None
+    kind: str = ""
+    added_inertia_kg: float = 0.0
+    not_identifiable: tuple[str, ...] = ()
+    length_rms_m: float = float("nan")
+    capacitance_rms_f: float = float("nan")
+    length_noise_m: float = float("nan")
+    capacitance_noise_f: float = float("nan")
+    evaluations: int = 0
+    chi_squared_ratio: float = float("nan")
+    residual_whiteness_p: float = float("nan")
+    channels: tuple[tuple[str, str], ...] = ()
+    linear_models: tuple[OperatingPoint, ...] = ()
+    mass_kg: float = float("nan")
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether there are parameters, with or without a model error."""
+        return bool(self.parameters)
+
+    def answer(self) -> JsonObject:
+        """See `Fit`."""
+        return {
+            "kind": self.kind,
+            "parameters": self.parameters,
+            "not_identifiable": list(self.not_identifiable),
+            "linear_models": [
+                {
+                    "voltage_v": point.voltage_v,
+                    "mass_kg": self.mass_kg,
+                    "gain": point.gain_m_per_v,
+                    "poles": _pairs(point.poles),
+                    "zeros": _pairs(point.zeros),
+                }
+                for point in self.linear_models
+            ],
+            "residual_rms": {
+                "length_m": self.length_rms_m,
+                "capacitance_f": self.capacitance_rms_f,
+            },
+            "noise_rms": {
+                "length_m": self.length_noise_m,
+                "capacitance_f": self.capacitance_noise_f,
+            },
+            "residual_whiteness_p": self.residual_whiteness_p,
+            "evaluations": self.evaluations,
+            "status": self.status,
+        }
+
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
+        """Root mean square of the residuals over the noise, experiment by experiment.
+
+        Args:
+            names: not used; the axes are the experiments.
+        Returns:
+            Bars of lengths and of capacitances.
+        Raises:
+            ResultError: the fit has no result.
+        """
+        self._require()
+        experiments = list(dict.fromkeys(name for name, _ in self.channels))
+        curves = []
+        for channel in (_LENGTH, _CAPACITANCE):
+            found = {name: _rms([part]) for (name, of), part in zip(
+                self.channels, self.residuals, strict=True) if of == channel}  # fmt: skip
+            x = np.array([experiments.index(name) for name in found], dtype=np.float64)
+            curves.append(Curve(x, np.array(list(found.values())), channel, "bars"))
+        panel = Panel("", "residual / noise (rms)", curves, ticks=experiments)
+        return Chart(f"Residuals of the {self.kind}", [panel])
+
+
+def fit_actuator(
+    law: ActuatorLaw,
+    records: Sequence[MotionRecord],
+    *,
+    mass_kg: float,
+    added_inertia_kg: float | None = None,
+    camera_bias_m: float = 2e-6,
+) -> ActuatorFit:
+    """Identify a physical model from records.
+
+    Args:
+        law: kind of the actuator, and where to start; what it declares as measured stays.
+        records: of one actuator.
+        mass_kg: hung mass, the scale of an added inertia.
+        added_inertia_kg: where to start with that; None: 5 % of the hung mass.
+        camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
+            is usual.
+    Returns:
+        The model, with the covariance of its parameters.
+    Raises:
+        InputError: There is no record.
+    """
+    if not records:
+        raise InputError("There is no record of the actuator's motion. Give at least one.")
+    if added_inertia_kg is None:
+        added_inertia_kg = _USUAL_INERTIA * mass_kg
+    start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
+    known = {CAMERA_OFFSET: camera_bias_m}
+    misfit = Misfit(records, known=known)
+    found = search(misfit, start)
+    if found is None:
+        return ActuatorFit(
+            status="the start values describe no motion: the actuator has no equilibrium under the "
+            "first load and voltage",
+            kind=law.kind,
+        )
+    count = found.evaluations
+    for _ in range(_ROUNDS):
+        factors = _factors(misfit, found)
+        same = np.allclose(factors, (misfit.length_factor, misfit.capacitance_factor),
+                           rtol=_SAME_NOISE)  # fmt: skip
+        misfit = Misfit(records, *factors, known)
+        if same:
+            break
+        again = refine(misfit, found)
+        if again is None:
+            break
+        found, count = again, count + again.evaluations
+    return _result(misfit, found, count)
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """Residuals of one channel in one experiment, with their rows."""
+
+    experiment: str
+    channel: str
+    rows: NDArray[np.int64]
+
+
+def _segments(records: Sequence[MotionRecord], rows_in_all: int) -> list[_Segment]:
+    found, at = [], 0
+    for record in records:
+        for channel, member in (
+            (_LENGTH, record.length_experiment),
+            (_CAPACITANCE, record.capacitance_experiment),
+        ):
+            for k, name in enumerate(record.experiments):
+                rows = at + np.flatnonzero(member == k)
+                if rows.size:
+                    found.append(_Segment(name, channel, rows))
+            at += member.size
+    known = np.arange(at, rows_in_all)
+    return [*found, _Segment("", "known", known)] if known.size else found
+
+
+def _channel(segments: Sequence[_Segment], channel: str, residuals: Floats) -> list[Floats]:
+    """Residuals of one channel, experiment by experiment."""
+    return [residuals[part.rows] for part in segments if part.channel == channel]
+
+
+def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
+    """True over stated standard deviation of both channels, by the residuals."""
+    segments = _segments(misfit.records, found.residuals.size)
+    share = 1.0 - found.unknowns.values.size / found.residuals.size
+    rms = [_rms(_channel(segments, name, found.residuals)) / math.sqrt(share)
+           for name in (_LENGTH, _CAPACITANCE)]  # fmt: skip
+    return misfit.length_factor * rms[0], misfit.capacitance_factor * rms[1]
+
+
+def _rms(parts: Sequence[Floats]) -> float:
+    return math.sqrt(float(np.mean(np.concatenate(parts) ** 2))) if parts else 1.0
+
+
+def _neighbours(parts: Sequence[Floats]) -> float:
+    """Noise by the differences of neighbours, which a slow misfit does not change."""
+    steps = [np.diff(part) for part in parts if part.size > 1]
+    return _rms(steps) / math.sqrt(2.0) if steps else math.nan
+
+
+def _typical(parts: Sequence[Floats]) -> float:
+    """Typical standard deviation of a channel; NaN where it has no values."""
+    joined = np.concatenate(list(parts))
+    return float(np.median(joined)) if joined.size else math.nan
+
+
+def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
+    unknowns = found.unknowns
+    segments = _segments(misfit.records, found.residuals.size)
+    covariance = coloured_covariance(
+        [found.jacobian[part.rows] for part in segments],
+        [found.residuals[part.rows] for part in segments],
+        unknowns.values.size,
+    )
+    std = np.sqrt(np.diag(covariance))
+    units = {about.key: about.unit for about in unknowns.law.described()}
+    units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
+              "sensing.latency_s": "s", "sensing.scale": ""}  # fmt: skip
+    slopes = unknowns.slopes
+    parameters, weak = {}, []
+    for k, name in enumerate(unknowns.names):
+        unit = units[name.partition("[")[0]]
+        if abs(found.left[k]) > _UNSETTLED * std[k]:
+            weak.append(name)
+        if unknowns.by_logarithm[k] or unknowns.by_inverse_square[k]:
+            share = std[k] * abs(slopes[k]) / unknowns.values[k]
+            if share > _WEAK or not np.abs(found.jacobian[:, k]).any():
+                weak.append(name)
+            parameters[name] = Estimate.lognormal(unknowns.values[k], share, unit)
+        else:
+            parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
+    lengths = _channel(segments, _LENGTH, found.residuals)
+    capacitances = _channel(segments, _CAPACITANCE, found.residuals)
+    std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])
+    std_f = misfit.capacitance_factor * _typical([r.capacitance_std_f for r in misfit.records])
+    length_noise, capacitance_noise = _neighbours(lengths), _neighbours(capacitances)
+    whiteness = min(whiteness_p(lengths), whiteness_p(capacitances))
+    excess = {
+        "lengths": _rms(lengths) / length_noise,
+        "capacitances": _rms(capacitances) / capacitance_noise,
+    }
+    status = _status(excess, whiteness, converged=found.converged)
+    scale = unknowns.value(SENSING_SCALE)
+    if abs(scale - 1.0) > _SCALE and not status.startswith(_NO_RESULT):
+        status = (
+            f"the records contradict each other: the capacitances are {scale:.3g} times those that "
+            "the forces need. Check the mass, the amplifier's gain and the calibration"
+        )
+    if status.startswith(_NO_RESULT):
+        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=count)
+    law = unknowns.present_law()
+    return ActuatorFit(
+        status=status,
+        parameters=parameters,
+        covariance=covariance * np.outer(slopes, slopes),
+        residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),
+        channels=tuple((part.experiment, part.channel) for part in segments if part.experiment),
+        length_rms_m=std_m * _rms(lengths),
+        length_noise_m=std_m * length_noise,
+        capacitance_rms_f=std_f * _rms(capacitances),
+        capacitance_noise_f=std_f * capacitance_noise,
+        residual_whiteness_p=whiteness,
+        law=law,
+        kind=law.kind,
+        mass_kg=unknowns.mass_kg,
+        added_inertia_kg=unknowns.value(ADDED_INERTIA),
+        linear_models=_linear_models(law, unknowns, misfit.records),
+        not_identifiable=tuple(dict.fromkeys(weak)),
+        evaluations=count,
+        chi_squared_ratio=float(np.mean(found.residuals**2)),
+    )
+
+
+_NO_RESULT = ("the search", "the records")
+
+
+def _status(excess: dict[str, float], whiteness: float, *, converged: bool) -> str:
+    """ "ok", a model error, or why there is no result; rms over noise is given per channel."""
+    largest = max(excess, key=lambda name: np.nan_to_num(excess[name]))
+    ratio = float(np.nan_to_num(excess[largest]))
+    if ratio > _GROSS:
+        return (
+            f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
+            "noise. Check the mass, the units and that all records are of one actuator, or start "
+            "nearer, by [actuator.parameters]"
+        )
+    if not converged:
+        return "the search did not converge; start nearer, by [actuator.parameters]"
+    if ratio > _SLIGHT and whiteness < _WHITE:
+        return (
+            f"model error: the {largest} are off by {ratio:.3g} times the noise, and the "
+            "intervals are wider for it"
+        )
+    return "ok"
+
+
+def _pairs(values: NDArray[np.complex128]) -> list[list[float]]:
+    return [[float(value.real), float(value.imag)] for value in values]
+
+
+def _linear_models(
+    law: ActuatorLaw, unknowns: Unknowns, records: Sequence[MotionRecord]
+) -> tuple[OperatingPoint, ...]:
+    """At the hung mass, for motion within the lengths that were reached."""
+    highest_v = max(float(np.abs(record.drive.voltage_v).max()) for record in records)
+    longest_m = max((float(r.length_m.max()) for r in records if r.length_m.size), default=None)
+    inertia_kg = unknowns.mass_kg + unknowns.value(ADDED_INERTIA)
+    found = []
+    for voltage_v in np.linspace(0.0, highest_v, _POINTS).tolist():
+        try:
+            found.append(
+                linearise(
+                    law, voltage_v, unknowns.mass_kg * GRAVITY_M_S2, inertia_kg,
+                    longest_m=longest_m,
+                )
+            )  # fmt: skip
+        except LimitError:
+            break
+    return tuple(found)

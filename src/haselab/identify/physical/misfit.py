@@ -1,0 +1,184 @@
+"""Misfit of a physical model to records, and its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
+from haselab.base import HaselabError, LimitError
+from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.unknowns import (
+    CAMERA_LATENCY,
+    CAMERA_OFFSET,
+    SENSING_LATENCY,
+    SENSING_SCALE,
+    Unknowns,
+)
+
+__all__ = ["Misfit", "Modelled", "modelled"]
+
+Floats = NDArray[np.float64]
+_LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
+
+
+@dataclass(frozen=True)
+class Modelled:
+    """What a model says of one record.
+
+    Args:
+        length_m: as the camera shows it. Shape `(F,)`.
+        capacitance_f: as it is sensed. Shape `(C,)`.
+        length_by: derivatives by what varies. Shape `(F, P)`; P is 0 where they were not wanted.
+        capacitance_by: likewise. Shape `(C, P)`.
+    """
+
+    length_m: Floats
+    capacitance_f: Floats
+    length_by: Floats
+    capacitance_by: Floats
+
+
+def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = True) -> Modelled:
+    """Simulate a record.
+
+    Args:
+        unknowns: of the model.
+        record: with what acted, and when it was seen.
+        derivatives: whether they are wanted.
+    Returns:
+        Lengths and capacitances at the times of the record.
+    Raises:
+        HaselabError: The law has no equilibrium, is outside its limits, or not smooth.
+    """
+    law = unknowns.present_law()
+    added_kg = unknowns.value(ADDED_INERTIA)
+    lightest_kg = float(record.drive.mass_kg.min()) + law.moving_mass_kg + added_kg
+    if lightest_kg < _LIGHTEST * unknowns.mass_kg:
+        raise LimitError(f"{record.name}: {lightest_kg:g} kg move, too few to simulate.")
+    names = unknowns.law_names if derivatives else ()
+    sampled = SampledLaw(
+        law,
+        _highest_v(record),
+        names,
+        added_inertia_kg=added_kg,
+    )
+    response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY))
+    scale = unknowns.value(SENSING_SCALE)
+    latency_s = unknowns.value(SENSING_LATENCY)
+    drift = record.over_windows(response.drift_f_s)
+    inside = record.over_windows(response.capacitance_f) - latency_s * drift
+    length_m = response.length_m + unknowns.value(CAMERA_OFFSET)
+    if not derivatives:
+        none = np.zeros((0, 0))
+        return Modelled(length_m, scale * inside, none, none)
+    columns: dict[str, tuple[ArrayLike, ArrayLike]] = {
+        CAMERA_LATENCY: (-response.speed_m_s, 0.0),
+        CAMERA_OFFSET: (1.0, 0.0),
+        SENSING_LATENCY: (0.0, -scale * drift),
+        SENSING_SCALE: (0.0, inside),
+    }
+    length_by = np.empty((length_m.size, len(unknowns.names)))
+    capacitance_by = np.empty((inside.size, len(unknowns.names)))
+    count = len(unknowns.law_names)
+    length_by[:, :count] = response.length_by
+    capacitance_by[:, :count] = scale * record.over_windows(response.capacitance_by)
+    for k, name in enumerate(unknowns.names[count:], start=count):
+        length_by[:, k] = np.asarray(columns[name][0])
+        capacitance_by[:, k] = np.asarray(columns[name][1])
+    slopes = unknowns.slopes
+    return Modelled(length_m, scale * inside, length_by * slopes, capacitance_by * slopes)
+
+
+def _highest_v(record: MotionRecord) -> float:
+    drive = record.drive
+    peak_v = np.abs(drive.voltage_v) + np.sqrt(2.0 * drive.ripple_v2)
+    return float(np.ceil(peak_v.max() / 1e3 + 1.0) * 1e3)
+
+
+def _respond(sampled: SampledLaw, record: MotionRecord, latency_s: float) -> Response:
+    drive = record.drive
+    low, high = drive.edge_s[0], drive.edge_s[-1]
+    times_s = np.clip(record.length_time_s - latency_s, low, high)
+    start, start_by = sampled.at_rest(
+        float(drive.voltage_v[0]), float(drive.ripple_v2[0]), float(drive.load_n[0])
+    )
+    sensed = np.zeros(drive.voltage_v.size, np.uint8)
+    sensed[record.window] = 1
+    return sampled.respond(drive, times_s, start, sensed=sensed, start_by=start_by)
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Weighted differences between records and a model.
+
+    Args:
+        records: what was seen.
+        length_factor: true over stated standard deviation of the lengths.
+        capacitance_factor: the same of the capacitances.
+        known: standard deviations of what is known of an instrument beforehand, by its name; each
+            is one more residual, after those of the records.
+    """
+
+    records: Sequence[MotionRecord]
+    length_factor: float = 1.0
+    capacitance_factor: float = 1.0
+    known: Mapping[str, float] = field(default_factory=dict)
+
+    def residuals(self, unknowns: Unknowns) -> Floats | None:
+        """Measured minus modelled over the standard deviation; None where no motion exists.
+
+        Args:
+            unknowns: of the model.
+        Returns:
+            All lengths, then all capacitances, of one record after the other; then what is known.
+        """
+        found = self._each(unknowns, derivatives=False)
+        return None if found is None else self._weighed(found, unknowns)
+
+    def linearised(self, unknowns: Unknowns) -> tuple[Floats, Floats] | None:
+        """Residuals and their derivatives by what varies; None where no motion exists.
+
+        Args:
+            unknowns: of the model.
+        Returns:
+            Residuals, shape `(N,)`, and derivatives of the modelled over the standard deviation,
+            shape `(N, P)`.
+        """
+        found = self._each(unknowns, derivatives=True)
+        if found is None:
+            return None
+        by = []
+        for part, record in zip(found, self.records, strict=True):
+            by.append(part.length_by / (self.length_factor * record.length_std_m)[:, None])
+            std_f = self.capacitance_factor * record.capacitance_std_f
+            by.append(part.capacitance_by / std_f[:, None])
+        for name, std in self.known.items():
+            by.append(np.where(np.array(unknowns.names) == name, 1.0 / std, 0.0)[None])
+        return self._weighed(found, unknowns), np.vstack(by)
+
+    def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[Modelled] | None:
+        def one(record: MotionRecord) -> Modelled:
+            return modelled(unknowns, record, derivatives=derivatives)
+
+        try:
+            if len(self.records) == 1:
+                return [one(self.records[0])]
+            with ThreadPoolExecutor() as pool:
+                return list(pool.map(one, self.records))
+        except HaselabError:
+            return None
+
+    def _weighed(self, found: Sequence[Modelled], unknowns: Unknowns) -> Floats:
+        parts = []
+        for part, record in zip(found, self.records, strict=True):
+            std_m = self.length_factor * record.length_std_m
+            parts.append((record.length_m - part.length_m) / std_m)
+            std_f = self.capacitance_factor * record.capacitance_std_f
+            parts.append((record.capacitance_f - part.capacitance_f) / std_f)
+        known = [-unknowns.value(name) / std for name, std in self.known.items()]
+        return np.concatenate([*parts, known])

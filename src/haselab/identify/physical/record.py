@@ -1,0 +1,99 @@
+"""What acted on an actuator without interruption, and what was seen of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from haselab.actuators import Drive
+from haselab.base import InputError
+
+__all__ = ["MotionRecord"]
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class MotionRecord:
+    """One uninterrupted record of an actuator; at its first edge the actuator rests.
+
+    Args:
+        name: for messages.
+        drive: what acted, from the first edge to the last.
+        length_time_s: rising. Shape `(F,)`.
+        length_m: seen by the camera. Shape `(F,)`.
+        length_std_m: standard deviation of each. Shape `(F,)`.
+        window: intervals of the drive in which capacitances were sensed. Shape `(W,)`.
+        window_of: index of the capacitance to which each of them belongs. Shape `(W,)`.
+        capacitance_f: mean over its intervals. Shape `(C,)`.
+        capacitance_std_f: standard deviation of each. Shape `(C,)`.
+        experiments: names of the experiments that the record consists of.
+        length_experiment: index of the experiment of each length. Shape `(F,)`.
+        capacitance_experiment: the same of each capacitance. Shape `(C,)`.
+    Raises:
+        InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
+            not positive.
+    """
+
+    name: str
+    drive: Drive
+    length_time_s: Floats
+    length_m: Floats
+    length_std_m: Floats
+    window: Integers
+    window_of: Integers
+    capacitance_f: Floats
+    capacitance_std_f: Floats
+    experiments: tuple[str, ...]
+    length_experiment: Integers
+    capacitance_experiment: Integers
+
+    def over_windows(self, values: Floats) -> Floats:
+        """Means over the intervals in which each capacitance was sensed.
+
+        Args:
+            values: means over each interval of the drive. Shape `(N,)` or `(N, P)`.
+        Returns:
+            One per capacitance. Shape `(C,)` or `(C, P)`.
+        """
+        duration_s = np.diff(self.drive.edge_s)[self.window]
+        share = duration_s / np.bincount(self.window_of, duration_s)[self.window_of]
+        shape = self.capacitance_f.size, values.shape[0]
+        weights = csr_array((share, (self.window_of, self.window)), shape=shape)
+        return np.asarray(weights @ values)
+
+    def __post_init__(self) -> None:
+        frames = (self.length_m, self.length_std_m, self.length_experiment)
+        blocks = (self.capacitance_f, self.capacitance_std_f, self.capacitance_experiment)
+        if any(part.size != self.length_time_s.size for part in frames) or any(
+            part.size != self.capacitance_f.size for part in blocks
+        ):
+            raise InputError(
+                f"{self.name}: lengths and capacitances each need one time, standard deviation "
+                "and experiment per value."
+            )
+        if self.window.size != self.window_of.size or not np.array_equal(
+            np.unique(self.window_of), np.arange(self.capacitance_f.size)
+        ):
+            raise InputError(
+                f"{self.name}: each capacitance needs at least one interval in which it was sensed."
+            )
+        if self.length_m.size + self.capacitance_f.size == 0:
+            raise InputError(
+                f"{self.name} has neither lengths nor capacitances. Record at least one of them."
+            )
+        for what, values, std in (
+            ("length", self.length_m, self.length_std_m),
+            ("capacitance", self.capacitance_f, self.capacitance_std_f),
+        ):
+            if not np.isfinite(values).all():
+                raise InputError(f"{self.name}: a {what} is not finite. Leave such values out.")
+            if not (std > 0.0).all():
+                raise InputError(
+                    f"{self.name}: the standard deviation of a {what} is "
+                    f"{float(std.min()):g}. It must be above 0."
+                )

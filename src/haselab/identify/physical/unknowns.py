@@ -1,0 +1,175 @@
+"""The numbers that a joint fit estimates: the law's parameters, and those of the instruments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.actuators import ADDED_INERTIA, ActuatorLaw, with_parameters
+
+__all__ = [
+    "CAMERA_LATENCY",
+    "CAMERA_OFFSET",
+    "INSTRUMENTS",
+    "SENSING_LATENCY",
+    "SENSING_SCALE",
+    "Unknowns",
+    "fitted_parameters",
+]
+
+Floats = NDArray[np.float64]
+CAMERA_LATENCY = "camera.latency_s"
+CAMERA_OFFSET = "camera.offset_m"
+SENSING_LATENCY = "sensing.latency_s"
+SENSING_SCALE = "sensing.scale"
+INSTRUMENTS = (CAMERA_LATENCY, CAMERA_OFFSET, SENSING_LATENCY, SENSING_SCALE)
+# how far a start value may be off: of a logarithm, or in the unit
+_WIDTH = 0.4
+_WIDTHS = {CAMERA_LATENCY: 2e-3, CAMERA_OFFSET: 1e-3, SENSING_LATENCY: 2e-3, SENSING_SCALE: 0.05}
+_INERTIA_WIDTH = 0.1  # of the mass
+
+
+def fitted_parameters(law: ActuatorLaw) -> dict[str, float]:
+    """Parameters of a law that a joint fit estimates, with their present values.
+
+    A parameter of 0 switches its effect off and stays 0; so do the time constants of branches and
+    charge without a share.
+
+    Args:
+        law: to start from.
+    Returns:
+        Values by name, see `with_parameters`.
+    Example:
+        >>> from haselab.actuators import DeaStack
+        >>> list(fitted_parameters(DeaStack()))[:2]
+        ['actuator.layer_thickness_m', 'actuator.shear_modulus_pa']
+    """
+    found: dict[str, float] = {}
+    for about in law.described():
+        if not about.fitted:
+            continue
+        value = getattr(law, about.name)
+        if isinstance(value, tuple):
+            found |= {f"{about.key}[{k}]": part for k, part in enumerate(value)}
+        else:
+            found[about.key] = value
+    idle = {name for name, value in found.items() if value == 0.0}
+    return {name: value for name, value in found.items() if not idle & {name, *_shares_of(name)}}
+
+
+def _shares_of(name: str) -> tuple[str, ...]:
+    """The share without which a time constant has no effect."""
+    return (name.replace("relaxation_s", "share"), name.replace("relaxation_s", "relaxation_share"))
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Names, scales and values of what a fit estimates.
+
+    Positive parameters of the law vary by their logarithm or by their inverse square, all others
+    by their value.
+
+    Args:
+        law: to start from; parameters that are not estimated stay those of this law.
+        names: of the parameters of the law, of `ADDED_INERTIA` and of `INSTRUMENTS`.
+        values: in their units. Shape `(P,)`.
+        mass_kg: hung mass, the scale of an added inertia.
+    """
+
+    law: ActuatorLaw
+    names: tuple[str, ...]
+    values: Floats
+    mass_kg: float
+
+    @classmethod
+    def of(cls, law: ActuatorLaw, *, added_inertia_kg: float, mass_kg: float) -> Unknowns:
+        """All numbers that can be estimated for a law."""
+        values = fitted_parameters(law)
+        names = (*values, ADDED_INERTIA, *INSTRUMENTS)
+        start = [*values.values(), added_inertia_kg, 0.0, 0.0, 0.0, 1.0]
+        return cls(law, names, np.array(start, dtype=np.float64), mass_kg)
+
+    @property
+    def law_names(self) -> tuple[str, ...]:
+        """Those of which the motion depends, in order; they come first."""
+        return tuple(name for name in self.names if name not in INSTRUMENTS)
+
+    @property
+    def by_logarithm(self) -> NDArray[np.bool_]:
+        """Which of them vary by their logarithm. Shape `(P,)`."""
+        linear = {ADDED_INERTIA, *INSTRUMENTS} - {SENSING_SCALE}
+        return np.array([name not in linear for name in self.names]) & ~self.by_inverse_square
+
+    @property
+    def by_inverse_square(self) -> NDArray[np.bool_]:
+        """Which of them vary by their inverse square. Shape `(P,)`."""
+        marked = {about.key for about in self.law.described() if about.inverse_square}
+        return np.array([name in marked for name in self.names])
+
+    @property
+    def widths(self) -> Floats:
+        """How far the start may be off, in what varies. Shape `(P,)`."""
+        widths = {ADDED_INERTIA: _INERTIA_WIDTH * self._inertia_kg, **_WIDTHS}
+        found = np.array([widths.get(name, _WIDTH) for name in self.names])
+        inverse = self.by_inverse_square
+        found[inverse] *= 2.0 / self.values[inverse] ** 2
+        return found
+
+    @property
+    def _inertia_kg(self) -> float:
+        return self.mass_kg + self.value(ADDED_INERTIA)
+
+    @property
+    def slopes(self) -> Floats:
+        """Change of the values per change of what varies. Shape `(P,)`."""
+        found = np.where(self.by_logarithm, self.values, 1.0)
+        return np.where(self.by_inverse_square, -0.5 * self.values**3, found)
+
+    def value(self, name: str) -> float:
+        """Value of one of them; an instrument's default where it is not estimated."""
+        if name in self.names:
+            return float(self.values[self.names.index(name)])
+        return 1.0 if name == SENSING_SCALE else 0.0
+
+    def moved(self, step: Floats) -> Unknowns:
+        """Change what varies.
+
+        Args:
+            step: changes. Shape `(P,)`.
+        """
+        logarithm, inverse = self.by_logarithm, self.by_inverse_square
+        values = self.values + step
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            values[logarithm] = self.values[logarithm] * np.exp(np.minimum(step[logarithm], 50.0))
+            values[inverse] = (self.values[inverse] ** -2.0 + step[inverse]) ** -0.5
+        return Unknowns(self.law, self.names, values, self.mass_kg)
+
+    def distance(self, other: Unknowns) -> Floats:
+        """What varies here minus there, of the same names. Shape `(P,)`."""
+        logarithm, inverse = self.by_logarithm, self.by_inverse_square
+        found = self.values - other.values
+        found[logarithm] = np.log(self.values[logarithm] / other.values[logarithm])
+        found[inverse] = self.values[inverse] ** -2.0 - other.values[inverse] ** -2.0
+        return found
+
+    def without(self, names: Sequence[str]) -> Unknowns:
+        """Keep some of them at their present values."""
+        kept = np.array([name not in names for name in self.names])
+        return Unknowns(
+            self.present_law(),
+            tuple(name for name in self.names if name not in names),
+            self.values[kept],
+            self.mass_kg,
+        )
+
+    def present_law(self) -> ActuatorLaw:
+        """The law with the present values.
+
+        Raises:
+            LimitError: A value is outside its limits.
+        """
+        law_values = dict(zip(self.law_names, self.values.tolist(), strict=False))
+        return with_parameters(self.law, law_values)

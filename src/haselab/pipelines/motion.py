@@ -1,0 +1,201 @@
+"""A recorded session as one motion: what acted on the actuator, and what was seen of it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.actuators import Drive
+from haselab.base import InputError
+from haselab.identify.physical import MotionRecord
+from haselab.pipelines.sensing.series import DEFAULT_REQUEST
+from haselab.pipelines.sensing.source import session_config
+from haselab.runtime.observer import FIDUCIALS
+from haselab.sensing import Lockin
+from haselab.store.session.layout import ExperimentRecord
+from haselab.store.session.reader import SessionReader
+from haselab.study.fits.observe import gauge_length
+
+__all__ = ["motion_of_session"]
+
+Floats = NDArray[np.float64]
+_SAME_S = 1e-7  # times closer than that are one
+_EMPTY = 0.05  # inertia of an empty clamp, of the largest hung mass
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Blocks of an experiment: drive, and what the lock-in found in the samples it uses.
+
+    Args:
+        spans_s: beginnings and ends of the samples that count, from a block's first one.
+            Shape `(S, 2)`.
+    """
+
+    start_s: Floats
+    drive_v: Floats
+    spans_s: Floats
+    capacitance_f: Floats
+    std_f: Floats
+    used: NDArray[np.bool_]
+
+
+def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
+    """Join all experiments of a session to one uninterrupted motion.
+
+    Between the experiments the session's conditions state what acted: drive, carrier and load. In
+    the blocks it is their own drive, from the switch on.
+
+    Args:
+        reader: of the session, open.
+        path: of the session, for messages.
+    Returns:
+        The motion, which begins when the run began, after the mass has hung for long.
+    Raises:
+        InputError: The session has no conditions, no rig, or neither lengths nor capacitances.
+    """
+    conditions = reader.conditions()
+    if conditions.size == 0:
+        raise InputError(
+            "The session does not say what acted on the actuator between its experiments: it was "
+            f"recorded by an older version, imported, or by a chip. Record it again. {path}"
+        )
+    rig = reader.header["rig"]
+    block_s = rig["block_samples"] / rig["rate_hz"]
+    switch_s = rig["switch_sample"] / rig["rate_hz"]
+    records = [reader.experiment(name) for name in reader.names]
+    records = [record for record in records if record.name != "particles"]
+    blocks = {r.name: _sensed(reader, r, path, block_s) for r in records if len(r.codes)}
+    drive = _drive(conditions, blocks.values(), (block_s, switch_s), float(rig["amplifier_gain"]))
+    names = tuple(record.name for record in records)
+    time_s, length_m, std_m, of_length = _lengths(records, float(rig["scale_m_per_px"]))
+    inside = (time_s >= drive.edge_s[0]) & (time_s <= drive.edge_s[-1])
+    order = np.argsort(time_s[inside], kind="stable")
+    chosen = np.flatnonzero(inside)[order]
+    none, no = np.zeros(0, dtype=np.int64), np.zeros(0)
+    window, window_of, of_block, farad, std_f = [none], [none], [none], [no], [no]
+    count = 0
+    for k, name in enumerate(names):
+        if name not in blocks:
+            continue
+        part = blocks[name]
+        intervals, values = _windows(drive, part)
+        window.append(intervals)
+        window_of.append(values + count)
+        farad.append(part.capacitance_f[part.used])
+        std_f.append(part.std_f[part.used])
+        of_block.append(np.full(farad[-1].size, k))
+        count += farad[-1].size
+    return MotionRecord(
+        path.name, drive, time_s[chosen], length_m[chosen], std_m[chosen],
+        np.concatenate(window), np.concatenate(window_of), np.concatenate(farad),
+        np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
+    )  # fmt: skip
+
+
+def _windows(drive: Drive, blocks: _Blocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Intervals that count for the used blocks, and the index of the block of each."""
+    intervals, values = [], []
+    start_s = blocks.start_s[blocks.used]
+    for low_s, high_s in blocks.spans_s.tolist():
+        at, end = np.searchsorted(
+            drive.edge_s, [start_s + low_s - _SAME_S, start_s + high_s - _SAME_S]
+        )
+        while (left := at < end).any():
+            intervals.append(at[left])
+            values.append(np.flatnonzero(left))
+            at = at + 1
+    none = np.zeros(0, dtype=np.int64)
+    return np.concatenate([none, *intervals]), np.concatenate([none, *values])
+
+
+def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s: float) -> _Blocks:
+    config = session_config(reader, record.codes.shape[1], DEFAULT_REQUEST, path)
+    lockin = Lockin(config)
+    sensed = lockin.sense(record.codes)
+    middle_s = sensed.time_s - block_s * np.arange(len(record.codes))
+    # other models than the plain one use other samples
+    plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz
+    used = sensed.valid & plain & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_std_f > 0)
+    changes = np.flatnonzero(np.diff(np.pad(lockin.counted, 1).astype(np.int8)))
+    return _Blocks(
+        record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
+        sensed.capacitance_f, sensed.capacitance_std_f, used,
+    )  # fmt: skip
+
+
+def _lengths(
+    records: list[ExperimentRecord], scale_m_per_px: float
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    times, lengths, stds, member = [], [], [], []
+    for k, record in enumerate(records):
+        if record.tracks.ndim != 2 or record.tracks.shape[1] != FIDUCIALS:
+            continue
+        length_m = gauge_length(record.tracks, scale_m_per_px)
+        good = np.isfinite(length_m)
+        variance = (record.tracks["std_y_px"].astype(np.float64) ** 2).sum(axis=1)
+        std_m = scale_m_per_px * np.sqrt(variance) / (FIDUCIALS // 2)
+        good &= np.isfinite(std_m) & (std_m > 0.0)
+        times.append(record.frame_time_s[good])
+        lengths.append(length_m[good])
+        stds.append(std_m[good])
+        member.append(np.full(int(good.sum()), k))
+    none = np.zeros(0)
+    return (
+        np.concatenate([none, *times]),
+        np.concatenate([none, *lengths]),
+        np.concatenate([none, *stds]),
+        np.concatenate([none.astype(np.int64), *member]),
+    )
+
+
+def _drive(
+    conditions: NDArray[np.void],
+    blocks: Collection[_Blocks],
+    timing_s: tuple[float, float],
+    gain: float,
+) -> Drive:
+    """What acted."""
+    block_s, switch_s = timing_s
+    changes: list[tuple[float, float]] = [
+        (float(row["time_s"]), float(row["drive_v"])) for row in conditions
+    ]
+    edges = [conditions["time_s"]]
+    for part in blocks:
+        changes += [(float(t) + switch_s, float(v))
+                    for t, v in zip(part.start_s, part.drive_v, strict=True)]  # fmt: skip
+        edges += [part.start_s, part.start_s + switch_s, part.start_s + block_s]
+        edges += [part.start_s + at_s for at_s in part.spans_s.ravel().tolist()]
+    ramps = _ramp_edges(conditions)
+    edge_s = np.sort(np.concatenate([*edges, ramps]))
+    edge_s = edge_s[np.append(True, np.diff(edge_s) > _SAME_S)]
+    middle_s = 0.5 * (edge_s[1:] + edge_s[:-1])
+    changes.sort(key=lambda change: change[0])  # stable: at one time, the later entry counts
+    change_s, change_v = np.array(changes).T
+    drive_v = change_v[np.searchsorted(change_s, middle_s, side="right") - 1]
+    row = np.searchsorted(conditions["time_s"], middle_s, side="right") - 1
+    pull_n = np.interp(middle_s, *_steps(conditions["time_s"], conditions["pull_n"]))
+    carrier_v = gain * conditions["carrier_v"][row]
+    # nobody sees how fast an actuator without mass moves
+    mass_kg = np.maximum(conditions["mass_kg"], _EMPTY * conditions["mass_kg"].max())[row]
+    return Drive(edge_s, gain * drive_v, pull_n, mass_kg, 0.5 * carrier_v**2)
+
+
+def _steps(time_s: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Times that rise, for interpolation; of two rows at one time, the first is earlier."""
+    shifted = time_s - _SAME_S * np.append(np.diff(time_s) < _SAME_S, False)
+    return shifted, values
+
+
+def _ramp_edges(conditions: NDArray[np.void]) -> Floats:
+    """Edges inside the times in which the pull changes."""
+    found = [np.zeros(0)]
+    for before, after in itertools.pairwise(conditions):
+        if before["pull_n"] != after["pull_n"] and after["time_s"] - before["time_s"] > _SAME_S:
+            found.append(np.linspace(before["time_s"], after["time_s"], 51)[1:-1])
+    return np.concatenate(found)

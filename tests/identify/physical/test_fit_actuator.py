@@ -1,0 +1,143 @@
+"""One physical model from all records: recovery, model errors, contradictions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from haselab.actuators import (
+    ADDED_INERTIA,
+    GRAVITY_M_S2,
+    Drive,
+    PlanarHasel,
+    SampledLaw,
+    with_parameters,
+)
+from haselab.base import InputError
+from haselab.identify.physical import MotionRecord, fit_actuator
+from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
+
+MASS_KG = 0.25
+LENGTH_STD_M, CAPACITANCE_STD_F = 4e-6, 3e-13
+BLOCK_S = 0.01
+
+
+def drive(duration_s: float, seed: int) -> Drive:
+    """Held random voltages, most of them long, and a lift of the mass in the middle."""
+    rng = np.random.default_rng(seed)
+    edges = np.arange(0.0, duration_s + 0.5 * BLOCK_S, BLOCK_S)
+    count = edges.size - 1
+    changes = rng.random(count) < np.where(np.arange(count) % 1000 < 300, 0.2, 0.003)
+    volt = rng.uniform(0.0, 9500.0, count)[np.maximum.accumulate(changes * np.arange(count))]
+    volt[:100] = 0.0
+    pull = np.full(count, MASS_KG * GRAVITY_M_S2)
+    for k in range(1, 9):  # loads tell the shell from the electrodes
+        pull[count * k // 10 : count * k // 10 + 300] *= 0.4 * k
+    volt[pull > 1.2 * pull[0]] = 0.0
+    return Drive(edges, volt, pull, np.full(count, MASS_KG), np.full(count, 5e3))
+
+
+def record(law, seed=1, *, duration_s=60.0, scale=1.0, mass_scale=1.0):
+    """What camera and monitors see of a law, with noise."""
+    rng = np.random.default_rng(100 + seed)
+    acts = drive(duration_s, seed)
+    sampled = SampledLaw(law, 11e3)
+    start, _ = sampled.at_rest(acts.voltage_v[0], acts.ripple_v2[0], acts.load_n[0])
+    times = np.arange(0.0, duration_s, 0.02)
+    seen = sampled.respond(acts, times, start)
+    count = acts.voltage_v.size
+    stated = replace(acts, load_n=mass_scale * acts.load_n, mass_kg=mass_scale * acts.mass_kg)
+    return MotionRecord(
+        f"record-{seed}", stated, times,
+        seen.length_m + LENGTH_STD_M * rng.standard_normal(times.size),
+        np.full(times.size, LENGTH_STD_M), np.arange(count), np.arange(count),
+        scale * seen.capacitance_f + CAPACITANCE_STD_F * rng.standard_normal(count),
+        np.full(count, CAPACITANCE_STD_F), ("all",), np.zeros(times.size, int),
+        np.zeros(count, int),
+    )  # fmt: skip
+
+
+TRUE = PlanarHasel()
+START = with_parameters(
+    TRUE,
+    {
+        "shell.shear_modulus_pa": 12.5e3,
+        "electrodes.stiffness_n_per_m": 180.0,
+        "viscosity.share[0]": 0.03,
+        "viscosity.share[2]": 0.4,
+        "viscosity.relaxation_s[1]": 1.4,
+        "viscosity.relaxation_s[2]": 4.0,
+        "viscosity.damping_n_s_per_m": 2.3,
+        "dielectric.permittivity": 2.5,
+    },
+)
+
+
+@pytest.mark.long
+def test_parameters_are_found_within_their_intervals():
+    fit = fit_actuator(START, [record(TRUE, 1), record(TRUE, 2)], mass_kg=MASS_KG)
+    assert fit.status == "ok"
+    truth = {**fitted_parameters(TRUE), ADDED_INERTIA: 0.0, "sensing.scale": 1.0}
+    far = []
+    for name, found in fit.parameters.items():
+        true, (low, high) = truth.get(name, 0.0), found.ci95
+        half = high - found.value if true > found.value else found.value - low
+        far.append((true - found.value) / half)
+    # 22 correlated numbers: one in 20 is outside by chance, by twice as far one in 10,000
+    assert np.mean(np.abs(far) < 1.0) > 0.8 and np.abs(far).max() < 2.0, dict(
+        zip(fit.parameters, far, strict=True)
+    )
+    count = sum(part.size for part in fit.residuals)
+    assert fit.chi_squared_ratio == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / count))
+    assert fit.length_rms_m == pytest.approx(LENGTH_STD_M, rel=0.05)
+    assert fit.capacitance_rms_f == pytest.approx(CAPACITANCE_STD_F, rel=0.05)
+    point = fit.linear_models[0]
+    assert point.voltage_v == 0.0 and point.gain_m_per_v == pytest.approx(0.0, abs=1e-12)
+    assert len(fit.chart().panels[0].curves) == 2
+
+
+@pytest.mark.long
+def test_a_branch_that_the_model_lacks_is_a_model_error():
+    shares, times = TRUE.losses.branch_share, TRUE.losses.branch_relaxation_s
+    more = replace(TRUE, branch_share=(*shares, 0.05), branch_relaxation_s=(*times, 12.0))
+    fit = fit_actuator(START, [record(more, 3)], mass_kg=MASS_KG)
+    assert fit.status.startswith("model error: the ")
+    assert fit.succeeded and fit.parameters
+
+
+def refused(records):
+    fit = fit_actuator(START, records, mass_kg=records[-1].drive.mass_kg[0])
+    assert not fit.succeeded and not fit.parameters
+    return fit.status
+
+
+@pytest.mark.slow
+def test_records_of_two_actuators_give_no_numbers():
+    other = replace(TRUE, electrode_stiffness_n_per_m=220.0)
+    records = [record(TRUE, 4, duration_s=15.0), record(other, 5, duration_s=15.0)]
+    assert refused(records).startswith("the records contradict the model: its ")
+
+
+@pytest.mark.long
+def test_a_wrong_mass_gives_no_numbers():
+    found = refused([record(TRUE, 4, duration_s=15.0, mass_scale=2.0)])
+    assert found.startswith("the records contradict each other: the capacitances ")
+    assert "Check the mass" in found
+
+
+@given(st.lists(st.floats(-0.3, 0.3), min_size=22, max_size=22))
+def test_what_varies_is_the_distance(steps):
+    start = Unknowns.of(TRUE, added_inertia_kg=0.01, mass_kg=MASS_KG)
+    step = 0.5 * np.array(steps) * start.widths
+    moved = start.moved(step)
+    np.testing.assert_allclose(moved.distance(start), step, rtol=1e-9, atol=1e-12)
+    little = 1e-6 * start.widths
+    by = (start.moved(little).values - start.moved(-little).values) / (2.0 * little)
+    np.testing.assert_allclose(by, start.slopes, rtol=1e-6)
+
+
+def test_no_record_is_refused():
+    with pytest.raises(InputError, match=r"There is no record of the actuator's motion"):
+        fit_actuator(TRUE, [], mass_kg=MASS_KG)

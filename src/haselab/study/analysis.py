@@ -149,7 +149,8 @@ class Analysis:
         try:
             with fitting(experiment.title), foreign(experiment, "fit"):
                 found = experiment.fit(self)
-            check_result(experiment, found)
+            with foreign(experiment, "fit"):
+                check_result(experiment, found)
         except NotPlayedError as reason:
             self._outcomes[experiment.table] = reason
             raise

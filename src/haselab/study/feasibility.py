@@ -21,7 +21,7 @@ from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study
-from haselab.study.experiments.foreign import declared
+from haselab.study.experiments.foreign import declared, foreign
 
 __all__ = [
     "check_drives",
@@ -77,7 +77,8 @@ def check_settings(study: Study) -> None:
             "such as [steps]."
         )
     for experiment in experiments:
-        experiment.check()
+        with foreign(experiment, "check", InputError):
+            experiment.check()
 
 
 def check_drives(study: Study, rig: RigDescription) -> None:

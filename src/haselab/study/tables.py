@@ -75,6 +75,8 @@ class Triangle(Section):
     def _lasts(self) -> Self:
         if self.cycles / self.frequency_hz > _DAY_S:
             raise ValueError("cycles / frequency_hz must not exceed a day")
+        if not self.low_v < self.high_v:
+            raise ValueError(f"low_v = {self.low_v:g} must be below high_v = {self.high_v:g}")
         if self.left_out_cycles >= self.cycles:
             raise ValueError(
                 f"left_out_cycles = {self.left_out_cycles} must be below cycles = {self.cycles}"

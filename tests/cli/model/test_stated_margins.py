@@ -101,6 +101,22 @@ def test_gains_changed_by_hand_do_not_have_the_margins_of_the_design(
     assert "but with [model] of the same file the pid has" in built(capsys, leg)[1]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("ki = ", "Ki = ", "[controller.parameters] lacks ki, has the key Ki"),
+        ("kp = ", "# kp = ", "[controller.parameters] lacks kp. A pid has kp, ki, kd, "),
+    ],
+)
+def test_a_misspelled_or_missing_gain_is_named(
+    leg: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+) -> None:
+    changed(leg, (f"\n{old}", f"\n{new}"))
+    assert said in built(capsys, leg)[1]
+    code, out, _ = run(capsys, "report", leg, "--json")
+    assert code == 0 and "cannot be verified" in out
+
+
 def test_a_typed_controller_states_margins_that_are_verified(
     leg: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

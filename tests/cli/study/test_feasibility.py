@@ -177,6 +177,7 @@ frame_rate_hz = 100.0
          "only 0 frames on each edge within 0.06 V of the baseline of 2.1 V"),
         ("left_out_cycles = 1", "left_out_cycles = 3",
          "left_out_cycles = 3 must be below cycles = 3"),
+        ("high_v = 2.0", "high_v = 0.0", "low_v = 0 must be below high_v = 0"),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("run", [True, False])
@@ -298,8 +299,9 @@ def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study()
     found = judge_study(study, describe(config), rating_of_twin(config, study)).checks
     asked = {check.name: check.requested for check in found}
     assert (
-        f"{asked['peak current']:.1f} of 12 mA, {asked['time of an update']:.2f} of 5 ms and "
-        f"{asked['field']:.1f} of 36 MV/m"
+        f"a current of {asked['peak current']:.1f} mA (limit 12 mA), "
+        f"{asked['time of an update']:.2f} ms for the largest update (limit 5 ms) and a field of "
+        f"{asked['field']:.1f} MV/m (limit 36 MV/m)"
     ) in page.read_text(encoding="utf-8")
 
 

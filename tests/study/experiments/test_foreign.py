@@ -77,7 +77,7 @@ def chart(*curves: Any) -> ExperimentResult:
     [
         (with_time(2.0, 0.1, "ms"), r"own\.time in 'ms', but its row is in 's'\. Convert"),
         (ExperimentResult({"own.ratio": GOOD}), r"own\.ratio in 's', but its row is in 'no unit'"),
-        (with_time(1.0, -0.5), r"own\.time with a standard deviation of -0\.5 and .* at least 0"),
+        (with_time(1.0, -0.5), r"own\.time = 1 with .* deviation of -0\.5 and .* at least 0"),
         (with_time(np.nan, 0.1), r"own\.time = nan with .* not all finite\. .*'missing'"),
         (with_time(1.0, np.nan), r"own\.time = 1 with a standard deviation of nan"),
         (with_time(1.0, np.inf), r"own\.time = 1 with a standard deviation of inf"),
@@ -92,6 +92,20 @@ def chart(*curves: Any) -> ExperimentResult:
         (chart(Curve("a", 1.0, 2.0)), r"curve 'a' has x of shape \(\) and y of shape \(\)"),
         (chart(Curve("a", ["x"], [1.0])), r"'fit' of the experiment \[own\].*ValueError"),
         (chart("a"), r"returns in chart 'creep' 'a' \(str\), which is no Curve"),
+        (ExperimentResult([1.0]), r"as quantities \[1\.0\] \(list\), which is no Mapping"),  # type: ignore[arg-type]
+        (ExperimentResult(missing=["own.time"]), r"as missing .* \(list\), which is no Mapping"),  # type: ignore[arg-type]
+        (
+            ExperimentResult({"own.time": Estimate("1", 0.1, (0.9, 1.1), "s")}),  # type: ignore[arg-type]
+            r"returns for own\.time '1' \(str\), which is no number",
+        ),
+        (
+            ExperimentResult({"own.time": GOOD}, missing={"own.time": "why"}),
+            r"own\.time both as a result and as missing",
+        ),
+        (
+            ExperimentResult({"own.time": Estimate(5.0, 0.1, (0.0, 1.0), "s")}),
+            r"own\.time = 5 with .* the interval 0 to 1\. Return .* around the value",
+        ),
         (SystemExit(0), r"'fit' of the experiment \[own\].*it called sys\.exit\(0\)\. The rec"),
     ],
 )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import MISSING, fields
 from pathlib import Path
 
 from haselab.base import HaselabError, InputError
@@ -37,6 +38,19 @@ def held_controller(path: Path, kind: str | None) -> ControllerSection:
         raise InputError(f"{error} {path}") from None
 
 
+def _gains(held: ControllerSection) -> PidGains:
+    """Gains of a PI or PID by name; a name that is missing or unknown is an `InputError`."""
+    known = {field.name: field.default is MISSING for field in fields(PidGains)}
+    lacking = [name for name, needed in known.items() if needed and name not in held.parameters]
+    unknown = sorted(set(held.parameters) - set(known))
+    if lacking or unknown:
+        wrong = [f"lacks {name}" for name in lacking] + [f"has the key {n}" for n in unknown]
+        raise InputError(
+            f"[controller.parameters] {', '.join(wrong)}. A {held.kind} has {', '.join(known)}."
+        )
+    return PidGains(**held.parameters)
+
+
 def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearController:
     """Return the linear feedback of a controller from the measurement.
 
@@ -49,7 +63,7 @@ def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearCon
         InputError: the kind has no linear feedback, or does not accept its parameters.
     """
     if held.kind in ("pi", "pid"):
-        return PidGains(**held.parameters)
+        return _gains(held)
     chosen = CONTROLLERS.find(held.kind).choose(held.parameters)
     with _named_failures(held.kind):
         controller = chosen.make()

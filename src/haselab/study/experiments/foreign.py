@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
@@ -127,6 +128,16 @@ def check_result(experiment: AnyExperiment, found: object) -> None:
     """
     _require(experiment, "fit", found, ExperimentResult)
     assert isinstance(found, ExperimentResult)
+    for name in ("quantities", "notes", "figures", "missing"):
+        _require(experiment, "fit", getattr(found, name), Mapping, f" as {name}")
+    for name in ("charts", "values"):
+        _require(experiment, "fit", getattr(found, name), tuple, f" as {name}")
+    both = sorted({*found.quantities} & {*found.missing})
+    if both and not _is_own(experiment):
+        raise ResultError(
+            f"The experiment [{experiment.table}] returns {', '.join(both)} both as a result and "
+            "as missing. Return it once."
+        )
     rows = rows_of_experiment(experiment)
     unnamed = sorted({*found.quantities, *found.missing} - set(rows))
     if unnamed:
@@ -154,16 +165,19 @@ def _check_estimate(experiment: AnyExperiment, key: str, estimate: Estimate, uni
     if _is_own(experiment):  # where NaN stands for a metric that a trial does not have
         return
     low, high = estimate.ci95
+    for number in (estimate.value, estimate.std, low, high):
+        _require(experiment, "fit", number, (Real,), f" for {key}")
     if not all(map(math.isfinite, (estimate.value, estimate.std, low, high))):
         raise ResultError(
             f"{where} = {estimate.value:g} with a standard deviation of {estimate.std:g} and the "
             f"interval {low:g} to {high:g}, which are not all finite. Return it in 'missing' with "
             "the reason instead."
         )
-    if estimate.std < 0.0 or low > high:
+    if estimate.std < 0.0 or not low <= estimate.value <= high:
         raise ResultError(
-            f"{where} with a standard deviation of {estimate.std:g} and the interval {low:g} to "
-            f"{high:g}. Return a standard deviation of at least 0, and the lower end first."
+            f"{where} = {estimate.value:g} with a standard deviation of {estimate.std:g} and the "
+            f"interval {low:g} to {high:g}. Return a standard deviation of at least 0 and an "
+            "interval around the value, the lower end first."
         )
 
 

@@ -61,7 +61,7 @@ class TriangleTest(Experiment[Triangle]):
         """See `Experiment`: enough frames near the baseline."""
         t, baseline_v = self.settings, self.study.nominal_baseline_v
         width_v = min(baseline_v + NEAR_V, t.high_v) - max(baseline_v - NEAR_V, t.low_v)
-        edge_s = 0.5 * max(width_v, 0.0) / (abs(t.high_v - t.low_v) * t.frequency_hz)
+        edge_s = 0.5 * max(width_v, 0.0) / ((t.high_v - t.low_v) * t.frequency_hz)
         kept = t.cycles - t.left_out_cycles
         frames = kept * edge_s * t.frame_rate_hz
         if frames < LEAST_FRAMES:

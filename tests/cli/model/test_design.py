@@ -147,6 +147,29 @@ def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, cap
         assert error.startswith("haselab: 1 error(s): loop_delay_s: Input should be ")
 
 
+def test_margins_of_a_designed_controller_are_those_that_the_design_stated(tmp_path, capsys):
+    """The model states no rate and no delay; the design had options for both."""
+    file = tmp_path / "a.toml"
+    file.write_text("[model]\ngain = 0.8\nnatural_frequency_rad_s = 32.0\ndamping_ratio = 0.3\n"
+                    "[drive]\nhigh_v = 2.0\n")  # fmt: skip
+    options = ("--rate-hz", 50, "--delay-s", 0.02, "--controller", "pi", "--accept-shortfalls")
+    assert run(capsys, "design", file, *options)[0] == 0
+    stated = tomllib.loads(file.read_text())["controller"]["margins"]
+    code, out, _ = run(capsys, "margins", file, "--controller", "pi", "--json")
+    found = json.loads(out)
+    assert (code, found["rate_hz"], found["delay_s"]) == (0, 50.0, 0.02)
+    assert found["gain_margin_db"] == pytest.approx(stated["gain_margin_db"], abs=1e-6)
+    code, out, _ = run(capsys, "margins", file, "--controller", "pi", "--rate-hz", 100, "--json")
+    assert (json.loads(out)["rate_hz"], json.loads(out)["delay_s"]) == (100.0, 0.02)
+
+
+def test_a_misspelled_gain_is_not_a_missing_model(tmp_path, capsys):
+    file = tmp_path / "a.toml"
+    file.write_text("[model]\ngian = 0.8\ndamping_ratio = 0.3\n[drive]\nhigh_v = 2.0\n")
+    code, _, error = run(capsys, "design", file)
+    assert code == 2 and "[model] has gian, damping_ratio, but neither gain nor numerator" in error
+
+
 def test_margins_of_given_gains_are_those_of_the_library(model, capsys):
     code, text, _ = run(
         capsys, "margins", model, "--kp", 0, "--ki", 8.95, "--kd", 0.0152,

@@ -78,8 +78,12 @@ def command(
     controller is the PID of --kp and --ki, or one of the actuator file: PI, PID, or any kind whose
     controller has the method linear_feedback.
     """
-    setting = LoopSetting(*loop_of(model, rate_hz, delay_s))
-    given = (kp, ki, kd, derivative_filter_s)
+    given, held = (kp, ki, kd, derivative_filter_s), None
+    if model.suffix.lower() == ".toml" and all(value is None for value in given):
+        held = held_controller(model, kind)
+    loop = None if held is None else held.loop
+    usual = (None, None) if loop is None else (loop.rate_hz, loop.measurement_delay_s)
+    setting = LoopSetting(*loop_of(model, rate_hz, delay_s, usual))
     gains: PidGains | LinearController
     if any(value is not None for value in given):
         if kp is None or ki is None or kind is not None:
@@ -88,8 +92,8 @@ def command(
                 "them: then --controller names a controller of the actuator file."
             )
         gains = PidGains(*(value or 0.0 for value in given))
-    elif model.suffix.lower() == ".toml":
-        gains = feedback_of(held_controller(model, kind), setting.rate_hz)
+    elif held is not None:
+        gains = feedback_of(held, setting.rate_hz)
     else:
         raise click.UsageError("Missing options '--kp' and '--ki': the file has no [controller].")
     plant = read_any_plant(model)

@@ -80,12 +80,19 @@ def _data(path: Path) -> Any:
     sections = read_actuator(path)
     warn_misspelled(sections, path)
     model = sections.get("model")
-    if not isinstance(model, dict) or not model.keys() & {"gain", "numerator"}:
+    table = model if isinstance(model, dict) else {}
+    if not table.keys() & {"gain", "numerator"}:
+        held = [key for key in table if key not in ("physical", "provenance")]
+        if held:
+            raise InputError(
+                f"[model] has {', '.join(held)}, but neither gain nor numerator. Add gain, or "
+                f"check its spelling: {path}"
+            )
         raise InputError(f"{missing('model', 'haselab identify transfer FILE')} {path}")
-    if "numerator" in model:
-        return model
-    loop = {name: model[name] for name in ("rate_hz", "loop_delay_s") if name in model}
-    return {"plant": model, **loop}
+    if "numerator" in table:
+        return table
+    loop = {name: table[name] for name in ("rate_hz", "loop_delay_s") if name in table}
+    return {"plant": table, **loop}
 
 
 def _from_struct(fields: Mapping[str, Any], path: Path) -> RationalModel:
@@ -209,16 +216,33 @@ def loop_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def loop_of(path: Path, rate_hz: float | None, delay_s: float | None) -> tuple[float, float]:
-    """Rate and delay of a loop: as given, else from the model file, else the defaults.
+def loop_of(
+    path: Path,
+    rate_hz: float | None,
+    delay_s: float | None,
+    usual: tuple[float | None, float | None] = (None, None),
+) -> tuple[float, float]:
+    """Rate and delay of a loop: as given, else from the model file, else the usual ones.
 
+    Args:
+        path: of the model.
+        rate_hz: as given; None: not given.
+        delay_s: likewise.
+        usual: rate and delay where the model file states none; None: the defaults.
+    Returns:
+        Rate, in Hz, and delay, in s.
     Raises:
         InputError: a value in the file is not a number above 0.
     """
-    stated = {} if path.suffix.lower() == ".mat" else read_loop(path)
+    stated = {
+        "rate_hz": _RATE_HZ if usual[0] is None else usual[0],
+        "loop_delay_s": _DELAY_S if usual[1] is None else usual[1],
+    }
+    if path.suffix.lower() != ".mat":
+        stated |= read_loop(path)
     return (
-        stated.get("rate_hz", _RATE_HZ) if rate_hz is None else rate_hz,
-        stated.get("loop_delay_s", _DELAY_S) if delay_s is None else delay_s,
+        stated["rate_hz"] if rate_hz is None else rate_hz,
+        stated["loop_delay_s"] if delay_s is None else delay_s,
     )
 
 

@@ -36,6 +36,13 @@ from haselab.store.columns.units import is_unit, parse_unit, split_header
         ("p [psi]", "p", "Pa", 6894.757293168),
         ("time_hours", "time", "s", 3600.0),
         ("force_kn", "force", "N", 1e3),
+        ("F [gf]", "F", "N", 9.80665e-3),  # the standard acceleration, by definition
+        ("F (kgf)", "F", "N", 9.80665),
+        ("F [N]", "F", "N", 1.0),
+        ("u [KV]", "u", "V", 1e3),
+        ("u [kv]", "u", "V", 1e3),
+        ("E [MV/m]", "E", "V/m", 1e6),
+        ("p [MPa]", "p", "Pa", 1e6),
     ],
 )
 def test_usual_spellings_are_known(header, name, si, factor):
@@ -53,11 +60,23 @@ def test_unknown_and_ambiguous_ones_are_refused_with_those_that_are_known(header
         parse_unit(text, header)
 
 
+@pytest.mark.parametrize(
+    "header",
+    ["F [GF]", "x [gm]", "x [Gm]", "x [Mm]", "x [MM]", "x / Mm", "x_Mm", "t [gs]", "t [MS]",
+     "I [fa]", "I [MA]", "C [MF]", "E [mV/m]", "E (mV/m)", "p (MBAR)", "G [S]", "G (µS)", "G / mS",
+     "G [uS]", "u [gv]"],
+)  # fmt: skip
+def test_a_unit_in_the_wrong_case_never_changes_its_prefix_or_quantity(header):
+    _, text = split_header(header)
+    with pytest.raises(InputError, match=r"unknown or ambiguous"):
+        parse_unit(text, header)
+
+
 def test_every_unit_that_the_refusal_names_is_known():
     with pytest.raises(InputError, match=r"unknown") as refused:
         parse_unit("furlong", "here")
     listed = str(refused.value).split("Use ")[1].removesuffix(" for a pure number.")
-    for word in ("and ", "g with a prefix from f to G (such as", ")", "or "):
+    for word in ("and ", "g with a prefix from f to k (such as", ")", "or "):
         listed = listed.replace(word, ",")
     names = [name.strip() for name in listed.split(",") if name.strip()]
     assert len(names) > 30

@@ -13,6 +13,7 @@ __all__ = ["Unit", "is_unit", "parse_unit", "split_header"]
 _PREFIXES = {"f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "": 1.0,
              "k": 1e3, "M": 1e6, "G": 1e9}  # fmt: skip
 _WITH_PREFIX = ("V", "A", "F", "s", "Hz", "m", "N", "Pa", "Ω", "C", "J", "W", "H")
+_NEVER_LARGE = ("A", "F", "s", "m", "C", "H")  # Mm is rather a misspelt mm, and Gs gauss
 _OTHER = {
     "1": ("1", 1.0), "-": ("1", 1.0), "a.u.": ("1", 1.0), "%": ("1", 0.01), "‰": ("1", 1e-3),
     "ppm": ("1", 1e-6), "mm/mm": ("1", 1.0), "µm/m": ("1", 1e-6), "cm": ("m", 0.01),
@@ -26,8 +27,14 @@ _OTHER = {
     "N/m": ("N/m", 1.0), "N/mm": ("N/m", 1e3), "Nm": ("Nm", 1.0), "mNm": ("Nm", 1e-3),
     "N/mm²": ("Pa", 1e6), "N/m²": ("Pa", 1.0), "bar": ("Pa", 1e5), "mbar": ("Pa", 100.0),
     "psi": ("Pa", 6894.757293168), "°C": ("°C", 1.0), "K": ("K", 1.0), "m²": ("m²", 1.0),
-    "mm²": ("m²", 1e-6), "cm²": ("m²", 1e-4),
+    "mm²": ("m²", 1e-6), "cm²": ("m²", 1e-4), "gf": ("N", 9.80665e-3), "kgf": ("N", 9.80665),
 }  # fmt: skip
+# Of these, every spelling in upper and lower case means the same.
+_ANY_CASE = (
+    "V", "kV", "A", "kA", "F", "Hz", "kHz", "N", "kN", "kPa", "Ω", "kΩ", "J", "kJ", "W", "kW",
+    "cm", "kg", "kgf", "min", "bar", "psi", "ppm", "deg", "rad", "rad/s", "V/m", "kV/mm", "V/s",
+    "kV/s", "V²", "kV²", "N/m", "N/mm", "N/mm²", "N/m²", "°C",
+)  # fmt: skip
 _WORDS = {
     "volt": "V", "volts": "V", "millivolt": "mV", "millivolts": "mV", "kilovolt": "kV",
     "kilovolts": "kV", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A", "sec": "s",
@@ -61,8 +68,9 @@ _STROKE = re.compile(r"^(?P<name>.+?)\s*(?:/|,|\s+in\s)\s*(?P<unit>[^/,\s]+)$")
 _LOOKS_LIKE_ONE = re.compile(r"[fpnuµmkg]?(v|a|f|s|hz|m|n|pa|ohm|c|g)(\^\d)?", re.IGNORECASE)
 _STATED = re.compile(r"[^\s\d]{1,8}(\^-?\d)?")  # in square brackets
 _KNOWN = (
-    f"{', '.join(_WITH_PREFIX)} and g with a prefix from f to G (such as kV, mV, µA or uA, pF, mm, "
-    "ms), %, ‰, min, h, cm, bar, °, °C, V², mm², N/mm², V/m, m/s, or 1 for a pure number"
+    f"{', '.join(_WITH_PREFIX)} and g with a prefix from f to k (such as kV, mV, µA or uA, pF, mm, "
+    "ms), MHz, MPa, MΩ, %, ‰, min, h, cm, bar, gf, kgf, °, °C, V², mm², N/mm², V/m, m/s, or 1 for "
+    "a pure number"
 )
 
 
@@ -85,23 +93,16 @@ def _table() -> dict[str, Unit]:
     found = {symbol: Unit(symbol, si, factor) for symbol, (si, factor) in _OTHER.items()}
     for si in _WITH_PREFIX:
         for prefix, factor in _PREFIXES.items():
-            found[prefix + si] = Unit(prefix + si, si, factor)
+            if prefix not in ("M", "G") or si not in _NEVER_LARGE:
+                found[prefix + si] = Unit(prefix + si, si, factor)
     return found
 
 
 _UNITS = _table()
-
-
-def _by_lower_case() -> dict[str, Unit | None]:
-    """Units by their lower-case symbols; None where two differ in case alone, as mPa and MPa."""
-    found: dict[str, Unit | None] = {}
-    for symbol, unit in _UNITS.items():
-        lower = symbol.lower()
-        found[lower] = unit if found.get(lower, unit) == unit else None
-    return found
-
-
-_LOWER = _by_lower_case()
+_LOWER = {symbol.lower(): _UNITS[symbol] for symbol in _ANY_CASE}
+# Written where a unit is, these state one, although it is refused: Mm, MA, siemens.
+_REFUSED = {prefix + si for prefix in "MG" for si in _NEVER_LARGE} | {"mS", "µS", "uS", "nS"}
+_MISSPELT = {symbol.lower() for symbol in _UNITS}  # refused in brackets too, such as (mV/m)
 
 
 def is_unit(text: str) -> bool:
@@ -168,14 +169,19 @@ def split_header(header: str) -> tuple[str, str]:
     text = header.strip()
     if match := _BRACKETS.match(text):
         unit = match["square"] if match["square"] is not None else match["round"]
-        stated = bool(_find(unit)) or bool(_LOOKS_LIKE_ONE.fullmatch(unit.strip()))
+        stated = (
+            _find(unit) is not None
+            or unit.strip().lower() in _MISSPELT
+            or _LOOKS_LIKE_ONE.fullmatch(unit.strip()) is not None
+        )
         if stated or (match["square"] is not None and _STATED.fullmatch(unit.strip())):
             return match["name"].strip() or text, unit.strip()
         return text, ""
-    if (match := _STROKE.match(text)) and match["unit"] in _UNITS and match["unit"] not in "1-":
+    units = _UNITS.keys() | _REFUSED
+    if (match := _STROKE.match(text)) and match["unit"] in units and match["unit"] not in "1-":
         return match["name"].strip(), match["unit"]
     name, _, ending = text.rpartition("_")
-    known = ending in _ENDINGS or ending == _AMBIGUOUS or (ending in _UNITS and len(ending) > 1)
+    known = ending in _ENDINGS or ending == _AMBIGUOUS or (ending in units and len(ending) > 1)
     if name and known:
         return name, _ENDINGS.get(ending, ending)
     return text, ""

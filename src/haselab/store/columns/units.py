@@ -121,10 +121,7 @@ def _find(text: str) -> Unit | None:
         return _UNITS[_WORDS[lower]]
     if lower == plain and lower in _ENDINGS:  # the m of mv is milli: only the v is misspelt
         return _UNITS[_ENDINGS[lower]]
-    found = _LOWER.get(lower)
-    # the m of mV/m is no mega, and the g of gf no giga
-    larger = found is not None and found.symbol[0] in "MGT" and found.symbol[0] != plain[0]
-    return None if larger else found
+    return _LOWER.get(lower)
 
 
 def parse_unit(text: str, where: str) -> Unit:

@@ -29,6 +29,7 @@ __all__ = ["TriangleTest"]
 
 _LEAD_S = 0.2  # recorded at the lowest voltage, before the first rise
 _SHEET = "particles"
+_DRIFTS = ("S13.peak_drift", "S13.residual_drift")
 
 
 class TriangleTest(Experiment[Triangle]):
@@ -86,17 +87,20 @@ class TriangleTest(Experiment[Triangle]):
         """See `Experiment`."""
         cycles = Cycles.of(analysis.observe(TRIANGLE), self.study, analysis.rig)
         maps = fit_maps(cycles, baseline_v(analysis))
+        reason = "one kept cycle; a drift needs two"
+        missing = {key: reason for key in _DRIFTS if key not in maps.quantities}
         with fitting("Paper's sensing chain"):
             chain = _chain(cycles, maps, analysis)
         if chain is None:
             return ExperimentResult(
-                maps.quantities, maps.notes, figures=maps.figures, values=(maps,)
+                maps.quantities, maps.notes, figures=maps.figures, values=(maps,), missing=missing
             )
         return ExperimentResult(
             {**maps.quantities, **chain.quantities},
             {**maps.notes, **chain.notes},
             figures={**maps.figures, **chain.figures},
             values=(maps, chain),
+            missing=missing,
         )
 
     def rows(self) -> Mapping[str, Quantity]:

@@ -100,7 +100,7 @@ def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
         cycles: of the triangle test.
         zero_length_m: length at zero strain.
     Returns:
-        Results S13.
+        Results S13; the drifts only if at least two cycles are kept.
     """
     seen = cycles.seen
     strain = seen.length_m / zero_length_m - 1.0
@@ -116,9 +116,9 @@ def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
     def estimate(value: float) -> Estimate:
         return with_resolution(Estimate.normal(float(value), 0.0, ""), finest)
 
+    found = {"S13.residual_first": estimate(ends[1] - ends[0])}
     kept = peaks[cycles.left_out :]
-    return {
-        "S13.residual_first": estimate(ends[1] - ends[0]),
-        "S13.peak_drift": estimate(kept[-1] - kept[0]),
-        "S13.residual_drift": estimate(ends[-1] - ends[cycles.left_out + 1]),
-    }
+    if kept.size > 1:
+        found["S13.peak_drift"] = estimate(kept[-1] - kept[0])
+        found["S13.residual_drift"] = estimate(ends[-1] - ends[cycles.left_out + 1])
+    return found

@@ -13,7 +13,9 @@ import pytest
 from haselab.cli.main import main
 from haselab.control import step_metrics
 from haselab.firmware import ChipSettings, FrontEnd, settings_header
+from haselab.models.maps import VoltageMap
 from haselab.rig.chip import ChipFile, Firmware, find_tool, read_design
+from haselab.rig.chip.design import strains_within
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.chip.loops import SLOW, StepPlan, desktop_loop
@@ -146,9 +148,17 @@ def test_a_build_says_which_strains_the_module_does_not_reach(
                             tmp_path, "--json")  # fmt: skip
     answer = json.loads(text)
     assert code == 0 and error.count("\n") == 1
-    assert "limited to 0 to 1.5 V" in error
+    assert "the chip's output, which reaches 1.5 V, limit the drive" in error
     assert f"instead of {designed[0]:.4g} to {designed[1]:.4g}" in error
     assert 0.0 < answer["strain_high"] < designed[1] and answer["strain_low"] == designed[0]
+
+
+def test_a_lowest_drive_narrows_the_strains_as_well() -> None:
+    eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+    low, high = strains_within((-0.1, 0.05), eq4, 1.9, 0.8)
+    assert -0.1 < low < 0.0 and high == 0.05
+    assert eq4.voltage_v(low) == pytest.approx(0.8, abs=0.01)
+    assert strains_within((-0.1, 0.05), eq4, 1.9, 1.2) == (-0.1, 0.05)  # not even zero strain
 
 
 def test_a_folder_without_a_run_is_reported_in_one_line(

@@ -131,9 +131,10 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
     low, high = settings.strain_low, settings.strain_high
     if (low, high) != designed:
         click.echo(
-            f"haselab: warning: the chip's output is limited to 0 to {settings.drive_high_v:g} V, "
-            f"so the controller's output is limited to strains of {low:.4g} to {high:.4g} instead "
-            f"of {designed[0]:.4g} to {designed[1]:.4g}: {run}",
+            "haselab: warning: [drive] and the chip's output, which reaches "
+            f"{settings.drive_high_v:g} V, limit the drive, so the controller's output is limited "
+            f"to strains of {low:.4g} to {high:.4g} instead of {designed[0]:.4g} to "
+            f"{designed[1]:.4g}: {run}",
             err=True,
         )
 

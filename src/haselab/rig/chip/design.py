@@ -110,7 +110,7 @@ def _settings(
             "limits = {low = -0.05, high = 0.1}."
         )
     gains = _NO_GAINS if step is not None else _gains(controller)
-    _, high_v = tables.drive_ends_v()
+    low_v, high_v = tables.drive_ends_v()
     high_v = _HIGHEST_DRIVE_V if high_v is None else min(_HIGHEST_DRIVE_V, high_v)
     designed = (limits.low, limits.high)
     settings = ChipSettings(
@@ -118,7 +118,7 @@ def _settings(
         gains["ki"],
         gains.get("kd", 0.0),
         gains.get("derivative_filter_s", 0.0),
-        *strains_within(designed, volt, high_v),
+        *strains_within(designed, volt, high_v, max(low_v or 0.0, 0.0)),
         (volt.a1_v, volt.b1, volt.a2_v, volt.b2),
         strain.coefficients,
         front_end,
@@ -130,19 +130,20 @@ def _settings(
 
 
 def strains_within(
-    limits: tuple[float, float], to_volt: VoltageMap, high_v: float
+    limits: tuple[float, float], to_volt: VoltageMap, high_v: float, low_v: float = 0.0
 ) -> tuple[float, float]:
     """Narrow the limits of a controller's output to what a microcontroller's output reaches.
 
     Args:
         limits: lowest and highest strain.
         to_volt: strain to drive voltage.
-        high_v: highest drive, in V; the lowest is 0.
+        high_v: highest drive, in V.
+        low_v: lowest drive, in V.
     Returns:
         The narrower limits; unchanged if these would exclude zero strain, which `ChipSettings`
         refuses.
     """
-    found = to_volt.reach(limits, 0.0, high_v)
+    found = to_volt.reach(limits, low_v, high_v)
     return limits if found is None or not found[0] <= 0.0 <= found[1] else found
 
 

@@ -1,6 +1,8 @@
 """The compiled motion against a general solver, and its derivatives against differences."""
 
 import dataclasses
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -143,6 +145,27 @@ def test_derivatives_are_those_of_the_simulated_numbers(name):
             expected = (getattr(ends[1], what) - getattr(ends[0], what)) / (2.0 * step)
             worst = np.abs(by[:, column] - expected).max()
             assert worst < 3e-4 * np.abs(expected).max(), (key, what)
+
+
+def test_a_part_of_the_columns_that_starts_late_is_waited_for(monkeypatch):
+    """As on a busy machine, where the second thread has not begun when the first is done."""
+    law, drive, times_s = LAWS["planar"], drive_of(), np.linspace(0.0, 4.0, 50)
+    sampled, start = SampledLaw(law, 15e3, BY["planar"]), start_of(law, 1.2)
+    found = sampled.respond(drive, times_s, start)
+    monkeypatch.setattr("haselab.actuators.response._CORES", 2)
+
+    class Late(ThreadPoolExecutor):
+        """One thread, which pauses after each part."""
+
+        def submit(self, *call):
+            submitted = super().submit(*call)
+            super().submit(time.sleep, 0.2)
+            return submitted
+
+    monkeypatch.setattr("haselab.actuators.response.ThreadPoolExecutor", lambda workers: Late(1))
+    again = sampled.respond(drive, times_s, start)
+    np.testing.assert_array_equal(again.length_by, found.length_by)
+    np.testing.assert_array_equal(again.capacitance_by, found.capacitance_by)
 
 
 def test_start_values_can_be_parameters_too():

@@ -402,7 +402,8 @@ class SampledLaw:
             state, seen = part(parts[0])
         else:
             with ThreadPoolExecutor(workers) as pool:
-                state, seen = next(iter(pool.map(part, parts)))  # the others end with the pool
+                found = list(pool.map(part, parts))  # all: who stops at the first cancels the rest
+            state, seen = found[0]
         length, speed, mean, drift = seen
         joined = np.block([
             [self._joined, np.zeros((self._joined.shape[0], extra))],

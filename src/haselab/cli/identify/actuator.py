@@ -58,8 +58,7 @@ def actuator(
     files = [session_file(session) for session in sessions]
     give(fit, files, as_json, out)
     save_plot(plot, fit.chart)
-    if fit.succeeded:
-        save_section(actuator, "model", {"physical": _section(fit)}, files)
+    save_section(actuator, "model", {"physical": _section(fit)}, files)
 
 
 def _law(section: ActuatorSection | None, path: Path) -> ActuatorLaw:

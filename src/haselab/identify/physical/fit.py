@@ -280,14 +280,10 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
         "lengths": _rms(lengths) / length_noise,
         "capacitances": _rms(capacitances) / capacitance_noise,
     }
-    status = _status(excess, whiteness, converged=found.converged)
-    scale = unknowns.value(SENSING_SCALE)
-    if abs(scale - 1.0) > _SCALE and not status.startswith(_NO_RESULT):
-        status = (
-            f"the records contradict each other: the capacitances are {scale:.3g} times those that "
-            "the forces need. Check the mass, the amplifier's gain and the calibration"
-        )
-    if status.startswith(_NO_RESULT):
+    status, usable = _status(
+        excess, whiteness, unknowns.value(SENSING_SCALE), converged=found.converged
+    )
+    if not usable:
         return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=count)
     law = unknowns.present_law()
     return ActuatorFit(
@@ -312,11 +308,17 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
     )
 
 
-_NO_RESULT = ("the search", "the records")
+def _status(
+    excess: dict[str, float], whiteness: float, scale: float, *, converged: bool
+) -> tuple[str, bool]:
+    """ "ok", a model error, or why there is no result; and whether there is one.
 
-
-def _status(excess: dict[str, float], whiteness: float, *, converged: bool) -> str:
-    """ "ok", a model error, or why there is no result; rms over noise is given per channel."""
+    Args:
+        excess: rms of the residuals over their noise, of each channel.
+        whiteness: probability of the residuals under white noise.
+        scale: measured over true capacitance.
+        converged: whether the search did.
+    """
     largest = max(excess, key=lambda name: np.nan_to_num(excess[name]))
     ratio = float(np.nan_to_num(excess[largest]))
     if ratio > _GROSS:
@@ -324,15 +326,20 @@ def _status(excess: dict[str, float], whiteness: float, *, converged: bool) -> s
             f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
             "noise. Check the mass, the units and that all records are of one actuator, or start "
             "nearer, by [actuator.parameters]"
-        )
+        ), False
     if not converged:
-        return "the search did not converge; start nearer, by [actuator.parameters]"
+        return "the search did not converge; start nearer, by [actuator.parameters]", False
+    if abs(scale - 1.0) > _SCALE:
+        return (
+            f"the records contradict each other: the capacitances are {scale:.3g} times those that "
+            "the forces need. Check the mass, the amplifier's gain and the calibration"
+        ), False
     if ratio > _SLIGHT and whiteness < _WHITE:
         return (
             f"model error: the {largest} are off by {ratio:.3g} times the noise, and the "
             "intervals are wider for it"
-        )
-    return "ok"
+        ), True
+    return "ok", True
 
 
 def _pairs(values: NDArray[np.complex128]) -> list[list[float]]:

@@ -76,9 +76,9 @@ def search(misfit: Misfit, start: Unknowns) -> Found | None:
         return None
     for _ in range(1, _STAGES):
         noise = max(1.0, 0.1 * noise)
-        now, used, _ = _descend(misfit, now, start, noise, _STEPS)
+        now, used = _descend(misfit, now, start, noise, _STEPS)
         count += used
-    now, used, _ = _descend(misfit, now, None, 1.0, _LAST_STEPS)
+    now, used = _descend(misfit, now, None, 1.0, _LAST_STEPS)
     return _found(now, count + used)
 
 
@@ -95,7 +95,7 @@ def refine(misfit: Misfit, found: Found) -> Found | None:
     if again is None:
         return None
     now = _State(found.unknowns, *again)
-    now, used, _ = _descend(misfit, now, None, 1.0, _LAST_STEPS)
+    now, used = _descend(misfit, now, None, 1.0, _LAST_STEPS)
     return _found(now, used + 1)
 
 
@@ -127,7 +127,7 @@ def _first_stage(misfit: Misfit, start: Unknowns, noise: float) -> tuple[_State 
         count += 1
         if first is None:
             continue
-        now, used, _ = _descend(misfit, _State(trials[k], *first), start, noise, _STEPS)
+        now, used = _descend(misfit, _State(trials[k], *first), start, noise, _STEPS)
         count += used
         cost = _bounded(now.residuals, noise)
         if best is None or cost < best[0]:
@@ -163,8 +163,8 @@ class _State:
 
 def _descend(
     misfit: Misfit, now: _State, start: Unknowns | None, noise: float, most: int
-) -> tuple[_State, int, bool]:
-    """One stage: state, evaluations used, whether it converged."""
+) -> tuple[_State, int]:
+    """One stage: state, evaluations used."""
     widths = now.unknowns.widths
     pull = np.zeros(widths.size) if start is None else 1.0 / widths**2
 
@@ -190,7 +190,7 @@ def _descend(
         left = float(slope @ np.linalg.lstsq(correlation, slope, rcond=1e-15)[0])
         done = _DONE * max(1.0, cost / now.residuals.size)
         if left < (done if start is None else max(_ENOUGH * cost, 1.0)):
-            return now, count, True
+            return now, count
         better: tuple[Unknowns, float] | None = None
         while better is None and damping < 1e6:
             damped = correlation + damping * np.eye(scale.size)
@@ -216,11 +216,11 @@ def _descend(
                     continue
             damping *= 10.0
         if better is None:
-            return now, count, True
+            return now, count
         cost = better[1]
         found = misfit.linearised(better[0])
         count += 1
         if found is None:
-            return now, count, False
+            return now, count
         now, damping = _State(better[0], *found), max(0.1 * damping, 1e-12)
-    return now, count, False
+    return now, count

@@ -59,7 +59,7 @@ def test_counts_are_words_and_what_a_run_lacks_is_listed():
     missing = [{"ids": ["S26.rise", "S26.error"], "reason": "only 'haselab reproduce' plays it."}]
     text = results_table({"quantities": [row], "not_played": missing})
     assert text.splitlines()[-1] == "1 quantity: 1 agrees"
-    assert "not played: S26.rise, S26.error: only 'haselab reproduce' plays it." in text
+    assert "no result: S26.rise, S26.error: only 'haselab reproduce' plays it." in text
 
 
 def test_a_simulated_table_says_that_no_verdict_is_evidence():

@@ -126,7 +126,7 @@ def _missing(results: Results, columns: int) -> list[str]:
     lines = []
     for ids, reason in results.not_played:
         lines += textwrap.wrap(
-            f"not played: {', '.join(ids)}: {reason}", columns, subsequent_indent="  ",
+            f"no result: {', '.join(ids)}: {reason}", columns, subsequent_indent="  ",
             break_long_words=False, break_on_hyphens=False,
         )  # fmt: skip
     return lines

@@ -19,7 +19,7 @@ from haselab.study import Analysis, Experiment, ExperimentResult, Player, Quanti
 from haselab.study.definition import builtin_study
 from haselab.study.experiment import Chart, Curve
 from haselab.study.experiments.foreign import refuse_repeated
-from haselab.study.feasibility import study_drives, study_masses_kg
+from haselab.study.feasibility import check_settings, study_drives, study_masses_kg
 from haselab.study.pipeline import investigate
 from haselab.study.results import rows_of
 
@@ -72,6 +72,14 @@ def chart(*curves: Any) -> ExperimentResult:
     return ExperimentResult({"own.time": GOOD}, charts=(drawn,))
 
 
+def one(value: Any = 1.0, std: Any = 0.1, ci95: Any = (0.8, 1.2)) -> ExperimentResult:
+    return ExperimentResult({"own.time": Estimate(value, std, ci95, "s")})
+
+
+def result(**parts: Any) -> ExperimentResult:
+    return ExperimentResult(**parts)
+
+
 @pytest.mark.parametrize(
     ("found", "said"),
     [
@@ -106,6 +114,18 @@ def chart(*curves: Any) -> ExperimentResult:
             ExperimentResult({"own.time": Estimate(5.0, 0.1, (0.0, 1.0), "s")}),
             r"own\.time = 5 with .* the interval 0 to 1\. Return .* around the value",
         ),
+        (one(1j), r"for own\.time 1j \(complex\), which is no number"),
+        (one(np.ones(2)), r"for own\.time array.* \(ndarray\), which is no number"),
+        (one(std=None), r"as std of own\.time None \(NoneType\), which is no number"),
+        (one(ci95=None), r"as ci95 of own\.time None \(NoneType\)"),
+        (one(ci95=(1.0,)), r"a ci95 of own\.time with 1 numbers\. Return the lower"),
+        (result(quantities={1: GOOD}), r"as a key of quantities 1 \(int\), which is no str"),
+        (result(missing={"own.time": 5}), r"in missing for own\.time 5 \(int\)"),
+        (result(notes={"own.time": 5}), r"in notes for own\.time 5 \(int\)"),
+        (result(charts=Chart("a", "A", "", "x", "y", ())), r"as charts Chart.* no tuple"),
+        (result(charts=(Chart("a", None, "", "x", "y", ()),)), r"as title of a chart None"),  # type: ignore[arg-type]
+        (result(figures={"a": object()}), r"in figures for a what JSON cannot hold: .*object"),
+        (result(values=5), r"as values 5 \(int\), which is no tuple"),
         (SystemExit(0), r"'fit' of the experiment \[own\].*it called sys\.exit\(0\)\. The rec"),
     ],
 )  # fmt: skip
@@ -137,6 +157,8 @@ def test_an_experiment_that_exits_while_it_plays_is_named(monkeypatch: Any) -> N
     [
         ("drives", None, r"'drives' .*TypeError"),
         ("drives", [np.zeros(3)], r"'drives' .*\(ndarray\), which is no Drive"),
+        ("drives", [Drive("own", [0.0, 1.0])], r"values_v of a Drive \[0\.0, 1\.0\] \(list\)"),  # type: ignore[arg-type]
+        ("drives", [Drive("own", np.zeros((3, 2)))], r"an array of shape \(3, 2\)"),
         ("masses_kg", ("heavy",), r"'masses_kg' .*returns 'heavy' \(str\), which is no number"),
     ],
 )
@@ -148,6 +170,17 @@ def test_wrong_declarations_are_refused_before_anything_is_played(
     with pytest.raises(InputError, match=said):
         study_drives(REFERENCE, RIG)
         study_masses_kg(REFERENCE)
+
+
+@pytest.mark.parametrize("ends", [ValueError("no"), SystemExit(0)])
+def test_a_check_that_fails_is_named(monkeypatch: Any, ends: BaseException) -> None:
+    def check(self: _Own) -> None:
+        raise ends
+
+    monkeypatch.setattr(_Own, "check", check)
+    monkeypatch.setattr("haselab.study.feasibility.experiments_of", lambda study: (own(),))
+    with pytest.raises(InputError, match=r"'check' of the experiment \[own\].*(no|sys\.exit)"):
+        check_settings(REFERENCE)
 
 
 def test_rows_of_the_wrong_type_are_named(monkeypatch: Any) -> None:

@@ -60,10 +60,14 @@ _ENDINGS = {
     "kpa": "kPa", "kn": "kN", "khz": "kHz", "minutes": "min", "hours": "h",
     "percent": "%", "pct": "%", "permille": "‰", "ppm": "ppm",
 }  # fmt: skip
+# After a space, as in "Weg mm"; a single letter or min there is more often part of the name.
+_LAST_WORDS = {*_ENDINGS.values(), "um", "uA", "us", "uF", "Hz", "MPa", "°C"} - {"min", "h"}
 _AMBIGUOUS = "mpa"  # an ending that is milli or mega, and not to be taken as the default
 _SPELLINGS = (("μ", "µ"), ("Ω", "Ω"), ("Ohms", "Ω"), ("Ohm", "Ω"), ("ohms", "Ω"), ("ohm", "Ω"),
               ("^2", "²"), ("·", ""), ("*", ""))  # fmt: skip
-_BRACKETS = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\[\]]*)\]|\((?P<round>[^()]*)\))\s*$")
+_BRACKETS = re.compile(
+    r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\[\]]*)\]|\((?P<round>[^()]*)\)|\{(?P<curly>[^{}]*)\})\s*$"
+)
 _STROKE = re.compile(r"^(?P<name>.+?)\s*(?:/|,|\s+in\s)\s*(?P<unit>[^/,\s]+)$")
 _LOOKS_LIKE_ONE = re.compile(r"[fpnuµmkg]?(v|a|f|s|hz|m|n|pa|ohm|c|g)(\^\d)?", re.IGNORECASE)
 _STATED = re.compile(r"[^\s\d]{1,8}(\^-?\d)?")  # in square brackets
@@ -153,7 +157,7 @@ def split_header(header: str) -> tuple[str, str]:
     """Name and stated unit of a column header; an empty unit where none is stated.
 
     Args:
-        header: one cell, such as `Spannung [V]`, `C (pF)`, `U / mV` or `voltage_kv`.
+        header: one cell, such as `Spannung [V]`, `C (pF)`, `U / mV`, `Weg mm` or `voltage_kv`.
     Returns:
         The name without the unit, and the text of the unit. A text in brackets that is no unit
         stays part of the name, unless it looks like one.
@@ -165,7 +169,7 @@ def split_header(header: str) -> tuple[str, str]:
     """
     text = header.strip()
     if match := _BRACKETS.match(text):
-        unit = match["square"] if match["square"] is not None else match["round"]
+        unit = next(part for part in match.group("square", "round", "curly") if part is not None)
         stated = (
             _find(unit) is not None
             or unit.strip().lower() in _MISSPELT
@@ -177,6 +181,9 @@ def split_header(header: str) -> tuple[str, str]:
     units = _UNITS.keys() | _REFUSED
     if (match := _STROKE.match(text)) and match["unit"] in units and match["unit"] not in "1-":
         return match["name"].strip(), match["unit"]
+    name, _, word = text.rpartition(" ")
+    if name and word in _LAST_WORDS:
+        return name.strip(), word
     name, _, ending = text.rpartition("_")
     known = ending in _ENDINGS or ending == _AMBIGUOUS or (ending in units and len(ending) > 1)
     if name and known:

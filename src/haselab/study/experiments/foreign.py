@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -11,8 +12,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from haselab.base import Estimate, HaselabError, InputError, ResultError
+from haselab.base import Estimate, HaselabError, InputError, ResultError, to_plain
 from haselab.base.exits import no_exit
+from haselab.safety.feasibility import Drive
 from haselab.study.experiment import Chart, Curve, Experiment, ExperimentResult
 from haselab.study.quantity import Quantity
 
@@ -27,6 +29,9 @@ __all__ = [
 
 AnyExperiment = Experiment[Any]
 Returned = TypeVar("Returned")
+_NUMBER = (Real,)  # with the scalars of NumPy
+_MAPPINGS = ("quantities", "notes", "figures", "missing")  # of an ExperimentResult
+_TEXTS = ("name", "title", "caption", "x_label", "y_label")  # of a Chart
 
 
 def _is_own(experiment: AnyExperiment) -> bool:
@@ -87,7 +92,20 @@ def declared(
         found = list(method())
     for each in found:
         _require(experiment, doing, each, kind, failed=InputError)
+        if isinstance(each, Drive):
+            _check_drive(experiment, each)
     return found
+
+
+def _check_drive(experiment: AnyExperiment, drive: Drive) -> None:
+    values = drive.values_v
+    where = " as values_v of a Drive"
+    _require(experiment, "drives", values, np.ndarray, where, InputError)
+    if values.ndim != 1 or values.dtype.kind not in "fiu":
+        raise InputError(
+            f"The method 'drives' of the experiment [{experiment.table}] returns{where} an array "
+            f"of shape {values.shape} and type {values.dtype}. Return one number per block there."
+        )
 
 
 def refuse_repeated(what: str, names: Sequence[str]) -> None:
@@ -116,7 +134,10 @@ def rows_of_experiment(experiment: AnyExperiment) -> Mapping[str, Quantity]:
     with foreign(experiment, "rows"):
         rows = dict(experiment.rows())
     for key, row in rows.items():
+        _require(experiment, "rows", key, str, " as the id of a row")
         _require(experiment, "rows", row, Quantity, f" for {key}")
+        for text in (row.name, row.unit):
+            _require(experiment, "rows", text, str, f" as name or unit of {key}")
     return rows
 
 
@@ -128,16 +149,7 @@ def check_result(experiment: AnyExperiment, found: object) -> None:
     """
     _require(experiment, "fit", found, ExperimentResult)
     assert isinstance(found, ExperimentResult)
-    for name in ("quantities", "notes", "figures", "missing"):
-        _require(experiment, "fit", getattr(found, name), Mapping, f" as {name}")
-    for name in ("charts", "values"):
-        _require(experiment, "fit", getattr(found, name), tuple, f" as {name}")
-    both = sorted({*found.quantities} & {*found.missing})
-    if both and not _is_own(experiment):
-        raise ResultError(
-            f"The experiment [{experiment.table}] returns {', '.join(both)} both as a result and "
-            "as missing. Return it once."
-        )
+    _check_types(experiment, found)
     rows = rows_of_experiment(experiment)
     unnamed = sorted({*found.quantities, *found.missing} - set(rows))
     if unnamed:
@@ -145,14 +157,67 @@ def check_result(experiment: AnyExperiment, found: object) -> None:
             f"The experiment [{experiment.table}] returns {', '.join(unnamed)}, but its method "
             "'rows' does not list them. Add a Quantity for each."
         )
+    both = sorted({*found.quantities} & {*found.missing})
+    if both and not _is_own(experiment):
+        raise ResultError(
+            f"The experiment [{experiment.table}] returns {', '.join(both)} both as a result and "
+            "as missing. Return it once."
+        )
     for key, estimate in found.quantities.items():
-        _require(experiment, "fit", estimate, Estimate, f" for {key}")
         _check_estimate(experiment, key, estimate, rows[key].unit)
     for chart in found.charts:
-        _require(experiment, "fit", chart, Chart, " among the charts")
         for curve in chart.curves:
-            _require(experiment, "fit", curve, Curve, f" in chart {chart.name!r}")
             _check_curve(experiment, chart, curve)
+
+
+def _check_types(experiment: AnyExperiment, found: ExperimentResult) -> None:
+    """Refuse a result any part of which has the wrong type."""
+
+    def require(value: object, kind: type | tuple[type, ...], where: str) -> None:
+        _require(experiment, "fit", value, kind, where)
+
+    for part in _MAPPINGS:
+        require(getattr(found, part), Mapping, f" as {part}")
+        for key in getattr(found, part):
+            require(key, str, f" as a key of {part}")
+    for part in ("charts", "values"):
+        require(getattr(found, part), tuple, f" as {part}")
+    for part, texts in (("notes", found.notes), ("missing", found.missing)):
+        for key, text in texts.items():
+            require(text, str, f" in {part} for {key}")
+    for key, estimate in found.quantities.items():
+        require(estimate, Estimate, f" for {key}")
+        require(estimate.value, _NUMBER, f" for {key}")
+        require(estimate.std, _NUMBER, f" as std of {key}")
+        require(estimate.unit, str, f" as unit of {key}")
+        ends = list(estimate.ci95) if isinstance(estimate.ci95, np.ndarray) else estimate.ci95
+        require(ends, Sequence, f" as ci95 of {key}")
+        if len(ends) != 2:
+            raise ResultError(
+                f"The method 'fit' of the experiment [{experiment.table}] returns a ci95 of {key} "
+                f"with {len(ends)} numbers. Return the lower and the upper end."
+            )
+        for end in ends:
+            require(end, _NUMBER, f" in ci95 of {key}")
+    for chart in found.charts:
+        require(chart, Chart, " among the charts")
+        for part in _TEXTS:
+            require(getattr(chart, part), str, f" as {part} of a chart")
+        require(chart.curves, Sequence, f" as curves of chart {chart.name!r}")
+        for curve in chart.curves:
+            require(curve, Curve, f" in chart {chart.name!r}")
+            require(curve.name, str, f" as name of a curve in chart {chart.name!r}")
+    if _is_own(experiment):
+        return
+    for key, section in found.figures.items():  # converted twice, so only where it may fail
+        try:
+            json.dumps(to_plain(section))
+        except (TypeError, ValueError) as error:
+            raise ResultError(
+                f"The method 'fit' of the experiment [{experiment.table}] returns in figures for "
+                f"{key} what JSON cannot hold: {error}. Return numbers, texts, arrays, lists and "
+                "mappings there."
+            ) from error
 
 
 def _check_estimate(experiment: AnyExperiment, key: str, estimate: Estimate, unit: str) -> None:
@@ -165,8 +230,6 @@ def _check_estimate(experiment: AnyExperiment, key: str, estimate: Estimate, uni
     if _is_own(experiment):  # where NaN stands for a metric that a trial does not have
         return
     low, high = estimate.ci95
-    for number in (estimate.value, estimate.std, low, high):
-        _require(experiment, "fit", number, (Real,), f" for {key}")
     if not all(map(math.isfinite, (estimate.value, estimate.std, low, high))):
         raise ResultError(
             f"{where} = {estimate.value:g} with a standard deviation of {estimate.std:g} and the "

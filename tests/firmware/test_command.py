@@ -140,6 +140,25 @@ def test_a_twin_with_another_capacitance_is_refused_before_anything_is_built(
     assert "accepts 14 to 419 pF" in err and "--twin TWIN.toml" in err
 
 
+@pytest.mark.parametrize(
+    ("recorded", "front_end", "code"), [(1000.0, None, 2), (5050.0, None, 0), (1000.0, 1000.0, 0)]
+)
+def test_a_module_whose_gain_differs_from_that_of_the_records_is_refused(
+    recorded: float,
+    front_end: float | None,
+    code: int,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, rig = tmp_path / "small.toml", tmp_path / "chip.toml"
+    path.write_text(SMALL.replace("[drive]", f"[drive]\ngain_v_per_v = {recorded}"))
+    rig.write_text(f'kind = "chip"\nrun = "{path}"\n[simulator]\n[front_end]\ngain = {front_end}\n')
+    which = [] if front_end is None else ["--rig", rig]
+    found, _, err = run(capsys, "firmware", "build", path, "--build-dir", tmp_path / "fw", *which)
+    assert found == code, err
+    assert ("it would put out 5 times the high voltage of the records" in err) == (code == 2)
+
+
 @pytest.mark.long
 def test_an_actuator_below_500_pf_is_calibrated_within_its_range(
     tmp_path: Path, firmware: Firmware, cosim_program: Path

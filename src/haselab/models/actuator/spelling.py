@@ -22,7 +22,7 @@ _WRITTEN = {
     "sensing": ("date", "amplifier", "rate_hz", "scale_std_s", "stray_s", "offsets_v", "residual",
                 "reference"),
     "model": (*PlantTable.model_fields, *RationalTable.model_fields, "fit_percent", "input_unit",
-              "output_unit", "fitted_to", "through_voltage_map", "linear_models"),
+              "output_unit", "training_output", "through_voltage_map", "linear_models"),
     "controller": ("predicted", "plausible", "uncertainty"),
 }  # fmt: skip
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
@@ -30,7 +30,7 @@ _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
 _NOT_LOOKED_INTO = {
     "provenance",
     "model.covariance",
-    "model.fitted_to",
+    "model.training_output",
     "model.linear_models",
     "controller.demands",
 }

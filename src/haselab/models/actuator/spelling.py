@@ -26,6 +26,9 @@ _WRITTEN = {
     "controller": ("predicted", "plausible", "uncertainty"),
 }  # fmt: skip
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
+_MARGINS = ("phase_margin_deg", "phase_margin_deg_std", "gain_margin_db", "gain_margin_db_std",
+            "delay_margin_s", "peak_sensitivity", "crossover_rad_s", "worst_phase_margin_deg",
+            "worst_gain_margin_db", "stable")  # fmt: skip
 # Their content is checked by whoever reads it, or is written only.
 _NOT_LOOKED_INTO = {
     "provenance",
@@ -91,6 +94,8 @@ def _looked_into(
     known = [*fields, *_WRITTEN.get(place, ())]
     if place.endswith("parameters"):
         known += _GAINS
+    if place == "controller.margins":
+        known += _MARGINS
     for key, item in table.items():
         inner = f"{place}.{key}" if place else key
         if key not in known:
@@ -104,6 +109,8 @@ def _looked_into(
             if table.get("kind", "pid") in ("pi", "pid") and isinstance(item, Mapping):
                 yield from _looked_into(item, None, inner)
             continue
+        if inner == "controller.margins" and isinstance(item, Mapping):
+            yield from _looked_into(item, None, inner)
         model = _model_in(fields[key].annotation)
         for part in item if isinstance(item, list) else [item]:
             if model is not None and isinstance(part, Mapping):

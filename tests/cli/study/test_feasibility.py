@@ -199,6 +199,32 @@ def test_a_triangle_without_a_result_is_refused_before_anything_moves(
     assert str(study) in error and not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("[quick.triangle]\nframe_rate_hz = -1.0", "triangle.frame_rate_hz"),
+        ("[quick.trangle]\ncycles = 4", "has a table [trangle], but no installed experiment"),
+        ("[quick.triangle]\ncycle = 4", "triangle.cycle: no such key"),
+        ("[quick.triangle]\nframe_rate_hz = 50.0", "The triangle gives only 6 frames"),
+    ],
+)
+def test_the_quick_tables_are_checked_without_quick(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, words: str
+) -> None:
+    study, rig = tmp_path / "study.toml", tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+    study.write_text(f"{TRIANGLE}{table}\n")
+    with pytest.raises(SystemExit) as stop:
+        main(["plan", "feasibility", str(study), "--rig", str(rig)])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and error.count("\n") == 1
+    assert error.startswith("haselab: With the changes of [quick]: ") and words in error
+    study.write_text(f"{TRIANGLE}[quick.triangle]\ncycles = 4\n")
+    with pytest.raises(SystemExit) as stop:
+        main(["plan", "feasibility", str(study), "--rig", str(rig)])
+    assert stop.value.code == 0
+
+
 @pytest.mark.parametrize("high_v", [0.5, 2.0, 10.0])
 def test_a_triangle_with_just_enough_frames_is_feasible(tmp_path: Path, high_v: float) -> None:
     text = TRIANGLE.replace("high_v = 2.0", f"high_v = {high_v}")

@@ -229,6 +229,11 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
     """
     kinds = [name for name in EXPERIMENTS.packages() if name not in _Head.model_fields]
     fields = {*_Head.model_fields, *kinds}
+    if loose := sorted(key for key in set(data) - fields if not isinstance(data[key], Mapping)):
+        raise InputError(
+            f"The study has the key {loose[0]} outside its tables, where only name may be. Write "
+            f"it below the heading of its table, such as [{kinds[0]}]. {source}"
+        )
     if unknown := sorted(set(data) - fields):
         close = difflib.get_close_matches(unknown[0], fields, 1)
         meant = f" Did you mean [{close[0]}]?" if close else ""

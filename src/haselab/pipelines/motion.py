@@ -35,6 +35,8 @@ class _Blocks:
     Args:
         spans_s: beginnings and ends of the samples that count, from a block's first one.
             Shape `(S, 2)`.
+        carrier_v: peak of the carrier at the actuator, by the voltage monitor; NaN if it was not
+            seen.
     """
 
     start_s: Floats
@@ -43,6 +45,7 @@ class _Blocks:
     capacitance_f: Floats
     std_f: Floats
     used: NDArray[np.bool_]
+    carrier_v: float
 
 
 def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
@@ -123,9 +126,12 @@ def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s
     plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz
     used = sensed.valid & plain & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_std_f > 0)
     changes = np.flatnonzero(np.diff(np.pad(lockin.counted, 1).astype(np.int8)))
+    rig = reader.header["rig"]
+    volt_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]
+    carrier_v = 0.5 * volt_per_code * float(np.median(sensed.v_pp[used])) if used.any() else np.nan
     return _Blocks(
         record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
-        sensed.capacitance_f, sensed.capacitance_std_f, used,
+        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v,
     )  # fmt: skip
 
 
@@ -180,10 +186,21 @@ def _drive(
     drive_v = change_v[np.searchsorted(change_s, middle_s, side="right") - 1]
     row = np.searchsorted(conditions["time_s"], middle_s, side="right") - 1
     pull_n = np.interp(middle_s, *_steps(conditions["time_s"], conditions["pull_n"]))
-    carrier_v = gain * conditions["carrier_v"][row]
+    carrier_v = _carrier_gain(conditions, blocks, gain) * conditions["carrier_v"][row]
     # nobody sees how fast an actuator without mass moves
     mass_kg = np.maximum(conditions["mass_kg"], _EMPTY * conditions["mass_kg"].max())[row]
     return Drive(edge_s, gain * drive_v, pull_n, mass_kg, 0.5 * carrier_v**2)
+
+
+def _carrier_gain(conditions: NDArray[np.void], blocks: Collection[_Blocks], gain: float) -> float:
+    """Of the amplifier at the carrier, in V/V: it resonates or falls there. By its monitor."""
+    found = []
+    for part in blocks:
+        row = np.searchsorted(conditions["time_s"], part.start_s[0], side="right") - 1
+        sent_v = float(conditions["carrier_v"][row])
+        if sent_v > 0.0 and np.isfinite(part.carrier_v):
+            found.append(part.carrier_v / sent_v)
+    return float(np.median(found)) if found else gain
 
 
 def _steps(time_s: Floats, values: Floats) -> tuple[Floats, Floats]:

@@ -17,6 +17,7 @@ from haselab.actuators import (
 )
 from haselab.base import InputError
 from haselab.identify.physical import MotionRecord, fit_actuator
+from haselab.identify.physical.misfit import SHARED_PX, SharedErrors
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
 MASS_KG = 0.25
@@ -142,3 +143,20 @@ def test_what_varies_is_the_distance(steps):
 def test_no_record_is_refused():
     with pytest.raises(InputError, match=r"There is no record of the actuator's motion"):
         fit_actuator(TRUE, [], mass_kg=MASS_KG)
+
+
+@given(st.lists(st.floats(0.03, 0.05), min_size=3, max_size=20), st.floats(1e-7, 1e-5))
+def test_shared_errors_of_tracking_are_whitened(lengths, std_m):
+    count = len(lengths)
+    stds = np.linspace(std_m, 2.0 * std_m, count)
+    seen = replace(
+        record(TRUE, duration_s=0.05), length_time_s=np.arange(count) * 1e-3,
+        length_m=np.array(lengths), length_std_m=stds, length_experiment=np.zeros(count, int),
+        pixel_m=3e-3,
+    )  # fmt: skip
+    white = SharedErrors.of(seen, stds).whitened(np.eye(count))
+    pixel = np.floor(seen.length_m / seen.pixel_m)
+    shared = (SHARED_PX * seen.pixel_m) ** 2 * (pixel[:, None] == pixel)
+    covariance = np.diag(stds**2) + shared
+    both = white @ (covariance / np.outer(stds, stds)) @ white.T
+    np.testing.assert_allclose(both, np.eye(count), atol=1e-6)

@@ -31,6 +31,7 @@ __all__ = [
     "as_number_type",
     "filled",
     "number_type",
+    "one_rate",
     "plain_reader",
     "positive",
     "take_each",
@@ -40,6 +41,7 @@ RATE_NAMES = ("rate_hz", "sample_rate_hz", "fs_hz", "fs")
 _OWN_TYPES = (np.dtype(np.int16), np.dtype(np.float32), np.dtype(np.float64))
 _REAL_KINDS = "fiub"
 _MOST_LISTED = 30
+_SAME_RATE = 1e-6  # of two statements of one rate; single precision rounds by 6e-8
 
 # Gives exactly so many values, the next ones, in the type that the member states.
 Read = Callable[[int], NDArray[Any]]
@@ -96,6 +98,19 @@ def positive(value: Any) -> float | None:
     except (TypeError, ValueError):
         return None
     return number if 0.0 < number < float("inf") else None
+
+
+def one_rate(rates_hz: Iterable[float]) -> float | None:
+    """The rate that all columns state.
+
+    Args:
+        rates_hz: of the columns that state one.
+    Returns:
+        None where they differ by more than rounding, or where no column states one.
+    """
+    stated = list(rates_hz)
+    same = stated and max(stated) <= (1.0 + _SAME_RATE) * min(stated)
+    return stated[0] if same else None
 
 
 class MissingColumnsError(InputError):

@@ -20,6 +20,7 @@ from haselab.store.columns.archive import (
     Member,
     MemberArchive,
     Read,
+    one_rate,
     plain_reader,
     positive,
 )
@@ -213,14 +214,14 @@ class Hdf5Archive(MemberArchive):
         return Member(dataset.shape, dataset.dtype, start)
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
-        """A dataset of one number, or an attribute of the file or of a column."""
-        rate_hz = super().rate_hz(names)
-        for holder in (self._file, *(self._sets[name] for name in names)):
-            for name in RATE_NAMES:
-                value = holder.attrs.get(name)
-                if rate_hz is None and value is not None and np.size(value) == 1:
-                    rate_hz = positive(np.reshape(value, -1)[0])
-        return rate_hz
+        """A dataset of one number, or what the attributes of the file and the columns agree on."""
+        stated = super().rate_hz(names)
+        if stated is not None:
+            return stated
+        holders = (self._file, *(self._sets[name] for name in names))
+        values = [holder.attrs.get(name) for holder in holders for name in RATE_NAMES]
+        single = [np.reshape(v, -1)[0] for v in values if v is not None and np.size(v) == 1]
+        return one_rate(rate_hz for value in single if (rate_hz := positive(value)))
 
     def unit_text(self, full: str) -> str:
         """The dataset's attribute `units` or `unit`, else what its name states."""

@@ -93,8 +93,9 @@ def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = 
     plain = [(full, archive.plain_name(full).casefold()) for full in archive.names]
     for name in TIME_NAMES:
         found = [full for full, base in plain if base == name and full not in used]
-        if len(found) == 1 and _is_time(archive, found[0], options):
-            return found[0]
+        times = [full for full in found if _is_time(archive, full, options)]
+        if len(times) == 1:
+            return times[0]
     return None
 
 

@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.store.columns.archive import Member, MemberArchive, Read, positive
+from haselab.store.columns.archive import Member, MemberArchive, Read, one_rate, positive
+from haselab.store.columns.units import find_unit
 
 __all__ = ["TdmsArchive"]
 
@@ -69,18 +70,27 @@ class TdmsArchive(MemberArchive):
             )
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
-        """A channel of one number, or the increment of a column's waveform."""
-        rate_hz = super().rate_hz(names)
-        for name in names:
-            step_s = positive(self._channels[name].properties.get("wf_increment"))
-            if rate_hz is None and step_s is not None:
-                rate_hz = 1.0 / step_s
-        return rate_hz
+        """A channel of one number, or the increment that the waveforms of all columns share."""
+        stated = super().rate_hz(names)
+        waveforms = [self._channels[name].properties for name in names]
+        if stated is not None or len({each.get("wf_start_offset", 0.0) for each in waveforms}) > 1:
+            return stated
+        return one_rate(
+            1.0 / (step * unit_s)
+            for each in waveforms
+            if (step := positive(each.get("wf_increment"))) and (unit_s := _seconds(each))
+        )
 
     def unit_text(self, full: str) -> str:
         """The channel's property `unit_string`, else what its name states."""
         unit = str(self._channels[full].properties.get("unit_string") or "")
         return unit.strip() or super().unit_text(full)
+
+
+def _seconds(waveform: Mapping[str, Any]) -> float:
+    """Seconds of the unit of a waveform's X axis; 0 where that is no time."""
+    unit = find_unit(str(waveform.get("wf_xunit_string") or "s"))
+    return unit.factor if unit is not None and unit.si == "s" else 0.0
 
 
 def _member(channel: Any) -> Member:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from haselab.base import InputError
 
-__all__ = ["Unit", "is_unit", "parse_unit", "split_header"]
+__all__ = ["Unit", "find_unit", "is_unit", "parse_unit", "split_header"]
 
 _PREFIXES = {"f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "": 1.0,
              "k": 1e3, "M": 1e6, "G": 1e9}  # fmt: skip
@@ -111,10 +111,11 @@ _MISSPELT = {symbol.lower() for symbol in _UNITS}  # refused in brackets too, su
 
 def is_unit(text: str) -> bool:
     """Whether a text, perhaps in brackets, is a unit."""
-    return _find(text.strip().strip("[]()")) is not None
+    return find_unit(text.strip().strip("[]()")) is not None
 
 
-def _find(text: str) -> Unit | None:
+def find_unit(text: str) -> Unit | None:
+    """The unit that a text names, as `parse_unit`; None where it is unknown or ambiguous."""
     plain = text.strip()
     for written, symbol in _SPELLINGS:
         plain = plain.replace(written, symbol)
@@ -144,7 +145,7 @@ def parse_unit(text: str, where: str) -> Unit:
         >>> parse_unit("pF", "--unit").factor
         1e-12
     """
-    unit = _find(text)
+    unit = find_unit(text)
     if unit is None:
         raise InputError(
             f"{where} states the unit '{text.strip()}', which is unknown or ambiguous. Use "
@@ -171,7 +172,7 @@ def split_header(header: str) -> tuple[str, str]:
     if match := _BRACKETS.match(text):
         unit = next(part for part in match.group("square", "round", "curly") if part is not None)
         stated = (
-            _find(unit) is not None
+            find_unit(unit) is not None
             or unit.strip().lower() in _MISSPELT
             or _LOOKS_LIKE_ONE.fullmatch(unit.strip()) is not None
         )

@@ -111,6 +111,30 @@ def test_a_repetition_in_steps_of_a_coarse_converter_is_no_copy(kind, noise_lsb,
             assert share_used([copy], known) >= 0.99
 
 
+@pytest.mark.parametrize(
+    "processed",
+    [
+        lambda y, rng: y - np.linspace(0.0, 0.01 * rng.normal(), y.size),  # another slope each time
+        lambda y, rng: 0.1 * np.sqrt(0.05 + y),
+        lambda y, rng: y + 20.0 * y**2,
+    ],
+    ids=["slope", "root", "square"],
+)
+@pytest.mark.parametrize("noise_lsb", [0.01, 0.1, 0.2, 1.0])
+def test_processing_of_coarse_steps_makes_no_copy_of_a_repetition(noise_lsb, processed):
+    rng, lsb = np.random.default_rng(3), 1e-3
+    clean = vibration(rng)
+    first, second = (
+        processed(lsb * np.round(clean / lsb + noise_lsb * rng.normal(size=clean.size)), rng)
+        for _ in range(2)
+    )
+    known = hash_output([first])
+    assert known.quantised or noise_lsb > 0.4
+    share = share_used([second], known)
+    assert np.isnan(share) or share <= 0.05
+    assert share_used([first], known) >= 0.99
+
+
 def test_a_copy_in_which_another_level_is_zero_is_known():
     y = output(2000)
     assert share_used([y - y[0]], hash_output([y])) == 1.0

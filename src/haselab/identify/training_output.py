@@ -26,6 +26,8 @@ _MARGIN = 2.0**-8  # of a cell: windows with a difference nearer to its border a
 _HIDDEN_NOISE = 0.4
 _OFF_GRID = 0.15  # steps, from the nearest multiple; values were printed with few digits
 _FEW_OFF_GRID = 0.05  # share of the levels
+_ROUNDING = 1e-9  # of the span of the levels: closer ones are the same
+_FEW_LEVELS, _MANY_SAME = 0.25, 0.1  # share of the samples, and of their differences
 _MOST_BY_CHANCE = 0.05  # share of quantised windows; below it the records are new
 _LEAST_ALIKE, _LEAST_WINDOWS = 0.99, 100  # share and number of windows that show a copy of them
 
@@ -118,14 +120,34 @@ def share_used(outputs: Sequence[ArrayLike], known: TrainingOutput) -> float:
 
 
 def _level_step(y: Floats) -> float:
-    """Step between the levels of a quantised output; 0 for any other."""
-    gaps = np.diff(np.unique(y))
+    """Step between the levels of a quantised output; 0 for any other.
+
+    A slope that was subtracted leaves the differences in steps, a curved map leaves repeated
+    values.
+    """
+    return max(_grid_step(y), _grid_step(np.diff(y)), _repeated_step(y))
+
+
+def _grid_step(values: Floats) -> float:
+    """Step of the grid on which the values lie; 0 if there is none."""
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > _ROUNDING * np.ptp(levels)] if levels.size else gaps
     if gaps.size < 2:
         return 0.0
     step = float(np.quantile(gaps, _FEW_OFF_GRID))
     steps = gaps / step
     on_grid = np.abs(steps - np.round(steps)) < _OFF_GRID
     return step if np.mean(on_grid) > 1.0 - _FEW_OFF_GRID else 0.0
+
+
+def _repeated_step(y: Floats) -> float:
+    """Typical step where few values recur, also in successive samples; 0 elsewhere."""
+    levels, counts = np.unique(y, return_counts=True)
+    if not 3 <= levels.size <= _FEW_LEVELS * y.size or np.mean(np.diff(y) == 0.0) < _MANY_SAME:
+        return 0.0
+    gaps = np.concatenate([[math.inf], np.diff(levels), [math.inf]])
+    return float(np.quantile(np.repeat(np.minimum(gaps[1:], gaps[:-1]), counts), 0.75))
 
 
 def _all_hashes(outputs: Sequence[Floats], known: TrainingOutput, margin: float) -> Hashes:

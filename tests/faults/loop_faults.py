@@ -139,6 +139,7 @@ class Case:
         rated: the field is watched.
         readings: of the twin for which 0.5 s are enough.
         misses: runs at random moments that may go unnoticed, as the docs say.
+        ringing: the drive changed 2 s before the loop closes, so the actuator may still ring.
     """
 
     name: str
@@ -152,6 +153,7 @@ class Case:
     rated: bool = False
     readings: tuple[str, ...] = ("hz", "rad")
     misses: int = 0
+    ringing: bool = False
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,9 @@ def play(case: Case, reading: str, seed: int, blocks_after: int = 80) -> Outcome
             Runner(rig, NoRecord(), scene, 2000.0, 0.02, SilentProgress()) as runner,
         ):
             runner.settle(rest_v, 20.0)
+            if case.ringing:
+                runner.settle(rest_v + 0.8, 6.0)
+                runner.settle(rest_v, 2.0)
             if case.video:
                 loop = replace(loop, video_zero_px=twin.length_m / 0.35e-3)
             scene.block = -1
@@ -464,6 +469,10 @@ CASES = [
     Case("derivative too high", f"{SWINGS}|{JUMP}", loop=gains(0.4, 0.7, 3.0), onset=0),
     Case("strain map reversed", AGAINST, loop=_mirrored, onset=0, reference="step"),
     Case("voltage map reversed", AGAINST, loop=_falling, onset=0, reference="step"),
+    Case("strain map reversed while it rings", AGAINST, loop=_mirrored, onset=0, reference="far",
+         ringing=True),
+    Case("voltage map reversed while it rings", AGAINST, loop=_falling, onset=0, reference="far",
+         ringing=True, readings=("hz",)),
     Case("strain reversed in a step", AGAINST, on_strain(lambda k, s, past: -s),
          reference="step", readings=("hz",)),
     Case("blocks late by 5", DELAY, late_blocks(5)),

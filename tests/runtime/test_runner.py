@@ -370,11 +370,11 @@ def test_a_loop_may_close_while_the_actuator_still_rings_from_a_sweep(tmp_path):
         softened_v = triangle(0.0, 1.8, 0.3, 2, 100.0)
         drive_v = np.append(softened_v, to_volt.voltage_v(sweep))
         runner.play("x", drive_v, FRAME_RATE_HZ, MASS_KG)
-        assert scene.rig.settled_drive_v is None
+        assert not scene.rig.bench.is_settled
         runner.close_loop("y", np.zeros(120), loop, FRAME_RATE_HZ, MASS_KG)
         assert len(scene.record("y").drive_v) == 120
         runner.settle(0.5, 6.0)
-        assert scene.rig.settled_drive_v == 0.5
+        assert scene.rig.bench.is_settled
 
 
 def test_late_outputs_are_those_of_a_loop_some_blocks_before(tmp_path):

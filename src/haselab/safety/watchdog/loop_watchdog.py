@@ -82,8 +82,8 @@ class LoopWatchdog:
         model: of the loop.
         settings: limits.
         rating: of the dielectric; None if it is unknown.
-        before_v: drive at which the actuator was in equilibrium before the loop closes; None: it
-            was moving.
+        before_v: drive before the loop closes; None: unknown.
+        settled: the actuator was in equilibrium with it; else it may still ring.
     """
 
     def __init__(
@@ -92,6 +92,7 @@ class LoopWatchdog:
         settings: WatchdogSettings,
         rating: FieldRating | None = None,
         before_v: float | None = None,
+        settled: bool = True,
     ) -> None:
         self._model, self._settings, self._rating = model, settings, rating
         self._plausible = Plausible(model, settings)
@@ -115,6 +116,7 @@ class LoopWatchdog:
             settings.direction_ratio,
             max(1, round(WINDOW_S / POINTS / model.block_s)),
             None if before_v is None else self._static(before_v),
+            settled,
         )
         self._lost: deque[bool] = deque(maxlen=max(round(WINDOW_S / model.block_s), 2))
         self._held = 1

@@ -18,8 +18,9 @@ _FEWEST = 30
 _LEAST_MOVE = 0.03
 _NOISE_STD = 4.0
 _AGREE = 2  # evaluations in a row
-# the ratio must be larger by this factor if the plant is assumed to start in equilibrium
-_START = 1.5
+# the ratio must be larger by this factor if the plant is assumed to start in equilibrium: where it
+# is settled, and where it may still ring
+_START, _RINGING = 1.5, 4.0
 
 Floats = NDArray[np.float64]
 _SUBSETS = [list(s) for n in (3, 2, 1) for s in itertools.combinations(range(3), n)]
@@ -118,7 +119,8 @@ class Reaction:
         response_share: see `WatchdogSettings`.
         ratio: see `WatchdogSettings.direction_ratio`.
         every: blocks per point.
-        rest: static strain of the drive before the loop closes, where the plant is in equilibrium.
+        rest: static strain of the drive before the loop closes.
+        settled: the plant is in equilibrium there; else it may ring.
     """
 
     def __init__(
@@ -129,8 +131,10 @@ class Reaction:
         ratio: float,
         every: int,
         rest: float | None = None,
+        settled: bool = True,
     ) -> None:
         self._range, self._every, self._rest = range_, every, rest
+        self._start = _START if settled else _RINGING
         self._points = 0
         self._move, self._share, self._ratio = move_share * range_, response_share, ratio
         self._static: deque[float] = deque(maxlen=POINTS)
@@ -181,7 +185,7 @@ class Reaction:
         if len(strain) > _FEWEST and np.ptp(static[-_FEWEST:]) > _LEAST_MOVE * self._range:
             ratio = max(ratio, direction_ratio(static[-_FEWEST:], strain[-_FEWEST:], floor=floor))
         if self._rest is not None:
-            ratio = max(ratio, direction_ratio(static, strain, self._rest, floor) / _START)
+            ratio = max(ratio, direction_ratio(static, strain, self._rest, floor) / self._start)
         self._against = self._against + 1 if ratio > self._ratio and self._alive(strain) else 0
         if self._against < _AGREE:
             return ""

@@ -129,6 +129,15 @@ def test_a_wrong_mass_gives_no_numbers():
     assert "Check the mass" in found
 
 
+@pytest.mark.long
+def test_capacitances_that_contradict_the_forces_by_little_have_a_note():
+    fit = fit_actuator(TRUE, [record(TRUE, 4, duration_s=15.0, scale=1.1)], mass_kg=MASS_KG)
+    assert fit.succeeded
+    (note,) = fit.notes
+    assert note.startswith("The capacitances are 1.1")
+    assert fit.answer()["notes"] == [note]
+
+
 @given(st.lists(st.floats(-0.3, 0.3), min_size=23, max_size=23))
 def test_what_varies_is_the_distance(steps):
     start = Unknowns.of(TRUE, added_inertia_kg=0.01, mass_kg=MASS_KG)

@@ -42,6 +42,7 @@ _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
+_GOOD_SCALE = 0.01  # and a careful one
 _WHITE = 1e-3  # probability of the residuals under white noise
 _POINTS = 5  # voltages of the linear models
 _UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
@@ -119,6 +120,7 @@ class ActuatorFit(Fit):
             },
             "residual_whiteness_p": self.residual_whiteness_p,
             "evaluations": self.evaluations,
+            "notes": list(self.notes),
             "status": self.status,
         }
 
@@ -297,6 +299,7 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
     law = unknowns.present_law()
     return ActuatorFit(
         status=status,
+        notes=_notes(unknowns.value(SENSING_SCALE)),
         parameters=parameters,
         covariance=covariance * np.outer(slopes, slopes),
         residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),
@@ -349,6 +352,16 @@ def _status(
             "intervals are wider for it"
         ), True
     return "ok", True
+
+
+def _notes(scale: float) -> tuple[str, ...]:
+    if abs(scale - 1.0) <= _GOOD_SCALE:
+        return ()
+    return (
+        f"The capacitances are {scale:.4g} times those that the forces need. If they are well "
+        "calibrated, the amplifier's gain or the mass is wrong, and so are permittivity and "
+        "stiffness, although their intervals are narrow.",
+    )
 
 
 def _pairs(values: NDArray[np.complex128]) -> list[list[float]]:

@@ -176,9 +176,11 @@ class Unknowns:
         )
 
     def at(self, other: Unknowns) -> Unknowns:
-        """These numbers with the values of others, which may be fewer."""
-        values = np.array([other.value(name) for name in self.names])
-        return Unknowns(other.law, self.names, values, self.mass_kg)
+        """These numbers with the values of others where those have them."""
+        known = dict(zip(other.names, other.values.tolist(), strict=True))
+        pairs = zip(self.names, self.values.tolist(), strict=True)
+        values = np.array([known.get(name, value) for name, value in pairs])
+        return Unknowns(self.law, self.names, values, self.mass_kg)
 
     def present_law(self) -> ActuatorLaw:
         """The law with the present values.

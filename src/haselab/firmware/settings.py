@@ -219,28 +219,42 @@ class ChipSettings:
     @property
     def capacitance_range_f(self) -> tuple[float, float]:
         """Capacitances that count as valid, in F: of plausible strains, where the map is usable."""
-        slope, offset, curvature, cubic = self.strain_map
-        ends = []
-        for strain in (self.strain_low - _MARGIN, self.strain_high + _MARGIN):
-            # in nF: coefficients of 1e26 and 1 beside each other are too far apart
-            scaled = [1e-27 * cubic, 1e-18 * curvature, 1e-9 * slope, offset - strain]
-            roots = 1e-9 * np.roots(scaled)
-            real = [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
-            if not real:
+        lowest, highest = self.strain_low - _MARGIN, self.strain_high + _MARGIN
+        if self.usable_f is None:
+            ends = [min(self._capacitances_f(strain), default=None) for strain in (lowest, highest)]
+            reached = [end for end in ends if end is not None]
+            if len(reached) < len(ends):
                 raise InputError(
-                    f"The strain map does not reach a strain of {strain:g}, but it must cover the "
-                    f"saturation with a margin of {_MARGIN:g}. Fit it over a wider range."
+                    f"The strain map does not reach a strain of {lowest:g} or {highest:g}, but it "
+                    f"must cover the saturation with a margin of {_MARGIN:g}. Fit it to a record "
+                    "with haselab identify capacitance-map, which also states its range."
                 )
-            ends.append(min(real))
-        usable_low_f, usable_high_f = self.usable_f or (0.0, math.inf)
-        low_f, high_f = max(min(ends), usable_low_f), min(max(ends), usable_high_f)
-        if not low_f < high_f:
+            return min(reached), max(reached)
+        low_f, high_f = self.usable_f
+        middle_f = 0.5 * (low_f + high_f)  # of the record
+        slope, offset, curvature, cubic = self.strain_map
+        middle = ((cubic * middle_f + curvature) * middle_f + slope) * middle_f + offset
+        if not lowest <= middle <= highest:
             raise InputError(
-                f"The strain map is usable from {usable_low_f:g} to {usable_high_f:g} F, but the "
-                f"saturation needs {min(ends):g} to {max(ends):g} F. Fit the map over a range that "
-                "covers the saturation."
+                f"The strain map is usable from {low_f:g} to {high_f:g} F, but the saturation is "
+                f"{self.strain_low:g} to {self.strain_high:g}, far from the strain of {middle:.3g} "
+                "in its middle. Fit the map over a range that covers the saturation."
             )
-        return low_f, high_f
+        turns_f = _positive_roots([3e-27 * cubic, 2e-18 * curvature, 1e-9 * slope])
+        ends_f = [*self._capacitances_f(lowest), *self._capacitances_f(highest), *turns_f]
+        below = [end for end in ends_f if end < middle_f]
+        return max([low_f, 0.0, *below]), min([high_f, *(end for end in ends_f if end > middle_f)])
+
+    def _capacitances_f(self, strain: float) -> list[float]:
+        """Positive capacitances at which the strain map gives a strain."""
+        slope, offset, curvature, cubic = self.strain_map
+        return _positive_roots([1e-27 * cubic, 1e-18 * curvature, 1e-9 * slope, offset - strain])
+
+
+def _positive_roots(per_nf: list[float]) -> list[float]:
+    """Positive roots, in F, of a polynomial in nF: in F its coefficients are 1e26 and 1."""
+    roots = 1e-9 * np.roots(per_nf)
+    return [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
 
 
 def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:

@@ -72,6 +72,7 @@ class RigDescription:
         mass_kg: mass hung on the lower clamp when a study begins.
         amplifier: make and number; a calibration of the monitors is valid only for this one.
         calibration: of the monitors; None: by the nominal gains.
+        exposure_s: of one frame; 0 if it is not known.
     """
 
     name: str
@@ -90,6 +91,7 @@ class RigDescription:
     mass_kg: float
     amplifier: str = ""
     calibration: MonitorCalibration | None = None
+    exposure_s: float = 0.0
 
     @property
     def block_s(self) -> float:

@@ -160,4 +160,4 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         settings.settle_s,
         None if by_video else loop.strain_map.coefficients,
     )
-    return LoopWatchdog(model, settings.loop, settings.rating, rig.present_drive_v)
+    return LoopWatchdog(model, settings.loop, settings.rating, rig.settled_drive_v)

@@ -426,6 +426,12 @@ def test_the_highest_field_lowers_the_limits_of_a_design(known, capsys):
     assert limits["high"] == pytest.approx(0.0692, abs=2e-4)
 
 
+def test_init_states_the_gain_of_the_amplifier(tmp_path, capsys):
+    path = tmp_path / "a.toml"
+    assert run(capsys, "init", "leg", "--gain-v-per-v", "1000", "--out", path)[0] == 0
+    assert tomllib.loads(path.read_text())["drive"]["gain_v_per_v"] == 1000.0
+
+
 def test_compare_draws_the_prediction_with_its_band(known, capsys, tmp_path):
     actuator, _, second = known
     figure = tmp_path / "prediction.svg"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,9 +15,11 @@ from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import (
     CAMERA_LATENCY,
     CAMERA_OFFSET,
+    CAMERA_SCALE,
     SENSING_LATENCY,
     SENSING_SCALE,
     Unknowns,
+    usual,
 )
 
 __all__ = ["Misfit", "Modelled", "modelled"]
@@ -72,20 +74,22 @@ def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = Tr
     latency_s = unknowns.value(SENSING_LATENCY)
     drift = record.over_windows(response.drift_f_s)
     inside = record.over_windows(response.capacitance_f) - latency_s * drift
-    length_m = response.length_m + unknowns.value(CAMERA_OFFSET)
+    shown = unknowns.value(CAMERA_SCALE)
+    length_m = shown * response.length_m + unknowns.value(CAMERA_OFFSET)
     if not derivatives:
         none = np.zeros((0, 0))
         return Modelled(length_m, scale * inside, none, none)
     columns: dict[str, tuple[ArrayLike, ArrayLike]] = {
-        CAMERA_LATENCY: (-response.speed_m_s, 0.0),
+        CAMERA_LATENCY: (-shown * response.speed_m_s, 0.0),
         CAMERA_OFFSET: (1.0, 0.0),
+        CAMERA_SCALE: (response.length_m, 0.0),
         SENSING_LATENCY: (0.0, -scale * drift),
         SENSING_SCALE: (0.0, inside),
     }
     length_by = np.empty((length_m.size, len(unknowns.names)))
     capacitance_by = np.empty((inside.size, len(unknowns.names)))
     count = len(unknowns.law_names)
-    length_by[:, :count] = response.length_by
+    length_by[:, :count] = shown * response.length_by
     capacitance_by[:, :count] = scale * record.over_windows(response.capacitance_by)
     for k, name in enumerate(unknowns.names[count:], start=count):
         length_by[:, k] = np.asarray(columns[name][0])
@@ -103,13 +107,25 @@ def _highest_v(record: MotionRecord) -> float:
 def _respond(sampled: SampledLaw, record: MotionRecord, latency_s: float) -> Response:
     drive = record.drive
     low, high = drive.edge_s[0], drive.edge_s[-1]
-    times_s = np.clip(record.length_time_s - latency_s, low, high)
+    middle_s = record.length_time_s - latency_s
+    # Gauss's two points of the exposure, over which a frame shows the mean
+    half_s = record.exposure_s / np.sqrt(12.0)
+    both_s = np.clip(np.concatenate([middle_s - half_s, middle_s + half_s]), low, high)
+    order = np.argsort(both_s, kind="stable")
     start, start_by = sampled.at_rest(
         float(drive.voltage_v[0]), float(drive.ripple_v2[0]), float(drive.load_n[0])
     )
     sensed = np.zeros(drive.voltage_v.size, np.uint8)
     sensed[record.window] = 1
-    return sampled.respond(drive, times_s, start, sensed=sensed, start_by=start_by)
+    found = sampled.respond(drive, both_s[order], start, sensed=sensed, start_by=start_by)
+    first, second = np.split(np.argsort(order), 2)
+    return replace(
+        found,
+        **{
+            name: 0.5 * (getattr(found, name)[first] + getattr(found, name)[second])
+            for name in ("length_m", "speed_m_s", "length_by")
+        },
+    )
 
 
 @dataclass(frozen=True)
@@ -180,5 +196,5 @@ class Misfit:
             parts.append((record.length_m - part.length_m) / std_m)
             std_f = self.capacitance_factor * record.capacitance_std_f
             parts.append((record.capacitance_f - part.capacitance_f) / std_f)
-        known = [-unknowns.value(name) / std for name, std in self.known.items()]
+        known = [(usual(name) - unknowns.value(name)) / std for name, std in self.known.items()]
         return np.concatenate([*parts, known])

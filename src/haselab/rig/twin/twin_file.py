@@ -28,7 +28,7 @@ __all__ = ["identified_twin", "is_actuator_file", "load_twin"]
 
 _SCALE = "sensing.scale"
 # What the recording bench adds, and the instruments of a twin have of their own.
-_OF_THE_BENCH = ("camera.latency_s", "camera.offset_m", "sensing.latency_s")
+_OF_THE_BENCH = ("camera.latency_s", "camera.offset_m", "camera.scale", "sensing.latency_s")
 _TRIES = 1000  # draws outside the limits of a law before they are given up
 _SIGMAS = 3.0  # within which a negative inertia is an error of its estimate
 

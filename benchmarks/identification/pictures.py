@@ -1,6 +1,6 @@
 """Draws the pictures of docs/identify and prints the figures of identification.md.
 
-    python -m benchmarks.identification.pictures docs/pictures [DATA]
+    python -m benchmarks.identification.pictures docs/pictures/identify [DATA]
 
 DATA is a folder with identification/ecoflex-00-30-tensile.csv (LucMarechal/Soft-Robotics-
 Materials-Database, ODbL 1.0); without it the picture of the laws is left out.
@@ -267,13 +267,13 @@ def main(folder, data):
     folder.mkdir(parents=True, exist_ok=True)
     with figure_style():
         figures = {
-            "identify-transfer": draw_transfer(),
-            "identify-frequency-response": draw_frequency_response(),
-            "identify-free-response": draw_free_response(),
-            "identify-operating-points": draw_operating_points(),
+            "transfer": draw_transfer(),
+            "frequency-response": draw_frequency_response(),
+            "free-response": draw_free_response(),
+            "operating-points": draw_operating_points(),
         }
         if data is not None:
-            figures["identify-hyperelastic"] = draw_hyperelastic(data)
+            figures["hyperelastic"] = draw_hyperelastic(data)
         for name, figure in figures.items():
             svg = to_svg(figure, name, name.replace("-", " "))
             (folder / f"{name}.svg").write_text(svg, encoding="utf-8")

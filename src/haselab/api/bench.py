@@ -48,7 +48,8 @@ def twin(
     """A simulated bench.
 
     Args:
-        file: TWIN.toml. None: the actuator of the reference study.
+        file: TWIN.toml, or an actuator file with an identified `[model.physical]`. None: the
+            actuator of the reference study.
         frequency_unit: interpretation of that study's frequency axis, "hz" or "rad".
         seed: of its noise.
     Returns:

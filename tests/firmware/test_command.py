@@ -66,7 +66,7 @@ def test_the_chip_steps_like_the_desktop_at_its_rate(answer: dict[str, Any]) -> 
     assert chip["overshoot"] < 0.12
     assert chip["phase_margin_deg"] > 45.0
     assert answer["status"] == "ok"
-    assert answer["deviation"] < answer["deviation_covered"] < 0.2
+    assert answer["deviation"] < answer["deviation_tolerated"] < 0.2
     assert abs(chip["overshoot"] - chip["predicted"]["overshoot"]) < 0.1
     assert chip["phase_margin_deg"] > slow["phase_margin_deg"]
     assert answer["load"] <= 0.60
@@ -85,7 +85,7 @@ def test_a_step_that_differs_from_the_prediction_says_why_and_exits_with_3(
     assert code == 3
     answer = json.loads(text)
     assert answer["status"] == "differs from the prediction"
-    assert answer["deviation"] > answer["deviation_covered"]
+    assert answer["deviation"] > answer["deviation_tolerated"]
     assert "Cause: the step stretches the twin farther than before" in error
     assert error.count("\n") == 1
     chip = answer["loops"][-1]

@@ -153,7 +153,7 @@ class ChipSettings:
         settle_s: time after arming until the strain must be valid, in s.
         blind_updates: updates without a strain that trip it.
         level_off: largest deviation of the high voltage, as a fraction of its range.
-        astray_updates: updates with a larger deviation that trip it.
+        wrong_output_updates: updates with a larger deviation that trip it.
         own: a user's controller in place of the PID, whose gains are then not used.
         usable_f: capacitances for which the strain map may be used, in F, see
             `StrainMap.usable_f`; None: unknown.
@@ -175,7 +175,7 @@ class ChipSettings:
     settle_s: float = 0.05
     blind_updates: int = 3
     level_off: float = 0.15
-    astray_updates: int = 10
+    wrong_output_updates: int = 10
     own: ControllerStep | None = None
     usable_f: tuple[float, float] | None = None
 
@@ -376,7 +376,7 @@ def _body(s: ChipSettings) -> str:
         ("settle_updates", str(round(s.settle_s * RATE_HZ))),
         ("token_updates", str(RATE_HZ)),
         ("blind_updates", str(s.blind_updates)),
-        ("astray_updates", str(s.astray_updates)),
+        ("wrong_output_updates", str(s.wrong_output_updates)),
         ("rate_hz", str(RATE_HZ)),
         ("crc", "@CRC@"),
     ]

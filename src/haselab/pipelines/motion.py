@@ -103,7 +103,7 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
         path.name, drive, time_s[chosen], length_m[chosen], std_m[chosen],
         np.concatenate(window), np.concatenate(window_of), np.concatenate(farad),
         np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
-        float(rig.get("exposure_s", 0.0)),
+        float(rig.get("exposure_s", 0.0)), float(rig["scale_m_per_px"]),
     )  # fmt: skip
 
 

@@ -292,7 +292,7 @@ def _compared(found: Agreement | None) -> dict[str, Any]:
         sentence += f" Cause: {'; '.join(found.causes) or 'none of those that are checked'}."
     return {
         "deviation": found.deviation,
-        "deviation_covered": found.covered,
+        "deviation_tolerated": found.covered,
         "comparison": sentence,
         "status": "ok" if found.agrees else "differs from the prediction",
     }

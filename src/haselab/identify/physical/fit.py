@@ -176,7 +176,8 @@ def fit_actuator(
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
     known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
     misfit = Misfit(records, known=known)
-    found = search(misfit, start)
+    # the scale of the camera and the actuator's size can hardly be told apart: it comes last
+    found = search(misfit, start.without((CAMERA_SCALE,)))
     if found is None:
         return ActuatorFit(
             status="the start values describe no motion: the actuator has no equilibrium under the "
@@ -189,12 +190,12 @@ def fit_actuator(
         same = np.allclose(factors, (misfit.length_factor, misfit.capacitance_factor),
                            rtol=_SAME_NOISE)  # fmt: skip
         misfit = Misfit(records, *factors, known)
-        if same:
-            break
-        again = refine(misfit, found)
+        again = refine(misfit, start.at(found.unknowns))
         if again is None:
             break
         found, count = again, count + again.evaluations
+        if same:
+            break
     return _result(misfit, found, count)
 
 

@@ -170,6 +170,11 @@ class Unknowns:
             self.mass_kg,
         )
 
+    def at(self, other: Unknowns) -> Unknowns:
+        """These numbers with the values of others, which may be fewer."""
+        values = np.array([other.value(name) for name in self.names])
+        return Unknowns(other.law, self.names, values, self.mass_kg)
+
     def present_law(self) -> ActuatorLaw:
         """The law with the present values.
 

@@ -27,8 +27,8 @@ from haselab.store.toml import read_toml, validated
 __all__ = ["identified_twin", "is_actuator_file", "load_twin"]
 
 _SCALE = "sensing.scale"
-# What the recording bench adds, and the instruments of a twin have of their own.
-_OF_THE_BENCH = ("camera.latency_s", "camera.offset_m", "camera.scale", "sensing.latency_s")
+# Tables of what the recording bench adds, and the instruments of a twin have of their own.
+_OF_THE_BENCH = ("camera.", "sensing.")
 _TRIES = 1000  # draws outside the limits of a law before they are given up
 _SIGMAS = 3.0  # within which a negative inertia is an error of its estimate
 
@@ -163,7 +163,7 @@ def _with(
         InputError: A name is unknown, or a value cannot be.
         LimitError: A value is outside the limits of the law.
     """
-    own = {key: value for key, value in values.items() if key not in (_SCALE, *_OF_THE_BENCH)}
+    own = {key: value for key, value in values.items() if not key.startswith(_OF_THE_BENCH)}
     changed = with_parameters(law, own)
     _ = changed.length_limits_m  # which states what its values exclude together
     added_kg, scale = values.get(ADDED_INERTIA, 0.0), values.get(_SCALE, 1.0)
@@ -187,7 +187,7 @@ def _drawn(
         LimitError: A bound of a distribution is outside the limits of the law.
     """
     for name in model.not_identifiable:
-        if name not in distribution and name not in _OF_THE_BENCH:
+        if name not in distribution and not name.startswith(_OF_THE_BENCH):
             raise InputError(
                 f"{name} cannot be drawn: it is not identifiable from the records, and "
                 f'[actuator.distribution] does not say where it lies. Add "{name}" = [low, high] '
@@ -202,7 +202,7 @@ def _drawn(
     spread = np.array(model.covariance.matrix, dtype=np.float64).reshape(len(names), len(names))
     open_names = set(distribution) - (set(model.parameters) - set(model.not_identifiable))
     lacking = set(model.parameters) ^ {*names, *open_names.intersection(model.parameters)}
-    lacking -= set(_OF_THE_BENCH)
+    lacking = {name for name in lacking if not name.startswith(_OF_THE_BENCH)}
     if lacking or not np.isfinite(spread).all():
         raise InputError(
             "The covariance of [model.physical] is not finite, or not that of its parameters "

@@ -5,16 +5,17 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 from matplotlib.figure import Figure
 
 from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
-from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
+from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.model.stated_margins import controller_doubt, model_doubt, warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
+from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
 from haselab.control import PidGains
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
@@ -32,7 +33,7 @@ from haselab.rig.chip import (
     read_design,
 )
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json, write_json
 from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
@@ -157,6 +158,7 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
 @_structure
 @_source
 @shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@draw_option
 @shared_option(
     "--reading", type=click.Choice(["rad", "hz"]),
     detail="Default: the twin of the run in RUN, else hz.",
@@ -211,13 +213,12 @@ def simulate(
     the microcontroller is compared with the step that [model] predicts. If they differ by more than
     the design covers, the command names the cause and exits with code 3.
     """
-    refuse_two_twins(options["reading"], options["twin"])
+    config = _twin(run, options["reading"], options["twin"], options["draw"])
     refuse_linked_folders(run, "firmware", "figures")
     warn_doubts(run, structure)
     design = read_design(run, structure, FrontEnd(), source)
     settings, zero_m = design.settings, design.zero_length_m
     _say_narrowed(settings, design.limits, run)
-    config = _twin(run, options["reading"], options["twin"])
     before, after = options["step"]
     precondition_v = options["precondition"]
     plan = StepPlan(before, after, options["before_s"], options["after_s"], zero_m, precondition_v)
@@ -254,10 +255,14 @@ def simulate(
         raise ResultError(f"{answer['comparison']} {run}")
 
 
-def _twin(run: Path, reading: str | None, twin: Path | None) -> TwinConfig:
+def _twin(
+    run: Path, reading: Literal["rad", "hz"] | None, twin: Path | None, draw: int | None
+) -> TwinConfig:
     """The twin of the options, else that of the run in the folder, else the default one."""
-    if twin is not None:
-        return load_twin(twin)
+    if twin is not None or draw is not None:
+        config = twin_of_options(reading, twin, 1, draw).configuration(Path())
+        name_origin(config)
+        return config
     results = run / "results.json"
     if reading is None and results.is_file():
         known = twin_of(table_at(read_json(results), "provenance", "rig_config"))

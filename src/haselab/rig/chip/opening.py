@@ -27,9 +27,10 @@ from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
 from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel
 from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
-from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import GRAVITY_M_S2, TwinBench
+from haselab.rig.twin.twin_file import load_twin
 from haselab.store.toml import PrintableSection
 
 __all__ = [

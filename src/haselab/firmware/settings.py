@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab import _core
 from haselab.base import InputError
@@ -37,6 +38,7 @@ _SINGLE = 1e-6  # relative error of the map in single precision; the firmware li
 _PARAMETERS = 8  # HS_CONTROLLER_PARAMETERS of core/include/hs_controller.h
 _BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
 _FALLS = 5.0  # largest fall of the level per frame, relative to the fastest drive
+_GRID = 1001  # points of the strain map, to find where it gives the saturation
 _MARGIN = 0.1  # plausible strain beyond the saturation: 0 V, creep
 
 
@@ -193,12 +195,14 @@ class ChipSettings:
                 f"converter's {_OUTPUT_V:g} V. Change drive_high_v."
             )
         table, slack_v = self.table_v, _SINGLE * self.drive_high_v
+        table = table if self.rises else table[::-1]
         ends_v = table[0] + slack_v, table[-1] - slack_v
         if not (np.diff(table) > 0.0).all() or ends_v[0] < 0.0 or ends_v[1] > self.drive_high_v:
             raise InputError(
-                f"The voltage map goes from {table[0]:g} V to {table[-1]:g} V over the saturation, "
-                f"but it must rise within [0, {self.drive_high_v:g}] V. Give narrower --limits to "
-                "'haselab design', or measure the voltage map again."
+                f"The voltage map goes from {self.table_v[0]:g} V to {self.table_v[-1]:g} V over "
+                "the saturation, but it must rise, or fall, everywhere within [0, "
+                f"{self.drive_high_v:g}] V. Give narrower --limits to 'haselab design', or measure "
+                "the voltage map again."
             )
 
     @property
@@ -206,6 +210,16 @@ class ChipSettings:
         """Drive at equal steps of corrected strain, in V, in single precision."""
         span = np.linspace(self.strain_low, self.strain_high, _TABLE_STEPS + 1)
         return [_core.voltage_from_strain(*self.voltage_map, float(u)) for u in span]
+
+    @property
+    def rises(self) -> bool:
+        """Whether the voltage rises with the strain; it falls for an actuator that contracts."""
+        return self.table_v[-1] > self.table_v[0]
+
+    @property
+    def strain_start(self) -> float:
+        """Corrected strain from which a loop starts: that of the lowest voltage."""
+        return self.strain_low if self.rises else self.strain_high
 
     @property
     def sensing(self) -> tuple[float, float, int, int, int]:
@@ -218,29 +232,49 @@ class ChipSettings:
 
     @property
     def capacitance_range_f(self) -> tuple[float, float]:
-        """Capacitances that count as valid, in F: of plausible strains, where the map is usable."""
-        slope, offset, curvature, cubic = self.strain_map
-        ends = []
-        for strain in (self.strain_low - _MARGIN, self.strain_high + _MARGIN):
-            # in nF: coefficients of 1e26 and 1 beside each other are too far apart
-            scaled = [1e-27 * cubic, 1e-18 * curvature, 1e-9 * slope, offset - strain]
-            roots = 1e-9 * np.roots(scaled)
-            real = [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
-            if not real:
-                raise InputError(
-                    f"The strain map does not reach a strain of {strain:g}, but it must cover the "
-                    f"saturation with a margin of {_MARGIN:g}. Fit it over a wider range."
-                )
-            ends.append(min(real))
-        usable_low_f, usable_high_f = self.usable_f or (0.0, math.inf)
-        low_f, high_f = max(min(ends), usable_low_f), min(max(ends), usable_high_f)
-        if not low_f < high_f:
+        """Capacitances that count as valid, in F: of plausible strains, where the map is usable.
+
+        On the branch of the map around the saturation: beyond a turning point it has the same
+        strains again.
+        """
+        plausible = (self.strain_low - _MARGIN, self.strain_high + _MARGIN)
+        edges_f = [self._capacitances_f(strain) for strain in plausible]
+        if self.usable_f is None:
+            for strain, found_f in zip(plausible, edges_f, strict=True):
+                if not found_f:
+                    raise InputError(
+                        f"The strain map does not reach a strain of {strain:g}, but it must cover "
+                        f"the saturation with a margin of {_MARGIN:g}. Fit it over a wider range."
+                    )
+            first_f = [min(found_f) for found_f in edges_f]
+            return min(first_f), max(first_f)
+        low_f, high_f = self.usable_f
+        grid_f = np.linspace(low_f, high_f, _GRID)
+        strains = np.polyval(self._scaled_map, 1e9 * grid_f)
+        nearest = int(np.abs(strains - 0.5 * (self.strain_low + self.strain_high)).argmin())
+        if not plausible[0] < strains[nearest] < plausible[1]:
             raise InputError(
-                f"The strain map is usable from {usable_low_f:g} to {usable_high_f:g} F, but the "
-                f"saturation needs {min(ends):g} to {max(ends):g} F. Fit the map over a range that "
-                "covers the saturation."
+                f"The strain map is usable from {low_f:g} to {high_f:g} F, but the saturation "
+                f"needs strains of {self.strain_low:g} to {self.strain_high:g}, which the map does "
+                "not give there. Fit the map over a range that covers the saturation."
             )
-        return low_f, high_f
+        turns_f = 1e-9 * np.roots(np.polyder(np.trim_zeros(self._scaled_map, "f")))
+        ends_f = [*edges_f[0], *edges_f[1], *(float(f.real) for f in turns_f if f.imag == 0.0)]
+        return (
+            max([0.0, low_f, *(f for f in ends_f if f < grid_f[nearest])]),
+            min([high_f, *(f for f in ends_f if f > grid_f[nearest])]),
+        )
+
+    @property
+    def _scaled_map(self) -> NDArray[np.float64]:
+        """Strain map in falling powers of nF: 1e26 and 1 beside each other are too far apart."""
+        slope, offset, curvature, cubic = self.strain_map
+        return np.array([1e-27 * cubic, 1e-18 * curvature, 1e-9 * slope, offset])
+
+    def _capacitances_f(self, strain: float) -> list[float]:
+        """Capacitances of a strain, in F, also outside the range of the map."""
+        roots = 1e-9 * np.roots(self._scaled_map - [0.0, 0.0, 0.0, strain])
+        return [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
 
 
 def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
@@ -343,7 +377,7 @@ def _body(s: ChipSettings) -> str:
         ("controller.period_s", _single(period_s)),
         ("controller.u_low", _single(s.strain_low)),
         ("controller.u_high", _single(s.strain_high)),
-        ("controller.u_start", _single(s.strain_low)),  # where the table meets 0 V
+        ("controller.u_start", _single(s.strain_start)),
         *_own_entries(s, period_s),
         (
             "voltage",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from haselab.base import Limits
 
 __all__ = [
+    "PLANAR_HASEL",
     "Acquisition",
     "BuiltInController",
     "Camera",
@@ -31,6 +32,7 @@ __all__ = [
     "VoltageSource",
 ]
 
+PLANAR_HASEL = "planar-hasel"  # the kind of the reference study
 
 _T = TypeVar("_T")
 
@@ -72,6 +74,7 @@ class RigDescription:
         mass_kg: mass hung on the lower clamp when a study begins.
         amplifier: make and number; a calibration of the monitors is valid only for this one.
         calibration: of the monitors; None: by the nominal gains.
+        actuator_kind: of the actuator, as in its actuator file.
     """
 
     name: str
@@ -90,6 +93,7 @@ class RigDescription:
     mass_kg: float
     amplifier: str = ""
     calibration: MonitorCalibration | None = None
+    actuator_kind: str = PLANAR_HASEL
 
     @property
     def block_s(self) -> float:

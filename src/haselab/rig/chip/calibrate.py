@@ -56,13 +56,27 @@ def calibrated_firmware(
     """
     program = build_cosim(folder)
     plain = build_firmware(settings, folder)
-    share = chip_correction(program, plain.elf, config, seed)
+    share = chip_correction(program, plain.elf, config, seed, _reference_f(settings))
     front_end = replace(settings.front_end, correction=settings.front_end.correction * share)
     settings = replace(settings, front_end=front_end)
     return Calibrated(program, build_firmware(settings, folder), settings, share)
 
 
-def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> float:
+def _reference_f(settings: ChipSettings) -> float:
+    """Capacitance of a reference capacitor that the microcontroller accepts as an actuator, in F.
+
+    Args:
+        settings: of the microcontroller.
+    Returns:
+        500 pF, or the middle of the capacitances of the strain map if 500 pF is not one of them.
+    """
+    low_f, high_f = settings.capacitance_range_f
+    return REFERENCE[0] if low_f < REFERENCE[0] < high_f else 0.5 * (low_f + high_f)
+
+
+def chip_correction(
+    program: Path, elf: Path, config: TwinConfig, seed: int, farad: float = REFERENCE[0]
+) -> float:
     """Measure `FrontEnd.correction` with a reference capacitor.
 
     Args:
@@ -70,6 +84,7 @@ def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> 
         elf: firmware without a correction.
         config: of the twin.
         seed: of its noise.
+        farad: capacitance of the reference, in F.
     Returns:
         Capacitance of the reference over the reported value.
     Raises:
@@ -77,7 +92,7 @@ def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> 
     """
     with CoSim(program, elf, TwinBench(config, seed)) as chip:
         chip.run(0.02)
-        chip.command(f"connect {REFERENCE[0]} {REFERENCE[1]}")
+        chip.command(f"connect {farad} {REFERENCE[1]}")
         chip.arm()
         known = len(chip.messages)
         for _ in range(_READINGS):
@@ -86,6 +101,6 @@ def chip_correction(program: Path, elf: Path, config: TwinConfig, seed: int) -> 
     if not reported or min(reported) <= 0.0:
         raise DeviceError(
             f"The microcontroller measured no capacitance in {reported.count(0.0)} of "
-            f"{len(reported)} readings of {REFERENCE[0]:g} F. Check the values of [front_end]."
+            f"{len(reported)} readings of {farad:g} F. Check the values of [front_end]."
         )
-    return REFERENCE[0] / float(np.mean(reported))
+    return farad / float(np.mean(reported))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from haselab.base import InputError
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.rig.twin.camera import TwinCameraConfig
 from haselab.store.toml import Section, read_toml, validated
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from haselab.actuators import ActuatorLaw, PlanarHasel
 
 __all__ = [
-    "PLANAR_HASEL",
     "READINGS",
     "AcquisitionConfig",
     "Amplifier",
@@ -30,8 +30,6 @@ __all__ = [
     "twin_of_reading",
 ]
 
-
-PLANAR_HASEL = "planar-hasel"
 _PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "dielectric")
 
 

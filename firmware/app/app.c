@@ -13,7 +13,7 @@ void app_init(app_state *state, uint8_t fault)
     state->blind = 0;
     state->slipped = 0;
     state->code = 0;
-    state->astray = 0;
+    state->wrong_output = 0;
 }
 
 /* ---- sensing ---- */
@@ -59,7 +59,7 @@ static void sense(const app_config *c, const app_inputs *in, app_outputs *out)
 /* A lost conversion invalidates this update and the next one, whose windows contain it. */
 static void judge_readings(app_state *s, const app_inputs *in, app_outputs *out)
 {
-    if (in->alarms & HP_ALARM_SLIP) {
+    if (in->alarms & HP_ALARM_LOST_SAMPLE) {
         s->slipped = 2;
     }
     if (s->slipped > 0) {
@@ -82,9 +82,9 @@ static void judge_level(const app_config *c, app_state *s, const app_inputs *in)
     const uint16_t expected = (uint16_t)(((uint32_t)s->code * c->level_share) >> 16);
     const int16_t off = (int16_t)(in->v[HS_QUADRATURE_SAMPLES / 2] - (int16_t)expected);
     if (off <= c->level_off && off >= -c->level_off) {
-        s->astray = 0;
-    } else if (s->astray < 255) {
-        ++s->astray;
+        s->wrong_output = 0;
+    } else if (s->wrong_output < 255) {
+        ++s->wrong_output;
     }
 }
 
@@ -178,8 +178,8 @@ static void judge(const app_config *c, app_state *s, const app_inputs *in)
     if (s->blind >= c->blind_updates && s->settled > c->settle_updates) {
         trip(s, HP_FAULT_SENSING);
     }
-    if (s->astray >= c->astray_updates) {
-        trip(s, HP_FAULT_ASTRAY);
+    if (s->wrong_output >= c->wrong_output_updates) {
+        trip(s, HP_FAULT_WRONG_OUTPUT);
     }
     if (in->alarms & HP_ALARM_LATE) {
         trip(s, HP_FAULT_LATE);

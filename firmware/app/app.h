@@ -33,7 +33,7 @@ typedef struct {
     uint16_t settle_updates; /* after arming, until the strain must be valid */
     uint16_t token_updates;  /* validity of an arming token */
     uint8_t blind_updates;   /* without a strain, before a trip */
-    uint8_t astray_updates;  /* with a wrong level, before a trip */
+    uint8_t wrong_output_updates;  /* with a wrong level, before a trip */
     uint16_t rate_hz;
     uint32_t crc; /* of the settings, for the handshake */
 } app_config;
@@ -59,7 +59,7 @@ typedef struct {
     uint8_t fault;    /* HP_FAULT_ */
     uint8_t blind;    /* updates in a row without a strain */
     uint16_t code;    /* of the last update */
-    uint8_t astray;   /* updates in a row with a wrong level */
+    uint8_t wrong_output;   /* updates in a row with a wrong level */
     uint8_t slipped;  /* updates whose window contains a lost conversion */
 } app_state;
 

@@ -40,7 +40,7 @@ static inline uint8_t sampler_take(sampler *s, uint8_t slot, uint16_t code, uint
     uint8_t alarms = s->alarms, at;
     s->slot = slot;
     if (slot != (uint8_t)((last + 1u) & (SAMPLER_SLOTS - 1u))) {
-        alarms |= HP_ALARM_SLIP;
+        alarms |= HP_ALARM_LOST_SAMPLE;
         if (slot <= last && last != SAMPLER_SLOTS - 1u) {
             alarms |= sampler_end_frame(s); /* the last slot itself was lost */
         }

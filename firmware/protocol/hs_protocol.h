@@ -50,12 +50,12 @@
 #define HP_FAULT_NOT_FINITE 5u /* the drive was NaN or outside its limits: memory was damaged */
 #define HP_FAULT_WATCHDOG 6u /* the watchdog reset the microcontroller */
 #define HP_FAULT_BROWN_OUT 7u /* the supply dipped */
-#define HP_FAULT_ASTRAY 9u /* the high voltage differs from the requested one */
+#define HP_FAULT_WRONG_OUTPUT 9u /* the high voltage differs from the requested one */
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */
 
 /* Bits that the sampling interrupt sets. */
 #define HP_ALARM_RAIL 1u /* a monitor at the end of its range, or the level collapsed, while enabled */
-#define HP_ALARM_SLIP 2u /* a conversion was lost or late */
+#define HP_ALARM_LOST_SAMPLE 2u /* a conversion was lost or late */
 #define HP_ALARM_LATE 4u /* updates are not completed */
 
 /* Why there is no strain; bits of core/include/hs.h and two of the firmware. */

@@ -1,5 +1,6 @@
 """Files, pandas, xarray and dictionaries give the same tables and records."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,17 @@ def test_times_in_a_unit_come_out_in_seconds():
     assert (volts.time_name, volts.rate_hz) == (None, None)
     with pytest.raises(InputError, match=r"^Column 't \[ticks\]' states the unit 'ticks', which"):
         hl.records({"t [ticks]": TIME_S, "u": U, "y": Y})
+
+
+@pytest.mark.parametrize("name", ["time [V]", "t (V)", "time_s [V]"])
+def test_times_in_another_unit_are_named(name, tmp_path):
+    path = tmp_path / "a.csv"
+    rows = np.c_[TIME_S, U, Y]
+    np.savetxt(path, rows, "%.9g", ",", header=f"{name},u,y", comments="")
+    said = rf"no sampling rate\. Column {re.escape(name)} states a unit that is not a time\. Give"
+    for data in (path, {name: TIME_S, "u": U, "y": Y}):
+        with pytest.raises(InputError, match=said):
+            hl.records(data)
 
 
 @pytest.mark.parametrize("name", ["t", "time_ms"])

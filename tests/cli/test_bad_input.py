@@ -199,7 +199,7 @@ def test_a_fault_in_a_rig_file_is_one_line(
         ("[acquisition]\nblock_samples = 1001", "acquisition.block_samples"),
         ("[viscosity]\nshare = [0.1]", "share and relaxation_s each need one number per branch"),
         ('reading = "khz"', "reading: Input should be 'rad' or 'hz'"),
-        ("load = 3", "load: Input should be a valid dictionary"),
+        ("load = 3", "load: Input should be a table, headed [load]"),
         ('[load]\nmass_kg = -1\n[shell]\nwidth_m = "wide"', "2 error(s): shell.width_m"),
     ],
 )

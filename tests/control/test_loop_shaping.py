@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from haselab.base import InputError
+from haselab.base import InputError, ResultError
 from haselab.control.candidates import Task, score
-from haselab.control.gains import PidGains
+from haselab.control.gains import PidGains, Saturation
 from haselab.control.loop_shaping import design_pi, design_pid, predict
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
@@ -115,3 +115,10 @@ def test_an_unusable_specification_is_refused(data, message):
 def test_a_plant_that_pushes_back_is_refused():
     with pytest.raises(InputError, match=r"plant gain = -0\.5"):
         design_pi(Plant(-0.5, 5.0, 0.1), DesignSpec(), LATE, rng=np.random.default_rng(0))
+
+
+def test_a_step_beyond_the_limits_is_refused_as_a_demand_with_what_is_reachable():
+    setting = LoopSetting(saturation=Saturation(-0.02, 0.06))
+    said = r"step of 0\.04 needs .* of 0\.08, .* State a step of -0\.01 to 0\.03 in the demands"
+    with pytest.raises(ResultError, match=said):
+        design_pi(Plant(0.5, 32.0, 0.3), DesignSpec(), setting, rng=np.random.default_rng(0))

@@ -192,7 +192,7 @@ static void a_lost_conversion_spoils_two_updates_and_no_third(void)
     app_state s;
     app_inputs in;
     run(&s, &in);
-    in.alarms = HP_ALARM_SLIP;
+    in.alarms = HP_ALARM_LOST_SAMPLE;
     CHECK(step(&s, &in).reason == HP_REASON_SLIPPED, "first");
     in.alarms = 0;
     CHECK(step(&s, &in).reason == HP_REASON_SLIPPED, "second");
@@ -289,9 +289,9 @@ static void a_module_that_does_not_follow_trips(int16_t off, uint8_t trips)
         in.event = HP_EVENT_ALIVE;
         in.v[4] = (int16_t)(level_of(s.code) + off);
         app_step(&settings, &s, &in, &out);
-        CHECK(k >= settings.astray_updates - 1 || s.state == HP_STATE_RUNNING, "update %d", k);
+        CHECK(k >= settings.wrong_output_updates - 1 || s.state == HP_STATE_RUNNING, "update %d", k);
     }
-    CHECK((s.fault == HP_FAULT_ASTRAY) == trips, "%d codes off: %d", off, s.fault);
+    CHECK((s.fault == HP_FAULT_WRONG_OUTPUT) == trips, "%d codes off: %d", off, s.fault);
     CHECK(!trips || (!out.enable && out.code == 0), "%d", out.code);
 }
 

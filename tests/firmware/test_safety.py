@@ -142,7 +142,7 @@ def test_a_module_that_does_not_follow_trips(chip: CoSim) -> None:
     chip.send(SetReference(-0.03))
     chip.run(0.14)
     assert off_s(chip) - at < 0.13
-    assert status(chip).fault == Fault.ASTRAY
+    assert status(chip).fault == Fault.WRONG_OUTPUT
 
 
 def test_a_level_that_is_gone_counts_as_breakdown(chip: CoSim) -> None:

@@ -52,7 +52,7 @@ static void a_lost_conversion_is_told_and_the_next_ones_keep_their_places(void)
         feed(&s, 0, lost, 200);
         feed(&s, (uint8_t)(lost + 1u), 8, 200);
         feed(&s, 0, 8, 300);
-        CHECK(s.alarms == HP_ALARM_SLIP, "slot %d: %d", lost, s.alarms);
+        CHECK(s.alarms == HP_ALARM_LOST_SAMPLE, "slot %d: %d", lost, s.alarms);
         CHECK(s.frames == 3, "slot %d: %d frames", lost, s.frames);
         sampler_window(&s, s.start, v, i);
         CHECK(v[4] == 300 && i[7] == 307, "slot %d: %d %d", lost, v[4], i[7]);

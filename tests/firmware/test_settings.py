@@ -140,6 +140,29 @@ def test_the_range_of_the_strain_map_is_compiled_in(actuator: Path) -> None:
         _ = read_design(actuator, None, FrontEnd()).settings.capacitance_range_f
 
 
+@pytest.mark.parametrize(
+    ("strain_map", "usable_f"),
+    [
+        # fitted to 149 to 284 pF; the cubics turn back beyond, or reach no strain of -0.1 or 0.17
+        ((4.54e8, -0.07437, 3.68e17, -5.52e26), (1.35e-11, 4.2e-10)),
+        ((-4.36e8, -0.01287, 4.579e18, -7.0796e27), (1.35e-11, 4.2e-10)),
+        ((5.33e8, -0.08, 0.0, 0.0), (1.35e-11, 4.2e-10)),
+    ],
+)
+def test_the_range_of_an_actuator_that_doubles_its_capacitance_is_about_its_record(
+    strain_map: tuple[float, float, float, float],
+    usable_f: tuple[float, float],
+    settings: ChipSettings,
+) -> None:
+    found = replace(
+        settings, strain_low=0.0, strain_high=0.0715, strain_map=strain_map, usable_f=usable_f
+    )
+    low_f, high_f = found.capacitance_range_f
+    assert usable_f[0] <= low_f < 1.49e-10 and 2.84e-10 < high_f <= usable_f[1]
+    c = np.linspace(low_f, high_f, 500)
+    assert (np.diff(np.polyval([*strain_map[:1:-1], *strain_map[:2]], c)) > 0.0).all()
+
+
 def test_the_range_of_capacitance_covers_the_saturation(settings: ChipSettings) -> None:
     low_f, high_f = settings.capacitance_range_f
     slope, offset, curvature, cubic = settings.strain_map

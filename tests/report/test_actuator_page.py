@@ -40,8 +40,8 @@ names = ["natural_frequency_rad_s", "damping_ratio", "delay_s", "gain"]
 logarithmic = [true, true, false, false]
 values = [28.0, 0.15, 0.0, 0.8]
 matrix = [[1e-4, 0, 0, 0], [0, 1e-2, 0, 0], [0, 0, 1e-6, 0], [0, 0, 0, 1e-4]]
-[model.fitted_to]
-step = 2e-4
+[model.training_output]
+cell = 2e-4
 hashes = HASHES
 [controller]
 kind = "pid"
@@ -92,7 +92,7 @@ def test_the_page_has_every_section_with_intervals_bands_and_provenance(
     # 60 with a standard deviation of 1.5: 57.06 to 62.94
     assert re.search(r"margins.phase_margin_deg\s+60.0\s+\[57.1, 62.9\]\s+°", text)
     assert re.search(r"slope_per_f\s+4.900×10⁸\s+\[4.880", text)
-    assert "fitted_to.hashes 256 values: 0, 7, 14, …" in text and "1785" not in text
+    assert "training_output.hashes 256 values: 0, 7, 14, …" in text and "1785" not in text
     assert "one.csv" in text and "identify transfer one.csv" in text
     assert (
         "<details>" in page

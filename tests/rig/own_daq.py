@@ -19,6 +19,7 @@ from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench
 
 BENCHES: list[TwinBench] = []  # the one that was opened last stands at the end
+FAULTS: list[Exception] = []  # that `write` raises under voltage
 
 
 class OwnDaqConfig(DaqConfig):
@@ -59,8 +60,14 @@ class OwnDaqDevice:
     def __init__(self) -> None:
         self._bench = TwinBench(twin_of_reading("hz"), 1)
         BENCHES.append(self._bench)
-        self.write, self.zero, self.read = self._bench.write, self._bench.zero, self._bench.read
+        self.zero, self.read = self._bench.zero, self._bench.read
         self.pass_time = self._bench.wait
+
+    def write(self, voltage_v: float) -> None:
+        """Put a value out, and fail where a test wants it."""
+        self._bench.write(voltage_v)
+        if voltage_v > 0.0 and FAULTS:
+            raise FAULTS[0]
 
     @property
     def time_s(self) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from haselab.cli.main import main
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.instruments.registry import INSTRUMENTS
 from haselab.rig.real_bench import identify
@@ -104,3 +105,31 @@ def test_rig_safe_revokes_its_permission_by_the_key_of_its_driver(file: BenchCon
         assert interlock.revision != before and interlock.reason.startswith("a test (on ")
     finally:
         interlock.close()
+
+
+@pytest.mark.parametrize(
+    "error", [ZeroDivisionError("division by zero"), ConnectionResetError(104, "reset")]
+)
+@pytest.mark.long
+def test_a_driver_that_fails_under_voltage_is_named_after_0_v(
+    rig_file: Path,
+    tmp_path: Path,
+    module: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: Exception,
+) -> None:
+    monkeypatch.setattr(module, "FAULTS", [error])
+    monkeypatch.setenv("PYTHONPATH", str(Path(module.__file__).parent))  # of the guardians
+    study = tmp_path / "study.toml"
+    study.write_text(
+        'name = "a"\n[triangle]\nlow_v = 0.0\nhigh_v = 1.0\nfrequency_hz = 1.0\ncycles = 3\n'
+        "left_out_cycles = 1\nframe_rate_hz = 400.0\n"
+    )
+    with pytest.raises(SystemExit) as stop:
+        main(["run", str(study), "--rig", str(rig_file), "--yes", "--acknowledge",
+              "--out", str(tmp_path / "out")])  # fmt: skip
+    said = capsys.readouterr().err
+    assert stop.value.code == 4
+    assert f"OwnDaqDevice.write of the package 'own_daq' failed: {type(error).__name__}" in said
+    assert module.BENCHES[-1].output_v == pytest.approx(0.0, abs=1e-6)

@@ -27,6 +27,7 @@ from haselab.runtime.runner import Runner
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
+from haselab.signals import linear_chirp, triangle
 from haselab.store.session.writer import ExperimentPlan, ExperimentRecord, SessionWriter
 from haselab.store.video.opening import open_video
 
@@ -353,6 +354,27 @@ def test_each_output_is_the_core_s_answer_to_the_block_before_bit_for_bit(tmp_pa
             output_v = _core.voltage_from_strain(
                 v.a1_v, v.b1, v.a2_v, v.b2, pid.step(desired, strain)
             )
+
+
+@pytest.mark.long
+def test_a_loop_may_close_while_the_actuator_still_rings_from_a_sweep(tmp_path):
+    """The watchdog must not take the last drive of the sweep for that of an equilibrium."""
+    scene = Scene(tmp_path, limits=SafetySettings())
+    to_strain = StrainMap(1.038e9, -0.3998, -5.266e17, 1.166e26)  # of this twin, softened
+    to_volt = VoltageMap(15.13, -2.406, -14.648, -3.581)
+    loop = LoopSettings(
+        PidGains(0.0, 6.88).controller(), Saturation(-0.02, 0.06), to_volt, to_strain
+    )
+    sweep = 0.015 * linear_chirp(0.2, 8.0, 8.0, 100.0)
+    with scene.runner as runner:
+        softened_v = triangle(0.0, 1.8, 0.3, 2, 100.0)
+        drive_v = np.append(softened_v, to_volt.voltage_v(sweep))
+        runner.play("x", drive_v, FRAME_RATE_HZ, MASS_KG)
+        assert scene.rig.settled_drive_v is None
+        runner.close_loop("y", np.zeros(120), loop, FRAME_RATE_HZ, MASS_KG)
+        assert len(scene.record("y").drive_v) == 120
+        runner.settle(0.5, 6.0)
+        assert scene.rig.settled_drive_v == 0.5
 
 
 def test_late_outputs_are_those_of_a_loop_some_blocks_before(tmp_path):

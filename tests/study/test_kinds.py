@@ -192,7 +192,7 @@ def test_the_design_and_the_firmware_hold_what_they_predict(
     assert built["strain_high"] == limits["saturation_high"]
     found = json.loads(command("firmware", "simulate", kind.folder, "--json"))
     assert found["status"] == "ok" and found["overruns"] == 0
-    assert found["deviation"] <= found["deviation_covered"]
+    assert found["deviation"] <= found["deviation_tolerated"]
 
 
 @pytest.mark.slow

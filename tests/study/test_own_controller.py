@@ -13,6 +13,8 @@ from haselab.cli.main import main
 from haselab.control import LoopSetting, PidGains
 from haselab.controllers import chosen_controller
 from haselab.models.actuator import ActuatorTables
+from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.maps import VoltageMap
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import describe
 from haselab.store.actuator_file import ACTUATOR, read_actuator
@@ -20,6 +22,7 @@ from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study, builtin_study, load_study
 from haselab.study.fits.loops import Loops
+from haselab.study.fits.maps import Maps
 from haselab.study.folder import write_design
 from haselab.study.own_controller import (
     own_controller,
@@ -120,6 +123,19 @@ def test_an_own_pid_is_an_alternative_and_never_replaces_the_designed_one(tmp_pa
         "kp": 0.2, "ki": 0.7, "kd": 0.0, "derivative_filter_s": 0.0
     }  # fmt: skip
     assert set(tables.controller.all_kinds) == {"pid", "pi", "own"}
+
+
+def test_an_own_controller_alone_is_in_the_actuator_file_with_its_limits(tmp_path):
+    """No design is made then; the limits are those of the drive, 0 to 1.6 V."""
+    study = study_with(tmp_path, 'kind = "pi"\nkp = 0.3\nki = 1.0')
+    eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+    maps = Maps(0.05, eq4, StrainMap(4.9e8, -0.27), {}, {}, {})
+    write_design(tmp_path, maps, None, None, study, (0.0, 1.6))
+    path = tmp_path / ACTUATOR
+    tables = validated(ActuatorTables, read_actuator(path), path)
+    own = tables.designed("pi")
+    assert own.parameters == {"kp": 0.3, "ki": 1.0} and own.limits is not None
+    assert (own.limits.low, own.limits.high) == (-0.05, pytest.approx(0.0692, abs=1e-4))
 
 
 @pytest.mark.long

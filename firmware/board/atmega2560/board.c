@@ -127,7 +127,7 @@ ISR(TIMER1_COMPA_vect)
     const uint8_t slot = (uint8_t)(((uint16_t)(at * 33u) >> 8) & (SAMPLER_SLOTS - 1u));
     (void)low;
     if (!(ADCSRA & _BV(ADIF))) {
-        s->alarms |= HP_ALARM_SLIP; /* not finished or not started */
+        s->alarms |= HP_ALARM_LOST_SAMPLE; /* not finished or not started */
     }
     /* The next one but one. */
     ADMUX = (uint8_t)(_BV(REFS0) | (slot == SAMPLER_SLOTS - 2u ? LEVEL : slot & 1u));

@@ -140,7 +140,7 @@ void board_sample(void)
     TIM3.sr = ~TIMER_COMPARE_1;
     ADC1.isr = ADC_CONVERTED | ADC_SEQUENCE_END | ADC_OVERRUN;
     if (!keep_in_step(flags, slot)) {
-        s->alarms |= HP_ALARM_SLIP;
+        s->alarms |= HP_ALARM_LOST_SAMPLE;
     }
     if (sampler_take(s, slot, code, HIGHEST_CODE, SETTINGS_LEVEL_FALL,
                      (GPIOB.odr & ENABLE) != 0)) {

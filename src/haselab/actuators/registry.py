@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from numbers import Real
+
+import numpy as np
 
 from haselab.actuators.law import ActuatorLaw
-from haselab.base import InputError, LimitError
+from haselab.actuators.losses import Circuit, Losses
+from haselab.base import HaselabError, InputError, LimitError, Limits, shown
+from haselab.base.exits import no_exit
 from haselab.base.registry import Registry
 
 __all__ = ["ACTUATORS", "actuator_law"]
+
+_OWN = __name__.partition(".")[0]
+_POINTS = 3
+_PROPERTIES = {
+    "free_length_m": Real, "length_limits_m": Limits, "losses": Losses, "circuit": Circuit,
+    "moving_mass_kg": Real, "width_m": Real, "area_m2": Real, "lateral_stretch": Real,
+}  # fmt: skip
 
 
 def _fault(law: object, kind: str) -> str:
@@ -59,6 +72,54 @@ def actuator_law(kind: str, values: Mapping[str, float | tuple[float, ...]]) -> 
             wanted = "a list of numbers" if isinstance(default, tuple) else "a number"
             raise InputError(f"actuator.{name} is {value}, but it must be {wanted}. Change it.")
     try:
-        return law(**values)
+        made = law(**values)
     except LimitError as error:
         raise InputError(str(error)) from error
+    if not law.__module__.startswith(f"{_OWN}."):
+        _check_returned(made)
+    return made
+
+
+def _check_returned(law: ActuatorLaw) -> None:
+    """Refuse a law that returns what would fail later in code of haselab.
+
+    Raises:
+        InputError: the message names the method and what it returns.
+    """
+    for name, kind in _PROPERTIES.items():
+        value = _got(law, name)
+        finite = not isinstance(value, Real) or math.isfinite(value)
+        if not (isinstance(value, kind) and finite):
+            what = "finite number" if kind is Real else kind.__name__
+            raise InputError(f"{_place(law, name)} is {shown(value)}. Return a {what} there.")
+    limits = law.length_limits_m
+    length_m = np.linspace(limits.low, limits.high, _POINTS)
+    for name in ("elastic_energy_j", "capacitance_f", "gap_m"):
+        found = _got(law, name, length_m)
+        numbers = np.asarray(found)
+        if numbers.shape != length_m.shape or numbers.dtype.kind not in "fiu":
+            raise InputError(
+                f"{_place(law, name)} returns {shown(found)} for an array of {_POINTS} lengths. "
+                "Return an array with a number for each."
+            )
+
+
+def _got(law: ActuatorLaw, name: str, *lengths: object) -> object:
+    """A property of a law, or what its method returns.
+
+    Raises:
+        InputError: it raised an exception that is not one of haselab's.
+    """
+    try:
+        with no_exit():
+            found = getattr(law, name)
+            return found(*lengths) if lengths else found
+    except HaselabError:
+        raise
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}"
+        raise InputError(f"{_place(law, name)} failed: {why}. Repair it.") from error
+
+
+def _place(law: ActuatorLaw, name: str) -> str:
+    return f"{name} of the actuator kind {law.kind!r} ({type(law).__qualname__})"

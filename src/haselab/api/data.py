@@ -222,7 +222,8 @@ def _table(data: Any) -> Table:
     time_name = next((n for n in TIME_NAMES if n in columns and _may_be_times(n, columns[n])), None)
     time_s = None if time_name is None else columns[time_name]
     rate_hz = None if time_s is None else rate_of_times(time_s)
-    found = Table(columns, rate_hz, time_name=time_name, time_s=time_s)
+    why = "" if time_s is not None else _why_no_times(columns)
+    found = Table(columns, rate_hz, time_name=time_name, time_s=time_s, why_no_times=why)
     stated = getattr(data, "attrs", {}).get("rate_hz")
     if stated is None:
         return found
@@ -235,6 +236,16 @@ def _table(data: Any) -> Table:
 def _may_be_times(name: str, values: Floats) -> bool:
     """A column that is only called like times, such as t, has to rise, as in files."""
     return name == "time_s" or bool((np.diff(values) > 0.0).all())
+
+
+def _why_no_times(columns: Mapping[str, Floats]) -> str:
+    """Why a column that is called like one of times is none; empty where there is none."""
+    for name, values in columns.items():
+        if _base(name) in TIME_NAMES:
+            rises = (np.diff(values) > 0.0).all()
+            why = "states a unit that is not a time" if rises else "does not rise everywhere"
+            return f"Column {name} {why}."
+    return ""
 
 
 def _columns(data: Any) -> tuple[dict[str, Floats], dict[str, str]]:
@@ -335,8 +346,7 @@ def records(
     if found.rate_hz is not None and not is_uneven(found):
         return [Record.sampled(found[input], found[output], found.rate_hz, hold=hold)]
     if found.time_s is None or found.time_name is None:
-        falling = next((name for name in found if _base(name) in TIME_NAMES), None)
-        why = "" if falling is None else f" Column {falling} does not rise everywhere."
+        why = f" {found.why_no_times}" if found.why_no_times else ""
         raise InputError(f"The data state no sampling rate.{why} Give rate_hz, or a column time_s.")
     axis = time_axis(found.time_s, Path("data"), found.time_name)
     kept, _ = records_of(found, (input, output), axis, hold)

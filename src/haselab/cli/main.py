@@ -16,6 +16,7 @@ import click
 from haselab import __version__
 from haselab.base.errors import HaselabError
 from haselab.base.exits import SignalExit
+from haselab.base.foreign_code import foreign_failure
 from haselab.cli.bench.revoke_first import revoke_first
 from haselab.cli.invocation import Invocation
 
@@ -160,6 +161,16 @@ def _broken_pipe(error: BrokenPipeError) -> int:
     return _fail(f"A connection was lost ({error.strerror}). Check the instrument.", 4)
 
 
+def _exit_if_foreign(error: Exception) -> None:
+    """Report an error of a package that extends haselab as that package's."""
+    found = foreign_failure(error)
+    if found is None:
+        return
+    what = f"{found.place} of the package {found.package!r} failed: {type(error).__name__}: {error}"
+    advice = "Repair it; run again with --debug for the traceback"
+    sys.exit(_fail(f"{what}. {advice}.", 4 if "haselab.instruments" in found.groups else 2))
+
+
 def main(
     arguments: list[str] | None = None, *, on_command: Callable[[], None] = lambda: None
 ) -> None:
@@ -204,6 +215,7 @@ def main(
     except OSError as error:
         if debug:
             raise
+        _exit_if_foreign(error)
         if isinstance(error, _BAD_PATHS) or error.errno in _BAD_NAMES:
             sys.exit(_fail(f"{error.strerror}. Name another path. {error.filename}", 2))
         what = f"File error: {error.strerror or error}. Check the disk and your permissions."
@@ -211,6 +223,7 @@ def main(
     except Exception as error:
         if debug:
             raise
+        _exit_if_foreign(error)
         what = f"A bug in haselab ({type(error).__name__}: {error})."
         sys.exit(_fail(f"{what} Run again with --debug and report the traceback.", 1))
     sys.exit(0)

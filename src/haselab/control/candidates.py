@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
-from haselab.control.plants.general import AnyPlant, PlantScale, slowed
+from haselab.control.plants.general import AnyPlant, PlantScale, varied
 from haselab.control.plants.general_loops import closed_loop_poles, trace_general
 from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import default_step
@@ -62,9 +62,7 @@ class Task:
 
     def plants(self) -> tuple[AnyPlant, ...]:
         """The nominal plant, and with its natural frequency varied to both sides."""
-        spread = self.spec.frequency_spread
-        factors = (1.0 - spread, 1.0 + spread) if spread else ()
-        return (self.plant, *(slowed(self.plant, factor) for factor in factors))
+        return varied(self.plant, self.spec.frequency_spread)
 
     @property
     def step(self) -> float:

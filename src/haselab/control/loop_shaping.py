@@ -210,9 +210,10 @@ def _reachable(task: Task, gain: float) -> None:
     if integrates(task.plant) or gain * limits.low <= step <= gain * limits.high:
         return
     raise ResultError(
-        f"the output saturates: a step of {step:g} needs a controller output of {step / gain:.3g}, "
-        f"but --limits allows {limits.low:g} to {limits.high:g}. The step can be "
-        f"{gain * limits.low:.3g} to {gain * limits.high:.3g}. Lower the step, or widen the limits"
+        f"The output saturates: the demanded step of {step:g} needs a controller output of "
+        f"{step / gain:.3g}, but the limits are {limits.low:g} to {limits.high:g}. State a step of "
+        f"{gain * limits.low:.3g} to {gain * limits.high:.3g} in the demands (step), or widen the "
+        "limits."
     )
 
 

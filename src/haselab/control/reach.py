@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from haselab.base import ResultError
+from haselab.base import InputError, ResultError
 from haselab.control.gains import Saturation
 from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.models.maps import VoltageMap
@@ -54,7 +54,8 @@ def reachable(
     Returns:
         The limited range.
     Raises:
-        ResultError: zero strain is outside the range.
+        InputError: zero strain is outside the wanted range.
+        ResultError: the drive does not reach zero strain.
     Example:
         >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
         >>> round(reachable(Saturation(), eq4, 0.0, 1.6).high, 4)
@@ -63,7 +64,12 @@ def reachable(
     low_v = -math.inf if low_v is None else low_v
     high_v = math.inf if high_v is None else high_v
     found = to_volt.reach((wanted.low, wanted.high), low_v, high_v)
-    if found is None or not found[0] < 0.0 < found[1]:
+    if not wanted.low <= 0.0 <= wanted.high:
+        raise InputError(
+            f"The controller's limits are {wanted.low:g} to {wanted.high:g}, but they must contain "
+            "zero strain, where a loop starts. Widen the limits."
+        )
+    if found is None or not found[0] <= 0.0 <= found[1]:
         raise ResultError(
             f"The voltage map has zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
             f"drive is limited to [{low_v:g}, {high_v:g}] V. Change the limits of the drive, or "

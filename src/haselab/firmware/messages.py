@@ -55,7 +55,7 @@ class Fault(IntEnum):
     NOT_FINITE = 5  # the drive was NaN or outside its limits: memory was damaged
     WATCHDOG = 6  # the watchdog reset the microcontroller
     BROWN_OUT = 7  # the supply dipped
-    ASTRAY = 9  # the high voltage differs from the requested one
+    WRONG_OUTPUT = 9  # the high voltage differs from the requested one
     LOST_STATE = 8  # the state machine's memory was damaged
 
 
@@ -63,7 +63,7 @@ class Alarm(IntFlag):
     """Bits that the sampling interrupt sets."""
 
     RAIL = 1  # a monitor at the end of its range, or the level collapsed, while enabled
-    SLIP = 2  # a conversion was lost or late
+    LOST_SAMPLE = 2  # a conversion was lost or late
     LATE = 4  # updates are not completed
 
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from haselab import _core
 from haselab.base import InputError
@@ -38,7 +37,6 @@ _SINGLE = 1e-6  # relative error of the map in single precision; the firmware li
 _PARAMETERS = 8  # HS_CONTROLLER_PARAMETERS of core/include/hs_controller.h
 _BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
 _FALLS = 5.0  # largest fall of the level per frame, relative to the fastest drive
-_GRID = 1001  # points of the strain map, to find where it gives the saturation
 _MARGIN = 0.1  # plausible strain beyond the saturation: 0 V, creep
 
 
@@ -155,7 +153,7 @@ class ChipSettings:
         settle_s: time after arming until the strain must be valid, in s.
         blind_updates: updates without a strain that trip it.
         level_off: largest deviation of the high voltage, as a fraction of its range.
-        astray_updates: updates with a larger deviation that trip it.
+        wrong_output_updates: updates with a larger deviation that trip it.
         own: a user's controller in place of the PID, whose gains are then not used.
         usable_f: capacitances for which the strain map may be used, in F, see
             `StrainMap.usable_f`; None: unknown.
@@ -177,7 +175,7 @@ class ChipSettings:
     settle_s: float = 0.05
     blind_updates: int = 3
     level_off: float = 0.15
-    astray_updates: int = 10
+    wrong_output_updates: int = 10
     own: ControllerStep | None = None
     usable_f: tuple[float, float] | None = None
 
@@ -232,49 +230,43 @@ class ChipSettings:
 
     @property
     def capacitance_range_f(self) -> tuple[float, float]:
-        """Capacitances that count as valid, in F: of plausible strains, where the map is usable.
-
-        On the branch of the map around the saturation: beyond a turning point it has the same
-        strains again.
-        """
-        plausible = (self.strain_low - _MARGIN, self.strain_high + _MARGIN)
-        edges_f = [self._capacitances_f(strain) for strain in plausible]
+        """Capacitances that count as valid, in F: of plausible strains, where the map is usable."""
+        lowest, highest = self.strain_low - _MARGIN, self.strain_high + _MARGIN
         if self.usable_f is None:
-            for strain, found_f in zip(plausible, edges_f, strict=True):
-                if not found_f:
-                    raise InputError(
-                        f"The strain map does not reach a strain of {strain:g}, but it must cover "
-                        f"the saturation with a margin of {_MARGIN:g}. Fit it over a wider range."
-                    )
-            first_f = [min(found_f) for found_f in edges_f]
-            return min(first_f), max(first_f)
+            ends = [min(self._capacitances_f(strain), default=None) for strain in (lowest, highest)]
+            reached = [end for end in ends if end is not None]
+            if len(reached) < len(ends):
+                raise InputError(
+                    f"The strain map does not reach a strain of {lowest:g} or {highest:g}, but it "
+                    f"must cover the saturation with a margin of {_MARGIN:g}. Fit it to a record "
+                    "with haselab identify capacitance-map, which also states its range."
+                )
+            return min(reached), max(reached)
         low_f, high_f = self.usable_f
-        grid_f = np.linspace(low_f, high_f, _GRID)
-        strains = np.polyval(self._scaled_map, 1e9 * grid_f)
-        nearest = int(np.abs(strains - 0.5 * (self.strain_low + self.strain_high)).argmin())
-        if not plausible[0] < strains[nearest] < plausible[1]:
-            raise InputError(
-                f"The strain map is usable from {low_f:g} to {high_f:g} F, but the saturation "
-                f"needs strains of {self.strain_low:g} to {self.strain_high:g}, which the map does "
-                "not give there. Fit the map over a range that covers the saturation."
-            )
-        turns_f = 1e-9 * np.roots(np.polyder(np.trim_zeros(self._scaled_map, "f")))
-        ends_f = [*edges_f[0], *edges_f[1], *(float(f.real) for f in turns_f if f.imag == 0.0)]
-        return (
-            max([0.0, low_f, *(f for f in ends_f if f < grid_f[nearest])]),
-            min([high_f, *(f for f in ends_f if f > grid_f[nearest])]),
-        )
-
-    @property
-    def _scaled_map(self) -> NDArray[np.float64]:
-        """Strain map in falling powers of nF: 1e26 and 1 beside each other are too far apart."""
+        middle_f = 0.5 * (low_f + high_f)  # of the record
         slope, offset, curvature, cubic = self.strain_map
-        return np.array([1e-27 * cubic, 1e-18 * curvature, 1e-9 * slope, offset])
+        middle = ((cubic * middle_f + curvature) * middle_f + slope) * middle_f + offset
+        if not lowest <= middle <= highest:
+            raise InputError(
+                f"The strain map is usable from {low_f:g} to {high_f:g} F, but the saturation is "
+                f"{self.strain_low:g} to {self.strain_high:g}, far from the strain of {middle:.3g} "
+                "in its middle. Fit the map over a range that covers the saturation."
+            )
+        turns_f = _positive_roots([3e-27 * cubic, 2e-18 * curvature, 1e-9 * slope])
+        ends_f = [*self._capacitances_f(lowest), *self._capacitances_f(highest), *turns_f]
+        below = [end for end in ends_f if end < middle_f]
+        return max([low_f, 0.0, *below]), min([high_f, *(end for end in ends_f if end > middle_f)])
 
     def _capacitances_f(self, strain: float) -> list[float]:
-        """Capacitances of a strain, in F, also outside the range of the map."""
-        roots = 1e-9 * np.roots(self._scaled_map - [0.0, 0.0, 0.0, strain])
-        return [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
+        """Positive capacitances at which the strain map gives a strain."""
+        slope, offset, curvature, cubic = self.strain_map
+        return _positive_roots([1e-27 * cubic, 1e-18 * curvature, 1e-9 * slope, offset - strain])
+
+
+def _positive_roots(per_nf: list[float]) -> list[float]:
+    """Positive roots, in F, of a polynomial in nF: in F its coefficients are 1e26 and 1."""
+    roots = 1e-9 * np.roots(per_nf)
+    return [float(r.real) for r in roots if abs(r.imag) <= 1e-9 * abs(r) and r.real > 0.0]
 
 
 def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
@@ -396,7 +388,7 @@ def _body(s: ChipSettings) -> str:
         ("settle_updates", str(round(s.settle_s * RATE_HZ))),
         ("token_updates", str(RATE_HZ)),
         ("blind_updates", str(s.blind_updates)),
-        ("astray_updates", str(s.astray_updates)),
+        ("wrong_output_updates", str(s.wrong_output_updates)),
         ("rate_hz", str(RATE_HZ)),
         ("crc", "@CRC@"),
     ]

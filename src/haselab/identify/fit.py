@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
-from haselab.identify.fingerprint import Fingerprint, fingerprint, share_used
 from haselab.identify.noise import fit_percent
+from haselab.identify.training_output import TrainingOutput, hash_output, share_used
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +37,8 @@ class Prediction:
     Args:
         status: "ok", or why this is no validation of the model.
         used_for_fit: share of the samples that the fit has used, recognised by their values; NaN
-            where it is not known what the model was fitted to.
+            where it is not known what the model was fitted to, and where the steps of the converter
+            hide it.
         fit_percent: NRMSE fit: 100 is perfect, 0 no better than the mean.
         rms_error: root mean square of measured minus predicted, in the unit of the output.
         inside_band: share of the samples inside the 95 % band; NaN where there is no band.
@@ -62,7 +63,7 @@ class Prediction:
         modelled: Sequence[Floats],
         half_band: Floats | None = None,
         *,
-        fitted_to: Fingerprint | None = None,
+        training_output: TrainingOutput | None = None,
     ) -> Prediction:
         """Judge the modelled outputs of some records.
 
@@ -70,11 +71,11 @@ class Prediction:
             measured: outputs of each record. Shape `(M_r,)` each.
             modelled: the same by the model. Shape `(M_r,)` each.
             half_band: half the width of the band, of all records. None: there is no band.
-            fitted_to: fingerprint of the outputs that the model was fitted to; None: not known.
+            training_output: what is kept of the outputs of the fit; None: not known.
         Returns:
             Both, with the error between them.
         """
-        used = math.nan if fitted_to is None else share_used(measured, fitted_to)
+        used = math.nan if training_output is None else share_used(measured, training_output)
         percent = fit_percent(measured, modelled)
         error = np.abs(np.concatenate(list(measured)) - np.concatenate(list(modelled)))
         half = np.zeros(0) if half_band is None else half_band
@@ -248,9 +249,9 @@ class RecordFit(Fit, Generic[Recorded]):
         return ()
 
     @property
-    def fingerprint(self) -> Fingerprint | None:
-        """Fingerprint of the outputs that the fit has used; None where it does not keep them."""
-        found = fingerprint(self.fitted_outputs, self.residuals)
+    def training_output(self) -> TrainingOutput | None:
+        """Hashes of the outputs that the fit has used; None where it does not keep them."""
+        found = hash_output(self.fitted_outputs, self.residuals)
         return found if found.hashes.size else None
 
     @abstractmethod
@@ -276,7 +277,7 @@ class RecordFit(Fit, Generic[Recorded]):
         self._require()
         pairs = [self._modelled(record) for record in several(records)]
         return Prediction.of(
-            [y for y, _ in pairs], [m for _, m in pairs], fitted_to=self.fingerprint
+            [y for y, _ in pairs], [m for _, m in pairs], training_output=self.training_output
         )
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import checked
-from haselab.identify.fingerprint import Fingerprint
 from haselab.identify.fit import Prediction, several
 from haselab.identify.record import Record
+from haselab.identify.training_output import TrainingOutput
 from haselab.models.plant import Plant
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
@@ -31,7 +31,7 @@ def predict(
     posterior: PlantPosterior | None = None,
     noise_std: float = 0.0,
     free_start: bool = True,
-    fitted_to: Fingerprint | None = None,
+    training_output: TrainingOutput | None = None,
     rng: np.random.Generator,
 ) -> Prediction:
     r"""Simulate records from their inputs and compare the result with their outputs.
@@ -47,7 +47,7 @@ def predict(
         posterior: of the model's parameters; None: no band.
         noise_std: root mean square of the residuals of the fit, in the unit of the output.
         free_start: fit initial state and constant; False: the record starts at 0 in steady state.
-        fitted_to: fingerprint of the outputs that the model was fitted to; None: not known.
+        training_output: what is kept of the outputs of the fit; None: not known.
         rng: random generator of the plants.
     Returns:
         The prediction.
@@ -67,7 +67,9 @@ def predict(
     if posterior is not None:
         spread = [_spread(posterior, record, free_start, rng) for record in records]
         half = _HALF_WIDTH * np.sqrt(np.concatenate(spread) ** 2 + noise_std**2)
-    return Prediction.of([record.y for record in records], modelled, half, fitted_to=fitted_to)
+    return Prediction.of(
+        [record.y for record in records], modelled, half, training_output=training_output
+    )
 
 
 def _spread(

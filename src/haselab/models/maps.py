@@ -88,7 +88,8 @@ class VoltageMap:
             >>> low, round(high, 4)
             (-0.05, 0.0692)
         """
-        grid = np.linspace(*strains, _REACH_POINTS)
+        zero = np.clip(0.0, *strains)  # not between two points, where it is the end of the range
+        grid = np.unique(np.append(np.linspace(*strains, _REACH_POINTS), zero))
         volt = self.voltage_v(grid)
         inside = grid[(volt >= low_v) & (volt <= high_v)]
         return (float(inside[0]), float(inside[-1])) if inside.size else None

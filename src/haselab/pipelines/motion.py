@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ __all__ = ["motion_of_session"]
 
 Floats = NDArray[np.float64]
 _SAME_S = 1e-7  # times closer than that are one
+_LARGE = 300.0  # step in codes, from which its own delay is known to less than a microsecond
 _EMPTY = 0.05  # inertia of an empty clamp, of the largest hung mass
 
 
@@ -35,6 +36,8 @@ class _Blocks:
     Args:
         spans_s: beginnings and ends of the samples that count, from a block's first one.
             Shape `(S, 2)`.
+        carrier_v: peak of the carrier at the actuator, by the voltage monitor; NaN if it was not
+            seen.
     """
 
     start_s: Floats
@@ -43,6 +46,8 @@ class _Blocks:
     capacitance_f: Floats
     std_f: Floats
     used: NDArray[np.bool_]
+    carrier_v: float
+    rise: Floats
 
 
 def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
@@ -71,7 +76,10 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
     records = [reader.experiment(name) for name in reader.names]
     records = [record for record in records if record.name != "particles"]
     blocks = {r.name: _sensed(reader, r, path, block_s) for r in records if len(r.codes)}
-    drive = _drive(conditions, blocks.values(), (block_s, switch_s), float(rig["amplifier_gain"]))
+    drive = _drive(
+        conditions, blocks.values(), _late_s(blocks.values(), rig["rate_hz"]),
+        (block_s, switch_s), float(rig["amplifier_gain"]),
+    )  # fmt: skip
     names = tuple(record.name for record in records)
     time_s, length_m, std_m, of_length = _lengths(records, float(rig["scale_m_per_px"]))
     inside = (time_s >= drive.edge_s[0]) & (time_s <= drive.edge_s[-1])
@@ -95,6 +103,7 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
         path.name, drive, time_s[chosen], length_m[chosen], std_m[chosen],
         np.concatenate(window), np.concatenate(window_of), np.concatenate(farad),
         np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
+        float(rig.get("exposure_s", 0.0)), float(rig["scale_m_per_px"]),
     )  # fmt: skip
 
 
@@ -123,9 +132,13 @@ def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s
     plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz
     used = sensed.valid & plain & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_std_f > 0)
     changes = np.flatnonzero(np.diff(np.pad(lockin.counted, 1).astype(np.int8)))
+    rig = reader.header["rig"]
+    volt_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]
+    carrier_v = 0.5 * volt_per_code * float(np.median(sensed.v_pp[used])) if used.any() else np.nan
     return _Blocks(
         record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
-        sensed.capacitance_f, sensed.capacitance_std_f, used,
+        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v,
+        _rise(record.codes[:, :, 0], lockin),
     )  # fmt: skip
 
 
@@ -157,6 +170,7 @@ def _lengths(
 def _drive(
     conditions: NDArray[np.void],
     blocks: Collection[_Blocks],
+    late_s: Sequence[Floats],
     timing_s: tuple[float, float],
     gain: float,
 ) -> Drive:
@@ -166,10 +180,10 @@ def _drive(
         (float(row["time_s"]), float(row["drive_v"])) for row in conditions
     ]
     edges = [conditions["time_s"]]
-    for part in blocks:
-        changes += [(float(t) + switch_s, float(v))
-                    for t, v in zip(part.start_s, part.drive_v, strict=True)]  # fmt: skip
-        edges += [part.start_s, part.start_s + switch_s, part.start_s + block_s]
+    for part, late in zip(blocks, late_s, strict=True):
+        acts_s = part.start_s + switch_s + late
+        changes += zip(acts_s.tolist(), part.drive_v.tolist(), strict=True)
+        edges += [part.start_s, acts_s, part.start_s + block_s]
         edges += [part.start_s + at_s for at_s in part.spans_s.ravel().tolist()]
     ramps = _ramp_edges(conditions)
     edge_s = np.sort(np.concatenate([*edges, ramps]))
@@ -180,10 +194,58 @@ def _drive(
     drive_v = change_v[np.searchsorted(change_s, middle_s, side="right") - 1]
     row = np.searchsorted(conditions["time_s"], middle_s, side="right") - 1
     pull_n = np.interp(middle_s, *_steps(conditions["time_s"], conditions["pull_n"]))
-    carrier_v = gain * conditions["carrier_v"][row]
+    carrier_v = _carrier_gain(conditions, blocks, gain) * conditions["carrier_v"][row]
     # nobody sees how fast an actuator without mass moves
     mass_kg = np.maximum(conditions["mass_kg"], _EMPTY * conditions["mass_kg"].max())[row]
     return Drive(edge_s, gain * drive_v, pull_n, mass_kg, 0.5 * carrier_v**2)
+
+
+def _carrier_gain(conditions: NDArray[np.void], blocks: Collection[_Blocks], gain: float) -> float:
+    """Of the amplifier at the carrier, in V/V: it resonates or falls there. By its monitor."""
+    found = []
+    for part in blocks:
+        row = np.searchsorted(conditions["time_s"], part.start_s[0], side="right") - 1
+        sent_v = float(conditions["carrier_v"][row])
+        if sent_v > 0.0 and np.isfinite(part.carrier_v):
+            found.append(part.carrier_v / sent_v)
+    return float(np.median(found)) if found else gain
+
+
+def _rise(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
+    """Change and area of the voltage monitor at each switch, and the same of its square.
+
+    The area is the sum of the samples after the switch, less what they reach.
+    """
+    first, end = lockin.config.blank
+    found = []
+    for power in (1, 2):
+        level = (codes[:, end:].astype(np.float64) ** power).mean(axis=1)
+        after = codes[1:, first:end].astype(np.float64) ** power
+        found += [np.diff(level), (after - level[1:, None]).sum(axis=1)]
+    change, area = found[:2]
+    found[1] = area - np.mean(area[np.abs(change) < _LARGE] if change.size else 0.0)
+    return np.stack(found)
+
+
+def _late_s(blocks: Collection[_Blocks], rate_hz: float) -> list[Floats]:
+    """By how much later than requested the voltage of each block acts, by the voltage monitor.
+
+    A large step takes the amplifier longer, up to its limits of current and slew rate; all others
+    are delayed equally.
+    """
+    rises = [part.rise for part in blocks]
+    small = [rise[:2, np.abs(rise[0]) < _LARGE] for rise in rises]
+    change, area = np.concatenate([np.zeros((2, 0)), *small], axis=1)
+    size = float(change @ change)
+    usual = -float(change @ area) / size if size > 0.0 else 0.5
+    found = []
+    for rise in rises:
+        late = np.full(rise.shape[1] + 1, usual)  # of the first block nobody knows the step
+        large = np.flatnonzero(np.abs(rise[0]) >= _LARGE)
+        late[1 + large] = -rise[3, large] / rise[2, large]
+        # the first sample still shows the voltage before: half an interval of the sums
+        found.append((late - 0.5) / rate_hz)
+    return found
 
 
 def _steps(time_s: Floats, values: Floats) -> tuple[Floats, Floats]:

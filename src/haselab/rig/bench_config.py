@@ -239,5 +239,6 @@ class BenchConfig(PrintableSection):
             scale_m_per_px=self.scale_m_per_px,
             mass_kg=self.specimen.mass_kg,
             amplifier=amplifier.name,
+            exposure_s=getattr(self.camera, "exposure_s", None) or 0.0,
             actuator_kind=self.specimen.kind,
         )

@@ -74,6 +74,7 @@ class RigDescription:
         mass_kg: mass hung on the lower clamp when a study begins.
         amplifier: make and number; a calibration of the monitors is valid only for this one.
         calibration: of the monitors; None: by the nominal gains.
+        exposure_s: of one frame; 0 if it is not known.
         actuator_kind: of the actuator, as in its actuator file.
     """
 
@@ -93,6 +94,7 @@ class RigDescription:
     mass_kg: float
     amplifier: str = ""
     calibration: MonitorCalibration | None = None
+    exposure_s: float = 0.0
     actuator_kind: str = PLANAR_HASEL
 
     @property

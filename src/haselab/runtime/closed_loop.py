@@ -162,4 +162,4 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         None if by_video else loop.strain_map.coefficients,
         0.5 * (range_f[0] + range_f[1]),
     )
-    return LoopWatchdog(model, settings.loop, settings.rating, rig.present_drive_v)
+    return LoopWatchdog(model, settings.loop, settings.rating, rig.settled_drive_v)

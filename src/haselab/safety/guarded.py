@@ -107,6 +107,11 @@ class GuardedRig(Rig):
         """Drive during the last block; if the requested one was late, the one still in force."""
         return self.bench.present_drive_v if self.controller is None else self.controller.output_v
 
+    @property
+    def settled_drive_v(self) -> float | None:
+        """Drive with which the actuator is in equilibrium; None if it may still be ringing."""
+        return self.present_drive_v if self.bench.is_settled else None
+
     def check_idle(self) -> None:
         """Check before energising that the link works and the monitor shows 0 V.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -38,6 +39,7 @@ __all__ = [
 ]
 
 _ROUNDING = 1.0 + 1e-9  # of a difference of two outputs
+_RINGING_S = 5.0  # after which 10 % are left at the reference study's 5.1 rad/s, damping 0.09
 _SETUP_S = 30.0  # longest time to set an instrument that has its own connection
 _MANUAL_S = 3600.0  # longest time for a person to hang a mass
 
@@ -56,6 +58,7 @@ class GuardedBench:
         self.requested_v = 0.0  # last accepted
         self.present_drive_v = 0.0  # in force during the last block
         self.time_s = 0.0
+        self.moved_s = -math.inf  # when drive or load last changed
         self.unbroken = False  # whether the next block has to follow without a gap
         self.found: dict[str, OutputState] = {}  # by instrument, since anything was energised
         self.asked_guardian = False  # since anything was energised
@@ -108,6 +111,11 @@ class GuardedBench:
         """Whether this program has deadlines; not if the rig has its own controller."""
         return self.safety.settings.real_time and self.rig.controller is None
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether drive and load have been constant for so long that the actuator hardly rings."""
+        return self.time_s - self.moved_s >= _RINGING_S
+
     def passed(self) -> None:
         """Note that time passed with the present output, and that blocks may be missing."""
         self.unbroken = False
@@ -154,6 +162,8 @@ class GuardedSource(_Part):
             b.safety.heartbeat(0.0)
         with b.calling():
             self._plain.write(voltage_v)
+        if voltage_v != b.requested_v:
+            b.moved_s = b.time_s
         b.requested_v = voltage_v
         b.answered()
 
@@ -162,6 +172,8 @@ class GuardedSource(_Part):
         try:
             self._plain.zero()
         finally:
+            if self._bench.requested_v != 0.0:
+                self._bench.moved_s = self._bench.time_s
             self._bench.requested_v = 0.0
             self._bench.passed()
 
@@ -348,6 +360,7 @@ class GuardedStand(_Part):
         self._bench.safety.heartbeat(_MANUAL_S)
         with self._bench.calling():
             self._plain.drop()
+        self._bench.moved_s = self._bench.time_s
 
     def wait(self, duration_s: float) -> None:
         """Wait; on a real-time rig, read and check the blocks meanwhile."""
@@ -361,4 +374,5 @@ class GuardedStand(_Part):
         b.safety.heartbeat(duration_s)
         with b.calling():
             self._plain.wait(duration_s)
+        b.time_s = b.rig.acquisition.time_s
         b.passed()

@@ -171,6 +171,8 @@ def _missing(model: type[BaseModel], fault: Any, data: Any, section: str) -> str
 
 def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
     """Describe an error, with the valid keys of the table."""
+    if fault["type"] == "model_type":
+        return f"Input should be a table, headed [{_path('', fault['loc'])}]"
     if fault["type"] != "extra_forbidden":
         return str(fault["msg"])
     table = _table_of(model, fault["loc"][:-1], data)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,6 +43,7 @@ _STUDIES = Path(__file__).parent / "studies"
 _name: Any = Field(description="title of the report", examples=["one triangle"])
 
 Table = TypeVar("Table", bound=Section)
+_Kind = TypeVar("_Kind", bound=Section)
 
 
 class _Head(Section):
@@ -191,7 +192,10 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     Raises:
         InputError: no such file, invalid TOML, an unknown key or a value out of range.
     """
-    data = _read(path, quick)
+    return _checked_file(path, quick, _study_of)
+
+
+def _study_of(data: Mapping[str, Any], path: Path) -> Study:
     if "step_trials" in data:
         raise InputError(
             'The study has a table [step_trials], which needs a rig with kind = "chip". '
@@ -225,6 +229,11 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
     """
     kinds = [name for name in EXPERIMENTS.packages() if name not in _Head.model_fields]
     fields = {*_Head.model_fields, *kinds}
+    if loose := sorted(key for key in set(data) - fields if not isinstance(data[key], Mapping)):
+        raise InputError(
+            f"The study has the key {loose[0]} outside its tables, where only name may be. Write "
+            f"it below the heading of its table, such as [{kinds[0]}]. {source}"
+        )
     if unknown := sorted(set(data) - fields):
         close = difflib.get_close_matches(unknown[0], fields, 1)
         meant = f" Did you mean [{close[0]}]?" if close else ""
@@ -253,7 +262,10 @@ def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:
     Raises:
         InputError: see `load_study`.
     """
-    data = _read(path, quick)
+    return _checked_file(path, quick, _step_study_of)
+
+
+def _step_study_of(data: Mapping[str, Any], path: Path) -> StepStudy:
     if "step_trials" not in data:
         raise InputError(
             "The study has no table [step_trials] (step, zero_s, step_s, rest_s, frame_rate_hz, "
@@ -275,12 +287,21 @@ def step_study_of(study: Study, *, quick: bool = False) -> StepStudy:
     return steps.model_copy(update={"step_trials": trials})
 
 
-def _read(path: Path, quick: bool) -> dict[str, Any]:
+def _checked_file(
+    path: Path, quick: bool, check: Callable[[Mapping[str, Any], Path], _Kind]
+) -> _Kind:
+    """Read a study and check it, and its table `quick` also if it is not applied."""
     data = read_toml(path, "study")
     changes = data.pop("quick", {})
     if not isinstance(changes, dict):
         raise InputError(f"The study's quick is not a table. Write it under [quick.TABLE]. {path}")
-    return _merged(data, changes) if quick else data
+    study = check(_merged(data, changes) if quick else data, path)
+    if changes and not quick:
+        try:
+            check(_merged(data, changes), path)
+        except InputError as error:
+            raise InputError(f"With the changes of [quick]: {error}") from None
+    return study
 
 
 def builtin_study(*, quick: bool = False) -> Study:

@@ -9,6 +9,7 @@ from typing import Any
 
 from haselab.base import JsonObject, table_at
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
+from haselab.models.maps import VoltageMap
 from haselab.rig.protocols import PLANAR_HASEL
 from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.claim import refuse_linked_folders
@@ -37,7 +38,7 @@ _FOUND: Mapping[type, tuple[str, ...]] = {  # sections by the type of the findin
 # Keys of a model and a design that are removed from the file that the run started from.
 _OF_AN_OLDER_MODEL = (
     "poles", "zeros", "numerator", "denominator", "slow_modes", "delay_s", "fit_percent",
-    "fitted_to", "input_unit", "output_unit",
+    "fitted_to", "training_output", "input_unit", "output_unit",
 )  # fmt: skip
 _OF_AN_OLDER_DESIGN = ("name", "predicted", "plausible", "uncertainty")
 _START = """\
@@ -211,6 +212,8 @@ def write_design(
         sections["model"] = _model(dynamics, loops, maps)
     if loops is not None:
         sections["controller"] = _controllers(loops, study.control)
+    elif maps is not None and drive_limits is not None and not path.exists():
+        sections["controller"] = _own_alone(study, maps.voltage_map, drive_limits)
     if drive_limits is not None:
         sections["drive"] = {"low_v": drive_limits[0], "high_v": drive_limits[1]}
     if not path.exists():
@@ -239,6 +242,20 @@ def _model(dynamics: Dynamics, loops: Loops | None, maps: Maps | None) -> Mappin
         else (to_volt.a1_v, to_volt.b1, to_volt.a2_v, to_volt.b2),
         "covariance": dynamics.posterior.to_dict(),
     }
+
+
+def _own_alone(
+    study: Study, to_volt: VoltageMap, drive_limits: tuple[float, float]
+) -> Mapping[str, object]:
+    """The study's own controller as an alternative, where the study designs no other one."""
+    control = study.control if study.has("control") else Control()
+    if control.kind is None:
+        return {}
+    wanted = (control.saturation_low, control.saturation_high)
+    low, high = to_volt.reach(wanted, *drive_limits) or wanted
+    limits = {"low": low, "high": high}
+    own = {"kind": control.kind, "parameters": control.parameters, "limits": limits}
+    return {"alternatives": [own]}
 
 
 def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:

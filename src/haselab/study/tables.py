@@ -51,8 +51,8 @@ class OperatingPoint(Section):
         None,
         ge=-100,
         le=100,
-        description="drive of zero strain; if left out, the voltage that centres the strain in the "
-        "longest linear region, or else the middle of the triangle",
+        description="drive of zero strain; if left out, the voltage at which the stretch is in the "
+        "middle of the longest linear region of the load curve, or else the middle of the triangle",
     )
 
 
@@ -181,7 +181,8 @@ class Steps(Section):
         2,
         ge=1,
         le=1000,
-        description="trials with the controller of [control], if it has a kind",
+        description="trials with the controller of [control], if it has a kind, or with that of "
+        "--actuator",
     )
     feedback: Literal["capacitance", "video"] = Field(
         "capacitance", description="sensor of the closed loops: self-sensing or the camera"

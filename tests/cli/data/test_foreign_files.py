@@ -404,6 +404,11 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
         (),
         "Column time_s does not increase after row 2 (step of 0 s). Sort the rows",
     ),
+    "times in V": (
+        "time [V];u;y\n1;2;3\n2;3;4\n",
+        (),
+        "no sampling rate. Column time [V] states a unit that is not a time. Add --rate-hz",
+    ),
     "perhaps times": (
         "t;u;y\n1;1;2\n2;3;1\n2;2;2\n",
         (),

@@ -111,6 +111,19 @@ def test_the_rate_of_the_file_is_used_when_none_is_given(
     assert set(COLUMNS) <= set(answer)
 
 
+def test_scales_that_nobody_stated_are_named(
+    tmp_path: Path, record: np.ndarray, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half the scale of the voltage is twice the capacitance, which looks as good."""
+    path = write_csv(tmp_path / "record.csv", record)
+    options = ["sense", path, "--carrier-hz", 2000, "--rate-hz", 200000]
+    assert run(*options) == 0
+    assert "no scale of the voltage monitor is stated" in capsys.readouterr().err
+    scale = ["--volt-per-monitor-volt", 5000, "--ampere-per-monitor-volt", 0.002]
+    assert run(*options, *scale) == 0
+    assert "no scale" not in capsys.readouterr().err
+
+
 def test_a_block_without_carrier_is_marked_and_the_others_are_kept(
     record: np.ndarray, tmp_path: Path
 ) -> None:

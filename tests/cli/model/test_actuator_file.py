@@ -213,16 +213,34 @@ def test_a_record_that_contains_the_one_of_the_fit_has_its_share(known, tmp_path
     assert code == 3
 
 
-def test_the_fingerprint_of_an_older_version_is_not_used(known, tmp_path, capsys):
+def test_the_hashes_of_an_older_version_are_not_used(known, tmp_path, capsys):
     actuator, first, _ = known
     old = tmp_path / "old.toml"
     text = actuator.read_text()
-    a, b = text.index("[model.fitted_to]"), text.index("[", text.index("hashes =") + 10)
+    a, b = text.index("[model.training_output]"), text.index("[", text.index("hashes =") + 10)
     hashes = re.search(r"hashes = (\[.*?\])", text, re.DOTALL)[1]
-    old.write_text(text[:a].replace("[model]\n", f"[model]\nfitted_to = {hashes}\n") + text[b:])
+    table = f"[model.fitted_to]\nstep = 1e-4\nhashes = {hashes}\n"
+    old.write_text(text[:a] + table + text[b:])
     code, text, error = run(capsys, "compare", old, first, "--json")
     assert code == 0 and json.loads(text)["used_for_fit"] is None
     assert "warning: the model does not state the samples that it was fitted to" in error
+
+
+def test_a_repetition_with_a_coarse_converter_is_no_copy(files, tmp_path, capsys):
+    actuator, first, _ = files
+    again, rng = tmp_path / "again.csv", np.random.default_rng(4)
+    rows = np.loadtxt(first, delimiter=",", skiprows=1)
+    clean = TRUTH.simulate(rows[:, 1], RATE_HZ, rows[:, 0])
+    lsb = 0.01 * np.std(clean)  # ten times the noise
+    for path in (first, again):
+        rows[:, 2] = lsb * np.round(clean / lsb + 0.1 * rng.normal(size=len(rows)))
+        np.savetxt(path, rows, "%.9g", ",", header="time_s,u,y", comments="")
+    assert run(capsys, "identify", "transfer", first, "--actuator", actuator)[0] == 0
+    code, text, error = run(capsys, "compare", actuator, again, "--json")
+    assert (code, json.loads(text)["used_for_fit"]) == (0, None)
+    assert "it can be a copy or a repetition. Use a record with another input" in error
+    rewritten(tmp_path / "copy.csv", first, fmt="%.6g", delimiter=",", header="time_s,u,y")
+    assert run(capsys, "compare", actuator, tmp_path / "copy.csv")[0] == 3
 
 
 def test_a_prediction_worse_than_the_mean_is_not_ok(known, tmp_path, capsys):
@@ -424,6 +442,12 @@ def test_the_highest_field_lowers_the_limits_of_a_design(known, capsys):
     assert run(capsys, "design", actuator)[0] == 0
     limits = tomllib.loads(actuator.read_text())["controller"]["limits"]
     assert limits["high"] == pytest.approx(0.0692, abs=2e-4)
+
+
+def test_init_states_the_gain_of_the_amplifier(tmp_path, capsys):
+    path = tmp_path / "a.toml"
+    assert run(capsys, "init", "leg", "--gain-v-per-v", "1000", "--out", path)[0] == 0
+    assert tomllib.loads(path.read_text())["drive"]["gain_v_per_v"] == 1000.0
 
 
 def test_compare_draws_the_prediction_with_its_band(known, capsys, tmp_path):

@@ -102,6 +102,54 @@ def test_gains_changed_by_hand_do_not_have_the_margins_of_the_design(
 
 
 @pytest.mark.parametrize(
+    ("key", "factor", "said"),
+    [
+        ("delay_margin_s", 1.1, "a delay margin of"),
+        ("peak_sensitivity", 0.9, "a peak sensitivity of"),
+        ("crossover_rad_s", 1.1, "a crossover at"),
+        ("worst_phase_margin_deg", 1.1, "a worst phase margin of"),
+        ("worst_gain_margin_db", 2.0, "a worst gain margin of"),
+    ],
+)
+def test_every_stated_margin_is_verified(
+    leg: Path, capsys: pytest.CaptureFixture[str], key: str, factor: float, said: str
+) -> None:
+    value = tomllib.loads(leg.read_text())["controller"]["margins"][key]
+    changed(leg, (f"\n{key} = {value!r}\n", f"\n{key} = {factor * value!r}\n"))
+    code, error = built(capsys, leg)
+    assert code == 2 and f"[controller] states {said} {factor * value:.3g}" in error
+    assert f"the pid has {said} {value:.3g}" in error
+
+
+def test_a_misspelled_margin_is_named(leg: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changed(
+        leg, ("[controller.margins]\nphase_margin_deg", "[controller.margins]\nphase_margin_dg")
+    )
+    _, _, warning = run(capsys, "report", leg, "--json")
+    said = "[controller.margins] phase_margin_dg has no effect; did you mean phase_margin_deg?"
+    assert warning == f"haselab: warning: {said} {leg}\n"
+
+
+def test_a_changed_delay_of_the_loop_is_noticed(
+    leg: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed(leg, ("loop_delay_s = 0.0075", "loop_delay_s = 0.02"))
+    true = json.loads(run(capsys, "margins", leg, "--delay-s", "0.02", "--json")[1])
+    _, out, warning = run(capsys, "report", leg, "--json")
+    assert warning == f"haselab: warning: {json.loads(out)['doubts']['controller']}\n"
+    assert "was designed for a loop delay of 0.0075 s, but [model] states loop_delay_s" in warning
+    assert f"it has a phase margin of {true['phase_margin_deg']:.3g} deg instead of" in warning
+    changed(leg, ("loop_delay_s = 0.02", "loop_delay_s = 0.00751"))  # the margins are the same
+    assert run(capsys, "report", leg)[2] == ""
+    changed(leg, ("loop_delay_s = 0.00751", "loop_delay_s = 0.02"))
+    assert run(capsys, "design", leg)[0] == 0
+    assert run(capsys, "report", leg)[2] == ""
+    arguments = ("--rate-hz", 1000, "--delay-s", 0.0018, "--accept-shortfalls")
+    assert run(capsys, "design", leg, *arguments)[0] == 0  # another rate has its own delay
+    assert run(capsys, "report", leg)[2] == ""
+
+
+@pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         ("ki = ", "Ki = ", "[controller.parameters] lacks ki, has the key Ki"),
@@ -183,7 +231,7 @@ def test_a_model_identified_through_another_voltage_map_is_refused(
 def test_a_run_with_such_a_file_warns_before_it_plays(
     leg: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    changed(leg, OTHER)
+    changed(leg, OTHER, ("loop_delay_s = 0.0075", "loop_delay_s = 0.02"))
     study, rig = tmp_path / "study.toml", tmp_path / "rig.toml"
     rig.write_text('kind = "twin"\n')
     study.write_text(
@@ -192,6 +240,7 @@ def test_a_run_with_such_a_file_warns_before_it_plays(
     )
     arguments = ("--rig", rig, "--actuator", leg, "--out", tmp_path / "out")
     code, _, error = run(capsys, "run", study, *arguments)
-    warning, refusal = error.splitlines()
+    warning, delay, refusal = error.splitlines()
+    assert delay.startswith("haselab: warning: The pid was designed for a loop delay of 0.0075 s")
     assert warning.startswith("haselab: warning: [controller] states a phase margin of")
     assert code == 2 and "is outside [0, 1.8] V" in refusal

@@ -175,6 +175,11 @@ frame_rate_hz = 100.0
          "The triangle gives only 6 frames on each edge within 0.06 V of the baseline of 1 V"),
         ("[triangle]", "[operating_point]\nbaseline_v = 2.1\n[triangle]",
          "only 0 frames on each edge within 0.06 V of the baseline of 2.1 V"),
+        # The window is 3 % of the span, so a larger span neither gives frames nor takes them away.
+        ("high_v = 2.0\nfrequency_hz = 0.5", "high_v = 10.0\nfrequency_hz = 1.0",
+         "only 6 frames on each edge within 0.3 V of the baseline of 5 V"),
+        ("[triangle]", "hold_s = 3\n[triangle]", "has the key hold_s outside its tables"),
+        ("[triangle]", "chirp = 3\n[triangle]", "chirp: Input should be a table, headed [chirp]"),
         ("left_out_cycles = 1", "left_out_cycles = 3",
          "left_out_cycles = 3 must be below cycles = 3"),
         ("high_v = 2.0", "high_v = 0.0", "low_v = 0 must be below high_v = 0"),
@@ -196,8 +201,36 @@ def test_a_triangle_without_a_result_is_refused_before_anything_moves(
     assert str(study) in error and not (tmp_path / "out").exists()
 
 
-def test_a_triangle_with_just_enough_frames_is_feasible(tmp_path: Path) -> None:
-    (tmp_path / "study.toml").write_text(TRIANGLE)
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("[quick.triangle]\nframe_rate_hz = -1.0", "triangle.frame_rate_hz"),
+        ("[quick.trangle]\ncycles = 4", "has a table [trangle], but no installed experiment"),
+        ("[quick.triangle]\ncycle = 4", "triangle.cycle: no such key"),
+        ("[quick.triangle]\nframe_rate_hz = 50.0", "The triangle gives only 6 frames"),
+    ],
+)
+def test_the_quick_tables_are_checked_without_quick(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, words: str
+) -> None:
+    study, rig = tmp_path / "study.toml", tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+    study.write_text(f"{TRIANGLE}{table}\n")
+    with pytest.raises(SystemExit) as stop:
+        main(["plan", "feasibility", str(study), "--rig", str(rig)])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and error.count("\n") == 1
+    assert error.startswith("haselab: With the changes of [quick]: ") and words in error
+    study.write_text(f"{TRIANGLE}[quick.triangle]\ncycles = 4\n")
+    with pytest.raises(SystemExit) as stop:
+        main(["plan", "feasibility", str(study), "--rig", str(rig)])
+    assert stop.value.code == 0
+
+
+@pytest.mark.parametrize("high_v", [0.5, 2.0, 10.0])
+def test_a_triangle_with_just_enough_frames_is_feasible(tmp_path: Path, high_v: float) -> None:
+    text = TRIANGLE.replace("high_v = 2.0", f"high_v = {high_v}")
+    (tmp_path / "study.toml").write_text(text.replace("100.0", "67.0"))
     check_settings(load_study(tmp_path / "study.toml"))
 
 

@@ -51,10 +51,10 @@ def reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_page_has_what_is_run_here() -> None:
-    assert (len(PYTHON), len(COMMANDS)) == (3, 5)
+    assert (len(PYTHON), len(COMMANDS)) == (4, 5)
 
 
-@pytest.mark.parametrize("code", PYTHON, ids=["frames", "follow", "xarray"])
+@pytest.mark.parametrize("code", PYTHON, ids=["load", "frames", "follow", "xarray"])
 def test_each_piece_of_python_runs(code: str) -> None:
     if "xarray" in code:
         pytest.importorskip("xarray")

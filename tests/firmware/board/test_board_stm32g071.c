@@ -172,7 +172,7 @@ static int frames_with_slips(int frames)
     for (; frames > 0; --frames) {
         board_done(number);
         number = board_wait(number, &in);
-        slips += (in.alarms & HP_ALARM_SLIP) != 0;
+        slips += (in.alarms & HP_ALARM_LOST_SAMPLE) != 0;
     }
     return slips;
 }

@@ -17,6 +17,7 @@ from haselab.actuators import (
 )
 from haselab.base import InputError
 from haselab.identify.physical import MotionRecord, fit_actuator
+from haselab.identify.physical.misfit import SHARED_PX, SharedErrors
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
 MASS_KG = 0.25
@@ -79,13 +80,14 @@ START = with_parameters(
 def test_parameters_are_found_within_their_intervals():
     fit = fit_actuator(START, [record(TRUE, 1), record(TRUE, 2)], mass_kg=MASS_KG)
     assert fit.status == "ok"
-    truth = {**fitted_parameters(TRUE), ADDED_INERTIA: 0.0, "sensing.scale": 1.0}
+    ones = {"camera.scale": 1.0, "sensing.scale": 1.0}
+    truth = {**fitted_parameters(TRUE), ADDED_INERTIA: 0.0, **ones}
     far = []
     for name, found in fit.parameters.items():
         true, (low, high) = truth.get(name, 0.0), found.ci95
         half = high - found.value if true > found.value else found.value - low
         far.append((true - found.value) / half)
-    # 22 correlated numbers: one in 20 is outside by chance, by twice as far one in 10,000
+    # 23 correlated numbers: one in 20 is outside by chance, by twice as far one in 10,000
     assert np.mean(np.abs(far) < 1.0) > 0.8 and np.abs(far).max() < 2.0, dict(
         zip(fit.parameters, far, strict=True)
     )
@@ -127,7 +129,7 @@ def test_a_wrong_mass_gives_no_numbers():
     assert "Check the mass" in found
 
 
-@given(st.lists(st.floats(-0.3, 0.3), min_size=22, max_size=22))
+@given(st.lists(st.floats(-0.3, 0.3), min_size=23, max_size=23))
 def test_what_varies_is_the_distance(steps):
     start = Unknowns.of(TRUE, added_inertia_kg=0.01, mass_kg=MASS_KG)
     step = 0.5 * np.array(steps) * start.widths
@@ -141,3 +143,20 @@ def test_what_varies_is_the_distance(steps):
 def test_no_record_is_refused():
     with pytest.raises(InputError, match=r"There is no record of the actuator's motion"):
         fit_actuator(TRUE, [], mass_kg=MASS_KG)
+
+
+@given(st.lists(st.floats(0.03, 0.05), min_size=3, max_size=20), st.floats(1e-7, 1e-5))
+def test_shared_errors_of_tracking_are_whitened(lengths, std_m):
+    count = len(lengths)
+    stds = np.linspace(std_m, 2.0 * std_m, count)
+    seen = replace(
+        record(TRUE, duration_s=0.05), length_time_s=np.arange(count) * 1e-3,
+        length_m=np.array(lengths), length_std_m=stds, length_experiment=np.zeros(count, int),
+        pixel_m=3e-3,
+    )  # fmt: skip
+    white = SharedErrors.of(seen, stds).whitened(np.eye(count))
+    pixel = np.floor(seen.length_m / seen.pixel_m)
+    shared = (SHARED_PX * seen.pixel_m) ** 2 * (pixel[:, None] == pixel)
+    covariance = np.diag(stds**2) + shared
+    both = white @ (covariance / np.outer(stds, stds)) @ white.T
+    np.testing.assert_allclose(both, np.eye(count), atol=1e-6)

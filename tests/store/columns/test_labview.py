@@ -38,8 +38,7 @@ def read(folder, content, options=None):
 
 @pytest.mark.parametrize("columns", ["One", "Multi", "No"])
 def test_each_channel_is_converted_from_its_own_unit(tmp_path, columns):
-    options = ColumnOptions("1") if columns == "Multi" else ColumnOptions()
-    table = read(tmp_path, text(columns), options)
+    table = read(tmp_path, text(columns))
     np.testing.assert_allclose(table["u"], U, rtol=1e-12)
     np.testing.assert_array_equal(table["y"], Y)
     assert {name: unit.symbol for name, unit in table.units.items()} == {"u": "mV", "y": "V"}
@@ -57,6 +56,17 @@ def test_an_x_axis_that_is_no_time_gives_no_rate(tmp_path):
         assert read(tmp_path, frequency).rate_hz is None
     milliseconds = text("One", labels="X_Unit_Label\tms\tms\n")
     assert read(tmp_path, milliseconds).rate_hz == pytest.approx(1e5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("Delta_X\t0.01\t\t0.01", "Delta_X\t0.01\t\t0.02"), ("X0\t0\t\t0", "X0\t0\t\t3")],
+)
+def test_channels_with_times_of_their_own_need_the_column_of_times(tmp_path, old, new):
+    own = text("Multi").replace(old, new)
+    assert read(tmp_path, own).rate_hz is None
+    assert read(tmp_path, own, ColumnOptions("1")).rate_hz == pytest.approx(100.0)
+    assert read(tmp_path, text("Multi"), ColumnOptions("3")).rate_hz == pytest.approx(100.0)
 
 
 def test_an_unknown_unit_of_a_channel_is_refused_and_can_be_stated(tmp_path):

@@ -27,7 +27,7 @@ from haselab.store.session.tail import TailReader
 
 BLOCKS, SAMPLES, PAGE = 56, 400, 4096
 WRITTEN, TRUNCATED, ALLOCATED, SAID = range(4)
-METADATA = (b"OHDR", b"OCHK", b"EAHD", b"EAIB", b"EASB", b"EADB")
+METADATA = (b"OHDR", b"OCHK", b"EAHD", b"EAIB", b"EASB", b"EADB", b"BTHD", b"BTIN", b"BTLF")
 # The ring has 4 chunks of 10 blocks, so that blocks replace others in it. A short sleep lets the
 # thread that packs chunks write between two blocks.
 _WRITER = """
@@ -37,9 +37,10 @@ _WRITER = """
     from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionWriter
 
     path, blocks, samples = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    header = {"rig": {"rate_hz": float(sys.argv[4])}} if sys.argv[4:] else {}
     rng = np.random.default_rng(1)
     plans = [ExperimentPlan("a", "chirp", 6, {})]
-    session = SessionWriter(path, plans, samples, {}, QueueRule(chunks=1))
+    session = SessionWriter(path, plans, samples, header, QueueRule(chunks=1))
     session.event(0.0, "start a")
     for k in range(blocks):
         codes = rng.integers(-9000, 9000, (samples, 2), dtype=np.int16)
@@ -89,13 +90,20 @@ def parsed(log: bytes) -> Iterator[Call]:
         place += stored
 
 
-@pytest.fixture(scope="module")
-def calls(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
+# Blocks of 0.1 s are chunks of their own: the index of 51 chunks is one node of HDF5's tree, and
+# that of more is split.
+@pytest.fixture(scope="module", params=[(), (10.0 * SAMPLES,)], ids=["10 blocks", "1 block"])
+def calls(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
     """All calls of a writer that is killed after its last block."""
+    return recorded_calls(tmp_path_factory, BLOCKS, SAMPLES, *request.param)
+
+
+def recorded_calls(factory: pytest.TempPathFactory, *arguments: float) -> list[Call]:
+    """All calls of a writer: blocks, samples of each and, if it is not unknown, the rate."""
     compiler = shutil.which("cc")
     if compiler is None or sys.platform != "linux":
         pytest.skip("recording the writes needs Linux and a C compiler")
-    folder = tmp_path_factory.mktemp("recorded")
+    folder = factory.mktemp("recorded")
     library, path = folder / "record.so", folder / "s.h5"
     source = Path(__file__).with_name("record_writes.c")
     subprocess.run(
@@ -105,7 +113,7 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
     recorded = {"LD_PRELOAD": str(library), "RECORDED_FILE": str(path.resolve()),
                 "RECORDED_LOG": str(folder / "log")}  # fmt: skip
     subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(_WRITER), path, str(BLOCKS), str(SAMPLES)],
+        [sys.executable, "-c", textwrap.dedent(_WRITER), path, *map(str, arguments)],
         check=True, env=os.environ | recorded, stdout=subprocess.DEVNULL, timeout=120,
     )  # fmt: skip
     found = list(parsed((folder / "log").read_bytes()))
@@ -117,8 +125,13 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
 
 
 def states(calls: list[Call]) -> Iterator[tuple[int, bytearray]]:
-    """Acknowledged blocks and file of each state that a kill may leave, from the first block on."""
-    start = next(k for k, call in enumerate(calls) if call.kind == SAID)
+    """Acknowledged blocks and file of each state that a kill may leave.
+
+    From the first block on; from where the index is about to be split, if each block is a chunk.
+    """
+    said = [k for k, call in enumerate(calls) if call.kind == SAID]
+    nodes = sum(call.data[:4] == b"BTLF" for call in calls)
+    start = said[48 if nodes >= BLOCKS else 0]
     for end in range(start, len(calls)):
         done = calls[: end + 1]
         said = sum(call.kind == SAID for call in done)
@@ -160,17 +173,31 @@ def test_a_kill_at_any_moment_loses_no_block_and_leaves_a_readable_session(
         assert said <= len(record.codes) <= said + 1
         np.testing.assert_array_equal(record.codes, codes[: len(record.codes)])
         count += 1
-    assert count > 2 * BLOCKS
+    assert count > BLOCKS
 
 
 @pytest.mark.long
 def test_no_record_of_hdf5_and_no_number_of_a_slot_lies_across_two_pages(calls: list[Call]) -> None:
     """Else a kill between the two pages would leave a checksum that does not match."""
+    written = after_the_first_block(calls)
+    slot = 56 + 4 * SAMPLES
+    places = {call.offset % 8 for call in written if call.length == slot}
+    assert places == {0}
+
+
+def after_the_first_block(calls: list[Call]) -> list[Call]:
+    """What was written; no record of HDF5 in it lies across two pages."""
     start = next(k for k, call in enumerate(calls) if call.kind == SAID)
     written = [call for call in calls[start:] if call.kind == WRITTEN]
     records = [call for call in written if call.data[:4] in METADATA]
     assert len(records) > 10
     assert all(call.cuts() == [0] for call in records)
-    slot = 56 + 4 * SAMPLES
-    places = {call.offset % 8 for call in written if call.length == slot}
-    assert places == {0}
+    return written
+
+
+@pytest.mark.long
+def test_the_index_of_a_long_recording_lies_in_single_pages(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """205 s: the index was an array whose parts then exceeded a page."""
+    after_the_first_block(recorded_calls(tmp_path_factory, 2100, 20_000, 2e5))

@@ -18,7 +18,7 @@ def cycles_of(count: int, left_out: int) -> Cycles:
     time_s = np.linspace(0.0, count, 100 * count + 1)
     length_m = 1.0 + 0.1 * (1.0 - np.abs(2.0 * (time_s % 1.0) - 1.0)) + 1e-3 * time_s
     seen: Any = SimpleNamespace(frame_time_s=time_s, length_m=length_m)
-    return Cycles(seen, np.arange(count + 1.0), left_out, describe(TwinConfig()))
+    return Cycles(seen, np.arange(count + 1.0), left_out, 0.06, describe(TwinConfig()))
 
 
 def test_one_kept_cycle_has_no_drift():

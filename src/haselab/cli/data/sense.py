@@ -299,6 +299,13 @@ def _sense(
             f"monitor output, but is treated as volts at the monitors. {_ALREADY_SCALED}.",
             err=True,
         )
+    elif plain and request.method != "paper":
+        click.echo(
+            "haselab: no scale of the voltage monitor is stated, so that of the reference study is "
+            "used: 5000 V/V. For another amplifier, state --volt-per-monitor-volt and "
+            "--ampere-per-monitor-volt (0.002 A/V).",
+            err=True,
+        )
     save_plot(plot, lambda: _chart(collected, path))
     answer = summary.answer(request.method)
     if doubt:

@@ -38,8 +38,8 @@ def actuator(
     """Identify a physical model from everything recorded.
 
     SESSIONS are folders of runs or their session.h5, all of one actuator. Lengths and
-    capacitances of all experiments are compared with one simulated motion. The kind, what was
-    measured otherwise, such as a width, and where to start come from [actuator].
+    capacitances of all experiments are compared with one simulated motion. [actuator] gives
+    the kind, the parameters that were measured otherwise, such as a width, and the starting values.
     """
     if actuator is None:
         raise InputError(

@@ -320,7 +320,7 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
             f"--rate-hz: {file}"
         )
     if rate_hz is None:
-        why = f" Column {table.not_rising} does not rise everywhere." if table.not_rising else ""
+        why = f" {table.why_no_times}" if table.why_no_times else ""
         raise InputError(
             f"The file states no sampling rate.{why} Add --rate-hz, name the column of the times "
             f"with --time, or add a line '# rate_hz = ...': {file}"

@@ -82,9 +82,9 @@ def command(
 ) -> None:
     """Design the drive signal of the next experiment.
 
-    It separates candidate models, or reduces the confidence interval of a parameter, as well as the
-    limits of the bench permit. MODEL is a JSON answer of `identify verdict` or `identify transfer`,
-    or the model.json of a run.
+    Within the limits of the bench, the signal separates candidate models, or reduces the confidence
+    interval of a parameter, as well as possible. MODEL is a JSON answer of `identify verdict` or
+    `identify transfer`, or the model.json of a run.
     """
     plant = _plant(model, options["baseline_v"])
     if goal not in goals_of(plant):

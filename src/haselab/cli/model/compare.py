@@ -27,10 +27,10 @@ from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_origin, read_posterior
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.identify.fingerprint import Fingerprint
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import predict
 from haselab.identify.record import Record
+from haselab.identify.training_output import TrainingOutput
 from haselab.models.actuator.model_tables import OriginTable
 from haselab.store.columns.selection import ColumnOptions
 
@@ -73,8 +73,9 @@ def command(
     and the share of samples inside the 95 % band. It first estimates the initial state and the
     offset of each record, unless --at-rest is given. Samples that were used for the fit are
     recognised by their values, also in a part of a record, in another format and with fewer digits.
-    Their share is used_for_fit. The exit code is 3 if this share is above 5 %, or if the prediction
-    is worse than the mean of the record.
+    Their share is used_for_fit; it is null if the steps of the converter hide whether the record is
+    a copy or a repetition. The exit code is 3 if this share is above 5 %, or if the prediction is
+    worse than the mean of the record.
     """
     plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
     through = model if through_voltage_map else None
@@ -91,15 +92,19 @@ def command(
             posterior=posterior,
             noise_std=origin.residual_std,
             free_start=not at_rest,
-            fitted_to=_fingerprint(origin),
+            training_output=_training_output(origin),
             rng=np.random.default_rng(seed),
         )
-    if origin.fitted_to is None:
-        click.echo(
-            "haselab: warning: the model does not state the samples that it was fitted to. Whether "
-            f"this record is new was not checked. {model}",
-            err=True,
+    if math.isnan(prediction.used_for_fit):
+        why = (
+            "the model does not state the samples that it was fitted to. Whether this record is "
+            "new was not checked"
+            if origin.training_output is None
+            else "part of this record has the same values as the record of the fit. The steps of "
+            "the converter are larger than the noise, so it can be a copy or a repetition. "
+            "Use a record with another input"
         )
+        click.echo(f"haselab: warning: {why}. {model}", err=True)
     emit(_answer(prediction, posterior is not None), as_json=as_json, out=out)
     names = ", ".join(file.name for file in files)
     title = f"Prediction of {names}: {prediction.fit_percent:.1f} %"
@@ -108,9 +113,11 @@ def command(
         raise ResultError(f"{prediction.status}. {' '.join(map(str, files))}")
 
 
-def _fingerprint(origin: OriginTable) -> Fingerprint | None:
-    known = origin.fitted_to
-    return None if known is None else Fingerprint(known.step, np.array(known.hashes, np.uint64))
+def _training_output(origin: OriginTable) -> TrainingOutput | None:
+    known = origin.training_output
+    if known is None:
+        return None
+    return TrainingOutput(known.cell, np.array(known.hashes, np.uint64), known.quantised)
 
 
 def _check_units(

@@ -40,7 +40,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
 {low}  # V, lowest drive voltage, before the amplifier
 {high}  # V, highest
 # amplifier = "name"
-# gain_v_per_v = 5000.0
+{gain}  # of the amplifier
 # highest_field_v_per_m = 2e7  # in gap_m; lowers high_v where that would be more
 # haselab identify voltage-map writes the map from strain to drive voltage. To type it:
 # voltage_map = {{a1_v = 1.324, b1 = 3.124, a2_v = -0.2805, b2 = -26.92}}
@@ -76,6 +76,11 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
 @click.option("--high-v", type=REAL,
               help="Write the highest drive voltage, before the amplifier, in V. Default: as a "
               "comment.")  # fmt: skip
+@click.option(
+    "--gain-v-per-v",
+    type=POSITIVE,
+    help="Write the gain of the amplifier in V/V. Default: as a comment.",
+)
 @answer_options(None, "An actuator file, for example leg.toml.  [required]")
 def command(
     name: str,
@@ -84,6 +89,7 @@ def command(
     zero_length_m: float | None,
     low_v: float,
     high_v: float | None,
+    gain_v_per_v: float | None,
     *,
     as_json: bool,
     out: Path | None,
@@ -103,6 +109,7 @@ def command(
         zero=_line("zero_length_m", zero_length_m, 0.05),
         low=_line("low_v", low_v, 0.0),
         high=_line("high_v", high_v, 2.0),
+        gain=_line("gain_v_per_v", gain_v_per_v, 5000.0),
     )
     for doubt in unknown_kind(kind):
         click.echo(f"haselab: warning: {doubt}", err=True)

@@ -22,7 +22,7 @@ __all__ = ["CONTROLLER_KEYS", "MODEL_KEYS", "controller_section", "limits_of", "
 MODEL_KEYS = (
     "gain", "natural_frequency_rad_s", "damping_ratio", "delay_s", "slow_modes", "poles", "zeros",
     "numerator", "denominator", "covariance", "residual_std", "fit_percent", "input", "output",
-    "input_unit", "output_unit", "fitted_to", "through_voltage_map",
+    "input_unit", "output_unit", "training_output", "fitted_to", "through_voltage_map",
 )  # fmt: skip
 CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
@@ -56,7 +56,7 @@ def model_section(
     simple = fit.structure.poles == 2 and not fit.structure.zeros
     resonance = ("natural_frequency_rad_s", "damping_ratio")
     roots = {} if simple else {"poles": list(fit.poles), "zeros": list(fit.zeros)}
-    residuals, known = np.concatenate(fit.residuals), fit.fingerprint
+    residuals, known = np.concatenate(fit.residuals), fit.training_output
     return {
         "input": names[0],
         "input_unit": units[0],
@@ -73,7 +73,7 @@ def model_section(
         "fit_percent": fit.fit_percent,
         "residual_std": float(np.sqrt(np.mean(residuals**2))),
         "covariance": fit.posterior.to_dict(),
-        "fitted_to": None if known is None else known.to_dict(),
+        "training_output": None if known is None else known.to_dict(),
     }
 
 

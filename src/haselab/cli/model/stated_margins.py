@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -11,14 +12,26 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_run
 from haselab.cli.model.feedback import feedback_of
 from haselab.cli.model.model_file import loop_of, read_any_plant, read_origin
-from haselab.control import margins
+from haselab.control import DesignSpec, margins
+from haselab.control.plants.general import varied
 from haselab.models.actuator import ControllerSection
 from haselab.store.actuator_file import ACTUATOR
 
-__all__ = ["controller_doubt", "model_doubt", "warn_doubts"]
+__all__ = ["controller_doubt", "delay_doubt", "model_doubt", "warn_doubts"]
 
-_DEG, _DB = 1.0, 0.5  # above the rounding of numbers typed by hand, below what matters to a loop
-_SAME = 1e-6  # relative difference of a map's coefficients
+_SAME = 1e-6  # relative difference of a map's coefficients, and of delays
+_WORST = "worst_"  # prefix of a margin over the plants that the design covers
+# What is said of each margin, and its absolute and relative tolerance: above the rounding of
+# numbers typed by hand, below what matters to a loop.
+_STATED = {
+    "phase_margin_deg": ("a phase margin of {:.3g} deg", 1.0, 0.0),
+    "gain_margin_db": ("a gain margin of {:.3g} dB", 0.5, 0.0),
+    "delay_margin_s": ("a delay margin of {:.3g} s", 0.0, 0.05),
+    "peak_sensitivity": ("a peak sensitivity of {:.3g}", 0.0, 0.05),
+    "crossover_rad_s": ("a crossover at {:.3g} rad/s", 0.0, 0.05),
+    "worst_phase_margin_deg": ("a worst phase margin of {:.3g} deg", 1.0, 0.0),
+    "worst_gain_margin_db": ("a worst gain margin of {:.3g} dB", 0.5, 0.0),
+}
 
 
 def controller_doubt(path: Path, kind: str | None = None) -> str:
@@ -38,43 +51,99 @@ def controller_doubt(path: Path, kind: str | None = None) -> str:
     file = path / ACTUATOR if path.is_dir() else path
     if held is None or not held.margins or not file.exists():  # an older run states no margins
         return ""
-    design = f"haselab design {file}" + ("" if held.kind == "pid" else f" --controller {held.kind}")
-    stated = held.margins.get("phase_margin_deg"), held.margins.get("gain_margin_db")
     try:
-        found = _margins(held, file)
+        found = _margins(held, file, _loop_of(held, file))
     except InputError as error:
         return f"The margins of [controller] cannot be verified. {error}"
-    if all(map(_agree, stated, found, (_DEG, _DB))):
+    wrong = [key for key in _STATED if not _agree(key, held.margins, found)]
+    if not wrong:
         return ""
     return (
-        f"[controller] states {_text(*stated)}, but with [model] of the same file the "
-        f"{held.name or held.kind} has {_text(*found)}. Design it again with: {design}"
+        f"[controller] states {_text(wrong, held.margins)}, but with [model] of the same file the "
+        f"{held.name or held.kind} has {_text(wrong, found)}. Design it again with: "
+        f"{_design(held, file)}"
     )
 
 
-def _margins(held: ControllerSection, file: Path) -> tuple[float, float]:
-    """Phase margin, in degrees, and gain margin, in dB, with the model of the file."""
+def delay_doubt(path: Path, kind: str | None = None) -> str:
+    """Why a controller was designed for another delay of the loop than `[model]` states.
+
+    A delay belongs to its rate: at another rate, as on a microcontroller, the controller has its
+    own.
+
+    Args:
+        path: an actuator file, or the folder of a run.
+        kind: kind or name of the controller; None: that of `[controller]`.
+    Returns:
+        What is wrong and what to do; empty if the delays or the margins are the same.
+    """
+    section = load_run(path).controller
+    held = section if kind is None or section is None else section.all_kinds.get(kind)
+    file = path / ACTUATOR if path.is_dir() else path
+    if held is None or held.loop is None or not file.exists():
+        return ""
+    rate_hz, delay_s = loop_of(file, None, None)
+    own_hz, own_s = _loop_of(held, file)
+    if rate_hz != own_hz or math.isclose(delay_s, own_s, rel_tol=_SAME):
+        return ""
+    try:
+        designed, found = (_margins(held, file, (rate_hz, delay)) for delay in (own_s, delay_s))
+    except InputError:
+        return ""  # the margins cannot be computed, which controller_doubt says
+    if all(_agree(key, designed, found) for key in _STATED):
+        return ""
+    margin = ["phase_margin_deg"]
+    return (
+        f"The {held.name or held.kind} was designed for a loop delay of {own_s:g} s, but [model] "
+        f"states loop_delay_s = {delay_s:g}, with which it has {_text(margin, found)} instead of "
+        f"{_text(margin, designed)}. Correct loop_delay_s, or design it again with: "
+        f"{_design(held, file)}"
+    )
+
+
+def _design(held: ControllerSection, file: Path) -> str:
+    return f"haselab design {file}" + ("" if held.kind == "pid" else f" --controller {held.kind}")
+
+
+def _loop_of(held: ControllerSection, file: Path) -> tuple[float, float]:
+    """Rate and delay that a controller was designed for."""
     loop = held.loop
-    rate_hz, delay_s = loop_of(
+    return loop_of(
         file,
         None if loop is None else loop.rate_hz,
         None if loop is None else loop.measurement_delay_s,
     )
-    feedback = feedback_of(held, rate_hz)
-    found = margins(read_any_plant(file), feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
-    return found.phase_margin_deg, found.gain_margin_db
 
 
-def _agree(stated: float | None, found: float, tolerance: float) -> bool:
-    """Whether two margins are the same; one that is not stated agrees with any."""
-    return stated is None or stated == found or abs(stated - found) <= tolerance
+def _margins(held: ControllerSection, file: Path, loop: tuple[float, float]) -> dict[str, float]:
+    """Margins with the model of the file; the worst ones where the section has its demands."""
+    rate_hz, delay_s = loop
+    feedback, plant = feedback_of(held, rate_hz), read_any_plant(file)
+    found = margins(plant, feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
+    known = {key: getattr(found, key) for key in _STATED if not key.startswith(_WORST)}
+    stated = [key for key in _STATED if key.startswith(_WORST) and key in held.margins]
+    if not (stated and held.demands):
+        return known
+    covered = varied(plant, DesignSpec.from_mapping(held.demands).frequency_spread)
+    every = [margins(p, feedback, loop_delay_s=delay_s, rate_hz=rate_hz) for p in covered]
+    return known | {
+        key: min(getattr(one, key.removeprefix(_WORST)) for one in every) for key in stated
+    }
 
 
-def _text(phase_deg: float | None, gain_db: float | None) -> str:
-    both = (("a phase margin of", phase_deg, "deg"), ("a gain margin of", gain_db, "dB"))
-    return " and ".join(
-        f"{name} {value:.3g} {unit}" for name, value, unit in both if value is not None
+def _agree(key: str, stated: Mapping[str, float], found: Mapping[str, float]) -> bool:
+    """Whether two margins are the same; one that is not known agrees with any."""
+    if key not in stated or key not in found:
+        return True
+    _, absolute, relative = _STATED[key]
+    one, other = stated[key], found[key]
+    return math.isclose(one, other, abs_tol=absolute, rel_tol=relative) or (
+        math.isnan(one) and math.isnan(other)
     )
+
+
+def _text(keys: Sequence[str], values: Mapping[str, float]) -> str:
+    return " and ".join(_STATED[key][0].format(values[key]) for key in keys)
 
 
 def model_doubt(path: Path) -> str:
@@ -101,12 +170,12 @@ def model_doubt(path: Path) -> str:
 
 
 def warn_doubts(path: Path, kind: str | None = None) -> None:
-    """Warn of margins that are not those of the model, and of a model for another voltage map.
+    """Warn of margins and a delay that are not those of the model, and of a model for another map.
 
     Args:
         path: an actuator file, or the folder of a run.
         kind: kind or name of the controller; None: that of `[controller]`.
     """
-    for doubt in (model_doubt(path), controller_doubt(path, kind)):
+    for doubt in (model_doubt(path), controller_doubt(path, kind), delay_doubt(path, kind)):
         if doubt:
             click.echo(f"haselab: warning: {doubt}", err=True)

@@ -58,6 +58,11 @@ def command(
     if the bench cannot play the study. STUDY is a TOML file.
     """
     plan = planned(study, actuator, quick=quick)
+    if not quick:
+        try:
+            planned(study, actuator, quick=True)
+        except InputError as error:
+            raise InputError(f"With the changes of [quick]: {error}") from None
     file = load_rig(rig)
     rated = rated_rig(file, plan, rig)
     if rated is None:

@@ -12,7 +12,7 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.common import answer_options, emit
 from haselab.cli.model.model_file import read_any_plant, read_posterior
-from haselab.cli.model.stated_margins import controller_doubt, model_doubt
+from haselab.cli.model.stated_margins import controller_doubt, delay_doubt, model_doubt
 from haselab.cli.output import OutputRule
 from haselab.cli.study.analyse import check_ends
 from haselab.models.actuator import ActuatorTables
@@ -91,4 +91,5 @@ def _report_actuator(path: Path, page_path: Path, as_json: bool) -> None:
 def _controller_doubts(tables: ActuatorTables, path: Path) -> str:
     """Margins of all controllers of the file that are not those of its model."""
     kinds = [] if tables.controller is None else tables.controller.all_kinds
-    return " ".join(doubt for kind in kinds if (doubt := controller_doubt(path, kind)))
+    doubts = [check(path, kind) for kind in kinds for check in (controller_doubt, delay_doubt)]
+    return " ".join(filter(None, doubts))

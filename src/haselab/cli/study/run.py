@@ -63,8 +63,9 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
 @shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
 @keep_video_option
 @actuator_option(
-    "Its limits and its calibration apply; its maps and its controller are used if the study has "
-    "no [triangle] and no [control]. The run's actuator.toml starts as a copy of it."
+    "Its limits and its calibration apply; its maps are used if the study has no "
+    "[triangle], its controller if it has no [control]. The run's actuator.toml starts as a copy "
+    "of it."
 )
 @arming_options
 @answer_options(OutputRule("folder"), RUN_FOLDER)

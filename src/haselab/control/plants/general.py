@@ -16,7 +16,7 @@ from haselab.control.plants.modes import Modes
 from haselab.models.plant import Plant
 from haselab.models.rational import RationalModel
 
-__all__ = ["AnyPlant", "HeldModel", "PlantScale", "corners_of", "sampled_response_of", "slowed"]
+__all__ = ["AnyPlant", "HeldModel", "PlantScale", "corners_of", "sampled_response_of", "varied"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -135,7 +135,7 @@ class PlantScale:
         return cls(gain, float(response.min()), slow, fast)
 
 
-def slowed(plant: AnyPlant, factor: float) -> AnyPlant:
+def _slowed(plant: AnyPlant, factor: float) -> AnyPlant:
     """Scale the frequencies of a plant, with the same static gain and delay.
 
     For a `Plant` only the resonance changes, not its slow branches.
@@ -149,6 +149,19 @@ def slowed(plant: AnyPlant, factor: float) -> AnyPlant:
     )
     gain = factor ** (len(bottom) - len(top))
     return replace(plant, numerator=tuple(gain * t for t in top), denominator=bottom)
+
+
+def varied(plant: AnyPlant, spread: float) -> tuple[AnyPlant, ...]:
+    """A plant, and with its frequencies lowered and raised.
+
+    Args:
+        plant: nominal plant, the first of the result.
+        spread: change of the frequencies, relative to them.
+    Returns:
+        Three plants; one without a spread.
+    """
+    factors = (1.0 - spread, 1.0 + spread) if spread else ()
+    return (plant, *(_slowed(plant, factor) for factor in factors))
 
 
 def sampled_response_of(

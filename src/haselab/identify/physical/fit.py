@@ -26,7 +26,12 @@ from haselab.identify.noise import coloured_covariance, whiteness_p
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.search import Found, refine, search
-from haselab.identify.physical.unknowns import CAMERA_OFFSET, SENSING_SCALE, Unknowns
+from haselab.identify.physical.unknowns import (
+    CAMERA_OFFSET,
+    CAMERA_SCALE,
+    SENSING_SCALE,
+    Unknowns,
+)
 
 __all__ = ["ActuatorFit", "fit_actuator"]
 
@@ -146,6 +151,7 @@ def fit_actuator(
     mass_kg: float,
     added_inertia_kg: float | None = None,
     camera_bias_m: float = 2e-6,
+    camera_scale_std: float = 5e-5,
 ) -> ActuatorFit:
     """Identify a physical model from records.
 
@@ -156,6 +162,8 @@ def fit_actuator(
         added_inertia_kg: where to start with that; None: 5 % of the hung mass.
         camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
             is usual.
+        camera_scale_std: relative standard deviation of the camera's scale, with the slow
+            errors of tracking over the picture, such as that of uneven light.
     Returns:
         The model, with the covariance of its parameters.
     Raises:
@@ -166,9 +174,10 @@ def fit_actuator(
     if added_inertia_kg is None:
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
-    known = {CAMERA_OFFSET: camera_bias_m}
+    known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
     misfit = Misfit(records, known=known)
-    found = search(misfit, start)
+    # the scale of the camera and the actuator's size can hardly be told apart: it comes last
+    found = search(misfit, start.without((CAMERA_SCALE,)))
     if found is None:
         return ActuatorFit(
             status="the start values describe no motion: the actuator has no equilibrium under the "
@@ -181,12 +190,12 @@ def fit_actuator(
         same = np.allclose(factors, (misfit.length_factor, misfit.capacitance_factor),
                            rtol=_SAME_NOISE)  # fmt: skip
         misfit = Misfit(records, *factors, known)
-        if same:
-            break
-        again = refine(misfit, found)
+        again = refine(misfit, start.at(found.unknowns))
         if again is None:
             break
         found, count = again, count + again.evaluations
+        if same:
+            break
     return _result(misfit, found, count)
 
 
@@ -256,7 +265,7 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
     std = np.sqrt(np.diag(covariance))
     units = {about.key: about.unit for about in unknowns.law.described()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
-              "sensing.latency_s": "s", "sensing.scale": ""}  # fmt: skip
+              "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": ""}  # fmt: skip
     slopes = unknowns.slopes
     parameters, weak = {}, []
     for k, name in enumerate(unknowns.names):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 
 from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
 from haselab.base import HaselabError, LimitError
@@ -15,14 +17,17 @@ from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import (
     CAMERA_LATENCY,
     CAMERA_OFFSET,
+    CAMERA_SCALE,
     SENSING_LATENCY,
     SENSING_SCALE,
     Unknowns,
+    usual,
 )
 
-__all__ = ["Misfit", "Modelled", "modelled"]
+__all__ = ["SHARED_PX", "Misfit", "Modelled", "SharedErrors", "modelled"]
 
 Floats = NDArray[np.float64]
+SHARED_PX = 1.5e-3  # error of tracking that all frames with the same pixels share
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
 
@@ -72,20 +77,22 @@ def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = Tr
     latency_s = unknowns.value(SENSING_LATENCY)
     drift = record.over_windows(response.drift_f_s)
     inside = record.over_windows(response.capacitance_f) - latency_s * drift
-    length_m = response.length_m + unknowns.value(CAMERA_OFFSET)
+    shown = unknowns.value(CAMERA_SCALE)
+    length_m = shown * response.length_m + unknowns.value(CAMERA_OFFSET)
     if not derivatives:
         none = np.zeros((0, 0))
         return Modelled(length_m, scale * inside, none, none)
     columns: dict[str, tuple[ArrayLike, ArrayLike]] = {
-        CAMERA_LATENCY: (-response.speed_m_s, 0.0),
+        CAMERA_LATENCY: (-shown * response.speed_m_s, 0.0),
         CAMERA_OFFSET: (1.0, 0.0),
+        CAMERA_SCALE: (response.length_m, 0.0),
         SENSING_LATENCY: (0.0, -scale * drift),
         SENSING_SCALE: (0.0, inside),
     }
     length_by = np.empty((length_m.size, len(unknowns.names)))
     capacitance_by = np.empty((inside.size, len(unknowns.names)))
     count = len(unknowns.law_names)
-    length_by[:, :count] = response.length_by
+    length_by[:, :count] = shown * response.length_by
     capacitance_by[:, :count] = scale * record.over_windows(response.capacitance_by)
     for k, name in enumerate(unknowns.names[count:], start=count):
         length_by[:, k] = np.asarray(columns[name][0])
@@ -103,13 +110,66 @@ def _highest_v(record: MotionRecord) -> float:
 def _respond(sampled: SampledLaw, record: MotionRecord, latency_s: float) -> Response:
     drive = record.drive
     low, high = drive.edge_s[0], drive.edge_s[-1]
-    times_s = np.clip(record.length_time_s - latency_s, low, high)
+    middle_s = record.length_time_s - latency_s
+    # Gauss's two points of the exposure, over which a frame shows the mean
+    half_s = record.exposure_s / np.sqrt(12.0)
+    both_s = np.clip(np.concatenate([middle_s - half_s, middle_s + half_s]), low, high)
+    order = np.argsort(both_s, kind="stable")
     start, start_by = sampled.at_rest(
         float(drive.voltage_v[0]), float(drive.ripple_v2[0]), float(drive.load_n[0])
     )
     sensed = np.zeros(drive.voltage_v.size, np.uint8)
     sensed[record.window] = 1
-    return sampled.respond(drive, times_s, start, sensed=sensed, start_by=start_by)
+    found = sampled.respond(drive, both_s[order], start, sensed=sensed, start_by=start_by)
+    first, second = np.split(np.argsort(order), 2)
+    return replace(
+        found,
+        **{
+            name: 0.5 * (getattr(found, name)[first] + getattr(found, name)[second])
+            for name in ("length_m", "speed_m_s", "length_by")
+        },
+    )
+
+
+@dataclass(frozen=True)
+class SharedErrors:
+    """Errors of tracking that all lengths within the same pixel share.
+
+    Args:
+        weights: their standard deviation over that of each length's own error; one row per pixel.
+        gain: what of a pixel's weighed sum is taken away, so that the rest is white.
+    """
+
+    weights: csr_array
+    gain: Floats
+
+    @classmethod
+    def of(cls, record: MotionRecord, length_std_m: Floats) -> SharedErrors:
+        """Those of a record.
+
+        Args:
+            record: with its lengths and the size of a pixel.
+            length_std_m: standard deviation of each length's own error. Shape `(F,)`.
+        """
+        count = record.length_m.size
+        if record.pixel_m > 0.0:
+            pixel = np.unique(np.floor(record.length_m / record.pixel_m), return_inverse=True)[1]
+        else:
+            pixel = np.arange(count)
+        share = SHARED_PX * record.pixel_m / length_std_m
+        total = np.bincount(pixel, share**2)
+        gain = np.divide(1.0 - (1.0 + total) ** -0.5, total, where=total > 0.0, out=0.0 * total)
+        return cls(csr_array((share, (pixel, np.arange(count))), shape=(total.size, count)), gain)
+
+    def whitened(self, values: Floats) -> Floats:
+        r"""Multiply by $(1 + u u^\top)^{-1/2}$, with the weights $u$ of each pixel.
+
+        Args:
+            values: over the own standard deviations. Shape `(F,)` or `(F, P)`.
+        """
+        sums = self.weights @ values
+        gain = self.gain if values.ndim == 1 else self.gain[:, None]
+        return np.asarray(values - self.weights.T @ (gain * sums))
 
 
 @dataclass(frozen=True)
@@ -128,6 +188,10 @@ class Misfit:
     length_factor: float = 1.0
     capacitance_factor: float = 1.0
     known: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def _shared(self) -> list[SharedErrors]:
+        return [SharedErrors.of(r, self.length_factor * r.length_std_m) for r in self.records]
 
     def residuals(self, unknowns: Unknowns) -> Floats | None:
         """Measured minus modelled over the standard deviation; None where no motion exists.
@@ -153,8 +217,9 @@ class Misfit:
         if found is None:
             return None
         by = []
-        for part, record in zip(found, self.records, strict=True):
-            by.append(part.length_by / (self.length_factor * record.length_std_m)[:, None])
+        for part, record, shared in zip(found, self.records, self._shared, strict=True):
+            std_m = self.length_factor * record.length_std_m
+            by.append(shared.whitened(part.length_by / std_m[:, None]))
             std_f = self.capacitance_factor * record.capacitance_std_f
             by.append(part.capacitance_by / std_f[:, None])
         for name, std in self.known.items():
@@ -175,10 +240,10 @@ class Misfit:
 
     def _weighed(self, found: Sequence[Modelled], unknowns: Unknowns) -> Floats:
         parts = []
-        for part, record in zip(found, self.records, strict=True):
+        for part, record, shared in zip(found, self.records, self._shared, strict=True):
             std_m = self.length_factor * record.length_std_m
-            parts.append((record.length_m - part.length_m) / std_m)
+            parts.append(shared.whitened((record.length_m - part.length_m) / std_m))
             std_f = self.capacitance_factor * record.capacitance_std_f
             parts.append((record.capacitance_f - part.capacitance_f) / std_f)
-        known = [-unknowns.value(name) / std for name, std in self.known.items()]
+        known = [(usual(name) - unknowns.value(name)) / std for name, std in self.known.items()]
         return np.concatenate([*parts, known])

@@ -34,6 +34,9 @@ class MotionRecord:
         experiments: names of the experiments that the record consists of.
         length_experiment: index of the experiment of each length. Shape `(F,)`.
         capacitance_experiment: the same of each capacitance. Shape `(C,)`.
+        exposure_s: of the frames, whose times are the middle of it; 0 if it is not known.
+        pixel_m: size of a pixel at the actuator, over which the tracker's errors are similar; 0:
+            the errors of all lengths are independent.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -51,6 +54,8 @@ class MotionRecord:
     experiments: tuple[str, ...]
     length_experiment: Integers
     capacitance_experiment: Integers
+    exposure_s: float = 0.0
+    pixel_m: float = 0.0
 
     def over_windows(self, values: Floats) -> Floats:
         """Means over the intervals in which each capacitance was sensed.

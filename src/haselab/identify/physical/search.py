@@ -82,19 +82,19 @@ def search(misfit: Misfit, start: Unknowns) -> Found | None:
     return _found(now, count + used)
 
 
-def refine(misfit: Misfit, found: Found) -> Found | None:
-    """Minimise the misfit again after its weights have changed.
+def refine(misfit: Misfit, start: Unknowns) -> Found | None:
+    """Minimise the misfit from near its minimum.
 
     Args:
-        misfit: with the new weights.
-        found: result before.
+        misfit: to minimise.
+        start: first values.
     Returns:
         The new result; None if no motion exists there.
     """
-    again = misfit.linearised(found.unknowns)
-    if again is None:
+    first = misfit.linearised(start)
+    if first is None:
         return None
-    now = _State(found.unknowns, *again)
+    now = _State(start, *first)
     now, used = _descend(misfit, now, None, 1.0, _LAST_STEPS)
     return _found(now, used + 1)
 

@@ -13,22 +13,27 @@ from haselab.actuators import ADDED_INERTIA, ActuatorLaw, with_parameters
 __all__ = [
     "CAMERA_LATENCY",
     "CAMERA_OFFSET",
+    "CAMERA_SCALE",
     "INSTRUMENTS",
     "SENSING_LATENCY",
     "SENSING_SCALE",
     "Unknowns",
     "fitted_parameters",
+    "usual",
 ]
 
 Floats = NDArray[np.float64]
 CAMERA_LATENCY = "camera.latency_s"
 CAMERA_OFFSET = "camera.offset_m"
+CAMERA_SCALE = "camera.scale"
 SENSING_LATENCY = "sensing.latency_s"
 SENSING_SCALE = "sensing.scale"
-INSTRUMENTS = (CAMERA_LATENCY, CAMERA_OFFSET, SENSING_LATENCY, SENSING_SCALE)
+INSTRUMENTS = (CAMERA_LATENCY, CAMERA_OFFSET, CAMERA_SCALE, SENSING_LATENCY, SENSING_SCALE)
+_SCALES = {CAMERA_SCALE, SENSING_SCALE}  # 1 where they are not estimated; 0 for the others
 # how far a start value may be off: of a logarithm, or in the unit
 _WIDTH = 0.4
-_WIDTHS = {CAMERA_LATENCY: 2e-3, CAMERA_OFFSET: 1e-3, SENSING_LATENCY: 2e-3, SENSING_SCALE: 0.05}
+_WIDTHS = {CAMERA_LATENCY: 2e-3, CAMERA_OFFSET: 1e-3, CAMERA_SCALE: 1e-3, SENSING_LATENCY: 2e-3,
+           SENSING_SCALE: 0.05}  # fmt: skip
 _INERTIA_WIDTH = 0.1  # of the mass
 
 
@@ -65,6 +70,11 @@ def _shares_of(name: str) -> tuple[str, ...]:
     return (name.replace("relaxation_s", "share"), name.replace("relaxation_s", "relaxation_share"))
 
 
+def usual(name: str) -> float:
+    """Value of a number of the instruments that is not estimated: 1 of a scale, 0 of others."""
+    return 1.0 if name in _SCALES else 0.0
+
+
 @dataclass(frozen=True)
 class Unknowns:
     """Names, scales and values of what a fit estimates.
@@ -89,7 +99,7 @@ class Unknowns:
         """All numbers that can be estimated for a law."""
         values = fitted_parameters(law)
         names = (*values, ADDED_INERTIA, *INSTRUMENTS)
-        start = [*values.values(), added_inertia_kg, 0.0, 0.0, 0.0, 1.0]
+        start = [*values.values(), added_inertia_kg, *map(usual, INSTRUMENTS)]
         return cls(law, names, np.array(start, dtype=np.float64), mass_kg)
 
     @property
@@ -100,7 +110,7 @@ class Unknowns:
     @property
     def by_logarithm(self) -> NDArray[np.bool_]:
         """Which of them vary by their logarithm. Shape `(P,)`."""
-        linear = {ADDED_INERTIA, *INSTRUMENTS} - {SENSING_SCALE}
+        linear = {ADDED_INERTIA, *INSTRUMENTS} - _SCALES
         return np.array([name not in linear for name in self.names]) & ~self.by_inverse_square
 
     @property
@@ -132,7 +142,7 @@ class Unknowns:
         """Value of one of them; an instrument's default where it is not estimated."""
         if name in self.names:
             return float(self.values[self.names.index(name)])
-        return 1.0 if name == SENSING_SCALE else 0.0
+        return usual(name)
 
     def moved(self, step: Floats) -> Unknowns:
         """Change what varies.
@@ -164,6 +174,11 @@ class Unknowns:
             self.values[kept],
             self.mass_kg,
         )
+
+    def at(self, other: Unknowns) -> Unknowns:
+        """These numbers with the values of others, which may be fewer."""
+        values = np.array([other.value(name) for name in self.names])
+        return Unknowns(other.law, self.names, values, self.mass_kg)
 
     def present_law(self) -> ActuatorLaw:
         """The law with the present values.

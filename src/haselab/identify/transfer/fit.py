@@ -207,7 +207,7 @@ class TransferFit(RecordFit[Record]):
             several(records),
             posterior=None if np.isinf(self.covariance).any() else self.posterior,
             noise_std=float(np.std(np.concatenate(self.residuals))),
-            fitted_to=self.fingerprint,
+            training_output=self.training_output,
             rng=np.random.default_rng(1),
         )
 
@@ -229,7 +229,7 @@ class TransferFit(RecordFit[Record]):
     def answer(self) -> JsonObject:
         """The result under its public JSON keys."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
-        known = self.fingerprint
+        known = self.training_output
         return {
             **{key: self.parameters.get(key) for key in keys},
             "poles": list(self.poles),
@@ -242,7 +242,7 @@ class TransferFit(RecordFit[Record]):
             "status": self.status,
             "notes": list(self.notes),
             "covariance": covariance_table(self.parameters, self.covariance),
-            "fitted_to": None if known is None else known.to_dict(),
+            "training_output": None if known is None else known.to_dict(),
             "other_minima": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
                 for r in self.other_minima

@@ -13,13 +13,13 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 __all__ = [
     "CovarianceTable",
     "EstimateTable",
-    "FingerprintTable",
     "LoopTable",
     "Number",
     "OriginTable",
     "PlantTable",
     "PolesTable",
     "RationalTable",
+    "TrainingOutputTable",
     "VoltagePlantTable",
 ]
 
@@ -119,16 +119,12 @@ class CovarianceTable(_Table):
     )
 
 
-class FingerprintTable(_Table):
-    """`identify.Fingerprint` of the outputs that a model was fitted to."""
+class TrainingOutputTable(_Table):
+    """`identify.TrainingOutput` of the outputs that a model was fitted to."""
 
-    step: Annotated[Number, Field(ge=0)]
+    cell: Annotated[Number, Field(ge=0)]
+    quantised: bool = False
     hashes: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]]
-
-
-def _known_form(item: Any) -> Any:
-    """A fingerprint; None for that of an older version, which was a list."""
-    return None if isinstance(item, list) else item
 
 
 class OriginTable(_Table):
@@ -143,7 +139,7 @@ class OriginTable(_Table):
     input_unit: str = ""
     output_unit: str = ""
     residual_std: Annotated[Number, Field(ge=0)] = 0.0
-    fitted_to: Annotated[FingerprintTable | None, BeforeValidator(_known_form)] = None
+    training_output: TrainingOutputTable | None = None
     through_voltage_map: tuple[Number, Number, Number, Number] | None = None
 
 

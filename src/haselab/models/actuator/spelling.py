@@ -22,15 +22,18 @@ _WRITTEN = {
     "sensing": ("date", "amplifier", "rate_hz", "scale_std_s", "stray_s", "offsets_v", "residual",
                 "reference"),
     "model": (*PlantTable.model_fields, *RationalTable.model_fields, "fit_percent", "input_unit",
-              "output_unit", "fitted_to", "through_voltage_map", "linear_models"),
+              "output_unit", "training_output", "through_voltage_map", "linear_models"),
     "controller": ("predicted", "plausible", "uncertainty"),
 }  # fmt: skip
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
+_MARGINS = ("phase_margin_deg", "phase_margin_deg_std", "gain_margin_db", "gain_margin_db_std",
+            "delay_margin_s", "peak_sensitivity", "crossover_rad_s", "worst_phase_margin_deg",
+            "worst_gain_margin_db", "stable")  # fmt: skip
 # Their content is checked by whoever reads it, or is written only.
 _NOT_LOOKED_INTO = {
     "provenance",
     "model.covariance",
-    "model.fitted_to",
+    "model.training_output",
     "model.linear_models",
     "controller.demands",
 }
@@ -91,6 +94,8 @@ def _looked_into(
     known = [*fields, *_WRITTEN.get(place, ())]
     if place.endswith("parameters"):
         known += _GAINS
+    if place == "controller.margins":
+        known += _MARGINS
     for key, item in table.items():
         inner = f"{place}.{key}" if place else key
         if key not in known:
@@ -104,6 +109,8 @@ def _looked_into(
             if table.get("kind", "pid") in ("pi", "pid") and isinstance(item, Mapping):
                 yield from _looked_into(item, None, inner)
             continue
+        if inner == "controller.margins" and isinstance(item, Mapping):
+            yield from _looked_into(item, None, inner)
         model = _model_in(fields[key].annotation)
         for part in item if isinstance(item, list) else [item]:
             if model is not None and isinstance(part, Mapping):

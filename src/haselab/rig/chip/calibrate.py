@@ -63,19 +63,13 @@ def calibrated_firmware(
 
 
 def _reference_f(settings: ChipSettings) -> float:
-    """Capacitance of a reference capacitor that the microcontroller accepts as an actuator, in F.
-
-    Args:
-        settings: of the microcontroller.
-    Returns:
-        500 pF, or the middle of the capacitances of the strain map if 500 pF is not one of them.
-    """
+    """Capacitance of the reference: the usual one, or the middle of the valid range."""
     low_f, high_f = settings.capacitance_range_f
     return REFERENCE[0] if low_f < REFERENCE[0] < high_f else 0.5 * (low_f + high_f)
 
 
 def chip_correction(
-    program: Path, elf: Path, config: TwinConfig, seed: int, farad: float = REFERENCE[0]
+    program: Path, elf: Path, config: TwinConfig, seed: int, reference_f: float = REFERENCE[0]
 ) -> float:
     """Measure `FrontEnd.correction` with a reference capacitor.
 
@@ -84,7 +78,7 @@ def chip_correction(
         elf: firmware without a correction.
         config: of the twin.
         seed: of its noise.
-        farad: capacitance of the reference, in F.
+        reference_f: capacitance of the reference, within the range of the firmware's strain map.
     Returns:
         Capacitance of the reference over the reported value.
     Raises:
@@ -92,7 +86,7 @@ def chip_correction(
     """
     with CoSim(program, elf, TwinBench(config, seed)) as chip:
         chip.run(0.02)
-        chip.command(f"connect {farad} {REFERENCE[1]}")
+        chip.command(f"connect {reference_f} {REFERENCE[1]}")
         chip.arm()
         known = len(chip.messages)
         for _ in range(_READINGS):
@@ -101,6 +95,6 @@ def chip_correction(
     if not reported or min(reported) <= 0.0:
         raise DeviceError(
             f"The microcontroller measured no capacitance in {reported.count(0.0)} of "
-            f"{len(reported)} readings of {farad:g} F. Check the values of [front_end]."
+            f"{len(reported)} readings of {reference_f:.3g} F. Check the values of [front_end]."
         )
-    return farad / float(np.mean(reported))
+    return reference_f / float(np.mean(reported))

@@ -110,6 +110,7 @@ def describe(config: TwinConfig) -> RigDescription:
         scale_m_per_px=config.camera.scale_m_per_px,
         mass_kg=config.load.mass_kg,
         amplifier=amplifier.name,
+        exposure_s=config.camera.exposure_s,
         actuator_kind=config.kind,
     )
 

@@ -10,7 +10,7 @@ from haselab.store.columns.archive import positive
 __all__ = ["LabviewHeader", "labview_header", "without_tags"]
 
 _MAGIC, _END = "LabVIEW Measurement", "***End_of_Header***"
-_TAGS = ("X_Columns", "X_Dimension", "X_Unit_Label", "Y_Unit_Label", "Delta_X")
+_TAGS = ("X_Columns", "X_Dimension", "X_Unit_Label", "Y_Unit_Label", "X0", "Delta_X")
 _X, _TIME = "X_Value", "Time"
 
 
@@ -20,7 +20,8 @@ class LabviewHeader:
 
     Args:
         units: text by column; empty where none is stated.
-        rate_hz: rows per second of a file without a column of times; None: not stated.
+        rate_hz: rows per second of a file without a column of times, or with the same times for
+            each channel; None: not stated.
     """
 
     units: tuple[str, ...]
@@ -77,7 +78,12 @@ def labview_header(
         unit_of_x(k + 1) if name == _X else cell("Y_Unit_Label", k) if k else ""
         for k, name in enumerate(names)
     ]
-    steps = {cell("Delta_X", k).replace(",", ".") for k in range(1, len(names))} - {""}
-    evenly = cell("X_Columns", 1) == "No" and len(steps) == 1 and unit_of_x(1) == "s"
+    every = range(1, len(names))
+    steps = {cell("Delta_X", k).replace(",", ".") for k in every} - {""}
+    starts = {cell("X0", k).replace(",", ".") for k in every} - {""}
+    no_column = cell("X_Columns", 1) == "No" or (
+        cell("X_Columns", 1) == "Multi" and names.count(_X) > 1 and len(starts) <= 1
+    )
+    evenly = no_column and len(steps) == 1 and unit_of_x(1) == "s"
     step_s = positive(steps.pop()) if evenly else None
     return LabviewHeader(tuple(units), None if step_s is None else 1.0 / step_s)

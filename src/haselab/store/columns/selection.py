@@ -16,6 +16,7 @@ __all__ = [
     "assumed_seconds",
     "stated_unit",
     "time_column",
+    "why_no_times",
 ]
 
 TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiempo", "tempo")
@@ -88,13 +89,30 @@ def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = 
         return full
     exact = archive.locate("time_s")
     if exact is not None:
-        return None if exact in used else exact
+        return None if exact in used or not _is_time(archive, exact, options) else exact
     plain = [(full, archive.plain_name(full).casefold()) for full in archive.names]
     for name in TIME_NAMES:
         found = [full for full, base in plain if base == name and full not in used]
         if len(found) == 1 and _is_time(archive, found[0], options):
             return found[0]
     return None
+
+
+def why_no_times(archive: Archive, options: ColumnOptions) -> str:
+    """Why a column that is called like one of times is none.
+
+    Args:
+        archive: the file.
+        options: of the user.
+    Returns:
+        A sentence; empty where no such column states another unit.
+    """
+    for full in archive.names:
+        if archive.plain_name(full).casefold() in TIME_NAMES and not _is_time(
+            archive, full, options
+        ):
+            return f"Column {full} states a unit that is not a time."
+    return ""
 
 
 def assumed_seconds(archive: Archive, full: str, options: ColumnOptions) -> bool:

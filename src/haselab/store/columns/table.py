@@ -20,6 +20,7 @@ from haselab.store.columns.selection import (
     assumed_seconds,
     stated_unit,
     time_column,
+    why_no_times,
 )
 from haselab.store.columns.units import Unit
 from haselab.store.optional import library
@@ -48,7 +49,7 @@ class Table:
         time_name: column of the times, if there is one.
         assumed_seconds: no unit of these times is stated anywhere: they are taken as seconds.
         time_s: its values. Shape `(N,)`.
-        not_rising: column that is called like one of times, but does not rise; empty: none.
+        why_no_times: why a column that is called like one of times is none; empty: there is none.
     """
 
     columns: Mapping[str, Floats]
@@ -58,7 +59,7 @@ class Table:
     time_name: str | None = None
     time_s: Floats | None = None
     assumed_seconds: bool = False
-    not_rising: str = ""
+    why_no_times: str = ""
 
     def __getitem__(self, name: str) -> Floats:
         if name not in self.columns:
@@ -171,10 +172,14 @@ def read_table(
         name, time_s = _times(archive, kept, options) if rate_hz is None else (None, None)
         if time_s is not None:
             rate_hz = rate_of_times(time_s)
-        time_name, not_rising = (None, name or "") if time_s is None else (name, "")
+        time_name, why = (
+            (name, "") if time_s is not None else (None, why_no_times(archive, options))
+        )
+        if name is not None and time_s is None:
+            why = f"Column {name} does not rise everywhere."
         units = dict(zip(wanted, stream.units, strict=True))
         assumed = time_name is not None and assumed_seconds(archive, time_name, options)
-    return Table(values, rate_hz, left_out, units, time_name, time_s, assumed, not_rising)
+    return Table(values, rate_hz, left_out, units, time_name, time_s, assumed, why)
 
 
 def _valid_rows(archive: Archive, wanted: Sequence[str], rows: int) -> NDArray[np.bool_]:

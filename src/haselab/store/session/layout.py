@@ -198,7 +198,11 @@ def create_experiment(
 ) -> None:
     """Create all datasets of one experiment, with dimension scales and NeXus attributes.
 
-    Only the codes are compressed: a table that grows row by row would be compressed repeatedly.
+    Only the codes are compressed: a table that grows row by row would be compressed repeatedly. A
+    second axis without limit makes HDF5 index the chunks of the fast datasets with a tree of nodes
+    of 2048 bytes: the parts of its array for one such axis exceed a page after 2051 chunks of codes
+    (205 s), and a kill inside the write of one would make the session unreadable. In the other
+    datasets this takes 8000 chunks of 1000 rows.
 
     Raises:
         InputError: the name cannot be a file name.
@@ -218,7 +222,7 @@ def create_experiment(
     scales = _create_scales(group, plan, sampling)
     samples = sampling.block_samples
     codes = group.create_dataset(
-        "codes", (0, samples, 2), np.int16, maxshape=(None, samples, 2),
+        "codes", (0, samples, 2), np.int16, maxshape=(None, None, 2),
         chunks=(sampling.chunk_blocks, samples, 2),
         compression="gzip", compression_opts=1, shuffle=True,
     )  # fmt: skip
@@ -232,7 +236,7 @@ def create_experiment(
     blocks = group.create_dataset("blocks", (0,), BLOCK, maxshape=(None,), chunks=(1000,))
     frames = group.create_dataset("frames", (0,), FRAME, maxshape=(None,), chunks=(1000,))
     shape = (0, plan.points)
-    tracks = group.create_dataset("tracks", shape, TRACK, maxshape=(None, plan.points),
+    tracks = group.create_dataset("tracks", shape, TRACK, maxshape=(None, None),
                                   chunks=(100, plan.points))  # fmt: skip
     for dataset, names in (
         (codes, ("start_s", "sample_s", "channel")),

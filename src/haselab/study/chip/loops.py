@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _core
-from haselab.base import JsonObject
+from haselab.base import InputError, JsonObject
 from haselab.control import PidGains, margins, step_metrics
 from haselab.controllers import (
     CONTROLLERS,
@@ -245,6 +245,19 @@ def _sheet(config: TwinConfig, seed: int, plan: StepPlan) -> TwinBench:
     return bench
 
 
+def _check_capacitance(settings: ChipSettings, bench: TwinBench) -> None:
+    """Refuse a twin whose capacitance at 0 V the microcontroller would take for a lost signal."""
+    found_f = bench.native.capacitance(bench.length_m)
+    low_f, high_f = settings.capacitance_range_f
+    if not low_f <= found_f <= high_f:
+        raise InputError(
+            f"The actuator of the twin has {1e12 * found_f:.4g} pF at 0 V, but the microcontroller "
+            f"accepts {1e12 * low_f:.4g} to {1e12 * high_f:.4g} pF, from the strain map and the "
+            "limits of the controller. Simulate with a twin of this actuator (--twin TWIN.toml, "
+            "from haselab twin new), or check the unit and the scales of the capacitance."
+        )
+
+
 def _reference_share(bench: TwinBench, lockin: Lockin, carrier_hz: float) -> float:
     """Ratio of a reference capacitor to its measured capacitance."""
     bench.connect(*REFERENCE)
@@ -378,9 +391,10 @@ def step_experiment(
     Returns:
         The responses.
     Raises:
-        InputError: a compiler or libsimavr is missing.
+        InputError: a compiler or libsimavr is missing, or the twin is of another actuator.
         DeviceError: the chip refused a command.
     """
+    _check_capacitance(settings, _sheet(config, seed, plan))
     with tempfile.TemporaryDirectory() as folder:
         made = calibrated_firmware(settings, config, seed, Path(folder))
         chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)

@@ -16,7 +16,7 @@ from haselab.store.session.writer import ExperimentPlan
 from haselab.study.analysis import Analysis, fitting
 from haselab.study.experiment import Experiment, ExperimentResult
 from haselab.study.experiments.operating_point import baseline_v
-from haselab.study.fits.cycles import LEAST_FRAMES, NEAR_V, Cycles
+from haselab.study.fits.cycles import LEAST_FRAMES, Cycles, near_v
 from haselab.study.fits.maps import Maps, fit_maps
 from haselab.study.fits.observe import TRIANGLE
 from haselab.study.fits.paper_chain import PrintedChain, compare_chain
@@ -61,13 +61,14 @@ class TriangleTest(Experiment[Triangle]):
     def check(self) -> None:
         """See `Experiment`: enough frames near the baseline."""
         t, baseline_v = self.settings, self.study.nominal_baseline_v
-        width_v = min(baseline_v + NEAR_V, t.high_v) - max(baseline_v - NEAR_V, t.low_v)
+        near = near_v(t)
+        width_v = min(baseline_v + near, t.high_v) - max(baseline_v - near, t.low_v)
         edge_s = 0.5 * max(width_v, 0.0) / ((t.high_v - t.low_v) * t.frequency_hz)
         kept = t.cycles - t.left_out_cycles
         frames = kept * edge_s * t.frame_rate_hz
         if frames < LEAST_FRAMES:
             raise InputError(
-                f"The triangle gives only {frames:.2g} frames on each edge within {NEAR_V:g} V of "
+                f"The triangle gives only {frames:.2g} frames on each edge within {near:.2g} V of "
                 f"the baseline of {baseline_v:g} V, but {LEAST_FRAMES} are needed. Raise "
                 "triangle.frame_rate_hz or cycles, lower frequency_hz, or let the triangle cross "
                 "the baseline."

@@ -13,10 +13,11 @@ from haselab.rig import RigDescription
 from haselab.study.definition import Study
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.resolution import POSITION_PX, with_resolution
+from haselab.study.tables import Triangle
 
-__all__ = ["LEAST_FRAMES", "NEAR_V", "Cycles", "drive_at", "repeatability"]
+__all__ = ["LEAST_FRAMES", "Cycles", "drive_at", "near_v", "repeatability"]
 
-NEAR_V = 0.06  # around a voltage, where length is linear in voltage
+_NEAR = 0.03  # of the span of the triangle, around a voltage, where length is linear in voltage
 LEAST_FRAMES = 8  # near a voltage, on each edge
 
 Floats = NDArray[np.float64]
@@ -29,6 +30,17 @@ def drive_at(seen: Observation, time_s: Floats, rig: RigDescription) -> Floats:
     return np.asarray(seen.drive_v[np.clip(index, 0, None)])
 
 
+def near_v(triangle: Triangle) -> float:
+    """Distance from a voltage within which the length is taken as linear in the voltage.
+
+    Args:
+        triangle: of the study.
+    Returns:
+        The distance, in V.
+    """
+    return _NEAR * (triangle.high_v - triangle.low_v)
+
+
 @dataclass(frozen=True)
 class Cycles:
     """A triangle test and the times of its cycles.
@@ -37,12 +49,14 @@ class Cycles:
         seen: the test.
         starts_s: start of each cycle and end of the last, by the clock, shape `(cycles + 1,)`.
         left_out: number of first cycles that are not fitted.
+        near_v: distance from a voltage within which the length is linear in it.
         rig: for the output's delay.
     """
 
     seen: Observation
     starts_s: Floats
     left_out: int
+    near_v: float
     rig: RigDescription
 
     @classmethod
@@ -51,7 +65,7 @@ class Cycles:
         t = study.triangle
         end_s = float(seen.block_start_s[-1]) + rig.block_s
         before = np.arange(t.cycles, -1, -1) / t.frequency_hz
-        return cls(seen, end_s - before, t.left_out_cycles, rig)
+        return cls(seen, end_s - before, t.left_out_cycles, near_v(t), rig)
 
     @property
     def from_s(self) -> float:
@@ -81,7 +95,7 @@ class Cycles:
         found = []
         rising = np.gradient(ramp_v) > 0.0
         for edge in (rising, ~rising):
-            near = edge & (np.abs(ramp_v - drive_v) < NEAR_V)
+            near = edge & (np.abs(ramp_v - drive_v) < self.near_v)
             if near.sum() < LEAST_FRAMES:
                 raise ResultError(
                     f"Only {int(near.sum())} frames are near the baseline of {drive_v:g} V, but "

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from haselab.identify import Record, TransferStructure, fit_transfer
-from haselab.identify.fingerprint import Fingerprint, fingerprint, share_used
+from haselab.identify.training_output import TrainingOutput, hash_output, share_used
 from haselab.models import Plant
 
 
@@ -15,7 +15,7 @@ def output(size, seed=1):
 @pytest.mark.parametrize(("size", "start", "length"), [(400, 31, 40), (20_000, 7777, 2000)])
 def test_a_part_cut_at_any_place_is_known(size, start, length):
     y = output(size)
-    known = fingerprint([output(size, 2), y])
+    known = hash_output([output(size, 2), y])
     assert share_used([y[start : start + length]], known) == 1.0
     assert share_used([output(length, 3)], known) == 0.0
 
@@ -24,12 +24,12 @@ def test_the_share_of_a_mixed_record_is_estimated():
     y = output(9000)
     mixed = np.concatenate([output(27_000, 2), y])
     # of 1024 windows with hashes below the limit, those well inside their cells: 0.78
-    assert share_used([mixed], fingerprint([y])) == pytest.approx(0.25, abs=4 * 0.43 / 28)
+    assert share_used([mixed], hash_output([y])) == pytest.approx(0.25, abs=4 * 0.43 / 28)
 
 
 def test_a_changed_sample_changes_the_windows_around_it_only():
     y = output(250)  # 235 windows: all of their hashes are kept
-    known = fingerprint([y])
+    known = hash_output([y])
     y[100] += 1e-4
     # 0.78 of the windows well inside their cells; 16 of 235 see the sample
     assert share_used([y], known) == pytest.approx(1 - 16 / 235, abs=4 * 0.25 / 13.5)
@@ -63,14 +63,14 @@ def vibration(rng):
 def test_a_copy_with_fewer_digits_is_known(copied, least):
     rng = np.random.default_rng(7)
     y = vibration(rng) + 2e-4 * rng.normal(size=3000)
-    assert share_used([copied(y)], fingerprint([y])) >= least
+    assert share_used([copied(y)], hash_output([y])) >= least
 
 
 @pytest.mark.parametrize("noise", [2e-3, 2e-4, 2e-5, 2e-6])
 def test_a_repetition_with_its_own_noise_is_new(noise):
     rng = np.random.default_rng(11)
     clean, noises = vibration(rng), noise * rng.normal(size=(2, 3000))
-    known = fingerprint([clean + noises[0]], [noises[0]])
+    known = hash_output([clean + noises[0]], [noises[0]])
     assert share_used([clean + noises[0]], known) == 1.0
     assert share_used([clean + noises[1]], known) == 0.0
     assert share_used([significant(clean + noises[1], 4)], known) == 0.0
@@ -79,33 +79,65 @@ def test_a_repetition_with_its_own_noise_is_new(noise):
 def test_residuals_show_the_noise_of_an_output_that_changes_in_every_sample():
     rng = np.random.default_rng(13)
     clean, noise = rng.normal(size=3000), 1e-3 * rng.normal(size=(2, 3000))
-    known = fingerprint([clean + noise[0]], [noise[0]])
-    assert known.step == pytest.approx(1e-3, rel=0.1)
+    known = hash_output([clean + noise[0]], [noise[0]])
+    assert known.cell == pytest.approx(np.sqrt(2.0) * 1e-3, rel=0.1)
     assert share_used([clean + noise[1]], known) == 0.0
     assert share_used([significant(clean + noise[0], 6)], known) > 0.95
 
 
+QUANTISED = {
+    "random steps": vibration,
+    "steady sine": lambda rng: 0.02 * np.sin(2 * np.pi * np.arange(3000) / 100.0),
+    "sine": lambda rng: 0.02 * np.sin(2 * np.pi * 7.3 * np.arange(3000) / 100.0),
+    "chirp": lambda rng: 0.02 * np.sin(2e-5 * np.pi * np.arange(3000) ** 2.0),
+}
+
+
+@pytest.mark.parametrize("lsb", [1e-3, 1e-4])
+@pytest.mark.parametrize("noise_lsb", [0.01, 0.03, 0.1, 0.2, 0.3, 1.0])
+@pytest.mark.parametrize("kind", list(QUANTISED))
+def test_a_repetition_in_steps_of_a_coarse_converter_is_no_copy(kind, noise_lsb, lsb):
+    rng = np.random.default_rng(3)
+    clean = QUANTISED[kind](rng)
+    first, second = lsb * np.round(clean / lsb + noise_lsb * rng.normal(size=(2, clean.size)))
+    known = hash_output([first], [first - clean])
+    share = share_used([second], known)
+    assert share <= 0.05 or np.isnan(share)
+    if noise_lsb >= 0.3:  # the noise shows
+        assert share <= 0.05
+    elif noise_lsb >= 0.1:  # where nothing is hidden by periods that repeat
+        assert known.quantised
+        for copy in (first, significant(first, 8), first.astype(np.float32), first + 0.1234):
+            assert share_used([copy], known) >= 0.99
+
+
+def test_a_copy_in_which_another_level_is_zero_is_known():
+    y = output(2000)
+    assert share_used([y - y[0]], hash_output([y])) == 1.0
+
+
 def test_two_windows_of_independent_noise_rarely_agree():
-    # cells as wide as the noise: P(same cell) = 2 Phi-integral = 0.27, to the 16th 8e-10
+    # cells as wide as the noise of the differences: P(same cell) = 2 Phi-integral = 0.27, to the
+    # 16th 8e-10
     steps = np.abs(
         np.diff(np.floor(np.random.default_rng(5).normal(size=(2, 10**6)) + 0.5), axis=0)
     )
     assert np.mean(steps == 0) == pytest.approx(0.27, abs=0.005)
     y = 0.05 + 1e-4 * np.random.default_rng(6).normal(size=200_000)  # at rest, noise alone
-    assert share_used([y[100_000:]], fingerprint([y[:100_000]])) == 0.0
+    assert share_used([y[100_000:]], hash_output([y[:100_000]])) == 0.0
 
 
 def test_rounding_of_a_conversion_does_not_hide_samples():
     y = output(2000)
-    assert share_used([(100.0 * y) * 0.01], fingerprint([y])) == 1.0
+    assert share_used([(100.0 * y) * 0.01], hash_output([y])) == 1.0
 
 
-def test_constant_and_short_outputs_have_no_fingerprint():
+def test_constant_and_short_outputs_have_no_training_output():
     steps = np.repeat([0.0, 1.0, 2.0], 100)  # the same in every record
-    assert fingerprint([steps]).hashes.size == fingerprint([output(15)]).hashes.size == 0
-    assert fingerprint([]).hashes.size == fingerprint([np.ones(400)]).hashes.size == 0
-    assert share_used([output(400)], Fingerprint(0.0, np.zeros(0, np.uint64))) == 0.0
-    assert share_used([], fingerprint([output(400)])) == 0.0
+    assert hash_output([steps]).hashes.size == hash_output([output(15)]).hashes.size == 0
+    assert hash_output([]).hashes.size == hash_output([np.ones(400)]).hashes.size == 0
+    assert share_used([output(400)], TrainingOutput(0.0, np.zeros(0, np.uint64))) == 0.0
+    assert share_used([], hash_output([output(400)])) == 0.0
 
 
 def test_compare_in_python_knows_half_of_the_record():

@@ -16,7 +16,8 @@ from haselab.cli.model.stated_margins import controller_doubt, model_doubt, warn
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
-from haselab.control import PidGains
+from haselab.control import PidGains, Saturation
+from haselab.control.reach import default_step
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
 from haselab.report import write_report
@@ -25,6 +26,7 @@ from haselab.report.chart_file import write_figure
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import figure_style
 from haselab.rig.chip import (
+    ChipDesign,
     ChipFile,
     Firmware,
     build_firmware,
@@ -167,8 +169,7 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
     "--step",
     "step",
     type=(REAL, REAL),
-    default=(0.0, 0.04),
-    show_default=True,
+    show_default="0 and the step of the design, else 0.04, or half of what the limits allow",
     metavar="BEFORE AFTER",
     help="Set the desired strain before and after the step.",
 )
@@ -219,7 +220,7 @@ def simulate(
     design = read_design(run, structure, FrontEnd(), source)
     settings, zero_m = design.settings, design.zero_length_m
     _say_narrowed(settings, design.limits, run)
-    before, after = options["step"]
+    before, after = options["step"] or (0.0, _step_of(design))
     precondition_v = options["precondition"]
     plan = StepPlan(before, after, options["before_s"], options["after_s"], zero_m, precondition_v)
     case = None
@@ -253,6 +254,16 @@ def simulate(
     emit(answer, as_json=as_json, out=out)
     if agreement is not None and not agreement.agrees:
         raise ResultError(f"{answer['comparison']} {run}")
+
+
+def _step_of(design: ChipDesign) -> float:
+    """The step for which the controller was designed, else one that its limits allow."""
+    controller = design.tables.controller
+    demanded = None if controller is None else controller.demands.get("step")
+    if demanded is not None:
+        return float(demanded)
+    limits = Saturation(design.settings.strain_low, design.settings.strain_high)
+    return default_step(design.plant, limits)
 
 
 def _twin(

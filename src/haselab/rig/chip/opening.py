@@ -156,7 +156,7 @@ class ChipFile(PrintableSection):
         Returns:
             The settings; the controller's output is limited to the strains that are reached.
         Raises:
-            InputError: The voltage map does not rise within what the module reaches.
+            InputError: The voltage map turns within what the module reaches.
         """
         high, rise = self.drive_high_v, self.rise_v_per_s
         high = settings.drive_high_v if high is None else high

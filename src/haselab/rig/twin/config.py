@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from haselab.base import InputError
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.rig.twin.camera import TwinCameraConfig
 from haselab.store.toml import Section, validated
 
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from haselab.actuators import ActuatorLaw, PlanarHasel
 
 __all__ = [
-    "PLANAR_HASEL",
     "READINGS",
     "AcquisitionConfig",
     "Amplifier",
@@ -29,8 +29,6 @@ __all__ = [
     "twin_of_reading",
 ]
 
-
-PLANAR_HASEL = "planar-hasel"
 _PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "dielectric")
 
 

@@ -9,7 +9,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from haselab.base import JsonObject
-from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig, twin_of_reading
+from haselab.rig.protocols import PLANAR_HASEL
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 
 __all__ = [
     "follows_from_twin",

@@ -19,7 +19,8 @@ from haselab.actuators import (
 from haselab.base import InputError, JsonObject, LimitError, table_at
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.sections import PhysicalTable
-from haselab.rig.twin.config import PLANAR_HASEL, READINGS, Origin, TwinConfig
+from haselab.rig.protocols import PLANAR_HASEL
+from haselab.rig.twin.config import READINGS, Origin, TwinConfig
 from haselab.store.actuator_file import read_actuator
 from haselab.store.manifest import sha256_of
 from haselab.store.toml import read_toml, validated

@@ -1,6 +1,6 @@
-"""Draws the pictures of docs/identify/identification.md and prints the figures of the page.
+"""Draws the pictures of docs/identify and prints the figures of identification.md.
 
-    python -m benchmarks.identification.pictures docs/pictures [DATA]
+    python -m benchmarks.identification.pictures docs/pictures/identify [DATA]
 
 DATA is a folder with identification/ecoflex-00-30-tensile.csv (LucMarechal/Soft-Robotics-
 Materials-Database, ODbL 1.0); without it the picture of the laws is left out.
@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from haselab.actuators import GRAVITY_M_S2, PlanarHasel, linearise
 from haselab.identify import (
     FreeTrial,
     Record,
@@ -158,6 +159,33 @@ def draw_hyperelastic(data):
     return figure
 
 
+def draw_operating_points():
+    """Gain, natural frequency and slowest pole of the reference actuator over voltage and mass."""
+    law, voltages, masses = PlanarHasel(), np.linspace(250.0, 10.8e3, 18), np.linspace(0.1, 0.4, 10)
+    longest_m = 0.1  # beyond all of them, so that the actuator is softened everywhere
+    found = np.empty((3, masses.size, voltages.size))
+    for row, mass_kg in enumerate(masses):
+        for column, volt in enumerate(voltages):
+            point = linearise(law, volt, mass_kg * GRAVITY_M_S2, mass_kg, longest_m=longest_m)
+            found[:, row, column] = (
+                np.log10(1e6 * point.gain_m_per_v),
+                np.abs(point.poles).max(),
+                np.abs(point.poles).min(),
+            )
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    labels = ("log10 of the gain / (µm/V)", "natural frequency / (rad/s)", "slowest pole / (rad/s)")
+    grid = np.meshgrid(1e-3 * voltages, masses)
+    for k, (values, label) in enumerate(zip(found, labels, strict=True)):
+        axes = figure.add_subplot(1, 3, k + 1, projection="3d")
+        axes.plot_surface(*grid, values, cmap="viridis", rstride=1, cstride=1, lw=0.2, ec="white")
+        axes.set(xlabel="voltage / kV", ylabel="hung mass / kg", xticks=[0, 5, 10],
+                 yticks=[0.1, 0.2, 0.3, 0.4])  # fmt: skip
+        axes.set_title(f"{'ABC'[k]}  {label}", loc="left")
+        axes.view_init(25.0, -125.0 if k == 0 else -40.0)
+        axes.set_box_aspect(None, zoom=0.9)
+    return figure
+
+
 def _bound(std):
     """Cramer-Rao bound of gain, frequency, damping, delay; state and offset unknown."""
 
@@ -239,12 +267,13 @@ def main(folder, data):
     folder.mkdir(parents=True, exist_ok=True)
     with figure_style():
         figures = {
-            "identify-transfer": draw_transfer(),
-            "identify-frequency-response": draw_frequency_response(),
-            "identify-free-response": draw_free_response(),
+            "transfer": draw_transfer(),
+            "frequency-response": draw_frequency_response(),
+            "free-response": draw_free_response(),
+            "operating-points": draw_operating_points(),
         }
         if data is not None:
-            figures["identify-hyperelastic"] = draw_hyperelastic(data)
+            figures["hyperelastic"] = draw_hyperelastic(data)
         for name, figure in figures.items():
             svg = to_svg(figure, name, name.replace("-", " "))
             (folder / f"{name}.svg").write_text(svg, encoding="utf-8")

@@ -210,18 +210,18 @@ def test_a_map_that_reaches_exactly_the_highest_drive_is_used(settings: ChipSett
     for end in (0.0, np.inf):
         beside_v = float(np.nextafter(highest_v, np.float32(end)))
         assert replace(settings, drive_high_v=beside_v).drive_high_v == beside_v
-    with pytest.raises(InputError, match=r"must rise within"):
+    with pytest.raises(InputError, match=r"everywhere within"):
         replace(settings, drive_high_v=float(highest_v) - 1e-4)
 
 
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"drive_high_v": 1.0}, "must rise within"),
+        ({"drive_high_v": 1.0}, "everywhere within"),
         ({"drive_high_v": 2.5}, "below the converter's"),
         ({"kp": math.nan}, "must be finite"),
         ({"strain_low": 0.2}, "low end below its high end"),
-        ({"voltage_map": (1.0, -3.0, 0.0, 0.0)}, "must rise"),
+        ({"voltage_map": (0.4, -30.0, 0.4, 30.0)}, "must rise, or fall, everywhere"),
     ],
 )
 def test_settings_that_cannot_be_meant_are_refused(
@@ -229,6 +229,36 @@ def test_settings_that_cannot_be_meant_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=match):
         replace(settings, **changes)
+
+
+def test_an_actuator_that_contracts_starts_at_its_longest(settings: ChipSettings) -> None:
+    """Mirrored maps: the strain of 0 V is at the upper end, and all numbers are mirrored."""
+    a1_v, b1, a2_v, b2 = settings.voltage_map
+    mirrored = replace(
+        settings,
+        voltage_map=(a1_v, -b1, a2_v, -b2),
+        strain_map=tuple(-x for x in settings.strain_map),
+        strain_low=-settings.strain_high,
+        strain_high=-settings.strain_low,
+    )
+    assert (settings.strain_start, settings.rises) == (settings.strain_low, True)
+    assert (mirrored.strain_start, mirrored.rises) == (mirrored.strain_high, False)
+    assert mirrored.table_v == pytest.approx(settings.table_v[::-1], rel=1e-6)
+    assert mirrored.capacitance_range_f == pytest.approx(settings.capacitance_range_f)
+    text = settings_header(mirrored)
+    assert numbers_of(text, "controller.u_start") == numbers_of(text, "controller.u_high")
+
+
+def test_the_capacitances_are_on_the_branch_of_the_fitted_range(settings: ChipSettings) -> None:
+    """A falling cubic has a minimum below its range, where the same strains occur again."""
+    # strain = 0.02 - (c - 1)^2 (c + 0.5) / 10 with c in nF: falls from 1 nF on, rises below
+    slope, offset, curvature, cubic = 0.0, 0.02 - 0.05, 0.15, -0.1
+    map_ = (1e9 * slope, offset, 1e18 * curvature, 1e27 * cubic)
+    wide = replace(settings, strain_low=-0.02, strain_high=0.015, strain_map=map_)
+    low_f, high_f = replace(wide, usable_f=(0.6e-9, 2.2e-9)).capacitance_range_f
+    assert low_f == pytest.approx(1e-9)  # its turning point
+    c = 1e9 * high_f
+    assert offset + curvature * c**2 + cubic * c**3 == pytest.approx(-0.12)
 
 
 def test_a_map_that_does_not_cover_the_saturation_is_refused(settings: ChipSettings) -> None:

@@ -9,7 +9,8 @@ from haselab.base import InputError
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.chip import ChipFile
 from haselab.rig.rig_file import load_rig, load_rig_to_shut_down
-from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.twin_file import load_twin
 from haselab.store.toml import toml_text
 
 _ROOT = Path(__file__).resolve().parents[2]

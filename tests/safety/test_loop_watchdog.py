@@ -190,6 +190,17 @@ def test_the_range_of_capacitance_is_that_of_the_map() -> None:
     assert capacitance_range((4.9e8, -0.27, 0.0, 0.0), -0.5, -0.4) == (0.0, 0.0)
 
 
+def test_the_range_of_capacitance_of_a_map_that_falls() -> None:
+    assert capacitance_range((-4.9e8, 0.27, 0.0, 0.0), -0.2, 0.1) == pytest.approx(
+        (0.17 / 4.9e8, 0.47 / 4.9e8)
+    )
+    # strain = 0.02 - (c - 1)^2 (c + 0.5) / 10 with c in nF: it falls from 1 nF on, and rises below
+    falling = (0.0, -0.03, 0.15e18, -0.1e27)
+    low, high = capacitance_range(falling, -0.1, 0.1, about_f=1.6e-9)
+    assert low == pytest.approx(1e-9)  # the strain is at most 0.02, at the turning point
+    assert -0.03 + 0.15e18 * high**2 - 0.1e27 * high**3 == pytest.approx(-0.1)
+
+
 def test_a_rig_with_its_own_controller_is_watched_by_its_output() -> None:
     rng = np.random.default_rng(9)
     watchdog = OutputWatchdog(RIG, Limits("strain", -0.05, 0.1, ""), SETTINGS)

@@ -63,11 +63,13 @@ def test_a_parabola_that_would_fall_inside_the_record_is_replaced_by_a_line():
     c, _ = cycles(3)
     x = (c - c.min()) / np.ptp(c)
     bend = x - 0.7 * x**2  # falls beyond 0.71
-    for kind in ("quadratic", "cubic"):
-        with pytest.raises(ResultError, match=r"everywhere.*Fit a lower degree"):
-            fit_strain_map(c, bend, kind)
-    line = fit_strain_map(c, bend)
-    assert line.curvature_per_f2 == 0.0 and line.slope_per_f > 0.0
+    for sign, way in ((1.0, "rise"), (-1.0, "fall")):
+        for kind in ("quadratic", "cubic"):
+            words = rf"does not {way} with the capacitance everywhere.*Fit a lower degree"
+            with pytest.raises(ResultError, match=words):
+                fit_strain_map(c, sign * bend, kind)
+        line = fit_strain_map(c, sign * bend)
+        assert line.curvature_per_f2 == 0.0 and sign * line.slope_per_f > 0.0
 
 
 def test_the_covariance_is_that_of_maps_of_other_cycles():
@@ -189,10 +191,22 @@ def test_columns_that_cannot_be_fitted_are_refused(change, words):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_strain_that_falls_with_the_capacitance_is_no_result(kind):
-    c, _ = cycles(2)
-    with pytest.raises(ResultError, match=r"does not rise with the capacitance.* Check the col"):
-        fit_strain_map(c, -straight(c), kind)
+def test_the_map_of_an_actuator_that_contracts_falls(kind):
+    c, way = cycles(3)
+    strain = straight(c) + 0.002 * way
+    falling, rising = fit_strain_map(c, -strain, kind), fit_strain_map(c, strain, kind)
+    # All numbers are those of the mirrored map; the quantiles of the band change places.
+    assert falling.coefficients == pytest.approx([-x for x in rising.coefficients], rel=1e-9)
+    assert falling.band == pytest.approx([-x for x in reversed(rising.band)], rel=1e-9)
+    assert falling.hysteresis_strain == pytest.approx(rising.hysteresis_strain, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_strain_that_does_not_follow_the_capacitance_is_no_result(kind):
+    c, _ = cycles(3)
+    late = np.roll(straight(c), 100)  # a quarter of a cycle: each capacitance has both strains
+    with pytest.raises(ResultError, match=r"does not follow the capacitance.* Check the columns"):
+        fit_strain_map(c, late, kind)
 
 
 def test_unknown_kinds_and_coverages_are_refused():

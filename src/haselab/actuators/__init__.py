@@ -20,6 +20,7 @@ from haselab.actuators.response import (
     with_parameters,
 )
 from haselab.actuators.table import LawTable, law_table
+from haselab.actuators.uncertain import Scales, draw_parameters
 
 __all__ = [
     "ACTUATORS",
@@ -41,7 +42,9 @@ __all__ = [
     "Pouch",
     "Response",
     "SampledLaw",
+    "Scales",
     "actuator_law",
+    "draw_parameters",
     "equilibrium_m",
     "law_table",
     "linearise",

@@ -78,15 +78,17 @@ class CurlingHasel(ActuatorLaw):
     kind: ClassVar[str] = "curling-hasel"
 
     # fmt: off
-    cells: float = parameter(5.0, unit="", low=1.0, high=100.0, description="number of cells")
+    cells: float = parameter(
+        5.0, unit="", low=1.0, high=100.0, description="number of cells", fitted=False)
     cell_length_m: float = parameter(
         0.02, unit="m", low=1e-3, high=0.2, description="one cell and the film of its pouch")
     electrode_length_m: float = parameter(
-        0.01, unit="m", low=5e-4, high=0.18, description="part of it with electrodes")
+        0.01, unit="m", low=5e-4, high=0.18, description="part of it with electrodes", fitted=False)
     strip_width_m: float = parameter(
-        0.05, unit="m", low=1e-3, high=1.0, description="across the load")
+        0.05, unit="m", low=1e-3, high=1.0, description="across the load", fitted=False)
     film_thickness_m: float = parameter(
-        18e-6, unit="m", low=1e-6, high=1e-3, description="one film; two are between electrodes")
+        18e-6, unit="m", low=1e-6, high=1e-3, description="one film; two are between electrodes",
+        fitted=False)
     permittivity: float = parameter(
         2.2, unit="", low=1.0, high=100.0, description="relative, of the film")
     film_stiffness_n_per_m: float = parameter(
@@ -106,7 +108,7 @@ class CurlingHasel(ActuatorLaw):
     curl_rad: float = parameter(
         1.1, unit="rad", low=0.3, high=1.7, description="clamp to tip, neither load nor voltage")
     own_mass_kg: float = parameter(
-        0.01, unit="kg", low=0.0, high=10.0, description="acting at the tip")
+        0.01, unit="kg", low=0.0, high=10.0, description="acting at the tip", fitted=False)
     damping_n_s_per_m: float = parameter(
         8.0, unit="N s/m", low=1e-6, high=1e4, description="linear damper")
     branch_share: tuple[float, ...] = parameter(
@@ -118,11 +120,12 @@ class CurlingHasel(ActuatorLaw):
     charge_relaxation_s: float = parameter(
         5.0, unit="s", low=0.01, high=1e4, description="of that part")
     series_ohm: float = parameter(
-        5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes")
+        5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes", fitted=False)
     leakage_ohm: float = parameter(
-        2e10, unit="ohm", low=1e6, high=1e18, description="of the dielectric")
+        2e10, unit="ohm", low=1e6, high=1e18, description="of the dielectric", fitted=False)
     breakdown_v_per_m: float = parameter(
-        450e6, unit="V/m", low=1e6, high=1e10, description="field that destroys the film")
+        450e6, unit="V/m", low=1e6, high=1e10, description="field that destroys the film",
+        fitted=False)
     # fmt: on
 
     def __post_init__(self) -> None:

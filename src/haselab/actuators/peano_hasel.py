@@ -114,15 +114,16 @@ class PeanoHasel(ActuatorLaw):
 
     # fmt: off
     pouches: float = parameter(
-        5.0, unit="", low=1.0, high=1e3, description="number of pouches in series")
+        5.0, unit="", low=1.0, high=1e3, description="number of pouches in series", fitted=False)
     pouch_length_m: float = parameter(
         0.02, unit="m", low=1e-3, high=0.2, description="film of one pouch")
     electrode_length_m: float = parameter(
-        0.01, unit="m", low=5e-4, high=0.18, description="part of it with electrodes")
+        0.01, unit="m", low=5e-4, high=0.18, description="part of it with electrodes", fitted=False)
     pouch_width_m: float = parameter(
-        0.05, unit="m", low=1e-3, high=1.0, description="across the load")
+        0.05, unit="m", low=1e-3, high=1.0, description="across the load", fitted=False)
     film_thickness_m: float = parameter(
-        18e-6, unit="m", low=1e-6, high=1e-3, description="one film; two are between electrodes")
+        18e-6, unit="m", low=1e-6, high=1e-3, description="one film; two are between electrodes",
+        fitted=False)
     permittivity: float = parameter(
         2.2, unit="", low=1.0, high=100.0, description="relative, of the film")
     film_stiffness_n_per_m: float = parameter(
@@ -138,7 +139,7 @@ class PeanoHasel(ActuatorLaw):
     unzipped_share: float = parameter(
         0.1, unit="", low=1e-3, high=1.0, description="unzipped over zipped capacitance")
     own_mass_kg: float = parameter(
-        0.005, unit="kg", low=0.0, high=10.0, description="acting at the moving end")
+        0.005, unit="kg", low=0.0, high=10.0, description="acting at the moving end", fitted=False)
     damping_n_s_per_m: float = parameter(
         6.0, unit="N s/m", low=1e-6, high=1e4, description="linear damper")
     branch_share: tuple[float, ...] = parameter(
@@ -150,11 +151,12 @@ class PeanoHasel(ActuatorLaw):
     charge_relaxation_s: float = parameter(
         5.0, unit="s", low=0.01, high=1e4, description="of that part")
     series_ohm: float = parameter(
-        5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes")
+        5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes", fitted=False)
     leakage_ohm: float = parameter(
-        2e10, unit="ohm", low=1e6, high=1e18, description="of the dielectric")
+        2e10, unit="ohm", low=1e6, high=1e18, description="of the dielectric", fitted=False)
     breakdown_v_per_m: float = parameter(
-        450e6, unit="V/m", low=1e6, high=1e10, description="field that destroys the film")
+        450e6, unit="V/m", low=1e6, high=1e10, description="field that destroys the film",
+        fitted=False)
     # fmt: on
 
     def __post_init__(self) -> None:

@@ -45,6 +45,11 @@ class LawTable:
     capacitance_f: Floats
     pull_n_v2: Floats
 
+    @property
+    def high_m(self) -> float:
+        """Last length."""
+        return self.low_m + self.step_m * (self.elastic_n.size - 1)
+
     def arrays(self) -> tuple[float, float, float, Floats, Floats, Floats, Floats]:
         """All values, in the order that the compiled code takes them."""
         return (

@@ -19,8 +19,9 @@ from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.record import Record
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig, RigDescription
-from haselab.rig.twin.config import load_twin, twin_of_reading
+from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
+from haselab.rig.twin.twin_file import load_twin
 from haselab.runtime import runner as runtime
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.lockin import lockin_of
@@ -47,7 +48,8 @@ def twin(
     """A simulated bench.
 
     Args:
-        file: TWIN.toml. None: the actuator of the reference study.
+        file: TWIN.toml, or an actuator file with an identified `[model.physical]`. None: the
+            actuator of the reference study.
         frequency_unit: interpretation of that study's frequency axis, "hz" or "rad".
         seed: of its noise.
     Returns:

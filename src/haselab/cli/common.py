@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import click
 
-from haselab.base import InputError, Progress, SilentProgress, to_plain
+from haselab.base import Progress, SilentProgress, to_plain
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule, reserved
 from haselab.cli.plot import PLOT
@@ -31,7 +31,6 @@ __all__ = [
     "answer_options",
     "emit",
     "progress_bar",
-    "refuse_two_twins",
     "unverified_option",
     "warn_unverified",
 ]
@@ -141,19 +140,6 @@ def warn_unverified(doubt: str, path: Path) -> None:
     """Warn in one line that the numbers of a session are not verified, and why."""
     if doubt:
         click.echo(f"haselab: unverified numbers: {doubt}. {path}", err=True)
-
-
-def refuse_two_twins(reading: str | None, twin: Path | None) -> None:
-    """Refuse `--reading` together with `--twin`: one of them would have no effect.
-
-    Raises:
-        InputError: both were given.
-    """
-    if reading is not None and twin is not None:
-        raise InputError(
-            f"--reading {reading} chooses a default twin, but --twin describes another one. Leave "
-            f"one of them out. {twin}"
-        )
 
 
 def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:

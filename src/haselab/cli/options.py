@@ -31,6 +31,11 @@ _SHARED: dict[str, tuple[str | None, str]] = {
         None,
         "Set the age of a measurement when the output computed from it takes effect, in s.",
     ),
+    "--draw": (
+        None,
+        "Draw the parameters of the identified actuator with this seed, within their uncertainty. "
+        "Default: the estimates.",
+    ),
     "--duration-s": (None, "Set the duration in s."),
     "--experiment": ("NAME", "Name the experiment in the session."),
     "--held-at-hz": (None, "State the update rate of the output converter in Hz."),
@@ -58,7 +63,10 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--stretch-min": (None, "Leave out rows below this stretch."),
     "--through-voltage-map": (None, "Convert the input from V to strain with [drive.voltage_map]."),
     "--to": (None, "Choose the output format."),
-    "--twin": ("TWIN.toml", "Use the twin of this file."),
+    "--twin": (
+        "FILE.toml",
+        "Use the twin of this TWIN.toml, or of the identified actuator of this actuator file.",
+    ),
     "--v": ("COLUMN", "Name the column of the voltage monitor, in V."),
     "--volt-per-monitor-volt": (None, "Set the scale of the voltage monitor in V/V."),
     "--yes": (None, "Skip the confirmation."),

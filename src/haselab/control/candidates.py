@@ -15,6 +15,7 @@ from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant, PlantScale, varied
 from haselab.control.plants.general_loops import closed_loop_poles, trace_general
 from haselab.control.plants.modes import SampledLoops
+from haselab.control.reach import default_step
 from haselab.control.ringing import Ringing
 from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
@@ -62,6 +63,13 @@ class Task:
     def plants(self) -> tuple[AnyPlant, ...]:
         """The nominal plant, and with its natural frequency varied to both sides."""
         return varied(self.plant, self.spec.frequency_spread)
+
+    @property
+    def step(self) -> float:
+        """Reference step of the simulated experiments."""
+        if self.spec.step is None:
+            return default_step(self.plant, self.setting.saturation)
+        return self.spec.step
 
     def horizon_s(self) -> float:
         """Length of the simulated step, in s: several rise times, and the slow modes."""
@@ -147,8 +155,9 @@ def _step_miss(
 ) -> NDArray[np.float64]:
     """Relative misses of rise time, overshoot and error in the simulated step."""
     spec, setting = task.spec, task.setting
-    reference = np.full(round(task.horizon_s() * setting.rate_hz), spec.step)
+    reference = np.full(round(task.horizon_s() * setting.rate_hz), task.step)
     measured, poles = _traces(candidates, plants, reference, setting)
+    measured *= math.copysign(1.0, task.step)
     rings = [_lasting(row, setting.rate_hz) for row in poles]
     numbers = [_step_numbers(y, ring, task) for y, ring in zip(measured, rings, strict=True)]
     shape = (3, len(plants), len(candidates))
@@ -192,10 +201,10 @@ def _traces(
 def _step_numbers(
     measured: NDArray[np.float64], ring: Ringing | None, task: Task
 ) -> tuple[float, float, float]:
-    """Rise time, overshoot over the reference, and magnitude of the error at the end."""
+    """Rise time, overshoot over the reference, and error of a response in the step's direction."""
     if measured[-measured.size // 10 :].mean() <= 0.0:
         return 1e3, 1e3, 1e3
-    step, rate_hz = task.spec.step, task.setting.rate_hz
+    step, rate_hz = abs(task.step), task.setting.rate_hz
     if ring is not None:  # a long period is averaged on fewer samples
         every = max(1, int(math.pi / ring.omega_rad_s * rate_hz / _LONGEST_WINDOW))
         measured, rate_hz = measured[::every], rate_hz / every

@@ -16,6 +16,7 @@ from haselab.control.candidates import Task, plant_crossover, score
 from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.control.plants.general_loops import trace_general
+from haselab.control.reach import integrates
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
 from haselab.control.stability.margins import Margins, margins
@@ -205,9 +206,8 @@ def _frequency(plant: AnyPlant) -> float:
 
 def _reachable(task: Task, gain: float) -> None:
     """Refuse a step that the limits do not allow."""
-    limits, step = task.setting.saturation, task.spec.step
-    integrates = not isinstance(task.plant, Plant) and task.plant.denominator[-1] == 0.0
-    if integrates or gain * limits.low <= step <= gain * limits.high:
+    limits, step = task.setting.saturation, task.step
+    if integrates(task.plant) or gain * limits.low <= step <= gain * limits.high:
         return
     raise ResultError(
         f"The output saturates: the demanded step of {step:g} needs a controller output of "
@@ -292,12 +292,11 @@ def _searched(task: Task, rng: np.random.Generator, space: _Space) -> Design:
     )
     gains = space.gains(best.x)
     spread = tuple(
-        predict(plant, gains, task.setting, step=task.spec.step, record_s=task.horizon_s())
+        predict(plant, gains, task.setting, step=task.step, record_s=task.horizon_s())
         for plant in task.plants()
     )
-    return Design(
-        gains, task.spec, task.setting, spread[0], spread, _shortfalls(task, gains, spread)
-    )
+    spec = dataclasses.replace(task.spec, step=task.step)
+    return Design(gains, spec, task.setting, spread[0], spread, _shortfalls(task, gains, spread))
 
 
 @dataclass(frozen=True)

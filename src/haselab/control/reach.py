@@ -1,4 +1,4 @@
-"""Range of a controller's output that the drive can produce."""
+"""Range of a controller's output that the drive can produce, and the step within it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,39 @@ import math
 
 from haselab.base import InputError, ResultError
 from haselab.control.gains import Saturation
+from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.models.maps import VoltageMap
+from haselab.models.plant import Plant
 
-__all__ = ["reachable"]
+__all__ = ["default_step", "integrates", "reachable"]
+
+_STEP = 0.04  # of the reference study
+_OF_REACH = 0.5
+
+
+def integrates(plant: AnyPlant) -> bool:
+    """Whether a plant reaches any output with any input."""
+    return not isinstance(plant, Plant) and plant.denominator[-1] == 0.0
+
+
+def default_step(plant: AnyPlant, limits: Saturation) -> float:
+    """The step of a design or a simulation, where none is given.
+
+    Args:
+        plant: plant.
+        limits: of the controller's output.
+    Returns:
+        0.04; where the limits do not allow that, half of the larger step that they allow, in the
+        direction of it.
+    Example:
+        >>> plant = Plant(0.8, 60.0, 0.2)
+        >>> default_step(plant, Saturation()), default_step(plant, Saturation(-0.02, 0.015))
+        (0.04, -0.008)
+    """
+    gain = PlantScale.of(plant).gain
+    if integrates(plant) or gain * limits.low <= _STEP <= gain * limits.high:
+        return _STEP
+    return _OF_REACH * gain * max(limits.low, limits.high, key=abs)
 
 
 def reachable(

@@ -10,6 +10,7 @@ from haselab.base import InputError, check_fields
 
 __all__ = ["DesignSpec"]
 
+_SMALLEST_STEP, _LARGEST_STEP = 1e-12, 1e12
 _LARGEST = 1e30  # NaN and infinity are not valid either
 
 
@@ -31,7 +32,9 @@ class DesignSpec:
         noise_gain: largest change of the output when one measurement changes by 1.
         frequency_spread: relative uncertainty of the natural frequency, up and down.
         keep_crossover: whether the highest crossover must be at least the plant's own.
-        step: reference step of the simulated experiments, in the unit of the plant's output.
+        step: reference step of the simulated experiments, in the unit of the plant's output,
+            negative for a contraction; None: 0.04, or where the limits do not allow that, half of
+            the larger step that they allow.
     Raises:
         InputError: a demand out of range.
     Example:
@@ -49,7 +52,7 @@ class DesignSpec:
     noise_gain: float = 15.0
     frequency_spread: float = 0.15
     keep_crossover: bool = False
-    step: float = 0.04
+    step: float | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -63,12 +66,16 @@ class DesignSpec:
             "peak_sensitivity": (1.0, 1e3),
             "noise_gain": (0.0, 1e6),
             "frequency_spread": (0.0, 0.9),
-            "step": (1e-12, 1e12),
         }
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise InputError(f"{name} = {value:g}; must be within [{low:g}, {high:g}].")
+        if self.step is not None and not _SMALLEST_STEP <= abs(self.step) <= _LARGEST_STEP:
+            raise InputError(
+                f"step = {self.step:g}; its magnitude must be within [{_SMALLEST_STEP:g}, "
+                f"{_LARGEST_STEP:g}]."
+            )
         if self.rise_time_tolerance is not None and self.rise_time_s is None:
             raise InputError("rise_time_tolerance is given without rise_time_s. Add rise_time_s.")
 

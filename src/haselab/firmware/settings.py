@@ -193,12 +193,14 @@ class ChipSettings:
                 f"converter's {_OUTPUT_V:g} V. Change drive_high_v."
             )
         table, slack_v = self.table_v, _SINGLE * self.drive_high_v
+        table = table if self.rises else table[::-1]
         ends_v = table[0] + slack_v, table[-1] - slack_v
         if not (np.diff(table) > 0.0).all() or ends_v[0] < 0.0 or ends_v[1] > self.drive_high_v:
             raise InputError(
-                f"The voltage map goes from {table[0]:g} V to {table[-1]:g} V over the saturation, "
-                f"but it must rise within [0, {self.drive_high_v:g}] V. Give narrower --limits to "
-                "'haselab design', or measure the voltage map again."
+                f"The voltage map goes from {self.table_v[0]:g} V to {self.table_v[-1]:g} V over "
+                "the saturation, but it must rise, or fall, everywhere within [0, "
+                f"{self.drive_high_v:g}] V. Give narrower --limits to 'haselab design', or measure "
+                "the voltage map again."
             )
 
     @property
@@ -206,6 +208,16 @@ class ChipSettings:
         """Drive at equal steps of corrected strain, in V, in single precision."""
         span = np.linspace(self.strain_low, self.strain_high, _TABLE_STEPS + 1)
         return [_core.voltage_from_strain(*self.voltage_map, float(u)) for u in span]
+
+    @property
+    def rises(self) -> bool:
+        """Whether the voltage rises with the strain; it falls for an actuator that contracts."""
+        return self.table_v[-1] > self.table_v[0]
+
+    @property
+    def strain_start(self) -> float:
+        """Corrected strain from which a loop starts: that of the lowest voltage."""
+        return self.strain_low if self.rises else self.strain_high
 
     @property
     def sensing(self) -> tuple[float, float, int, int, int]:
@@ -357,7 +369,7 @@ def _body(s: ChipSettings) -> str:
         ("controller.period_s", _single(period_s)),
         ("controller.u_low", _single(s.strain_low)),
         ("controller.u_high", _single(s.strain_high)),
-        ("controller.u_start", _single(s.strain_low)),  # where the table meets 0 V
+        ("controller.u_start", _single(s.strain_start)),
         *_own_entries(s, period_s),
         (
             "voltage",

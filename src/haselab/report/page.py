@@ -116,11 +116,16 @@ def compose_page(run: RunFolder) -> Page:
 
 
 def _title(results: Results, is_study: bool) -> str:
-    """What was done, or the name of the study; and whether the bench was simulated."""
+    """What was done, or the name of the study; and whether and how the bench was simulated."""
     study = results.provenance.get("study")
     name = study.get("name") if isinstance(study, Mapping) else None
     title = _TITLE if is_study or not name else str(name)
-    return f"SIMULATED: {title}" if results.simulated else title
+    if not results.simulated:
+        return title
+    rig = results.provenance.get("rig_config")
+    if isinstance(rig, Mapping) and rig.get("origin"):
+        return f"SIMULATED, {rig.get('name')}: {title}"
+    return f"SIMULATED: {title}"
 
 
 def _plans(analysis: Mapping[str, Any]) -> tuple[FigurePlan, ...]:

@@ -20,7 +20,7 @@ from haselab.rig.instruments.sections import (
     InstrumentConfig,
     SupplyConfig,
 )
-from haselab.rig.protocols import RigDescription
+from haselab.rig.protocols import PLANAR_HASEL, RigDescription
 from haselab.store.toml import PrintableSection
 
 __all__ = [
@@ -118,6 +118,7 @@ class StandConfig(PrintableSection):
 class SpecimenConfig(PrintableSection):
     """The actuator in the bench, measured with calipers and a balance."""
 
+    kind: str = Field(PLANAR_HASEL, description="of actuator; the shell is that of a planar-hasel")
     shell_width_m: float = Field(gt=0, description="width without load", examples=[0.05])
     shell_thickness_m: float = Field(
         gt=0, description="thickness without load and liquid", examples=[0.0012]
@@ -239,4 +240,5 @@ class BenchConfig(PrintableSection):
             mass_kg=self.specimen.mass_kg,
             amplifier=amplifier.name,
             exposure_s=getattr(self.camera, "exposure_s", None) or 0.0,
+            actuator_kind=self.specimen.kind,
         )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from haselab.base import Limits
 
 __all__ = [
+    "PLANAR_HASEL",
     "Acquisition",
     "BuiltInController",
     "Camera",
@@ -31,6 +32,7 @@ __all__ = [
     "VoltageSource",
 ]
 
+PLANAR_HASEL = "planar-hasel"  # the kind of the reference study
 
 _T = TypeVar("_T")
 
@@ -73,6 +75,7 @@ class RigDescription:
         amplifier: make and number; a calibration of the monitors is valid only for this one.
         calibration: of the monitors; None: by the nominal gains.
         exposure_s: of one frame; 0 if it is not known.
+        actuator_kind: of the actuator, as in its actuator file.
     """
 
     name: str
@@ -92,6 +95,7 @@ class RigDescription:
     amplifier: str = ""
     calibration: MonitorCalibration | None = None
     exposure_s: float = 0.0
+    actuator_kind: str = PLANAR_HASEL
 
     @property
     def block_s(self) -> float:

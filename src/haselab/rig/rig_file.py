@@ -24,8 +24,9 @@ from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.instruments.registry import instrument_of
 from haselab.rig.real_bench import RealBench
 from haselab.rig.replay import ReplayBench
-from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
+from haselab.rig.twin.twin_file import identified_twin, is_actuator_file, load_twin
 from haselab.store.toml import PrintableSection, read_toml, validated
 
 __all__ = [
@@ -43,12 +44,18 @@ _FORMER_CHIP = "mega"  # kind of a microcontroller in rig files of earlier versi
 
 
 class TwinFile(PrintableSection):
-    """`kind = "twin"`, `twin = "TWIN.toml"` or `reading = "hz"`, `seed = 1`."""
+    """`kind = "twin"`, `twin = "TWIN.toml"` or `reading = "hz"`, `seed = 1`.
+
+    `twin` may also be an actuator file with `[model.physical]`: then `bench` is the TWIN.toml with
+    the instruments, and `draw` the seed with which its parameters are drawn.
+    """
 
     kind: Literal["twin"]
     twin: str | None = None
     reading: Literal["rad", "hz"] | None = None
     seed: int = Field(1, ge=0, le=MAX_SEED)
+    bench: str | None = None
+    draw: int | None = Field(None, ge=0, le=MAX_SEED)
 
     def configuration(self, path: Path) -> TwinConfig:
         """Load the twin's configuration.
@@ -56,13 +63,23 @@ class TwinFile(PrintableSection):
         Args:
             path: of the rig file, relative to which the twin's file is found.
         Raises:
-            InputError: The twin's file is not valid, or both twin and reading are given.
+            InputError: The twin's file is not valid, or a key has no effect beside another.
         """
-        if self.twin is None:
+        file = None if self.twin is None else path.parent / self.twin
+        if file is not None and is_actuator_file(file):
+            bench = TwinFile(kind="twin", twin=self.bench, reading=self.reading)
+            return identified_twin(file, bench.configuration(path), self.draw)
+        for key, value in (("bench", self.bench), ("draw", self.draw)):
+            if value is not None:
+                raise InputError(
+                    f"{key} = {value!r} needs an identified actuator. Set twin to an actuator file "
+                    f"with [model.physical], or remove {key}. {path}"
+                )
+        if file is None:
             return twin_of_reading(self.reading or "hz")
         if self.reading is not None:
             raise InputError(f"Set either twin or reading; the twin's file has a reading. {path}")
-        return load_twin(path.parent / self.twin)
+        return load_twin(file)
 
 
 class ReplayFile(PrintableSection):

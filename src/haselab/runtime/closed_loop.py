@@ -152,6 +152,7 @@ def _sensor(
 
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:
     settings, by_video = rig.safety.settings, loop.video_zero_px is not None
+    range_f = loop.strain_map.range_f or (0.0, 0.0)
     model = loop_model(
         rig.description,
         loop.voltage_map,
@@ -159,6 +160,7 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         (carrier[0], carrier[1] if loop.carrier_v is None else loop.carrier_v),
         settings.settle_s,
         None if by_video else loop.strain_map.coefficients,
+        0.5 * (range_f[0] + range_f[1]),
     )
     return LoopWatchdog(
         model, settings.loop, settings.rating, rig.present_drive_v, rig.bench.is_settled

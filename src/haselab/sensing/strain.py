@@ -25,6 +25,7 @@ MapKind = Literal["auto", "line", "quadratic", "cubic"]
 _FEWEST = 32
 _CELLS = 24  # of equal capacitance; each counts once per branch, however long it took
 _TURN = 0.15  # of the range: smaller reversals do not start a new branch
+_LEFT = 0.5  # of the variance of the strain, that a line may leave
 _FOLDS = 10  # groups of cycles, each left out once
 _SEGMENTS = 16  # of a record that is checked for drift
 _HOUR_S = 3600.0
@@ -63,14 +64,16 @@ def fit_strain_map(
         capacitance_f: in order of time, in F. Shape `(N,)`.
         strain: of the camera at the same times. Shape `(N,)`.
         kind: "line", the study's form; "quadratic"; "cubic"; "auto" is the highest degree for
-            which the map rises over the whole record.
+            which the map rises, or falls, over the whole record. It falls for an actuator that
+            contracts.
         coverage: share of the strains that the band should contain.
     Returns:
         The map with its band and the range of the record. With one cycle it has no covariance.
     Raises:
         InputError: fewer than 32 samples, unequal lengths, NaN, a constant capacitance, values
             that cannot be F or strain, an unknown kind, a coverage outside (0, 1).
-        ResultError: the strain does not rise with the capacitance.
+        ResultError: the map turns within the record, or explains less than half of the variance
+            of the strain.
     Source: reference study, row S15, for the line; Efron, The Jackknife (1982), for the covariance.
     Example:
         >>> phase = 2 * np.pi * np.arange(4000) / 1000
@@ -292,19 +295,27 @@ def _chosen(record: _Record, kind: MapKind) -> tuple[int, Floats]:
     """Degree and factors of the map.
 
     Raises:
-        ResultError: no polynomial of this kind rises over the whole record.
+        ResultError: no polynomial of this kind rises, or falls, over the whole record, or the
+            strain does not depend on the capacitance.
     """
+    straight = _fit(record, 1)
+    left, direction = _left(record, straight), float(np.sign(straight[1]))
+    if left > _LEFT:
+        raise ResultError(
+            f"The strain does not follow the capacitance: a straight line leaves {100.0 * left:.3g}"
+            f" % of its variance, but at most {100.0 * _LEFT:g} % may be left. Check the columns "
+            "and their times."
+        )
     for degree in {"auto": (3, 2, 1), "cubic": (3,), "quadratic": (2,), "line": (1,)}[kind]:
         factors = _fit(record, degree)
-        if _rises(factors):
+        if _rises(direction * factors):
             return degree, factors
     low, high = np.polynomial.polynomial.polyval(np.array([-1.0, 1.0]), factors)
     ends_f = record.ends_f
-    bends = kind in ("quadratic", "cubic") and high > low
-    advice = "Fit a lower degree." if bends else "Check the columns and their times."
     raise ResultError(
-        f"The strain does not rise with the capacitance{' everywhere' if bends else ''}: "
-        f"{low:.3g} at {ends_f[0]:.3g} F and {high:.3g} at {ends_f[1]:.3g} F. {advice}"
+        f"The strain does not {'rise' if direction > 0.0 else 'fall'} with the capacitance "
+        f"everywhere: {low:.3g} at {ends_f[0]:.3g} F and {high:.3g} at {ends_f[1]:.3g} F, with a "
+        "turn in between. Fit a lower degree."
     )
 
 
@@ -314,6 +325,14 @@ def _fit(record: _Record, degree: int) -> Floats:
     columns = np.stack([record.x**power for power in range(degree + 1)], axis=1)
     factors = np.linalg.lstsq(root[:, None] * columns, root * record.e, rcond=None)[0]
     return np.concatenate([factors, np.zeros(3 - degree)])
+
+
+def _left(record: _Record, factors: Floats) -> float:
+    """Share of the strain's variance that a fit leaves, with the weights of the fit."""
+    weights = _weights(record.c, record.branch)
+    about = record.e - float(np.average(record.e, weights=weights))
+    residuals = record.e - record.values(factors)
+    return float(weights @ residuals**2 / (weights @ about**2))
 
 
 def _rises(factors: Floats) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 from haselab.base import JsonObject, table_at
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
 from haselab.models.maps import VoltageMap
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json
@@ -127,7 +128,8 @@ def write_findings(
     limits = header["rig"]["drive_limits"]
     ends = (float(limits["low"]), float(limits["high"]))
     maps, dynamics, loops = found.find(Maps), found.find(Dynamics), found.find(Loops)
-    write_design(folder, maps, dynamics, loops, study, ends)
+    kind = header["rig"].get("actuator_kind", PLANAR_HASEL)
+    write_design(folder, maps, dynamics, loops, study, ends, kind)
     return results
 
 
@@ -181,6 +183,7 @@ def write_design(
     loops: Loops | None,
     study: Study,
     drive_limits: tuple[float, float] | None = None,
+    kind: str = PLANAR_HASEL,
 ) -> None:
     """Write actuator.toml: maps, model and controllers, from which firmware is built.
 
@@ -191,6 +194,7 @@ def write_design(
         loops: the controllers; None: the study has none.
         study: its name, sensing and controllers.
         drive_limits: of the rig, in V; None: not written.
+        kind: of the actuator.
     Raises:
         DeviceError: a file cannot be written.
     """
@@ -213,7 +217,7 @@ def write_design(
     if drive_limits is not None:
         sections["drive"] = {"low_v": drive_limits[0], "high_v": drive_limits[1]}
     if not path.exists():
-        sections = {"actuator": {"name": study.name}, **sections}
+        sections = {"actuator": {"name": study.name, "kind": kind}, **sections}
     write_sections(path, sections, _START)
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from haselab.actuators import DeaStack
 from haselab.cli.main import main
-from haselab.rig.twin.config import TwinConfig, load_twin
+from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_file import load_twin
 
 
 def run(*arguments: object) -> int:

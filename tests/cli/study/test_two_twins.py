@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -9,9 +10,11 @@ import pytest
 from click.testing import CliRunner
 
 from haselab.base import InputError, LimitError
+from haselab.cli.bench.calibrate import command as calibrate
 from haselab.cli.doctor import command as doctor
 from haselab.cli.model.firmware import command as firmware
 from haselab.cli.study.reproduce import command as reproduce
+from haselab.cli.study.run import command as run
 from haselab.rig.chip import build
 from haselab.rig.rig_file import load_rig
 from haselab.store.toml import Section, validated
@@ -35,6 +38,89 @@ def test_a_reading_beside_a_twin_is_refused(reading: str, twin: Path, tmp_path: 
     with pytest.raises(InputError, match=words):
         CliRunner().invoke(firmware, ["simulate", str(tmp_path), *both], catch_exceptions=False)
     assert not list(out.glob("*"))
+
+
+LEG = """\
+[actuator]
+name = "leg"
+kind = "planar-hasel"
+[model.physical]
+kind = "planar-hasel"
+not_identifiable = ["mullins.width"]
+[model.physical.parameters]
+shell.shear_modulus_pa = 15e3
+mullins.width = 0.3
+"""
+STUDY = """\
+name = "short"
+[triangle]
+low_v = 0.0
+high_v = 2.0
+frequency_hz = 0.25
+cycles = 3
+left_out_cycles = 1
+frame_rate_hz = 50.0
+"""
+
+
+@pytest.fixture
+def leg(tmp_path: Path) -> Path:
+    path = tmp_path / "leg.toml"
+    path.write_text(LEG)
+    (tmp_path / "study.toml").write_text(STUDY)
+    return path
+
+
+def test_options_that_do_not_fit_an_identified_actuator_are_refused(leg: Path, twin: Path) -> None:
+    folder = leg.parent
+    study, out = str(folder / "study.toml"), str(folder / "out")
+    rigs = {"chip": '\nrun = "."\n[simulator]', "twin": '\ntwin = "leg.toml"'}
+    for kind, rest in rigs.items():
+        (folder / f"{kind}-rig.toml").write_text(f'kind = "{kind}"{rest}\n')
+    (folder / "plain.toml").write_text('kind = "twin"\n')
+    for command, arguments, words in (
+        (reproduce, ["--draw", 1], r"--draw 1 draws the parameters of an identified actuator"),
+        (reproduce, ["--draw", 1, "--twin", twin], r"Name its actuator file with --twin A\.toml"),
+        (run, [study, "--rig", folder / "plain.toml", "--draw", 1], r"--draw 1 needs --twin A"),
+        (run, [study, "--rig", folder / "plain.toml", "--twin", twin], r"is a whole twin with its"),
+        (run, [study, "--rig", folder / "chip-rig.toml", "--twin", leg], r"has kind = 'chip'"),
+        (run, [study, "--rig", folder / "twin-rig.toml", "--twin", leg], r"already has the ident"),
+        (run, [study, "--twin", leg, "--draw", 1], r"mullins\.width cannot be drawn: it is not"),
+    ):
+        given = [*map(str, arguments), "--out", out]
+        with pytest.raises(InputError, match=words):
+            CliRunner().invoke(command, given, catch_exceptions=False)
+    assert not list(Path(out).glob("*"))
+
+
+@pytest.mark.long
+def test_a_study_is_rehearsed_on_the_bench_of_a_rig_file(leg: Path) -> None:
+    """Also with a calibration for another amplifier, which the twin does not have."""
+    folder = leg.parent
+    rig, out = folder / "rig.toml", folder / "out"
+    (folder / "bench.toml").write_text('name = "my bench"\n[amplifier]\ni_monitor_lag_s = 1e-6\n')
+    rig.write_text('kind = "twin"\ntwin = "bench.toml"\nseed = 5\n')
+    other = folder / "other.toml"
+    other.write_text('kind = "twin"\ntwin = "trek.toml"\n')
+    (folder / "trek.toml").write_text('[amplifier]\nname = "Trek"\ni_monitor_gain_error = 0.03\n')
+    given = ["--rig", other, "--capacitor", 1e-9, "--capacitor", 5e-10, "--actuator", leg]
+    done = CliRunner().invoke(calibrate, [*map(str, given)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    given = [folder / "study.toml", "--rig", rig, "--twin", leg, "--actuator", leg]
+    given += ["--keep-video", "none"]
+    done = CliRunner().invoke(run, [*map(str, given), "--out", str(out)], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert "simulating the identified actuator 'leg', with its estimates. leg.toml" in done.stderr
+    assert "the calibration is for 'Trek' and is left out on the twin." in done.stderr
+    assert "warning: not identifiable from its records: mullins.width." in done.stderr
+    results = json.loads((out / "results.json").read_text())
+    config = results["provenance"]["rig_config"]
+    assert results["provenance"]["seed"] == 5
+    assert config["amplifier"]["i_monitor_lag_s"] == 1e-6
+    assert config["shell"]["shear_modulus_pa"] == 15e3
+    assert config["origin"]["not_identifiable"] == ["mullins.width"]
+    page = (out / "report.html").read_text()
+    assert "<h1>SIMULATED, twin of the identified actuator &#39;leg&#39;: short</h1>" in page
 
 
 def test_a_rig_file_without_a_kind_names_the_kinds(tmp_path: Path) -> None:

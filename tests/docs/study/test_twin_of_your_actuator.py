@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from haselab.actuators import equilibrium_m
-from haselab.rig.twin.config import load_twin
+from haselab.rig.twin.twin_file import load_twin
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "study" / "study.md"
 (SECTION,) = re.findall(

@@ -100,13 +100,32 @@ def test_parameters_are_found_within_their_intervals():
     assert len(fit.chart().panels[0].curves) == 2
 
 
-@pytest.mark.long
-def test_a_branch_that_the_model_lacks_is_a_model_error():
+def deviations(fit, law):
+    ones = {"camera.scale": 1.0, "sensing.scale": 1.0}
+    truth = {**fitted_parameters(law), ADDED_INERTIA: 0.0, **ones}
+    return {n: (e.value - truth.get(n, 0.0)) / e.std for n, e in fit.parameters.items()}
+
+
+@pytest.mark.slow
+def test_a_branch_that_the_law_lacks_is_found():
     shares, times = TRUE.losses.branch_share, TRUE.losses.branch_relaxation_s
     more = replace(TRUE, branch_share=(*shares, 0.05), branch_relaxation_s=(*times, 12.0))
     fit = fit_actuator(START, [record(more, 3)], mass_kg=MASS_KG)
-    assert fit.status.startswith("model error: the ")
-    assert fit.succeeded and fit.parameters
+    assert fit.status == "ok"
+    assert fit.rejected_laws[0].law.startswith("without a branch of about ")
+    far = deviations(fit, more)
+    assert "viscosity.share[3]" in far and max(map(abs, far.values())) < 4.0, far
+
+
+@pytest.mark.long
+def test_softening_that_the_law_lacks_is_found():
+    fit = fit_actuator(replace(START, softening_share=0.0), [record(TRUE, 3)], mass_kg=MASS_KG)
+    assert fit.status == "ok"
+    assert fit.rejected_laws[0].law == "without softening"
+    assert fit.rejected_laws[0].log_evidence < -5.0
+    far = deviations(fit, TRUE)
+    assert "mullins.share" in far and max(map(abs, far.values())) < 4.0, far
+    assert fit.answer()["rejected_laws"][0]["law"] == "without softening"
 
 
 def refused(records):

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from haselab.base import InputError
-from haselab.rig.twin.config import READINGS, TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.config import READINGS, TwinConfig, twin_of_reading
+from haselab.rig.twin.twin_file import load_twin
 
 
 def write(folder: Path, text: str) -> Path:

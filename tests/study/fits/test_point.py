@@ -108,11 +108,24 @@ def test_a_baseline_that_the_study_gives_is_kept_and_judged() -> None:
     )
 
 
-def test_a_stretch_that_falls_with_the_voltage_is_no_result() -> None:
+def test_the_baseline_of_an_actuator_that_contracts_is_found() -> None:
+    """The mirrored stretch has its centre at the same voltage."""
+    study = builtin_study()
+    held = holds(study)
+    expected = find_point(held, triangle(study), static(1.2, 1.5784), study, RIG)
+    free_m = static(1.2, 1.5784).free_length_m
+    mirrored = [replace(one, length_m=2.8 * free_m - one.length_m) for one in held]
+    point = find_point(mirrored, triangle(study), static(2.8 - 1.5784, 2.8 - 1.2), study, RIG)
+    assert point.baseline_v == pytest.approx(expected.baseline_v)
+    ours, theirs = (one.quantities["S18.centre_offset"].value for one in (point, expected))
+    assert ours == pytest.approx(-theirs, abs=1e-9)
+
+
+def test_a_stretch_that_turns_with_the_voltage_is_no_result() -> None:
     study = builtin_study()
     turned = holds(study)
     turned[1] = replace(turned[1], length_m=1.1 * turned[1].length_m)
-    with pytest.raises(ResultError, match="must increase with the voltage"):
+    with pytest.raises(ResultError, match="must rise, or fall, with the voltage"):
         find_point(turned, triangle(study), static(1.2, 1.6), study, RIG)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.config import Origin, twin_of_reading
 from haselab.study.definition import builtin_study
 from haselab.study.paper.quantity_table import quantities
 from haselab.study.paper.scope import changes_text, not_played
@@ -75,6 +75,16 @@ def test_changed_counts_a_fixed_baseline_and_another_twin_are_named() -> None:
     assert "operating_point.baseline_v 1.2 instead of found" in printed
     assert "steps.open_trials 1 instead of 6" in printed
     assert "load.mass_kg 0.27 instead of 0.25" in printed
+
+
+def test_the_identified_actuator_of_a_twin_is_named() -> None:
+    origin = Origin(actuator="leg", file="A.toml", draw=3)
+    load = twin_of_reading("hz").load.model_copy(update={"mass_kg": 0.27})
+    twin = twin_of_reading("hz").model_copy(update={"load": load, "origin": origin})
+    assert changes_text(header(twin=twin)) == (
+        "This run used the twin of the identified actuator 'leg' (A.toml, drawn with seed 3) "
+        "instead of the default twin of row S1: load.mass_kg 0.27 instead of 0.25."
+    )
 
 
 def test_another_rig_than_the_twin_is_said() -> None:

@@ -15,7 +15,8 @@ from haselab.base import InputError
 from haselab.cli.common import answer_options
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
-from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig
+from haselab.rig.protocols import PLANAR_HASEL
+from haselab.rig.twin.config import TwinConfig
 from haselab.store.folder import write_new
 from haselab.store.text_file import parse_toml
 from haselab.store.toml import validated

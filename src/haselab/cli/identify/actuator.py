@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import click
+import numpy as np
 
 from haselab.actuators import ACTUATORS, ActuatorLaw, with_parameters
 from haselab.base import InputError, LimitError
@@ -58,7 +59,7 @@ def actuator(
     files = [session_file(session) for session in sessions]
     give(fit, files, as_json, out)
     save_plot(plot, fit.chart)
-    save_section(actuator, "model", {"physical": _section(fit)}, files)
+    save_section(actuator, "model.physical", _section(fit), files, status=fit.status)
 
 
 def _law(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
@@ -73,11 +74,14 @@ def _law(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
 
 def _section(fit: ActuatorFit) -> Mapping[str, object]:
     """`[model.physical]`: estimates with their covariance."""
-    names = list(fit.parameters)
+    finite = np.isfinite(np.diag(fit.covariance))
+    names = [name for name, known in zip(fit.parameters, finite, strict=True) if known]
     return {
         "kind": fit.kind,
+        "status": fit.status,
+        "mass_kg": fit.mass_kg,
         "parameters": {name: estimate.value for name, estimate in fit.parameters.items()},
         "std": {name: estimate.std for name, estimate in fit.parameters.items()},
         "not_identifiable": list(fit.not_identifiable),
-        "covariance": {"names": names, "matrix": fit.covariance.tolist()},
+        "covariance": {"names": names, "matrix": fit.covariance[np.ix_(finite, finite)].tolist()},
     }

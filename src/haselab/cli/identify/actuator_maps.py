@@ -122,7 +122,7 @@ def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapp
         The section.
     Raises:
         InputError: the capacitance is not in F, or there are too few rows.
-        ResultError: the strain does not rise with the capacitance.
+        ResultError: the strain does not follow the capacitance, or the map turns.
     """
     if not pairs.in_farads:
         raise InputError(

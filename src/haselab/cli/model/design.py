@@ -143,7 +143,9 @@ def command(
             )
     emit(answer, as_json=as_json, out=None)
     slowest_s = 20.0 / max(design.nominal.margins.crossover_rad_s, 1e-3)
-    save_plot(plot, lambda: design_chart(plant, design.gains, setting, demands.step, slowest_s))
+    step = design.spec.step
+    assert step is not None  # of a design that was made
+    save_plot(plot, lambda: design_chart(plant, design.gains, setting, step, slowest_s))
 
 
 def _judge(

@@ -5,17 +5,19 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 from matplotlib.figure import Figure
 
 from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
-from haselab.cli.common import REAL, SEED, answer_options, emit, refuse_two_twins
+from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.model.stated_margins import controller_doubt, model_doubt, warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
-from haselab.control import PidGains
+from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
+from haselab.control import PidGains, Saturation
+from haselab.control.reach import default_step
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
 from haselab.report import write_report
@@ -24,6 +26,7 @@ from haselab.report.chart_file import write_figure
 from haselab.report.figures.chip import draw_loops
 from haselab.report.style import figure_style
 from haselab.rig.chip import (
+    ChipDesign,
     ChipFile,
     Firmware,
     build_firmware,
@@ -32,7 +35,7 @@ from haselab.rig.chip import (
     read_design,
 )
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json, write_json
 from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
@@ -157,6 +160,7 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
 @_structure
 @_source
 @shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@draw_option
 @shared_option(
     "--reading", type=click.Choice(["rad", "hz"]),
     detail="Default: the twin of the run in RUN, else hz.",
@@ -165,8 +169,7 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
     "--step",
     "step",
     type=(REAL, REAL),
-    default=(0.0, 0.04),
-    show_default=True,
+    show_default="0 and the step of the design, else 0.04, or half of what the limits allow",
     metavar="BEFORE AFTER",
     help="Set the desired strain before and after the step.",
 )
@@ -211,14 +214,13 @@ def simulate(
     the microcontroller is compared with the step that [model] predicts. If they differ by more than
     the design covers, the command names the cause and exits with code 3.
     """
-    refuse_two_twins(options["reading"], options["twin"])
+    config = _twin(run, options["reading"], options["twin"], options["draw"])
     refuse_linked_folders(run, "firmware", "figures")
     warn_doubts(run, structure)
     design = read_design(run, structure, FrontEnd(), source)
     settings, zero_m = design.settings, design.zero_length_m
     _say_narrowed(settings, design.limits, run)
-    config = _twin(run, options["reading"], options["twin"])
-    before, after = options["step"]
+    before, after = options["step"] or (0.0, _step_of(design))
     precondition_v = options["precondition"]
     plan = StepPlan(before, after, options["before_s"], options["after_s"], zero_m, precondition_v)
     case = None
@@ -254,10 +256,24 @@ def simulate(
         raise ResultError(f"{answer['comparison']} {run}")
 
 
-def _twin(run: Path, reading: str | None, twin: Path | None) -> TwinConfig:
+def _step_of(design: ChipDesign) -> float:
+    """The step for which the controller was designed, else one that its limits allow."""
+    controller = design.tables.controller
+    demanded = None if controller is None else controller.demands.get("step")
+    if demanded is not None:
+        return float(demanded)
+    limits = Saturation(design.settings.strain_low, design.settings.strain_high)
+    return default_step(design.plant, limits)
+
+
+def _twin(
+    run: Path, reading: Literal["rad", "hz"] | None, twin: Path | None, draw: int | None
+) -> TwinConfig:
     """The twin of the options, else that of the run in the folder, else the default one."""
-    if twin is not None:
-        return load_twin(twin)
+    if twin is not None or draw is not None:
+        config = twin_of_options(reading, twin, 1, draw).configuration(Path())
+        name_origin(config)
+        return config
     results = run / "results.json"
     if reading is None and results.is_file():
         known = twin_of(table_at(read_json(results), "provenance", "rig_config"))

@@ -22,7 +22,8 @@ from haselab.control import PidGains
 from haselab.firmware import FrontEnd
 from haselab.rig.chip import ChipFile, SupplyModel, read_design
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.config import TwinConfig, load_twin
+from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_file import load_twin
 from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.folder import read_json, write_json, write_text
 from haselab.store.toml import toml_text

@@ -8,7 +8,7 @@ from typing import Literal
 import click
 
 from haselab.cli.bench.arming import armed_rig
-from haselab.cli.common import answer_options, refuse_two_twins
+from haselab.cli.common import answer_options
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_experiments import ChipExperiments
@@ -19,7 +19,7 @@ from haselab.cli.study.study_run import (
     keep_video_option,
     twin_rig,
 )
-from haselab.rig.rig_file import TwinFile
+from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
 from haselab.study.definition import builtin_study
 
 __all__ = ["command"]
@@ -28,6 +28,7 @@ __all__ = ["command"]
 @click.command("reproduce")
 @shared_option("--reading", type=click.Choice(["rad", "hz"]), detail="Default: hz.")
 @shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@draw_option
 @shared_option("--seed", type=click.IntRange(0, MAX_SEED), default=1, show_default=True)
 @shared_option("--quick", is_flag=True, detail="It has fewer trials and frames.")
 @keep_video_option
@@ -35,6 +36,7 @@ __all__ = ["command"]
 def command(
     reading: Literal["rad", "hz"] | None,
     twin: Path | None,
+    draw: int | None,
     seed: int,
     quick: bool,
     keep_video: str,
@@ -44,16 +46,15 @@ def command(
     """Run the reference study on the simulated bench.
 
     It plays every test, fits all models, designs the controllers, plays the step experiments and
-    writes the report. No hardware is needed.
+    writes the report. No hardware is needed. With an actuator file of 'haselab identify actuator',
+    --twin simulates your own actuator.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
-    refuse_two_twins(reading, twin)
     at = Path("reproduce.toml") if twin is None else twin
-    file = TwinFile(
-        kind="twin", twin=None if twin is None else twin.name, seed=seed, reading=reading
-    )
+    file = twin_of_options(reading, twin, seed, draw)
     config = file.configuration(at)
+    name_origin(config)
     study = builtin_study(quick=quick)
     with armed_rig(twin_rig(config, seed), file, at, study, out) as bench:
         chips = ChipExperiments(out, study, config, seed, quick, keep_video)

@@ -22,11 +22,12 @@ from haselab.cli.study.study_run import (
     keep_video_option,
     twin_rig,
 )
+from haselab.cli.study.twin_option import draw_option, name_origin, on_bench_of, twin_of_options
 from haselab.pipelines.calibration_file import load_calibration
 from haselab.rig import Rig
 from haselab.rig.chip import ChipFile
 from haselab.rig.protocols import MonitorCalibration
-from haselab.rig.rig_file import TwinFile, load_rig
+from haselab.rig.rig_file import RigFile, TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.lockin import lockin_of
 from haselab.store.actuator_file import ACTUATOR
@@ -59,7 +60,12 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
 
 @click.command("run")
 @click.argument("study", type=click.Path(path_type=Path))
-@shared_option("--rig", required=True, type=click.Path(path_type=Path))
+@shared_option(
+    "--rig", type=click.Path(path_type=Path),
+    detail="Default: the default instruments, around the twin of --twin.",
+)  # fmt: skip
+@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: that of --rig.")
+@draw_option
 @shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
 @keep_video_option
 @actuator_option(
@@ -71,7 +77,9 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
 @answer_options(OutputRule("folder"), RUN_FOLDER)
 def command(
     study: Path,
-    rig: Path,
+    rig: Path | None,
+    twin: Path | None,
+    draw: int | None,
     quick: bool,
     keep_video: str,
     actuator: Path | None,
@@ -87,12 +95,12 @@ def command(
     the last trip, if there was one, and to confirm. STUDY is a TOML file; a microcontroller (kind =
     "chip") needs a study of step trials. The maps, model and controllers found are written to
     actuator.toml in the folder of the run; the file of --actuator is not changed. With --actuator,
-    a study that only has [steps] plays the controller of the file.
+    a study that only has [steps] plays the controller of the file. With --twin A.toml, an actuator
+    file of 'haselab identify actuator', the study is rehearsed on this simulated actuator.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the run.")
-    file = load_rig(rig)
-
+    file, rig = _rig(rig, twin, draw)
     operator = Operator(yes, acknowledge)
     known = None if actuator is None else load_actuator(actuator)
     if isinstance(file, ChipFile):
@@ -110,7 +118,8 @@ def command(
         warn_doubts(actuator)
     if isinstance(file, TwinFile):
         config = file.configuration(rig)
-        limited = _prepared(twin_rig(config, file.seed), plan, actuator)
+        name_origin(config)
+        limited = _prepared(twin_rig(config, file.seed), plan, actuator, config)
         with armed_rig(limited, file, rig, plan, out) as bench:
             _start_from(actuator, out)
             execute(plan, bench, config, file.seed, out, keep_video, as_json, known=known)
@@ -121,6 +130,30 @@ def command(
     ):
         _start_from(actuator, out)
         execute_on(plan, bench, file.model_dump(mode="json"), out, keep_video, as_json, known)
+
+
+def _rig(rig: Path | None, twin: Path | None, draw: int | None) -> tuple[RigFile, Path]:
+    """The rig of the options, and the path of its file.
+
+    Raises:
+        UsageError: neither --rig nor --twin.
+        InputError: the options contradict each other, or a file cannot be used.
+    """
+    if rig is None:
+        if twin is None:
+            raise click.UsageError("Missing option '--rig': the file of the bench, or '--twin'.")
+        return twin_of_options(None, twin, 1, draw), twin
+    file = load_rig(rig)
+    if twin is None:
+        if draw is not None:
+            raise InputError(f"--draw {draw} needs --twin A.toml; a rig file has a key draw. {rig}")
+        return file, rig
+    if not isinstance(file, TwinFile):
+        raise InputError(
+            f"--twin replaces the actuator of a twin, but the rig has kind = {file.kind!r}. Leave "
+            f"out --twin, or name the rig file of a twin. {rig}"
+        )
+    return on_bench_of(file, twin, draw, rig), rig
 
 
 def planned(path: Path, actuator: Path | None, *, quick: bool) -> Study:
@@ -148,8 +181,11 @@ def planned(path: Path, actuator: Path | None, *, quick: bool) -> Study:
     return study
 
 
-def _prepared(rig: Rig, study: Study, actuator: Path | None) -> Rig:
+def _prepared(rig: Rig, study: Study, actuator: Path | None, twin: TwinConfig | None = None) -> Rig:
     """The bench with the calibration of an actuator file, and its drive limited by that file.
+
+    The twin of an identified actuator reads capacitances as the calibrated bench did, so the
+    calibration of that bench is left out.
 
     Raises:
         InputError: no voltage is within both limits, or the calibration is for another carrier,
@@ -160,6 +196,13 @@ def _prepared(rig: Rig, study: Study, actuator: Path | None) -> Rig:
     _limit(rig, actuator)
     if load_actuator(actuator).sensing.is_calibrated:
         found, d = load_calibration(actuator), rig.description
+        if twin is not None and twin.origin is not None and found.amplifier != d.amplifier:
+            click.echo(
+                f"haselab: the calibration is for {found.amplifier!r} and is left out on the twin. "
+                f"{actuator}",
+                err=True,
+            )
+            return rig
         found.apply(lockin_of(d, study.sensing.carrier_hz).config, amplifier=d.amplifier)
         scale_s, stray_s = ((z.real, z.imag) for z in (found.scale_s, found.stray_s))
         calibration = MonitorCalibration(scale_s, stray_s, found.offsets_v)

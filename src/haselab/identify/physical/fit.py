@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,9 @@ from haselab.base import Estimate, InputError, JsonObject, LimitError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import Fit
 from haselab.identify.noise import coloured_covariance, whiteness_p
-from haselab.identify.physical.misfit import Misfit
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
 from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.rivals import Rival, richer, simpler
 from haselab.identify.physical.search import Found, refine, search
 from haselab.identify.physical.unknowns import (
     CAMERA_OFFSET,
@@ -36,7 +37,7 @@ from haselab.identify.physical.unknowns import (
 __all__ = ["ActuatorFit", "fit_actuator"]
 
 Floats = NDArray[np.float64]
-_LENGTH, _CAPACITANCE = "length", "capacitance"
+_MOST_ADDED = 2  # effects that the given law lacks
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
@@ -72,6 +73,8 @@ class ActuatorFit(Fit):
         residual_whiteness_p: probability of the less probable channel under white noise.
         channels: experiment and channel of each array of residuals.
         linear_models: at the hung mass and some voltages up to the highest that acted.
+        mass_kg: that hangs.
+        rejected_laws: those that the records contradict decisively.
     """
 
     law: ActuatorLaw | None = None
@@ -88,6 +91,7 @@ class ActuatorFit(Fit):
     channels: tuple[tuple[str, str], ...] = ()
     linear_models: tuple[OperatingPoint, ...] = ()
     mass_kg: float = float("nan")
+    rejected_laws: tuple[Rival, ...] = ()
 
     @property
     def succeeded(self) -> bool:
@@ -119,6 +123,10 @@ class ActuatorFit(Fit):
                 "capacitance_f": self.capacitance_noise_f,
             },
             "residual_whiteness_p": self.residual_whiteness_p,
+            "rejected_laws": [
+                {"law": rival.law, "log_evidence": rival.log_evidence}
+                for rival in self.rejected_laws
+            ],
             "evaluations": self.evaluations,
             "notes": list(self.notes),
             "status": self.status,
@@ -137,7 +145,7 @@ class ActuatorFit(Fit):
         self._require()
         experiments = list(dict.fromkeys(name for name, _ in self.channels))
         curves = []
-        for channel in (_LENGTH, _CAPACITANCE):
+        for channel in (LENGTH, CAPACITANCE):
             found = {name: _rms([part]) for (name, of), part in zip(
                 self.channels, self.residuals, strict=True) if of == channel}  # fmt: skip
             x = np.array([experiments.index(name) for name in found], dtype=np.float64)
@@ -176,7 +184,7 @@ def fit_actuator(
     if added_inertia_kg is None:
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
-    known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
+    known: dict[str, float] = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
     misfit = Misfit(records, known=known)
     # the scale of the camera and the actuator's size can hardly be told apart: it comes last
     found = search(misfit, start.without((CAMERA_SCALE,)))
@@ -186,57 +194,69 @@ def fit_actuator(
             "first load and voltage",
             kind=law.kind,
         )
-    count = found.evaluations
+    misfit, found = _weighed(replace(misfit, strict=True), start.at(found.unknowns), found)
+    rejected = []
+    for _ in range(_MOST_ADDED):
+        better = richer(misfit, found)
+        if better is None:
+            break
+        again = refine(misfit, better.start, found.evaluations)
+        if again is None or _rms([again.residuals]) > _rms([found.residuals]):
+            break
+        misfit, found = _weighed(misfit, again.unknowns, again)
+        rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
+    return _result(misfit, _ordered(found), rejected)
+
+
+def _ordered(found: Found) -> Found:
+    """Viscoelastic branches in the order of their relaxation times."""
+    unknowns = found.unknowns
+    keys = {about.name: about.key for about in unknowns.law.described()}
+    shares, times = (
+        [k for k, name in enumerate(unknowns.names) if name.startswith(f"{keys.get(field)}[")]
+        for field in ("branch_share", "branch_relaxation_s")
+    )
+    if len(shares) != len(times):
+        return found
+    order = np.argsort(unknowns.values[times])
+    moved = np.arange(unknowns.values.size)
+    for places in (shares, times):
+        moved[places] = np.array(places, dtype=np.int64)[order]
+    return replace(
+        found,
+        unknowns=replace(unknowns, values=unknowns.values[moved]),
+        jacobian=found.jacobian[:, moved],
+        left=found.left[moved],
+    )
+
+
+def _weighed(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Misfit, Found]:
+    """Estimate the noise and the parameters in turn."""
     for _ in range(_ROUNDS):
         factors = _factors(misfit, found)
         same = np.allclose(factors, (misfit.length_factor, misfit.capacitance_factor),
                            rtol=_SAME_NOISE)  # fmt: skip
-        misfit = Misfit(records, *factors, known)
-        again = refine(misfit, start.at(found.unknowns))
+        misfit = replace(misfit, length_factor=factors[0], capacitance_factor=factors[1])
+        again = refine(misfit, start, found.evaluations)
         if again is None:
             break
-        found, count = again, count + again.evaluations
+        start, found = again.unknowns, again
         if same:
             break
-    return _result(misfit, found, count)
+    return misfit, found
 
 
-@dataclass(frozen=True)
-class _Segment:
-    """Residuals of one channel in one experiment, with their rows."""
-
-    experiment: str
-    channel: str
-    rows: NDArray[np.int64]
-
-
-def _segments(records: Sequence[MotionRecord], rows_in_all: int) -> list[_Segment]:
-    found, at = [], 0
-    for record in records:
-        for channel, member in (
-            (_LENGTH, record.length_experiment),
-            (_CAPACITANCE, record.capacitance_experiment),
-        ):
-            for k, name in enumerate(record.experiments):
-                rows = at + np.flatnonzero(member == k)
-                if rows.size:
-                    found.append(_Segment(name, channel, rows))
-            at += member.size
-    known = np.arange(at, rows_in_all)
-    return [*found, _Segment("", "known", known)] if known.size else found
-
-
-def _channel(segments: Sequence[_Segment], channel: str, residuals: Floats) -> list[Floats]:
+def _channel(segments: Sequence[Segment], channel: str, residuals: Floats) -> list[Floats]:
     """Residuals of one channel, experiment by experiment."""
     return [residuals[part.rows] for part in segments if part.channel == channel]
 
 
 def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
     """True over stated standard deviation of both channels, by the residuals."""
-    segments = _segments(misfit.records, found.residuals.size)
+    segments = misfit.segments
     share = 1.0 - found.unknowns.values.size / found.residuals.size
     rms = [_rms(_channel(segments, name, found.residuals)) / math.sqrt(share)
-           for name in (_LENGTH, _CAPACITANCE)]  # fmt: skip
+           for name in (LENGTH, CAPACITANCE)]  # fmt: skip
     return misfit.length_factor * rms[0], misfit.capacitance_factor * rms[1]
 
 
@@ -256,14 +276,10 @@ def _typical(parts: Sequence[Floats]) -> float:
     return float(np.median(joined)) if joined.size else math.nan
 
 
-def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
+def _result(misfit: Misfit, found: Found, rejected: Sequence[Rival]) -> ActuatorFit:
     unknowns = found.unknowns
-    segments = _segments(misfit.records, found.residuals.size)
-    covariance = coloured_covariance(
-        [found.jacobian[part.rows] for part in segments],
-        [found.residuals[part.rows] for part in segments],
-        unknowns.values.size,
-    )
+    segments = misfit.segments
+    covariance = _covariance(found, segments)
     std = np.sqrt(np.diag(covariance))
     units = {about.key: about.unit for about in unknowns.law.described()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
@@ -281,8 +297,8 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
             parameters[name] = Estimate.lognormal(unknowns.values[k], share, unit)
         else:
             parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
-    lengths = _channel(segments, _LENGTH, found.residuals)
-    capacitances = _channel(segments, _CAPACITANCE, found.residuals)
+    lengths = _channel(segments, LENGTH, found.residuals)
+    capacitances = _channel(segments, CAPACITANCE, found.residuals)
     std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])
     std_f = misfit.capacitance_factor * _typical([r.capacitance_std_f for r in misfit.records])
     length_noise, capacitance_noise = _neighbours(lengths), _neighbours(capacitances)
@@ -295,13 +311,14 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
         excess, whiteness, unknowns.value(SENSING_SCALE), converged=found.converged
     )
     if not usable:
-        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=count)
+        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
     law = unknowns.present_law()
+    values = covariance * np.outer(slopes, slopes)
     return ActuatorFit(
         status=status,
         notes=_notes(unknowns.value(SENSING_SCALE)),
         parameters=parameters,
-        covariance=covariance * np.outer(slopes, slopes),
+        covariance=values,
         residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),
         channels=tuple((part.experiment, part.channel) for part in segments if part.experiment),
         length_rms_m=std_m * _rms(lengths),
@@ -315,9 +332,22 @@ def _result(misfit: Misfit, found: Found, count: int) -> ActuatorFit:
         added_inertia_kg=unknowns.value(ADDED_INERTIA),
         linear_models=_linear_models(law, unknowns, misfit.records),
         not_identifiable=tuple(dict.fromkeys(weak)),
-        evaluations=count,
+        evaluations=found.evaluations,
+        rejected_laws=(*rejected, *simpler(found, values)),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
+
+
+def _covariance(found: Found, segments: Sequence[Segment]) -> Floats:
+    """Of what varies; infinite for what has no effect on the records."""
+    acts = np.abs(found.jacobian).any(axis=0)
+    covariance = np.diag(np.where(acts, 0.0, np.inf))
+    covariance[np.ix_(acts, acts)] = coloured_covariance(
+        [found.jacobian[part.rows][:, acts] for part in segments],
+        [found.residuals[part.rows] for part in segments],
+        int(acts.sum()),
+    )
+    return covariance
 
 
 def _status(

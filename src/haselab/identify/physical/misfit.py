@@ -24,9 +24,19 @@ from haselab.identify.physical.unknowns import (
     usual,
 )
 
-__all__ = ["SHARED_PX", "Misfit", "Modelled", "SharedErrors", "modelled"]
+__all__ = [
+    "CAPACITANCE",
+    "LENGTH",
+    "SHARED_PX",
+    "Misfit",
+    "Modelled",
+    "Segment",
+    "SharedErrors",
+    "modelled",
+]
 
 Floats = NDArray[np.float64]
+LENGTH, CAPACITANCE = "length", "capacitance"
 SHARED_PX = 1.5e-3  # error of tracking that all frames with the same pixels share
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
@@ -48,13 +58,17 @@ class Modelled:
     capacitance_by: Floats
 
 
-def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = True) -> Modelled:
+def modelled(
+    unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = True, strict: bool = False
+) -> Modelled:
     """Simulate a record.
 
     Args:
         unknowns: of the model.
         record: with what acted, and when it was seen.
         derivatives: whether they are wanted.
+        strict: whether all lengths must be within the limits of the law. Outside, such as after a
+            collapse, the simulated motion is rough and its derivatives are wrong.
     Returns:
         Lengths and capacitances at the times of the record.
     Raises:
@@ -73,6 +87,10 @@ def modelled(unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = Tr
         added_inertia_kg=added_kg,
     )
     response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY))
+    if strict and record.length_m.size:
+        low_m, high_m = float(response.length_m.min()), float(response.length_m.max())
+        if low_m < sampled.table.low_m or high_m > sampled.table.high_m:
+            raise LimitError(f"{record.name}: the motion leaves the limits of the law.")
     scale = unknowns.value(SENSING_SCALE)
     latency_s = unknowns.value(SENSING_LATENCY)
     drift = record.over_windows(response.drift_f_s)
@@ -173,6 +191,21 @@ class SharedErrors:
 
 
 @dataclass(frozen=True)
+class Segment:
+    """Residuals of one channel in one experiment.
+
+    Args:
+        experiment: its name; empty for what is known beforehand.
+        channel: `LENGTH`, `CAPACITANCE` or "known".
+        rows: of the residuals.
+    """
+
+    experiment: str
+    channel: str
+    rows: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
 class Misfit:
     """Weighted differences between records and a model.
 
@@ -182,16 +215,35 @@ class Misfit:
         capacitance_factor: the same of the capacitances.
         known: standard deviations of what is known of an instrument beforehand, by its name; each
             is one more residual, after those of the records.
+        strict: whether a motion outside the law's limits counts as none.
     """
 
     records: Sequence[MotionRecord]
     length_factor: float = 1.0
     capacitance_factor: float = 1.0
     known: Mapping[str, float] = field(default_factory=dict)
+    strict: bool = False
 
     @cached_property
     def _shared(self) -> list[SharedErrors]:
         return [SharedErrors.of(r, self.length_factor * r.length_std_m) for r in self.records]
+
+    @cached_property
+    def segments(self) -> list[Segment]:
+        """All residuals, channel by channel and experiment by experiment."""
+        found, at = [], 0
+        for record in self.records:
+            for channel, member in (
+                (LENGTH, record.length_experiment),
+                (CAPACITANCE, record.capacitance_experiment),
+            ):
+                for k, name in enumerate(record.experiments):
+                    rows = at + np.flatnonzero(member == k)
+                    if rows.size:
+                        found.append(Segment(name, channel, rows))
+                at += member.size
+        known = np.arange(at, at + len(self.known))
+        return [*found, Segment("", "known", known)] if known.size else found
 
     def residuals(self, unknowns: Unknowns) -> Floats | None:
         """Measured minus modelled over the standard deviation; None where no motion exists.
@@ -228,7 +280,7 @@ class Misfit:
 
     def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[Modelled] | None:
         def one(record: MotionRecord) -> Modelled:
-            return modelled(unknowns, record, derivatives=derivatives)
+            return modelled(unknowns, record, derivatives=derivatives, strict=self.strict)
 
         try:
             if len(self.records) == 1:

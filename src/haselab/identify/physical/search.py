@@ -82,12 +82,13 @@ def search(misfit: Misfit, start: Unknowns) -> Found | None:
     return _found(now, count + used)
 
 
-def refine(misfit: Misfit, start: Unknowns) -> Found | None:
+def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | None:
     """Minimise the misfit from near its minimum.
 
     Args:
         misfit: to minimise.
         start: first values.
+        evaluations: of the model, made before.
     Returns:
         The new result; None if no motion exists there.
     """
@@ -96,7 +97,7 @@ def refine(misfit: Misfit, start: Unknowns) -> Found | None:
         return None
     now = _State(start, *first)
     now, used = _descend(misfit, now, None, 1.0, _LAST_STEPS)
-    return _found(now, used + 1)
+    return _found(now, evaluations + used + 1)
 
 
 def _found(now: _State, evaluations: int) -> Found:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import ADDED_INERTIA, ActuatorLaw, with_parameters
+from haselab.actuators import ADDED_INERTIA, ActuatorLaw, Scales, with_parameters
 
 __all__ = [
     "CAMERA_LATENCY",
@@ -108,16 +108,20 @@ class Unknowns:
         return tuple(name for name in self.names if name not in INSTRUMENTS)
 
     @property
+    def _scales(self) -> Scales:
+        found = Scales.of(self.law, self.names)
+        positive = np.array([name in _SCALES for name in self.names])
+        return Scales(found.by_logarithm | positive, found.by_inverse_square)
+
+    @property
     def by_logarithm(self) -> NDArray[np.bool_]:
         """Which of them vary by their logarithm. Shape `(P,)`."""
-        linear = {ADDED_INERTIA, *INSTRUMENTS} - _SCALES
-        return np.array([name not in linear for name in self.names]) & ~self.by_inverse_square
+        return self._scales.by_logarithm
 
     @property
     def by_inverse_square(self) -> NDArray[np.bool_]:
         """Which of them vary by their inverse square. Shape `(P,)`."""
-        marked = {about.key for about in self.law.described() if about.inverse_square}
-        return np.array([name in marked for name in self.names])
+        return self._scales.by_inverse_square
 
     @property
     def widths(self) -> Floats:
@@ -135,8 +139,7 @@ class Unknowns:
     @property
     def slopes(self) -> Floats:
         """Change of the values per change of what varies. Shape `(P,)`."""
-        found = np.where(self.by_logarithm, self.values, 1.0)
-        return np.where(self.by_inverse_square, -0.5 * self.values**3, found)
+        return self._scales.slopes(self.values)
 
     def value(self, name: str) -> float:
         """Value of one of them; an instrument's default where it is not estimated."""
@@ -150,20 +153,12 @@ class Unknowns:
         Args:
             step: changes. Shape `(P,)`.
         """
-        logarithm, inverse = self.by_logarithm, self.by_inverse_square
-        values = self.values + step
-        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            values[logarithm] = self.values[logarithm] * np.exp(np.minimum(step[logarithm], 50.0))
-            values[inverse] = (self.values[inverse] ** -2.0 + step[inverse]) ** -0.5
+        values = self._scales.moved(self.values, step)
         return Unknowns(self.law, self.names, values, self.mass_kg)
 
     def distance(self, other: Unknowns) -> Floats:
         """What varies here minus there, of the same names. Shape `(P,)`."""
-        logarithm, inverse = self.by_logarithm, self.by_inverse_square
-        found = self.values - other.values
-        found[logarithm] = np.log(self.values[logarithm] / other.values[logarithm])
-        found[inverse] = self.values[inverse] ** -2.0 - other.values[inverse] ** -2.0
-        return found
+        return self._scales.varying(self.values) - self._scales.varying(other.values)
 
     def without(self, names: Sequence[str]) -> Unknowns:
         """Keep some of them at their present values."""
@@ -176,9 +171,11 @@ class Unknowns:
         )
 
     def at(self, other: Unknowns) -> Unknowns:
-        """These numbers with the values of others, which may be fewer."""
-        values = np.array([other.value(name) for name in self.names])
-        return Unknowns(other.law, self.names, values, self.mass_kg)
+        """These numbers with the values of others where those have them."""
+        known = dict(zip(other.names, other.values.tolist(), strict=True))
+        pairs = zip(self.names, self.values.tolist(), strict=True)
+        values = np.array([known.get(name, value) for name, value in pairs])
+        return Unknowns(self.law, self.names, values, self.mass_kg)
 
     def present_law(self) -> ActuatorLaw:
         """The law with the present values.

@@ -27,6 +27,8 @@ __all__ = [
     "Limits",
     "LoopTable",
     "ModelSection",
+    "PhysicalCovariance",
+    "PhysicalTable",
     "SensingSection",
     "StrainMapTable",
     "VoltageMapTable",
@@ -59,6 +61,15 @@ def _four_by_four(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...
             {"lengths": str(lengths)},
         )  # fmt: skip
     return rows
+
+
+def _by_table(values: Any) -> Any:
+    """`shell.length_m = [0.06, 0.065]` is a table in TOML."""
+    found: dict[str, Any] = {}
+    for name, value in values.items() if isinstance(values, dict) else ():
+        inner = _by_table(value) if isinstance(value, dict) else {"": value}
+        found |= {f"{name}.{key}" if key else name: part for key, part in inner.items()}
+    return found if isinstance(values, dict) else values
 
 
 _Covariance = Annotated[tuple[tuple[_Variance, ...], ...], AfterValidator(_four_by_four)]
@@ -110,6 +121,8 @@ class ActuatorSection(_Section):
     geometry: Geometry = Geometry()
     # of the kind's law, by the names of TWIN.toml
     parameters: Annotated[dict[str, Number], BeforeValidator(_by_full_name)] = {}
+    # where a parameter lies that was not identified
+    distribution: Annotated[dict[str, _Range], BeforeValidator(_by_table)] = {}
 
 
 class StrainMapTable(_Section):
@@ -194,6 +207,34 @@ class DriveSection(_Section):
     voltage_map: VoltageMapTable | None = None
 
 
+class PhysicalCovariance(_Section):
+    """`[model.physical.covariance]`."""
+
+    names: tuple[str, ...] = Field(description="parameters of rows and columns, in order")
+    matrix: tuple[tuple[float, ...], ...] = Field(description="covariance of their values")
+
+    @model_validator(mode="after")
+    def _square(self) -> Self:
+        sizes = [len(row) for row in self.matrix]
+        if sizes != [len(self.names)] * len(self.names):
+            raise ValueError(f"{len(self.names)} names need as many rows of as many numbers")
+        return self
+
+
+class PhysicalTable(_Section):
+    """`[model.physical]`: the physical model that `identify actuator` writes."""
+
+    kind: str = Field(description="of the actuator", examples=["planar-hasel"])
+    status: str = "ok"
+    mass_kg: Annotated[Number, Field(gt=0, le=1e4)] | None = None  # hung mass of the records
+    parameters: Annotated[dict[str, Number], BeforeValidator(_by_full_name)] = Field(
+        description="values by the names of TWIN.toml", examples=[{"dielectric.permittivity": 3.0}]
+    )
+    std: Annotated[dict[str, float], BeforeValidator(_by_full_name)] = {}
+    not_identifiable: tuple[str, ...] = ()
+    covariance: PhysicalCovariance | None = None
+
+
 class ModelSection(_Section):
     """The linear model; its keys are kept unchanged.
 
@@ -207,6 +248,7 @@ class ModelSection(_Section):
     loop_delay_s: Annotated[Number, Field(gt=0, le=1e3)] | None = None
     residual_std: Annotated[Number, Field(ge=0)] | None = None
     covariance: CovarianceTable | None = None
+    physical: PhysicalTable | None = None
 
     def plant(self) -> Plant:
         """The model as one resonance with slow branches.

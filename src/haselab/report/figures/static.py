@@ -44,7 +44,6 @@ def _static(host: FigureBase, run: RunFolder) -> None:
     section = run.section("static")
     stretch = section.array("stretch")
     load_n = section.array("load_n", like=stretch)
-    fit_stretch = section.array("fit_stretch")
     axes = host.subplots()
     axes.errorbar(
         stretch,
@@ -56,14 +55,10 @@ def _static(host: FigureBase, run: RunFolder) -> None:
         capsize=2,
         label="measured ± 1 standard deviation of its frames",
     )
-    axes.plot(
-        fit_stretch,
-        section.array("fit_load_n", like=fit_stretch),
-        color=RED,
-        linewidth=1.0,
-        zorder=4,
-        label="Arruda-Boyce fit",
-    )
+    if "fit_stretch" in section:  # only a planar HASEL has the shell of the fit
+        fit_stretch = section.array("fit_stretch")
+        fit_n = section.array("fit_load_n", like=fit_stretch)
+        axes.plot(fit_stretch, fit_n, color=RED, linewidth=1.0, zorder=4, label="Arruda-Boyce fit")
     _regions(axes, section)
     if "operating_point" in section:
         point = section.section("operating_point")

@@ -27,9 +27,10 @@ from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
 from haselab.rig.chip.supplied import SuppliedCoSim, SupplyModel
 from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
-from haselab.rig.twin.config import TwinConfig, load_twin, twin_of_reading
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import GRAVITY_M_S2, TwinBench
+from haselab.rig.twin.twin_file import load_twin
 from haselab.store.toml import PrintableSection
 
 __all__ = [
@@ -155,7 +156,7 @@ class ChipFile(PrintableSection):
         Returns:
             The settings; the controller's output is limited to the strains that are reached.
         Raises:
-            InputError: The voltage map does not rise within what the module reaches.
+            InputError: The voltage map turns within what the module reaches.
         """
         high, rise = self.drive_high_v, self.rise_v_per_s
         high = settings.drive_high_v if high is None else high

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from haselab.base import InputError
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.rig.twin.camera import TwinCameraConfig
-from haselab.store.toml import Section, read_toml, validated
+from haselab.store.toml import Section, validated
 
 if TYPE_CHECKING:
     from haselab.actuators import ActuatorLaw, PlanarHasel
 
 __all__ = [
-    "PLANAR_HASEL",
     "READINGS",
     "AcquisitionConfig",
     "Amplifier",
@@ -23,15 +22,13 @@ __all__ = [
     "Electrodes",
     "Load",
     "Mullins",
+    "Origin",
     "Shell",
     "TwinConfig",
     "Viscosity",
-    "load_twin",
     "twin_of_reading",
 ]
 
-
-PLANAR_HASEL = "planar-hasel"
 _PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "dielectric")
 
 
@@ -155,6 +152,17 @@ class AcquisitionConfig(Section):
         return self
 
 
+class Origin(Section):
+    """The identified actuator whose twin this is."""
+
+    actuator: str = Field(description="its name")
+    file: str = Field(description="actuator file with [model.physical]")
+    sha256: str = Field("", description="of this file")
+    records_sha256: tuple[str, ...] = Field((), description="recordings of the identification")
+    draw: int | None = Field(None, description="seed of drawn parameters; none: the estimates")
+    not_identifiable: tuple[str, ...] = Field((), description="parameters not known from records")
+
+
 class TwinConfig(Section):
     """The whole bench."""
 
@@ -173,6 +181,7 @@ class TwinConfig(Section):
     amplifier: Amplifier = Amplifier()
     acquisition: AcquisitionConfig = AcquisitionConfig()
     camera: TwinCameraConfig = TwinCameraConfig()
+    origin: Origin | None = None
 
     @model_validator(mode="after")
     def _one_actuator(self) -> Self:
@@ -232,26 +241,6 @@ READINGS: dict[str, dict[str, dict[str, float]]] = {
     "rad": {"load": {"added_inertia_kg": 9.3}, "viscosity": {"damping_n_s_per_m": 7.5}},
     "hz": {"load": {"added_inertia_kg": 0.0}, "viscosity": {"damping_n_s_per_m": 1.85}},
 }
-
-
-def load_twin(path: Path) -> TwinConfig:
-    """Read TWIN.toml; all faults are reported at once, with its path in the file.
-
-    Args:
-        path: of the TOML file; keys that it leaves out take their defaults.
-    Returns:
-        The checked configuration.
-    Raises:
-        InputError: The file is missing or not TOML, or has an unknown key or a value out of range.
-    """
-    data = read_toml(path, "twin file")
-    reading = data.get("reading")
-    if isinstance(reading, str) and reading in READINGS:
-        for section, values in READINGS[reading].items():
-            given = data.setdefault(section, {})
-            if isinstance(given, dict):
-                data[section] = {**values, **given}
-    return validated(TwinConfig, data, path)
 
 
 def twin_of_reading(reading: str) -> TwinConfig:

@@ -111,6 +111,7 @@ def describe(config: TwinConfig) -> RigDescription:
         mass_kg=config.load.mass_kg,
         amplifier=amplifier.name,
         exposure_s=config.camera.exposure_s,
+        actuator_kind=config.kind,
     )
 
 

@@ -36,6 +36,7 @@ class LoopModel:
         queued: number of queued outputs.
         capacitance_map: coefficients of the strain map, see `capacitance_range`; None if the
             strain does not come from the capacitance.
+        capacitance_f: a capacitance in the range of the map; 0: unknown.
     """
 
     block_s: float
@@ -50,6 +51,7 @@ class LoopModel:
     level: slice
     queued: int
     capacitance_map: tuple[float, float, float, float] | None
+    capacitance_f: float
 
     @property
     def range(self) -> float:
@@ -64,6 +66,7 @@ def loop_model(
     carrier: tuple[float, float],
     settle_s: float,
     capacitance_map: tuple[float, float, float, float] | None,
+    capacitance_f: float = 0.0,
 ) -> LoopModel:
     """Build the model of a loop on a rig.
 
@@ -74,6 +77,7 @@ def loop_model(
         carrier: frequency in Hz and peak at the amplifier's input in V.
         settle_s: settling time of the output.
         capacitance_map: see `LoopModel`.
+        capacitance_f: see `LoopModel`.
     """
     low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
     strain = np.linspace(low, high, _GRID)
@@ -95,29 +99,39 @@ def loop_model(
         level=slice(rig.block_samples - counted, rig.block_samples),
         queued=rig.switch_sample // rig.block_samples,
         capacitance_map=capacitance_map,
+        capacitance_f=capacitance_f,
     )
 
 
 def capacitance_range(
-    strain_map: tuple[float, float, float, float], strain_low: float, strain_high: float
+    strain_map: tuple[float, float, float, float],
+    strain_low: float,
+    strain_high: float,
+    about_f: float = 0.0,
 ) -> tuple[float, float]:
-    """Capacitances of a strain range, in F, on the branch of the map that starts at 0 F.
+    """Capacitances of a strain range, in F, on one branch of the map.
 
     Args:
         strain_map: slope (1/F), offset, curvature (1/F^2) and cubic factor (1/F^3).
         strain_low: lower end.
         strain_high: upper end.
+        about_f: a capacitance on the branch, as in the range of the map.
     Returns:
         Lowest and highest; if the branch does not reach an end, 0 or its turning point.
     """
     factors = np.array(strain_map)[[3, 2, 0, 1]] * [1e-27, 1e-18, 1e-9, 1.0]  # falling powers, nF
-    turn = min(_positive(np.polyder(factors)), default=math.inf)
+    about, slopes = 1e9 * about_f, np.polyder(factors)
+    turns = _positive(slopes)
+    low = max((turn for turn in turns if turn < about), default=0.0)
+    high = min((turn for turn in turns if turn > about), default=math.inf)
+    rises = float(np.polyval(slopes, about)) > 0.0
     ends = []
     for strain in (strain_low, strain_high):
-        shifted = factors - [0.0, 0.0, 0.0, strain]
-        reached = [root for root in _positive(shifted) if root <= turn]
-        outward = shifted[3] * factors[2] < 0.0  # the branch approaches the strain
-        ends.append(min(reached, default=turn if outward else 0.0))
+        reached = [
+            root for root in _positive(factors - [0.0, 0.0, 0.0, strain]) if low <= root <= high
+        ]
+        above = strain > float(np.polyval(factors, about))
+        ends.append(min(reached, default=high if above == rises else low))
     return 1e-9 * min(ends), 1e-9 * max(ends)
 
 

@@ -35,7 +35,9 @@ class Plausible:
         self._low, self._high = model.strain_low - margin, model.strain_high + margin
         self._farad = (0.0, math.inf)
         if model.capacitance_map is not None:
-            self._farad = capacitance_range(model.capacitance_map, self._low, self._high)
+            self._farad = capacitance_range(
+                model.capacitance_map, self._low, self._high, model.capacitance_f
+            )
 
     def fault(self, strain: float, capacitance_f: float | None) -> str:
         """Return why the loop must stop, or an empty text; missing values (NaN) are ignored."""

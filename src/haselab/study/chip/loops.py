@@ -206,8 +206,7 @@ def desktop_loop(
     )  # fmt: skip
     share = _reference_share(bench, Lockin(sensing), desk.carrier_hz)
     lockin = Lockin(replace(sensing, scale_s=sensing.admittance_scale_s * share))
-    # The chip starts where its map reaches 0 V.
-    limits = ControllerSetting(1.0 / desk.rate_hz, s.strain_low, s.strain_high, s.strain_low)
+    limits = ControllerSetting(1.0 / desk.rate_hz, s.strain_low, s.strain_high, s.strain_start)
     controller = controller_of(s).make()
     controller.start(limits)
     bench.sine(desk.carrier_hz, _CARRIER_V)

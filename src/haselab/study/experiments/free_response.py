@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from haselab.base import Estimate
+from haselab.base import Estimate, ResultError
 from haselab.rig import RigDescription
 from haselab.safety.feasibility import Drive
 from haselab.study.analysis import Analysis
@@ -21,6 +21,7 @@ from haselab.study.tables import FreeResponse
 
 __all__ = ["FreeResponseTest"]
 
+_ENVELOPES = ("S19.decay_1", "S19.decay_2", "S19.eq6_decay_1", "S19.eq6_decay_2")
 _DIFFERENCE = "S19.chirp_difference"
 
 
@@ -53,8 +54,14 @@ class FreeResponseTest(Experiment[FreeResponse]):
 
     def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
-        found = fit_free([analysis.observe(name) for name in self.recordings()])
-        quantities, missing, notes = found.quantities, {}, found.notes
+        trials = [analysis.observe(name) for name in self.recordings()]
+        try:
+            found = fit_free(trials)
+        except ResultError as reason:  # as of an actuator that is too damped to oscillate
+            return ExperimentResult(missing=dict.fromkeys(self.rows(), str(reason)))
+        quantities, notes = found.quantities, found.notes
+        peaks = "too few peaks exceed the noise"
+        missing = {name: peaks for name in _ENVELOPES if name not in quantities}
         try:
             dynamics = analysis.need(Dynamics)
             quantities = {**quantities, **_against_chirp(found, dynamics)}

@@ -55,8 +55,13 @@ class StaticLoadTest(Experiment[StaticLoad]):
     def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
         found = fit_static(analysis.observe(_NAME), self.study, analysis.rig)
+        reason = (
+            "is of the shell of a planar-hasel; this actuator is a "
+            f"{analysis.rig.actuator_kind}, whose law haselab identify actuator fits"
+        )
+        missing = {key: reason for key in self.rows() if key not in found.quantities}
         return ExperimentResult(
-            found.quantities, found.notes, figures=found.figures, values=(found,)
+            found.quantities, found.notes, figures=found.figures, values=(found,), missing=missing
         )
 
     def rows(self) -> Mapping[str, Quantity]:

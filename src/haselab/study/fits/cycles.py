@@ -107,6 +107,11 @@ class Cycles:
         return float(np.mean(found))
 
 
+def _farthest(strain: Floats, start: float) -> float:
+    """The strain farthest from that at the start, of an elongation or of a contraction."""
+    return float(strain[np.abs(strain - start).argmax()])
+
+
 def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
     """Residual strain after the first cycle, and drift of the others.
 
@@ -121,8 +126,10 @@ def repeatability(cycles: Cycles, zero_length_m: float) -> dict[str, Estimate]:
     ends = np.interp(cycles.starts_s, seen.frame_time_s, strain)
     peaks = np.array(
         [
-            strain[(seen.frame_time_s >= low) & (seen.frame_time_s < high)].max()
-            for low, high in zip(cycles.starts_s[:-1], cycles.starts_s[1:], strict=True)
+            _farthest(strain[(seen.frame_time_s >= low) & (seen.frame_time_s < high)], start)
+            for low, high, start in zip(
+                cycles.starts_s[:-1], cycles.starts_s[1:], ends[:-1], strict=True
+            )
         ]
     )
     finest = math.sqrt(2.0) * POSITION_PX * cycles.rig.scale_m_per_px / zero_length_m

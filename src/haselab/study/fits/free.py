@@ -21,6 +21,7 @@ from haselab.study.fits.trials import normal_equivalent
 
 __all__ = ["Envelope", "Free", "PrintedFit", "fit_free", "fit_printed"]
 
+_WITH_CREEP = 3  # parameters that are searched: decay, frequency, and time constant of the creep
 _LEAST_PEAKS = 2  # of one sign, through which an envelope is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks are below the residuals of eq. 6
 
@@ -155,21 +156,27 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     """Fit eqs. 6 and 7 and both envelopes, as printed and with a creep term.
 
     Eq. 6 has no creep term. With an actuator that creeps it leaves large residuals, and creep makes
-    the two envelopes differ. Both fits are therefore reported.
+    the two envelopes differ. Both fits are therefore reported. If the motion has no creep that can
+    be fitted, there is none in either.
 
     Args:
         trials: one observation per trial.
     Returns:
         Results S19, data for figure 5.
     Raises:
-        ResultError: no trial oscillates, or a fit has no result.
+        ResultError: the motion is not a decaying oscillation.
     Source: reference study, row S19.
     """
     records = [_trial(seen).moving() for seen in trials]
     fit = fit_free_response(records, creep=True)
-    envelopes = (fit.envelope_positive_decay_per_s, fit.envelope_negative_decay_per_s)
-    if not fit.succeeded or envelopes[0] is None or envelopes[1] is None:
-        raise ResultError(f"Free response: {fit.status}; {' '.join(fit.notes)}")
+    if not fit.succeeded:
+        fit = fit_free_response(records, creep=False)
+    if not fit.succeeded:
+        raise ResultError(fit.status)
+    envelopes = {
+        "S19.decay_1": fit.envelope_positive_decay_per_s,
+        "S19.decay_2": fit.envelope_negative_decay_per_s,
+    }
     e = fit.parameters
     printed = [
         fit_printed(record, e["damped_frequency_rad_s"].value, e["decay_rate_per_s"].value)
@@ -181,8 +188,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     return Free(
         quantities={
             "S19.omega_d": e["damped_frequency_rad_s"],
-            "S19.decay_1": envelopes[0],
-            "S19.decay_2": envelopes[1],
+            **{name: decay for name, decay in envelopes.items() if decay is not None},
             "S19.omega_0": e["natural_frequency_rad_s"],
             "S19.eq6_omega_d": _repeated(np.array([p.omega_d for p in printed]), "rad/s"),
             "S19.eq6_decay": _repeated(np.array([p.decay for p in printed]), "1/s"),
@@ -191,8 +197,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
             "S19.eq6_rms": _repeated(np.array([p.rms_m for p in printed]), "m"),
         },
         notes={
-            "S19.omega_0": "decaying oscillation with exponential creep; the creep is "
-            f"{1e3 * _creep_m(fit):.2g} mm over the record, the rms residual is "
+            "S19.omega_0": f"{_model(fit)}; the rms residual is "
             f"{1e3 * float(np.sqrt(np.mean(left_m**2))):.2g} mm",
             "S19.eq6_omega_0": "decaying oscillation without a creep term" + _missing(printed),
         },
@@ -231,6 +236,16 @@ def _missing(printed: Sequence[PrintedFit]) -> str:
 def _trial(seen: Observation) -> FreeTrial:
     after = seen.frame_time_s >= seen.drop_s
     return FreeTrial(seen.length_m[after], seen.frame_time_s[after] - seen.drop_s)
+
+
+def _model(fit: FreeResponseFit) -> str:
+    """The fitted motion in words."""
+    if fit.search.size == _WITH_CREEP:
+        return (
+            "decaying oscillation with exponential creep; the creep is "
+            f"{1e3 * _creep_m(fit):.2g} mm over the record"
+        )
+    return " ".join(["decaying oscillation without creep.", *fit.notes]).rstrip(".")
 
 
 def _creep_m(fit: FreeResponseFit) -> float:

@@ -240,7 +240,8 @@ def design_loops(
     scaled = printed_gains(study, found.plant)
     pi = given.pi if given else playable(found.plant, scaled, setting)
     delayed_pi = given.delayed_pi if given else playable(found.plant, scaled, late)
-    pid = given.pid if given else design_pid(found.plant, _PID, setting, rng=rng).gains
+    demands = replace(_PID, step=study.steps.step or None)
+    pid = given.pid if given else design_pid(found.plant, demands, setting, rng=rng).gains
     as_printed = PidGains(study.control.kp, study.control.ki)
     alone = LoopSetting(rate_hz=setting.rate_hz, measurement_delay_s=0.0)
     judged = {

@@ -20,7 +20,7 @@ def sheet_figure(
 ) -> JsonObject:
     """Data of figure 2: tracks, strain along the length, lateral motion from the mid-line.
 
-    The profiles compare the frame with the largest elongation with the first one.
+    The profiles compare the frame with the largest elongation or contraction with the first one.
 
     Args:
         particles: tracks of the sheet's particles.
@@ -38,11 +38,13 @@ def sheet_figure(
     x_px = np.where(tracks["valid"], tracks["x_px"], np.nan)[:, followed]
     y_px = np.where(tracks["valid"], tracks["y_px"], np.nan)[:, followed]
     lower = fiducials.tracks[["x_px", "y_px"]][0, 3:]
-    longest = int(np.argmax(np.nanmedian(y_px, axis=1)))
+    middle_px = np.nanmedian(y_px, axis=1)
+    farthest = int(np.argmax(np.abs(middle_px - middle_px[0])))
     rest = np.stack([x_px[0], y_px[0]], axis=1)
-    moved = np.stack([x_px[longest], y_px[longest]], axis=1) - rest
+    moved = np.stack([x_px[farthest], y_px[farthest]], axis=1) - rest
     std = np.stack(
-        [tracks[axis][longest][followed].astype(float) for axis in ("std_x_px", "std_y_px")], axis=1
+        [tracks[axis][farthest][followed].astype(float) for axis in ("std_x_px", "std_y_px")],
+        axis=1,
     )
     try:
         profile = homogeneity(rest, moved, std, bands=_BANDS)

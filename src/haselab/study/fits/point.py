@@ -40,7 +40,7 @@ class Point:
 
 @dataclass(frozen=True)
 class _Held:
-    """Stretch at rest as a function of the held voltages, both increasing."""
+    """Stretch at rest as a function of the held voltages, which it rises or falls with."""
 
     drive_v: tuple[float, ...]
     stretch: tuple[float, ...]
@@ -51,13 +51,18 @@ class _Held:
             (float(seen.drive_v[-1]), float(seen.length_m.mean()) / free_length_m) for seen in holds
         )
         drive_v, stretch = zip(*points, strict=True)
-        if not (np.diff(stretch) > 0.0).all():
+        steps = np.diff(stretch)
+        if not ((steps > 0.0).all() or (steps < 0.0).all()):
             shown = ", ".join(f"{value:.4f}" for value in stretch)
             raise ResultError(
-                f"The stretch at rest must increase with the voltage, but is {shown}. Check the "
-                "amplifier and the hung mass, or increase static_load.settle_s."
+                f"The stretch at rest must rise, or fall, with the voltage, but is {shown}. Check "
+                "the amplifier and the hung mass, or increase static_load.settle_s."
             )
         return cls(drive_v, stretch)
+
+    def reaches(self, stretch: float) -> bool:
+        """Whether a voltage between the held ones gives this stretch."""
+        return min(self.stretch) < stretch < max(self.stretch)
 
     def at(self, drive_v: float) -> float:
         """Stretch at a voltage, interpolated between the held ones; outside, the nearest."""
@@ -68,8 +73,11 @@ class _Held:
 
     def centring_v(self, stretch: float) -> float:
         """Voltage of a stretch; the nearer end of the range if no voltage reaches it."""
-        inside = float(np.clip(stretch, self.stretch[0], self.stretch[-1]))
-        return float(PchipInterpolator(self.stretch, self.drive_v)(inside))
+        inside = float(np.clip(stretch, min(self.stretch), max(self.stretch)))
+        stretches, drives_v = zip(
+            *sorted(zip(self.stretch, self.drive_v, strict=True)), strict=True
+        )
+        return float(PchipInterpolator(stretches, drives_v)(inside))
 
     def slope_per_v(self, drive_v: float) -> float:
         """Stretch per volt."""
@@ -110,7 +118,7 @@ def find_point(
     Returns:
         Baseline, results S18; these always report the baseline found here.
     Raises:
-        ResultError: the stretch does not increase with the voltage, or too few frames are near it.
+        ResultError: the stretch turns with the voltage, or too few frames are near it.
     Source: reference study, row S18.
     """
     region, centre = static.region, static.centre
@@ -121,9 +129,10 @@ def find_point(
     std_v = 0.0
     if given is None:
         found_v = round(held.centring_v(centre.value) / _DIGIT_V) * _DIGIT_V
-        std_v = float(np.hypot(centre.std / held.slope_per_v(found_v), _DIGIT_V / np.sqrt(12.0)))
+        slope = abs(held.slope_per_v(found_v))
+        std_v = float(np.hypot(centre.std / slope, _DIGIT_V / np.sqrt(12.0)))
         notes["S18.baseline"] = f"centres the strain with {rig.mass_kg:g} kg"
-        if not held.stretch[0] < centre.value < held.stretch[-1]:
+        if not held.reaches(centre.value):
             std_v = _DIGIT_V / np.sqrt(12.0)  # an end of the range, not a result
             better_kg = _better_kg(held, static, rig.mass_kg)
             advice = "use a stiffer actuator" if better_kg is None else f"hang about {better_kg} kg"

@@ -1,4 +1,4 @@
-"""Static load test: Arruda-Boyce law of the shell, linear regions (rows S16 and S17)."""
+"""Static load test: law of the planar HASEL's shell, linear regions (rows S16 and S17)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from haselab.base import Estimate, JsonObject, ResultError
 from haselab.identify.statics.hyperelastic import HyperelasticFit, fit_hyperelastic
 from haselab.identify.statics.regions import Region, RegionsFit, find_regions
 from haselab.rig import RigDescription
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.study.definition import Study
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.resolution import POSITION_PX, with_resolution
@@ -19,6 +20,7 @@ from haselab.study.tables import LEAST_LOADS
 
 __all__ = ["GRAVITY_M_S2", "Static", "fit_static"]
 
+_SHELL_NOTE = "of the shell; the electrodes are fitted in parallel, with a cubic term"
 
 Floats = NDArray[np.float64]
 
@@ -53,15 +55,16 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     """Fit the load as a function of the elongation of the whole actuator.
 
     Stretch counts from the free length, where the shell itself is stretched by 1/sqrt(lateral).
+    Only a planar HASEL has that shell; for other kinds there are no results S16.
 
     Args:
         seen: the static load test.
         study: number of straight segments; None: chosen by BIC.
-        rig: cross-section and lateral stretch of the shell.
+        rig: kind of the actuator, cross-section and lateral stretch of the shell.
     Returns:
         Results S16 and S17, data for figure 4.
     Raises:
-        ResultError: fewer than seven loads, or the law could not be fitted.
+        ResultError: fewer than seven loads, or the law of the shell could not be fitted.
     Source: reference study, rows S16 and S17.
     """
     masses_kg = np.unique(seen.mass_kg)
@@ -75,6 +78,55 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     load_n = masses_kg * GRAVITY_M_S2
     free_length_m = float(length_m[0])
     stretch = length_m / free_length_m
+    shell = _fit_shell(stretch, load_n, rig) if rig.actuator_kind == PLANAR_HASEL else None
+    regions = find_regions(stretch, load_n, pieces=study.static_load.pieces)
+    chosen = regions.regions[regions.chosen]
+    finest = POSITION_PX * rig.scale_m_per_px / free_length_m
+    return Static(
+        free_length_m=free_length_m,
+        region=chosen,
+        quantities={
+            **({} if shell is None else shell.quantities),
+            "S17.region_low": with_resolution(chosen.low, finest * chosen.low.value),
+            "S17.region_high": with_resolution(chosen.high, finest * chosen.high.value),
+        },
+        notes={
+            **({} if shell is None else {"S16.mu": _SHELL_NOTE}),
+            "S17.region_low": _segments_note(regions, study),
+        },
+        figures={
+            "static": {
+                "stretch": stretch,
+                "stretch_std": spread_m / free_length_m,
+                "load_n": load_n,
+                **({} if shell is None else shell.curve),
+                "regions": [
+                    {
+                        "stretch": [r.low.value, r.high.value],
+                        "load_n": _line(r, stretch, load_n - regions.residuals[0]),
+                    }
+                    for r in regions.regions
+                ],
+                "chosen": regions.chosen,
+            }
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _Shell:
+    """Arruda-Boyce law of the planar HASEL's shell.
+
+    Args:
+        quantities: results S16.
+        curve: fitted load against stretch, for figure 4.
+    """
+
+    quantities: dict[str, Estimate]
+    curve: dict[str, Floats]
+
+
+def _fit_shell(stretch: Floats, load_n: Floats, rig: RigDescription) -> _Shell:
     shell_stretch = stretch / np.sqrt(rig.lateral_stretch)
     law = fit_hyperelastic(
         shell_stretch[1:],
@@ -87,40 +139,11 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     )
     if not law.succeeded:
         raise ResultError(f"Static load test: {law.status}")
-    regions = find_regions(stretch, load_n, pieces=study.static_load.pieces)
-    chosen = regions.regions[regions.chosen]
     grid = np.linspace(1.0, stretch[-1], 150)
-    finest = POSITION_PX * rig.scale_m_per_px / free_length_m
-    return Static(
-        free_length_m=free_length_m,
-        region=chosen,
-        quantities={
-            "S16.mu": law.best.parameters["mu_pa"],
-            "S16.lambda_m": law.best.parameters["lambda_m"],
-            "S17.region_low": with_resolution(chosen.low, finest * chosen.low.value),
-            "S17.region_high": with_resolution(chosen.high, finest * chosen.high.value),
-        },
-        notes={
-            "S16.mu": "of the shell; the electrodes are fitted in parallel, with a cubic term",
-            "S17.region_low": _segments_note(regions, study),
-        },
-        figures={
-            "static": {
-                "stretch": stretch,
-                "stretch_std": spread_m / free_length_m,
-                "load_n": load_n,
-                "fit_stretch": grid,
-                "fit_load_n": _fitted_load_n(law, grid, rig),
-                "regions": [
-                    {
-                        "stretch": [r.low.value, r.high.value],
-                        "load_n": _line(r, stretch, load_n - regions.residuals[0]),
-                    }
-                    for r in regions.regions
-                ],
-                "chosen": regions.chosen,
-            }
-        },
+    found = law.best.parameters
+    return _Shell(
+        {"S16.mu": found["mu_pa"], "S16.lambda_m": found["lambda_m"]},
+        {"fit_stretch": grid, "fit_load_n": _fitted_load_n(law, grid, rig)},
     )
 
 

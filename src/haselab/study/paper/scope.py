@@ -8,7 +8,7 @@ from typing import Any
 from haselab.base import JsonObject
 from haselab.study.definition import Study, builtin_study
 from haselab.study.results import rows_of
-from haselab.study.simulated.truth import with_default_twin
+from haselab.study.simulated.truth import identified_as, with_default_twin
 
 __all__ = ["changes_text", "not_played"]
 
@@ -95,7 +95,8 @@ def changes_text(header: Mapping[str, Any]) -> str:
     if twins is None:
         parts.append("another rig than the twin, which rows S1 and S4 describe")
     elif changed := list(_changed(*twins)):
-        parts.append(f"another twin than the default one of row S1: {_shown(changed)}")
+        which = identified_as(header["rig_config"]) or "another twin"
+        parts.append(f"{which} instead of the default twin of row S1: {_shown(changed)}")
     return f"This run used {', and '.join(parts)}." if parts else ""
 
 
@@ -103,7 +104,7 @@ def _changed(default: Any, own: Any, name: str = "") -> Iterator[str]:
     """Yield each setting that differs, with both values."""
     if isinstance(default, Mapping) and isinstance(own, Mapping):
         for key in dict.fromkeys([*default, *own]):
-            if key != "name":
+            if key not in ("name", "origin"):
                 yield from _changed(default.get(key), own.get(key), f"{name}.{key}".strip("."))
     elif default != own:
         yield f"{name} {_text(own)} instead of {_text(default)}"

@@ -99,8 +99,7 @@ def predicted_loop(run: LoopRun, case: StepCase, factor: float = 1.0) -> LoopRun
     settings, plant = case.design.settings, case.design.plant
     plant = replace(plant, natural_frequency_rad_s=factor * plant.natural_frequency_rad_s)
     limits = Saturation(settings.strain_low, settings.strain_high)
-    # its output is strain_low at 0 V
-    setting = LoopSetting(run.rate_hz, run.delay_s, limits, settings.strain_low, 1)
+    setting = LoopSetting(run.rate_hz, run.delay_s, limits, settings.strain_start, 1)
     return replace(run, strain=simulate_loop(plant, case.gains, run.reference, setting).y)
 
 

@@ -9,10 +9,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from haselab.base import JsonObject
-from haselab.rig.twin.config import PLANAR_HASEL, TwinConfig, twin_of_reading
+from haselab.rig.protocols import PLANAR_HASEL
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 
 __all__ = [
     "follows_from_twin",
+    "identified_as",
     "is_simulated",
     "parameters",
     "set_in_twin",
@@ -85,6 +87,26 @@ def with_default_twin(
         return None
     default = twin_of_reading(twin.reading)
     return default.model_dump(mode="json"), twin.model_dump(mode="json")
+
+
+def identified_as(rig_config: Mapping[str, Any]) -> str:
+    """Which identified actuator a twin simulates, in words.
+
+    Args:
+        rig_config: of a session's header.
+    Returns:
+        A noun phrase; empty for another rig.
+    Example:
+        >>> identified_as({"origin": {"actuator": "leg", "file": "A.toml", "draw": 3}})
+        "the twin of the identified actuator 'leg' (A.toml, drawn with seed 3)"
+    """
+    origin = rig_config.get("origin")
+    if not isinstance(origin, Mapping):
+        return ""
+    draw = origin.get("draw")
+    how = "" if draw is None else f", drawn with seed {draw}"
+    name, file = origin.get("actuator"), origin.get("file")
+    return f"the twin of the identified actuator {name!r} ({file}{how})"
 
 
 def is_simulated(rig_config: Mapping[str, Any]) -> bool:

@@ -1,0 +1,184 @@
+r"""Compare a physical model with laws that have one effect less or more.
+
+At the minimum, a law with one effect more is judged by the size $a$ that this effect would have and
+its standard deviation $\sigma$, with all other parameters free: its logarithm of evidence over the
+present law is
+
+$\tfrac12 (a/\sigma)^2 - \tfrac12 k \ln N$
+
+for $k$ parameters more and $N$ values (Schwarz's criterion). A law with one effect less is judged
+likewise by the size of that effect.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _motion
+from haselab.actuators import ADDED_INERTIA, ActuatorLaw
+from haselab.identify.noise import coloured_covariance
+from haselab.identify.physical.misfit import Misfit
+from haselab.identify.physical.search import Found
+from haselab.identify.physical.unknowns import INSTRUMENTS, Unknowns
+
+__all__ = ["DECISIVE", "Richer", "Rival", "richer", "simpler"]
+
+Floats = NDArray[np.float64]
+DECISIVE = 5.0  # logarithm of evidence: 150 to 1
+_LITTLE = 1e-6  # size of an effect at which its derivative is taken
+_LARGEST = 0.5  # size of an effect from which to refine
+_TIMES = 9  # relaxation times of a further branch that are tried
+_SHORTEST_S, _SHARE_OF_RECORD = 0.03, 0.1  # of them: shortest, and longest over the record
+_EFFECTS = ("branch_share", "softening_share", "charge_share")
+_NAMES = {"softening_share": "softening", "charge_share": "charge creep"}
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A law that was compared with the one that was chosen.
+
+    Args:
+        law: how it differs.
+        log_evidence: its logarithm of evidence less that of the chosen law.
+    """
+
+    law: str
+    log_evidence: float
+
+
+@dataclass(frozen=True)
+class Richer:
+    """A law with one effect more that the records prefer.
+
+    Args:
+        start: its parameters, from which to refine.
+        effect: in words.
+        log_evidence: over the law without.
+    """
+
+    start: Unknowns
+    effect: str
+    log_evidence: float
+
+
+def simpler(found: Found, covariance: Floats) -> list[Rival]:
+    """Laws without one of the effects that the records show decisively.
+
+    Args:
+        found: the minimum.
+        covariance: of the values there. Shape `(P, P)`.
+    Returns:
+        Rejected laws, in the order of the effects.
+    """
+    unknowns = found.unknowns
+    fields = {about.key: about for about in unknowns.law.described()}
+    rivals = []
+    for k, name in enumerate(unknowns.names):
+        about = fields.get(name.partition("[")[0])
+        if about is None:
+            continue
+        size, std = unknowns.values[k], math.sqrt(covariance[k, k])
+        if about.inverse_square:
+            effect, size, std = f"{about.key} (infinite)", size**-2.0, 2.0 * std / size**3
+        elif about.name == "branch_share":
+            effect = f"the branch {name}"
+        elif about.name in _EFFECTS:
+            effect = _NAMES[about.name]
+        else:
+            continue
+        evidence = _log_evidence(size, std, 1 if about.inverse_square else 2, found.residuals.size)
+        if evidence > DECISIVE:
+            rivals.append(Rival(f"without {effect}", -evidence))
+    return rivals
+
+
+def _log_evidence(size: float, std: float, parameters: int, count: int) -> float:
+    if not (std > 0.0 and math.isfinite(std)):
+        return -math.inf
+    return 0.5 * (size / std) ** 2 - 0.5 * parameters * math.log(count)
+
+
+def richer(misfit: Misfit, found: Found) -> Richer | None:
+    """The law with one effect more that the records prefer most, if any decisively.
+
+    Args:
+        misfit: that was minimised.
+        found: its minimum.
+    Returns:
+        That law; None if there is none.
+    """
+    best: Richer | None = None
+    for law, name, effect in _candidates(found.unknowns.present_law(), _duration_s(misfit)):
+        column = _column(misfit, found, law, name)
+        if column is None:
+            continue
+        columns = np.column_stack([found.jacobian, column])
+        columns = columns[:, np.abs(columns).any(axis=0)]
+        scale = np.linalg.norm(columns, axis=0)
+        step = np.linalg.lstsq(columns / scale, found.residuals, rcond=1e-12)[0]
+        rest = found.residuals - (columns / scale) @ step
+        covariance = coloured_covariance(
+            [columns[part.rows] for part in misfit.segments],
+            [rest[part.rows] for part in misfit.segments],
+            scale.size,
+        )
+        size, std = float(step[-1] / scale[-1]), math.sqrt(covariance[-1, -1])
+        evidence = _log_evidence(size, std, 2, rest.size)
+        if size > 0.0 and evidence > (DECISIVE if best is None else best.log_evidence):
+            start = Unknowns.of(
+                _with_size(law, name, min(size, _LARGEST)),
+                added_inertia_kg=found.unknowns.value(ADDED_INERTIA),
+                mass_kg=found.unknowns.mass_kg,
+            )
+            best = Richer(start.at(found.unknowns), effect, evidence)
+    return best
+
+
+def _duration_s(misfit: Misfit) -> float:
+    return max(float(np.ptp(record.drive.edge_s)) for record in misfit.records)
+
+
+def _candidates(law: ActuatorLaw, duration_s: float) -> list[tuple[ActuatorLaw, str, str]]:
+    """Laws with one effect more, of hardly any size: law, name of that size, words."""
+    fields = {about.name: about.key for about in law.described() if about.fitted}
+    found = []
+    for field in ("softening_share", "charge_share"):
+        if field in fields and getattr(law, field) == 0.0:
+            more = dataclasses.replace(law, **{field: _LITTLE})
+            found.append((more, fields[field], _NAMES[field]))
+    if "branch_share" in fields and "branch_relaxation_s" in fields:
+        shares, times = law.losses.branch_share, law.losses.branch_relaxation_s
+        if len(shares) < _motion.BRANCHES:
+            name = f"{fields['branch_share']}[{len(shares)}]"
+            longest_s = max(_SHARE_OF_RECORD * duration_s, 2.0 * _SHORTEST_S)
+            for time_s in np.geomspace(_SHORTEST_S, longest_s, _TIMES).tolist():
+                added = {
+                    "branch_share": (*shares, _LITTLE),
+                    "branch_relaxation_s": (*times, time_s),
+                }
+                more = dataclasses.replace(law, **added)
+                found.append((more, name, f"a branch of about {time_s:.2g} s"))
+    return found
+
+
+def _column(misfit: Misfit, found: Found, law: ActuatorLaw, name: str) -> Floats | None:
+    """Derivative of the modelled, over the standard deviations, by the size of an effect."""
+    instruments = [other for other in found.unknowns.names if other in INSTRUMENTS]
+    names = (name, ADDED_INERTIA, *instruments)
+    values = [_LITTLE, *(found.unknowns.value(other) for other in names[1:])]
+    unknowns = Unknowns(law, names, np.array(values), found.unknowns.mass_kg)
+    linear = misfit.linearised(unknowns)
+    return None if linear is None else linear[1][:, 0] / unknowns.slopes[0]
+
+
+def _with_size(law: ActuatorLaw, name: str, size: float) -> ActuatorLaw:
+    key, _, index = name.partition("[")
+    field = next(about.name for about in law.described() if about.key == key)
+    if index:
+        return dataclasses.replace(law, **{field: (*getattr(law, field)[:-1], size)})
+    return dataclasses.replace(law, **{field: size})

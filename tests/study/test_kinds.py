@@ -1,0 +1,244 @@
+"""The quick study of each kind of actuator, from its example folder, against the twin's own law."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haselab.actuators import GRAVITY_M_S2, ActuatorLaw, equilibrium_m, linearise
+from haselab.identify.physical.misfit import Misfit
+from haselab.identify.physical.search import Found, refine
+from haselab.identify.physical.unknowns import CAMERA_OFFSET, Unknowns
+from haselab.models.actuator import ActuatorTables
+from haselab.models.actuator.strain_map import StrainMap
+from haselab.pipelines.motion import motion_of_session
+from haselab.rig.twin.config import TwinConfig, load_twin
+from haselab.store.actuator_file import read_run
+from haselab.store.session.reader import SessionReader, session_file
+from haselab.store.toml import validated
+from haselab.study.fits.resolution import POSITION_PX
+from tests.study.conftest import Recorded
+
+KINDS = Path(__file__).parents[2] / "examples" / "kinds"
+STD = 5.0  # of an estimate: one of a million deviates further by chance
+pytestmark = pytest.mark.long
+
+
+class Kind:
+    """A played study, and the twin on which it was played."""
+
+    def __init__(self, folder: Path, twin: TwinConfig) -> None:
+        self.folder, self.twin, self.law = folder, twin, twin.law
+        self.recorded = Recorded(folder)
+        self.tables = validated(ActuatorTables, read_run(folder), folder)
+
+    @property
+    def strain_map(self) -> StrainMap:
+        return self.tables.strain_map()
+
+    @property
+    def zero_m(self) -> float:
+        length_m = self.tables.actuator.geometry.zero_length_m
+        assert length_m is not None
+        return length_m
+
+    @property
+    def baseline_v(self) -> float:
+        return self.twin.amplifier.gain * self.recorded.value("S18.baseline")
+
+    @property
+    def seen_m(self) -> float:
+        """Error of a mean length: the bias of a track, on both clamps."""
+        return np.sqrt(2.0) * POSITION_PX * self.twin.camera.scale_m_per_px
+
+    def rest_m(self, voltage_v: float, mass_kg: float | None = None) -> float:
+        mass_kg = self.twin.load.mass_kg if mass_kg is None else mass_kg
+        return equilibrium_m(self.law, voltage_v, mass_kg * GRAVITY_M_S2)
+
+    def creep(self) -> float:
+        """Share of a motion that the slowest branch has not made when frames are recorded."""
+        losses, settle_s = self.law.losses, self.recorded.study["static_load"]["settle_s"]
+        shares = np.array(losses.branch_share)
+        return float(shares @ np.exp(-settle_s / np.array(losses.branch_relaxation_s)))
+
+
+@pytest.fixture(scope="module", params=["peano-hasel", "dea-stack", "curling-hasel"])
+def kind(
+    request: pytest.FixtureRequest,
+    command: Callable[..., str],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Kind]:
+    source, out = KINDS / request.param, tmp_path_factory.mktemp("kind") / "run"
+    study, rig = source / "study.toml", source / "rig.toml"
+    command("run", study, "--rig", rig, "--quick", "--out", out)
+    found = Kind(out, load_twin(source / "twin.toml"))
+    yield found
+    found.recorded.file.close()
+
+
+def test_each_mass_and_voltage_has_the_length_of_the_law(kind: Kind) -> None:
+    static = kind.recorded.experiment("static")
+    moved_m = np.ptp(static.length)
+    for mass_kg in np.unique(static.mass):
+        seen_m = float(static.length[static.mass == mass_kg].mean())
+        within_m = STD * kind.seen_m + kind.creep() * moved_m
+        assert seen_m == pytest.approx(kind.rest_m(0.0, float(mass_kg)), abs=within_m), mass_kg
+    held = kind.recorded.experiment("hold-1")
+    rest_m = kind.rest_m(kind.baseline_v)
+    # before, it rested at 0 V
+    within_m = STD * kind.seen_m + kind.creep() * abs(rest_m - kind.rest_m(0.0))
+    assert held.length.mean() == pytest.approx(rest_m, abs=within_m)
+    assert rest_m < kind.rest_m(0.0)  # it contracts
+
+
+def test_a_video_gives_the_same_length_as_the_run(
+    kind: Kind, command: Callable[..., str], tmp_path: Path
+) -> None:
+    out = tmp_path / "tracks.csv"
+    command("track", kind.folder / "video" / "hold-1.avi", "--auto", "--out", out)
+    rows = np.genfromtxt(out, delimiter=",", names=True, dtype=None, encoding="utf-8")
+    height_px = [
+        rows["y_px"][np.char.startswith(rows["point"], end)].mean() for end in ("upper", "lower")
+    ]
+    length_m = kind.twin.camera.scale_m_per_px * (height_px[1] - height_px[0])
+    held = kind.recorded.experiment("hold-1")
+    assert length_m == pytest.approx(held.length.mean(), abs=STD * kind.seen_m)
+
+
+def test_the_capacitance_is_that_of_the_law(
+    kind: Kind, command: Callable[..., str], tmp_path: Path
+) -> None:
+    out = tmp_path / "c.csv"
+    command("sense", kind.folder / "session.h5", "--experiment", "hold-1", "--out", out)
+    rows = np.genfromtxt(out, delimiter=",", names=True, dtype=None, encoding="utf-8")
+    rows = rows[rows["valid"] == 1]
+    rest_m = kind.rest_m(kind.baseline_v)
+    known_f = float(kind.law.differential_capacitance_f(rest_m, kind.baseline_v))
+    # how much it changes with the rest of the creep
+    slope = kind.law.differential_capacitance_f(rest_m + 1e-5, kind.baseline_v) - known_f
+    late_f = abs(float(slope)) / 1e-5 * kind.creep() * abs(rest_m - kind.rest_m(0.0))
+    std_f = float(np.median(rows["capacitance_std_f"]))
+    assert rows["capacitance_f"].mean() == pytest.approx(known_f, abs=STD * std_f + late_f)
+    # The map gives the true strain within its band, and falls.
+    low, high = (float(end) for end in kind.strain_map.interval(known_f))
+    assert low <= rest_m / kind.zero_m - 1.0 <= high
+    assert kind.strain_map.slope_at(known_f) < 0.0
+
+
+def _swing(law: ActuatorLaw, twin: TwinConfig, voltage_v: float) -> tuple[float, float]:
+    """Natural frequency in rad/s and damping ratio of the resonance."""
+    mass_kg = twin.load.mass_kg
+    inertia_kg = mass_kg + twin.load.added_inertia_kg
+    poles = linearise(law, voltage_v, mass_kg * GRAVITY_M_S2, inertia_kg).poles
+    pole = poles[poles.imag.argmax()]
+    return abs(pole), -pole.real / abs(pole)
+
+
+def test_the_resonance_is_one_of_those_that_the_chirp_passes(kind: Kind) -> None:
+    """The law is not linear: its linear models within the chirp's voltages are the bounds."""
+    swing_v = kind.twin.amplifier.gain * kind.recorded.study["chirp"]["amplitude_v"]
+    voltages_v = np.linspace(kind.baseline_v - swing_v, kind.baseline_v + swing_v, 9)
+    passed = [_swing(kind.law, kind.twin, float(v)) for v in voltages_v]
+    for key, values in zip(("S20.omega_n", "S20.zeta"), zip(*passed, strict=True), strict=True):
+        row = kind.recorded.rows[key]
+        within = STD * float(row["std"])
+        assert min(values) - within <= float(row["value"]) <= max(values) + within, key
+
+
+def test_the_closed_loop_settles_at_the_step(kind: Kind) -> None:
+    """Self-sensing knows the strain to the band of its map; the loop has no other error."""
+    steps = kind.recorded.study["steps"]
+    assert steps["step"] < 0.0
+    band = kind.strain_map.band
+    assert band is not None
+    for group in ("pi", "pid"):
+        trial = kind.recorded.trials(group)[0]
+        strain = trial.length / kind.zero_m - 1.0
+        last = trial.time > trial.time[-1] - 1.0
+        within = max(-band[0], band[1]) + STD * kind.seen_m / kind.zero_m
+        # the PI has one slow pole, of which a rise from 10 to 90 % is ln 9 time constants
+        rise_s = kind.recorded.value("S24.rise_closed" if group == "pi" else "S25.rise_pid")
+        left = np.exp(-steps["step_s"] * np.log(9.0) / rise_s)
+        assert strain[last].mean() == pytest.approx(
+            steps["step"], abs=within + left * abs(steps["step"])
+        )
+        assert strain[last].std() < within
+    assert 0.0 <= kind.recorded.value("S25.overshoot_pid") < 0.1
+
+
+def test_what_does_not_apply_is_not_determined_for_a_true_reason(kind: Kind) -> None:
+    results = json.loads((kind.folder / "results.json").read_text())
+    reasons = {key: part["reason"] for part in results["not_played"] for key in part["ids"]}
+    assert f"this actuator is a {kind.twin.kind}" in reasons["S16.mu"]
+    assert kind.tables.actuator.kind == kind.twin.kind
+    assert (kind.folder / "report.html").is_file()
+
+
+def test_the_design_and_the_firmware_hold_what_they_predict(
+    kind: Kind, command: Callable[..., str], tmp_path: Path
+) -> None:
+    file = tmp_path / "designed.toml"
+    design = json.loads(
+        command("design", kind.folder / "actuator.toml", "--out", file, "--json")
+    )  # exit code 3 if a demand is missed
+    assert design["phase_margin_deg"] >= 50.0 and design["gain_margin_db"] >= 6.0
+    built = json.loads(command("firmware", "build", file, "--build-dir", tmp_path / "fw", "--json"))
+    limits = kind.recorded.study["control"]
+    assert built["strain_low"] == limits["saturation_low"]
+    assert built["strain_high"] == limits["saturation_high"]
+    found = json.loads(command("firmware", "simulate", kind.folder, "--json"))
+    assert found["status"] == "ok" and found["overruns"] == 0
+    assert found["deviation"] <= found["deviation_tolerated"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["peano-hasel", "dea-stack"], indirect=True, scope="module")
+def test_the_parameters_of_the_law_are_identified(
+    kind: Kind, command: Callable[..., str], tmp_path: Path
+) -> None:
+    """The stack's by the command; the search of the Peano takes minutes, so its end alone."""
+    truth = dict(kind.law.parameters())
+    if kind.twin.kind == "dea-stack":
+        file = tmp_path / "a.toml"
+        file.write_text((kind.folder / "actuator.toml").read_text())
+        found = json.loads(
+            command("identify", "actuator", kind.folder, "--actuator", file, "--json")
+        )
+        assert (found["status"], found["not_identifiable"]) == ("ok", [])
+        estimates = {name: (one["value"], one["std"]) for name, one in found["parameters"].items()}
+    else:
+        estimates = _refined(kind)
+    compared = 0
+    for name, (value, std) in estimates.items():
+        key, _, branch = name.partition("[")
+        if key in truth:
+            known = truth[key]
+            known = known[int(branch[:-1])] if isinstance(known, tuple) else known
+            assert value == pytest.approx(known, abs=STD * std), name
+            compared += 1
+    assert compared >= 9
+
+
+def _refined(kind: Kind) -> dict[str, tuple[float, float]]:
+    """Values and standard deviations at the smallest misfit near the twin's own parameters."""
+    with SessionReader(session_file(kind.folder)) as reader:
+        record = motion_of_session(reader, kind.folder)
+    misfit = Misfit([record], known={CAMERA_OFFSET: 2e-6})
+    start = Unknowns.of(kind.law, added_inertia_kg=1e-4, mass_kg=kind.twin.load.mass_kg)
+    nothing = np.zeros(0)
+    found = refine(misfit, Found(start, nothing, nothing, nothing, False, 0))
+    assert found is not None and found.converged
+    # the noise of the tracks and of the lock-in is stated: nothing is left but it
+    assert np.mean(found.residuals**2) == pytest.approx(1.0, abs=0.15)
+    unknowns = found.unknowns
+    std = np.sqrt(np.diag(np.linalg.inv(found.jacobian.T @ found.jacobian))) * np.abs(
+        unknowns.slopes
+    )
+    return {
+        name: (float(value), float(one))
+        for name, value, one in zip(unknowns.names, unknowns.values, std, strict=True)
+    }

@@ -19,7 +19,7 @@ from haselab.actuators import (
     rates,
     with_parameters,
 )
-from haselab.base import InputError
+from haselab.base import InputError, LimitError
 
 MASS_KG, LOAD_N = 0.25, 0.25 * 9.81
 LAWS = {
@@ -231,3 +231,14 @@ def test_the_state_at_rest_stays_and_has_the_derivatives_of_its_equilibrium(long
         expected = (lengths[1] - lengths[0]) / (0.002 * value)
         scale = max(abs(expected), 1e-5 / value)
         assert rows[0, column] == pytest.approx(expected, abs=1e-3 * scale), name
+
+
+def test_the_index_after_the_last_adds_a_branch():
+    law = with_parameters(
+        PlanarHasel(), {"viscosity.share[3]": 0.1, "viscosity.relaxation_s[3]": 9.0}
+    )
+    assert law.losses.branch_share[3:] == (0.1,) and law.losses.branch_relaxation_s[3:] == (9.0,)
+    with pytest.raises(LimitError, match=r"4 branch shares and 3 relaxation times"):
+        _ = with_parameters(PlanarHasel(), {"viscosity.share[3]": 0.1}).losses
+    with pytest.raises(InputError, match=r"viscosity.share\[4\] does not exist: .* has 3 values"):
+        with_parameters(PlanarHasel(), {"viscosity.share[4]": 0.1})

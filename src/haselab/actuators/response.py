@@ -143,7 +143,7 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
     Args:
         law: to start from.
         values: by the names of `ActuatorLaw.parameters`; one of several values by its index, such
-            as `viscosity.share[0]`.
+            as `viscosity.share[0]`; the index after the last one adds a value.
     Returns:
         The changed law; `ADDED_INERTIA` is none of its parameters and changes nothing.
     Raises:
@@ -169,9 +169,10 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
         if index:
             old = changed.get(field, getattr(law, field))
             parts = list(old) if isinstance(old, tuple) else []
-            if not index[:-1].isdigit() or int(index[:-1]) >= len(parts):
+            if not index[:-1].isdigit() or int(index[:-1]) > len(parts):
                 raise InputError(f"{key} does not exist: {name} has {len(parts)} values.")
-            parts[int(index[:-1])] = float(value)
+            place = int(index[:-1])
+            parts[place : place + 1] = [float(value)]
             changed[field] = tuple(parts)
         else:
             changed[field] = float(value)

@@ -56,9 +56,11 @@ def test_the_law_of_the_twin_is_found_in_a_quick_study(identified):
     for name, true in fitted_parameters(PlanarHasel()).items():
         found = answer["parameters"][name]
         far[name] = (found["value"] - true) / found["std"]
-    # Here the permittivity is off by 3.7; the page says that the intervals are not verified yet.
-    assert max(map(abs, far.values())) < 5.0, far
-    assert np.sqrt(np.mean(np.square(list(far.values())))) < 2.0, far
+    for name in ("camera.latency_s", "sensing.latency_s"):  # the amplifier's is measured
+        far[name] = answer["parameters"][name]["value"] / answer["parameters"][name]["std"]
+    # 19 numbers: one is outside 3.5 by chance once in 100 studies
+    assert max(map(abs, far.values())) < 3.5, far
+    assert np.sqrt(np.mean(np.square(list(far.values())))) < 1.6, far
     for channel, rms in answer["residual_rms"].items():
         assert rms == pytest.approx(answer["noise_rms"][channel], rel=0.05)
     assert [point["voltage_v"] for point in answer["linear_models"]] == pytest.approx(

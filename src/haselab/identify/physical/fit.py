@@ -185,16 +185,19 @@ def fit_actuator(
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
     known: dict[str, float] = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
-    misfit = Misfit(records, known=known)
+    # far from the minimum, errors of tracking that a pixel shares would only hide the misfit
+    plain = Misfit([replace(record, pixel_m=0.0) for record in records], known=known)
     # the scale of the camera and the actuator's size can hardly be told apart: it comes last
-    found = search(misfit, start.without((CAMERA_SCALE,)))
+    found = search(plain, start.without((CAMERA_SCALE,)))
     if found is None:
         return ActuatorFit(
             status="the start values describe no motion: the actuator has no equilibrium under the "
             "first load and voltage",
             kind=law.kind,
         )
-    misfit, found = _weighed(replace(misfit, strict=True), start.at(found.unknowns), found)
+    misfit, found = _weighed(
+        Misfit(records, known=known, strict=True), start.at(found.unknowns), found
+    )
     rejected = []
     for _ in range(_MOST_ADDED):
         better = richer(misfit, found)

@@ -100,7 +100,7 @@ def simpler(found: Found, covariance: Floats) -> list[Rival]:
 def _log_evidence(size: float, std: float, parameters: int, count: int) -> float:
     if not (std > 0.0 and math.isfinite(std)):
         return -math.inf
-    return 0.5 * (size / std) ** 2 - 0.5 * parameters * math.log(count)
+    return float(0.5 * (size / std) ** 2 - 0.5 * parameters * math.log(count))
 
 
 def richer(misfit: Misfit, found: Found) -> Richer | None:

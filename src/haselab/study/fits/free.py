@@ -21,6 +21,7 @@ from haselab.study.fits.trials import normal_equivalent
 
 __all__ = ["Envelope", "Free", "PrintedFit", "fit_free", "fit_printed"]
 
+_FEWEST = 16  # frames of a motion
 _WITH_CREEP = 3  # parameters that are searched: decay, frequency, and time constant of the creep
 _LEAST_PEAKS = 2  # of one sign, through which an envelope is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks are below the residuals of eq. 6
@@ -164,7 +165,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     Returns:
         Results S19, data for figure 5.
     Raises:
-        ResultError: the motion is not a decaying oscillation.
+        ResultError: the motion is not a decaying oscillation, or hardly seen.
     Source: reference study, row S19.
     """
     records = [_trial(seen).moving() for seen in trials]
@@ -235,6 +236,11 @@ def _missing(printed: Sequence[PrintedFit]) -> str:
 
 def _trial(seen: Observation) -> FreeTrial:
     after = seen.frame_time_s >= seen.drop_s
+    if (count := int(after.sum())) < _FEWEST:
+        raise ResultError(
+            f"{seen.name}: {count} frames after the drop show all marks, and {_FEWEST} are needed; "
+            "the tracker has lost one"
+        )
     return FreeTrial(seen.length_m[after], seen.frame_time_s[after] - seen.drop_s)
 
 

@@ -177,6 +177,7 @@ def test_a_fault_in_a_rig_file_is_one_line(
 ) -> None:
     (tmp_path / "study.toml").write_text(BUILTIN)
     (tmp_path / "rig.toml").write_text(text)
+    (tmp_path / "t.toml").write_text("")
     line = refused("run", tmp_path / "study.toml", "--rig", tmp_path / "rig.toml",
                    "--out", tmp_path / "out")  # fmt: skip
     assert words in line
@@ -219,7 +220,8 @@ def test_a_twin_that_cannot_be_is_one_line_that_names_every_fault(
         (["reproduce", "--out", "{out}", "--seed", "99999999999999999999"], "not in the range"),
         (["reproduce", "--out", "{out}", "--reading", "khz"], "'khz' is not one of"),
         (["reproduce", "--out", "{file}"], "--out names a file, not a folder. Name a new folder."),
-        (["run", "{file}"], "Missing option '--rig'"),
+        (["run", "{file}"], "Missing option '--out'"),
+        (["run", "{file}", "--out", "{out}"], "--rig"),
         (["analyse"], "Missing argument"),
         (["design", "{file}", "--out", "{file}/controller.toml"], ""),
         (["no-such-command"], "No such command 'no-such-command'"),

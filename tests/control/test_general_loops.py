@@ -67,7 +67,7 @@ def test_a_slow_branch_of_a_thousand_does_not_hide_the_easy_loop():
 @pytest.mark.long
 def test_a_step_beyond_the_limits_is_refused_with_what_can_be_reached():
     plant = Plant(1e-3, 30.0, 0.3)  # mm per volt, with the limits of a strain
-    with pytest.raises(ResultError, match=r"saturates.*The step can be -5e-05 to 0\.0001"):
+    with pytest.raises(ResultError, match=r"saturates.*a step of -5e-05 to 0\.0001"):
         design_pid(plant, DesignSpec(step=0.04), LoopSetting(), rng=RNG(0))
     volts = LoopSetting(100.0, 0.01, Saturation(0.0, 5000.0))
     design = design_pid(plant, DesignSpec(step=1.0), volts, rng=RNG(0))

@@ -121,4 +121,6 @@ def test_a_step_beyond_the_limits_is_refused_as_a_demand_with_what_is_reachable(
     setting = LoopSetting(saturation=Saturation(-0.02, 0.06))
     said = r"step of 0\.04 needs .* of 0\.08, .* State a step of -0\.01 to 0\.03 in the demands"
     with pytest.raises(ResultError, match=said):
-        design_pi(Plant(0.5, 32.0, 0.3), DesignSpec(), setting, rng=np.random.default_rng(0))
+        design_pi(
+            Plant(0.5, 32.0, 0.3), DesignSpec(step=0.04), setting, rng=np.random.default_rng(0)
+        )

@@ -16,7 +16,8 @@ from haselab.identify.physical.unknowns import CAMERA_OFFSET, Unknowns
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.pipelines.motion import motion_of_session
-from haselab.rig.twin.config import TwinConfig, load_twin
+from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.twin_file import load_twin
 from haselab.store.actuator_file import read_run
 from haselab.store.session.reader import SessionReader, session_file
 from haselab.store.toml import validated

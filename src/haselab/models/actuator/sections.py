@@ -210,8 +210,13 @@ class DriveSection(_Section):
 class PhysicalCovariance(_Section):
     """`[model.physical.covariance]`."""
 
-    names: tuple[str, ...] = Field(description="parameters of rows and columns, in order")
-    matrix: tuple[tuple[float, ...], ...] = Field(description="covariance of their values")
+    names: tuple[str, ...] = Field(
+        description="parameters of rows and columns, in order",
+        examples=[["dielectric.permittivity"]],
+    )
+    matrix: tuple[tuple[float, ...], ...] = Field(
+        description="covariance of their values", examples=[[[1e-6]]]
+    )
 
     @model_validator(mode="after")
     def _square(self) -> Self:

@@ -155,8 +155,8 @@ class AcquisitionConfig(Section):
 class Origin(Section):
     """The identified actuator whose twin this is."""
 
-    actuator: str = Field(description="its name")
-    file: str = Field(description="actuator file with [model.physical]")
+    actuator: str = Field(description="its name", examples=["leg-7"])
+    file: str = Field(description="actuator file with [model.physical]", examples=["actuator.toml"])
     sha256: str = Field("", description="of this file")
     records_sha256: tuple[str, ...] = Field((), description="recordings of the identification")
     draw: int | None = Field(None, description="seed of drawn parameters; none: the estimates")

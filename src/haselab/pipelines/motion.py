@@ -38,6 +38,8 @@ class _Blocks:
             Shape `(S, 2)`.
         carrier_v: peak of the carrier at the actuator, by the voltage monitor; NaN if it was not
             seen.
+        rise: of the voltage monitor at each switch but the first, see `_rise`. Shape
+            `(4, N - 1)`.
     """
 
     start_s: Floats
@@ -223,7 +225,9 @@ def _rise(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
         after = codes[1:, first:end].astype(np.float64) ** power
         found += [np.diff(level), (after - level[1:, None]).sum(axis=1)]
     change, area = found[:2]
-    found[1] = area - np.mean(area[np.abs(change) < _LARGE] if change.size else 0.0)
+    small = np.abs(change) < _LARGE
+    if small.any():  # the carrier's part is the same in all
+        found[1] = area - area[small].mean()
     return np.stack(found)
 
 
@@ -241,7 +245,8 @@ def _late_s(blocks: Collection[_Blocks], rate_hz: float) -> list[Floats]:
     found = []
     for rise in rises:
         late = np.full(rise.shape[1] + 1, usual)  # of the first block nobody knows the step
-        large = np.flatnonzero(np.abs(rise[0]) >= _LARGE)
+        # a step to the opposite voltage changes no square, hence no force
+        large = np.flatnonzero((np.abs(rise[0]) >= _LARGE) & (np.abs(rise[2]) >= _LARGE**2))
         late[1 + large] = -rise[3, large] / rise[2, large]
         # the first sample still shows the voltage before: half an interval of the sums
         found.append((late - 0.5) / rate_hz)

@@ -187,7 +187,7 @@ def fit_actuator(
     known: dict[str, float] = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
     # far from the minimum, errors of tracking that a pixel shares would only hide the misfit
     plain = Misfit([replace(record, pixel_m=0.0) for record in records], known=known)
-    # the scale of the camera and the actuator's size can hardly be told apart: it comes last
+    # records hardly separate the camera's scale from the actuator's size: it is estimated last
     found = search(plain, start.without((CAMERA_SCALE,)))
     if found is None:
         return ActuatorFit(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _motion
-from haselab.actuators import ADDED_INERTIA, ActuatorLaw
+from haselab.actuators import ADDED_INERTIA, ActuatorLaw, with_parameters
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.search import Found
@@ -115,7 +115,7 @@ def richer(misfit: Misfit, found: Found) -> Richer | None:
     best: Richer | None = None
     for law, name, effect in _candidates(found.unknowns.present_law(), _duration_s(misfit)):
         column = _column(misfit, found, law, name)
-        if column is None:
+        if column is None or not column.any():
             continue
         columns = np.column_stack([found.jacobian, column])
         columns = columns[:, np.abs(columns).any(axis=0)]
@@ -131,7 +131,7 @@ def richer(misfit: Misfit, found: Found) -> Richer | None:
         evidence = _log_evidence(size, std, 2, rest.size)
         if size > 0.0 and evidence > (DECISIVE if best is None else best.log_evidence):
             start = Unknowns.of(
-                _with_size(law, name, min(size, _LARGEST)),
+                with_parameters(law, {name: min(size, _LARGEST)}),
                 added_inertia_kg=found.unknowns.value(ADDED_INERTIA),
                 mass_kg=found.unknowns.mass_kg,
             )
@@ -174,11 +174,3 @@ def _column(misfit: Misfit, found: Found, law: ActuatorLaw, name: str) -> Floats
     unknowns = Unknowns(law, names, np.array(values), found.unknowns.mass_kg)
     linear = misfit.linearised(unknowns)
     return None if linear is None else linear[1][:, 0] / unknowns.slopes[0]
-
-
-def _with_size(law: ActuatorLaw, name: str, size: float) -> ActuatorLaw:
-    key, _, index = name.partition("[")
-    field = next(about.name for about in law.described() if about.key == key)
-    if index:
-        return dataclasses.replace(law, **{field: (*getattr(law, field)[:-1], size)})
-    return dataclasses.replace(law, **{field: size})

@@ -25,9 +25,9 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         Measurement("control.pid_step"),
     ),
     "identify": (
-        Measurement("identification.static_laws"),
+        Measurement("identification.static_laws", quick={"runs": 60}),
         Measurement(
-            "identification.transfer", quick={"runs": 60, "structures": 0, "libraries": False}
+            "identification.transfer", quick={"runs": 20, "structures": 0, "libraries": False}
         ),
         Measurement("control.many_loops"),
         Measurement("identification.frequency_response", quick={"runs": 10}),
@@ -35,7 +35,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         Measurement("identification.hysteresis", quick={"runs": 8}),
     ),
     "identify-board": (
-        Measurement("identification.random_plants", quick={"plants": 300}),
+        Measurement("identification.random_plants", quick={"plants": 200}),
         Measurement("control.margins", quick={"loops": 200}),
     ),
     "recording": (
@@ -51,7 +51,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     ),
     "tracking": (
         Measurement("tracking.points", quick={"quick": True, "only": ("bias",)}),
-        Measurement("tracking.difficult", quick={"every": 4}),
+        Measurement("tracking.difficult", quick={"every": 6}),
     ),
     "firmware": (
         Measurement(

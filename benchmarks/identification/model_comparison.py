@@ -78,6 +78,11 @@ class Sensed:
     def event(self, time_s: float, what: str) -> None:
         pass
 
+    def condition(
+        self, time_s: float, drive_v: float, carrier_v: float, pull_n: float, mass_kg: float
+    ) -> None:
+        pass
+
     def start(
         self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
     ) -> None:

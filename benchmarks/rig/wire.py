@@ -30,7 +30,6 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.client import TwinClient
 from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
-from haselab.runtime.runner import Runner
 from haselab.runtime.sensors import CapacitanceSensor
 from haselab.safety.gate import Gate
 
@@ -100,7 +99,7 @@ def loop(config: BenchConfig, blocks: int) -> tuple[int, np.ndarray, float]:
                 before_s = after_s
                 strain = sensor.strain(codes)
                 if strain == strain:
-                    output_v = Runner._voltage(settings, pid.step(STEP, strain))
+                    output_v = float(settings.voltage_map.voltage_v(pid.step(STEP, strain)))
         except DeviceError as error:
             print(f"  ended after {got} blocks: {error}")
         stalled_s = float(client.meters()["stalled_s"])

@@ -34,6 +34,7 @@ from haselab.safety.interlock import Interlock
 from haselab.safety.state_machine import Safety, SafetySettings
 
 SAFE_V = 50.0
+_SETTLES = 2000  # samples in which the amplifier settles after its last command
 _NUMBERS = itertools.count()
 _TWINS: list[TwinBench] = []  # one for all cases: it takes a while to hang its weight
 COUNTS: Counter[str] = Counter()  # of what the interleavings have done, for the table
@@ -193,6 +194,7 @@ class WireUnderTest:
     def make_safe(self, reason: str) -> None:
         faults = [fault for _, fault in revoke_and_make_safe(self.config, reason) if fault]
         assert not faults
+        self._twin.hub.spend(_SETTLES)
 
     def output_v(self) -> float:
         hub = self._twin.hub

@@ -47,7 +47,7 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
                         {"twin.toml": "twin.toml"}),
     "run": ("run study.toml --rig rig.toml --quick --out out", {"twin.toml": "twin.toml"}),
     "run, chip": ("run steps.toml --rig rig.toml --out out", _CHIP),
-    "reproduce": ("reproduce --twin twin.toml --quick --out out", {}),
+    "reproduce": ("reproduce --twin twin.toml --quick --no-physical-model --out out", {}),
     "calibrate": ("calibrate --rig rig.toml --capacitor 1e-9 --capacitor 2e-9,5,0.01 "
                   "--carrier-hz 2000 --carrier-v 0.1 --duration-s 0.1 --out c.toml",
                   {"twin.toml": "twin.toml"}),

@@ -154,7 +154,7 @@ def test_run_on_a_rig_file_plays_what_reproduce_plays(
     builtin = Path(haselab.study.__file__).parent / "studies" / "hasel-iros2018.toml"
     (tmp_path / "study.toml").write_text(builtin.read_text())
     run = ("run", tmp_path / "study.toml", "--rig", tmp_path / "rig.toml")
-    for order in (("reproduce", "--reading", "hz", "--seed", 11), run):
+    for order in (("reproduce", "--no-physical-model", "--reading", "hz", "--seed", 11), run):
         name = importlib.import_module(f"haselab.cli.study.{order[0]}")
         monkeypatch.setattr(name, "execute", execute)
         out = ("--quick", "--out", tmp_path / str(order[0]))

@@ -48,6 +48,10 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--model": (None, "Choose the model."),
     "--out": (None, "Write the result to this path; missing folders are created."),
     "--output": ("COLUMN", "Name the column of the output."),
+    "--physical-model/--no-physical-model": (
+        None,
+        "Identify the physical model from the recording.",
+    ),
     "--quick": (None, "Play the short version of the study."),
     "--rate-hz": (None, "Set the sampling rate in Hz."),
     "--reading": (

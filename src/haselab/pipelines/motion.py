@@ -89,6 +89,7 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
     chosen = np.flatnonzero(inside)[order]
     none, no = np.zeros(0, dtype=np.int64), np.zeros(0)
     window, window_of, of_block, farad, std_f = [none], [none], [none], [no], [no]
+    block = [none]
     count = 0
     for k, name in enumerate(names):
         if name not in blocks:
@@ -100,12 +101,14 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
         farad.append(part.capacitance_f[part.used])
         std_f.append(part.std_f[part.used])
         of_block.append(np.full(farad[-1].size, k))
+        block.append(np.flatnonzero(part.used))
         count += farad[-1].size
     return MotionRecord(
         path.name, drive, time_s[chosen], length_m[chosen], std_m[chosen],
         np.concatenate(window), np.concatenate(window_of), np.concatenate(farad),
         np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
         float(rig.get("exposure_s", 0.0)), float(rig["scale_m_per_px"]),
+        np.concatenate(block),
     )  # fmt: skip
 
 

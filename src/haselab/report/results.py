@@ -36,6 +36,7 @@ class Quantity:
         set_in_study: what in the study was set to the paper's value; `""`: nothing.
         follows_from_twin: parameters of the twin that determine the value; `""`: none.
         same_as: id of the row with the same printed quantity; `""`: none.
+        direct: the fit of the experiment alone, where `measured` is by the physical model.
     """
 
     id: str
@@ -52,6 +53,14 @@ class Quantity:
     set_in_study: str = ""
     follows_from_twin: str = ""
     same_as: str = ""
+    direct: Estimate | None = None
+
+    @property
+    def direct_text(self) -> str:
+        """The direct fit with its 95 % interval; `""` where there is none."""
+        if self.direct is None:
+            return ""
+        return " ".join(interval_text(self.direct.value, self.direct.std, self.direct.ci95))
 
     @property
     def measured_text(self) -> str:
@@ -193,13 +202,13 @@ def _quantity(row: Any, at: int) -> Quantity:
     unit = str(row.get("unit") or "")
     alone = {name: row.get(name) for name in ("noise_free", "truth")}
     try:
-        measured = _estimate(row.get("measured"), unit)
+        measured, direct = (_estimate(row.get(name), unit) for name in ("measured", "direct"))
         values = {name: None if value is None else float(value) for name, value in alone.items()}
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{where}: 'measured' = {row.get('measured')!r}, "
+            f"{where}: 'measured' = {row.get('measured')!r}, 'direct' = {row.get('direct')!r}, "
             + ", ".join(f"{name!r} = {value!r}" for name, value in alone.items())
-            + '. The first must be null or {"value", "std", "ci95": [low, high], "unit"}, the '
+            + '. The first two must be null or {"value", "std", "ci95": [low, high], "unit"}, the '
             "others null or a number. "
             "Write the folder again with 'haselab analyse'."
         ) from error
@@ -218,4 +227,5 @@ def _quantity(row: Any, at: int) -> Quantity:
         set_in_study=str(row.get("set_in_study") or ""),
         follows_from_twin=str(row.get("follows_from_twin") or ""),
         same_as=str(row.get("same_as") or ""),
+        direct=direct,
     )

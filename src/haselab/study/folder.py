@@ -70,7 +70,7 @@ def results_of(
     trials = found.find(Comparison)
     results: JsonObject = {
         "quantities": quantity_rows(
-            found.quantities, found.notes, header["rig_config"], noise_free, study
+            found.quantities, found.notes, header["rig_config"], noise_free, study, found.direct
         ),
         "not_played": not_played(found.quantities, found.figures, study, found.missing),
         "simulated": is_simulated(header["rig_config"]),

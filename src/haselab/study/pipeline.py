@@ -32,6 +32,8 @@ class Findings:
         values: maps, plant, controllers and others, by type.
         charts: further figures of the report.
         missing: why a result was not found, by id.
+        direct: results of the experiments' own fits, by id, where those of the identified physical
+            model stand in `quantities`.
     """
 
     quantities: Mapping[str, Estimate]
@@ -40,6 +42,7 @@ class Findings:
     values: Mapping[type, object] = field(default_factory=dict)
     charts: tuple[Chart, ...] = ()
     missing: Mapping[str, str] = field(default_factory=dict)
+    direct: Mapping[str, Estimate] = field(default_factory=dict)
 
     def find(self, kind: type[Value]) -> Value | None:
         """Return a value by its type; None if this study has not found one."""

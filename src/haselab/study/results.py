@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from haselab.base import Estimate, Json, JsonObject
@@ -70,6 +71,7 @@ def quantity_rows(
     rig_config: Mapping[str, Any],
     noise_free: Mapping[str, float] | None = None,
     study: Study | None = None,
+    direct: Mapping[str, Estimate] | None = None,
 ) -> list[JsonObject]:
     """Rows of results.json.
 
@@ -79,6 +81,8 @@ def quantity_rows(
         rig_config: of the session's header, for what was set in a twin.
         noise_free: results of the same experiments without noise, by id; None: not on a twin.
         study: that was played, whose experiments name the rows; None: the reference study.
+        direct: results of the experiments' own fits, by id, where `measured` has those of the
+            identified physical model.
     Returns:
         One row per id, in the table's order.
     """
@@ -104,6 +108,8 @@ def quantity_rows(
             "verdict": verdict(quantity, estimate),
             "note": "; ".join(parts),
         }
+        if direct and key in direct:
+            row["direct"] = replace(direct[key], unit=quantity.unit)
         if noise_free is not None and key in noise_free:
             row["noise_free"] = noise_free[key]
         if key in true:

@@ -15,7 +15,7 @@ from haselab.base import InputError
 from haselab.store.session.writer import ExperimentPlan, SessionReader, SessionWriter
 from haselab.study import definition
 
-_QUICK = ["reproduce", "--quick", "--keep-video", "none"]
+_QUICK = ["reproduce", "--quick", "--no-physical-model", "--keep-video", "none"]
 
 
 def haselab(*arguments: str, start: str = "") -> list[str]:

@@ -19,7 +19,7 @@ from haselab.models.actuator.sections import ActuatorSection
 from haselab.pipelines.motion import motion_of_session
 from haselab.store.session.reader import SessionReader, session_file
 
-__all__ = ["actuator"]
+__all__ = ["actuator", "law_of_section", "section_of_fit"]
 
 
 @click.command("actuator")
@@ -48,7 +48,7 @@ def actuator(
             "init' writes one."
         )
     tables = load_actuator(actuator, to_write=True)
-    law = _law(tables.actuator, actuator)
+    law = law_of_section(tables.actuator, actuator)
     records = []
     for session in sessions:
         with SessionReader(session, unverified=unverified) as reader:
@@ -59,10 +59,10 @@ def actuator(
     files = [session_file(session) for session in sessions]
     give(fit, files, as_json, out)
     save_plot(plot, fit.chart)
-    save_section(actuator, "model.physical", _section(fit), files, status=fit.status)
+    save_section(actuator, "model.physical", section_of_fit(fit), files, status=fit.status)
 
 
-def _law(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
+def law_of_section(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
     """The kind's law with the parameters that the file states."""
     section = section or ActuatorSection()
     law = ACTUATORS.find(section.kind)()
@@ -72,7 +72,7 @@ def _law(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
         raise InputError(f"[actuator.parameters]: {error} {path}") from error
 
 
-def _section(fit: ActuatorFit) -> Mapping[str, object]:
+def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
     """`[model.physical]`: estimates with their covariance."""
     finite = np.isfinite(np.diag(fit.covariance))
     names = [name for name, known in zip(fit.parameters, finite, strict=True) if known]

@@ -10,8 +10,10 @@ import click
 
 from haselab.base import InputError, table_at
 from haselab.cli.common import answer_options, unverified_option, warn_unverified
+from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import analyse_on_chip
+from haselab.cli.study.physical_model import identified
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.cli.study.study_run import mark_found, print_results, with_date
 from haselab.store.claim import refuse_linked_folders
@@ -66,8 +68,14 @@ def check_ends(session: SessionReader, path: Path) -> None:
     OutputRule("folder", own=_own_folder),
     "A folder for the results. Default: the folder of SESSION.",
 )
+@shared_option(
+    "--physical-model/--no-physical-model", default=False, show_default=True,
+    detail="Results S14 to S21 then follow from it.",
+)  # fmt: skip
 @unverified_option
-def command(session: Path, unverified: bool, as_json: bool, out: Path | None) -> None:
+def command(
+    session: Path, unverified: bool, physical_model: bool, as_json: bool, out: Path | None
+) -> None:
     """Repeat fits, design and report from a recording.
 
     SESSION is the folder of a run or its session.h5. The results replace those in that folder,
@@ -92,6 +100,10 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)
+    model = None
+    if physical_model:
+        model = identified(path, study, found, unverified=unverified)
+        found = model.joined(found)
     if study.is_reference:
         found = with_chip_rows(found, folder)
     found = with_mass_limit(found, study, table_at(header, "rig_config"))
@@ -99,6 +111,8 @@ def command(session: Path, unverified: bool, as_json: bool, out: Path | None) ->
     header = with_date(header, path.parent)
     results = write_findings(target, found, study, header, noise_free, doubt)
     mark_found(target, found, path.parent, simulated=bool(results["simulated"]))
+    if model is not None:
+        model.save(target, path)
     print_results(results, target, as_json)
 
 

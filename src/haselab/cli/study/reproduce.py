@@ -17,6 +17,7 @@ from haselab.cli.study.study_run import (
     RUN_FOLDER,
     execute,
     keep_video_option,
+    physical_model_option,
     twin_rig,
 )
 from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
@@ -31,6 +32,7 @@ __all__ = ["command"]
 @draw_option
 @shared_option("--seed", type=click.IntRange(0, MAX_SEED), default=1, show_default=True)
 @shared_option("--quick", is_flag=True, detail="It has fewer trials and frames.")
+@physical_model_option
 @keep_video_option
 @answer_options(OutputRule("folder"), RUN_FOLDER)
 def command(
@@ -39,6 +41,7 @@ def command(
     draw: int | None,
     seed: int,
     quick: bool,
+    physical_model: bool,
     keep_video: str,
     as_json: bool,
     out: Path | None,
@@ -58,4 +61,7 @@ def command(
     study = builtin_study(quick=quick)
     with armed_rig(twin_rig(config, seed), file, at, study, out) as bench:
         chips = ChipExperiments(out, study, config, seed, quick, keep_video)
-        execute(study, bench, config, seed, out, keep_video, as_json, chips)
+        execute(
+            study, bench, config, seed, out, keep_video, as_json, chips,
+            physical_model=physical_model,
+        )  # fmt: skip

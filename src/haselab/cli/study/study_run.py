@@ -16,6 +16,7 @@ from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
 from haselab.cli.study.noise_free_run import NoiseFreeRun
+from haselab.cli.study.physical_model import identified
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig
@@ -43,6 +44,7 @@ __all__ = [
     "keep_video_option",
     "kept_in",
     "mark_found",
+    "physical_model_option",
     "print_results",
     "twin_rig",
     "with_date",
@@ -52,6 +54,10 @@ RUN_FOLDER = "A new folder for the recording and the results.  [required]"
 keep_video_option = shared_option(
     "--keep-video", type=click.Choice(["none", "sample", "all"]), default="sample",
     show_default=True, detail="sample: the first and the last second of each experiment.",
+)  # fmt: skip
+physical_model_option = shared_option(
+    "--physical-model/--no-physical-model", default=True, show_default=True,
+    detail="Results S14 to S21 then follow from it.",
 )  # fmt: skip
 
 
@@ -100,6 +106,7 @@ def execute(
     as_json: bool,
     parallel: ParallelExperiments | None = None,
     known: ActuatorTables | None = None,
+    physical_model: bool = False,
 ) -> None:
     """Run a study on a twin, write its folder, print its table.
 
@@ -113,10 +120,12 @@ def execute(
         as_json: print JSON.
         parallel: experiments that run at the same time; None: there are none.
         known: the actuator file that the study starts from; None: there is none.
+        physical_model: identify the physical model from the recording.
     """
     rig_config = config.model_dump(mode="json")
     options = RunOptions(folder, seed, cast(KeepVideo, keep_video), rig_config, known)
-    _execute(study, rig, options, as_json, NoiseFreeRun(config, study, known), parallel)
+    noise_free_run = NoiseFreeRun(config, study, known)
+    _execute(study, rig, options, as_json, noise_free_run, parallel, physical_model)
 
 
 def execute_on(
@@ -140,6 +149,7 @@ def _execute(
     as_json: bool,
     noise_free_run: NoiseFreeRun | None = None,
     parallel: ParallelExperiments | None = None,
+    physical_model: bool = False,
 ) -> None:
     folder = options.folder
     _check_before_anything_moves(study, rig, folder)
@@ -156,6 +166,11 @@ def _execute(
         if noise_free_run is not None:
             running.enter_context(noise_free_run)
         found = run_study(study, rig, options, progress, fitted)
+        model = None
+        if physical_model:
+            progress.advance(0.0, "physical model")
+            model = identified(folder, study, found)
+            found = model.joined(found)
         if noise_free_run is not None:
             progress.advance(0.0, "noise-free reference run")
             noise_free = _noise_free(noise_free_run)
@@ -178,6 +193,8 @@ def _execute(
     header = with_date(session_header(study, rig.description, options), folder)
     results = write_findings(folder, found, study, header, noise_free)
     mark_found(folder, found, folder, simulated=bool(results["simulated"]))
+    if model is not None:
+        model.save(folder, folder)
     print_results(results, folder, as_json)
 
 

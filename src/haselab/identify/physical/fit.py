@@ -98,6 +98,18 @@ class ActuatorFit(Fit):
         """Whether there are parameters, with or without a model error."""
         return bool(self.parameters)
 
+    def unknowns(self) -> Unknowns:
+        """What was estimated, at the estimates.
+
+        Raises:
+            ResultError: the fit has no result.
+        """
+        self._require()
+        assert self.law is not None
+        start = Unknowns.of(self.law, added_inertia_kg=self.added_inertia_kg, mass_kg=self.mass_kg)
+        values = np.array([self.parameters[name].value for name in start.names])
+        return replace(start, values=values)
+
     def answer(self) -> JsonObject:
         """See `Fit`."""
         return {

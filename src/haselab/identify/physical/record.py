@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ class MotionRecord:
         exposure_s: of the frames, whose times are the middle of it; 0 if it is not known.
         pixel_m: size of a pixel at the actuator, over which the tracker's errors are similar; 0:
             the errors of all lengths are independent.
+        block: of each capacitance within its experiment, shape `(C,)`; empty if it is not known.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -56,6 +57,7 @@ class MotionRecord:
     capacitance_experiment: Integers
     exposure_s: float = 0.0
     pixel_m: float = 0.0
+    block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def over_windows(self, values: Floats) -> Floats:
         """Means over the intervals in which each capacitance was sensed.

@@ -229,7 +229,9 @@ def _later_s(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
     time_s = at / config.rate_hz
     turn = np.exp(1j * config.omega_rad_s * time_s)
     ramp_s = time_s - time_s.mean()
-    basis = np.stack([turn.real, turn.imag, np.ones(at.size), ramp_s / np.ptp(ramp_s)], axis=1)
+    # the update of the output moves the level
+    side = at >= config.blank[1]
+    basis = np.stack([turn.real, turn.imag, side, ~side, ramp_s / np.ptp(ramp_s)], axis=1)
     fit = np.linalg.pinv(basis)[:2]  # to the coefficients of cosine and sine
     cosine, sine = fit @ np.stack([ramp_s * turn.real, ramp_s * turn.imag], axis=1)
     voltage = codes[:, at].astype(np.float32) @ fit.T.astype(np.float32)

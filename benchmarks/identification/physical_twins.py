@@ -10,7 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from haselab.actuators import ADDED_INERTIA, ActuatorLaw, Drive, PlanarHasel, with_parameters
+from haselab.actuators import (
+    ADDED_INERTIA,
+    GRAVITY_M_S2,
+    ActuatorLaw,
+    Drive,
+    PlanarHasel,
+    SampledLaw,
+    with_parameters,
+)
 from haselab.base import HaselabError, LimitError, SilentProgress
 from haselab.identify.physical import MotionRecord
 from haselab.identify.physical.unknowns import fitted_parameters
@@ -35,6 +43,7 @@ __all__ = [
     "save_record",
     "seen",
     "shifted",
+    "short_record",
     "started",
     "true_values",
 ]
@@ -50,6 +59,8 @@ _RANGES = {
     "mullins.stretch": 0.05,
 }
 _DRAWS = 50
+_SHORT_BLOCKS = 6000
+_LENGTH_STD_M, _CAPACITANCE_STD_F = 4e-6, 3e-13  # of the twin's camera and monitors
 _DRIVE = ("edge_s", "voltage_v", "load_n", "mass_kg", "ripple_v2")
 _SEEN = ("length_time_s", "length_m", "length_std_m", "window", "window_of", "capacitance_f",
          "capacitance_std_f", "length_experiment", "capacitance_experiment",
@@ -178,6 +189,55 @@ def load_record(path: Path) -> MotionRecord:
             exposure_s=float(kept["exposure_s"]), pixel_m=float(kept["pixel_m"]),
             **{name: kept[name] for name in _SEEN},
         )  # fmt: skip
+
+
+def short_drive(seed: int) -> Drive:
+    """A minute of held random voltages, with lifts of the mass: blocks of 10 ms."""
+    rng = np.random.default_rng([seed, 4])
+    edge_s = 0.01 * np.arange(_SHORT_BLOCKS + 1)
+    block = np.arange(_SHORT_BLOCKS)
+    changes = rng.random(block.size) < np.where(block % 1000 < 300, 0.2, 0.003)
+    held = np.maximum.accumulate(changes * block)
+    volt = rng.uniform(0.0, 8000.0, block.size)[held]
+    volt[:100] = 0.0
+    pull_n = np.full(block.size, MASS_KG * GRAVITY_M_S2)
+    for k in range(1, 9):  # loads tell the shell from the electrodes
+        pull_n[block.size * k // 10 :][:300] *= 0.35 * k
+    volt[pull_n > 1.2 * pull_n[0]] = 0.0
+    return Drive(edge_s, volt, pull_n, np.full(block.size, MASS_KG), np.full(block.size, 5e3))
+
+
+def short_record(law: ActuatorLaw, seed: int, scale: float = 1.0) -> MotionRecord:
+    """What a camera and monitors would see of a law in a minute: the law itself, with noise.
+
+    Args:
+        law: of the actuator.
+        seed: of drive and noise.
+        scale: measured over true capacitance.
+    Raises:
+        LimitError: The drive takes the actuator beyond the limits of its law.
+    """
+    drive, rng = short_drive(seed), np.random.default_rng([seed, 5])
+    sampled = SampledLaw(law, 11e3)
+    start, _ = sampled.at_rest(0.0, float(drive.ripple_v2[0]), float(drive.load_n[0]))
+    times_s = np.arange(0.0, float(drive.edge_s[-1]), 0.02)
+    found = sampled.respond(drive, times_s, start)
+    if (
+        not law.length_limits_m.low
+        < found.length_m.min()
+        <= found.length_m.max()
+        < (law.length_limits_m.high)
+    ):
+        raise LimitError("The motion leaves the limits of the law.")
+    count, frames = drive.voltage_v.size, times_s.size
+    return MotionRecord(
+        f"short {seed}", drive, times_s,
+        found.length_m + _LENGTH_STD_M * rng.standard_normal(frames),
+        np.full(frames, _LENGTH_STD_M), np.arange(count), np.arange(count),
+        scale * found.capacitance_f + _CAPACITANCE_STD_F * rng.standard_normal(count),
+        np.full(count, _CAPACITANCE_STD_F), ("all",),
+        np.zeros(frames, np.int64), np.zeros(count, np.int64),
+    )  # fmt: skip
 
 
 def seen(record: MotionRecord, seed: int) -> tuple[MotionRecord, dict[str, float]]:

@@ -33,6 +33,10 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         Measurement("identification.frequency_response", quick={"runs": 10}),
         Measurement("identification.model_comparison", quick={"count": 1, "readings": ("hz",)}),
         Measurement("identification.hysteresis", quick={"runs": 8}),
+        Measurement(
+            "identification.physical_model",
+            quick={"twins": 0, "starts": 2, "planted": 1, "short": 3},
+        ),
     ),
     "identify-board": (
         Measurement("identification.random_plants", quick={"plants": 200}),

@@ -39,7 +39,8 @@ class Law {
     motion_law law{};
 };
 
-// Derivatives by `kind.size()` columns; the tables have one row for each parameter of the law.
+// Derivatives by `kind.size()` columns; the tables have one row for each parameter of the law. Those
+// of the columns at hand are put side by side.
 struct Tangent {
     Tangent(const Law &law, Kinds kind, Rows elastic, Tables pull, Tables capacitance,
             Values free_m)
@@ -52,16 +53,41 @@ struct Tangent {
                  pull.shape(1) == volts && capacitance.shape(1) == volts &&
                  elastic.shape(1) == n && pull.shape(2) == n && capacitance.shape(2) == n,
              "one table of derivatives for each parameter of the law");
+        std::vector<size_t> table;
+        for (size_t j = 0; j < kind.size(); ++j) {
+            if (kind.data()[j] < MOTION_START) {
+                need(kind.data()[j] >= 0 && static_cast<size_t>(kind.data()[j]) < laws,
+                     "one table of derivatives for each parameter of the law");
+                table.push_back(static_cast<size_t>(kind.data()[j]));
+                law_column.push_back(static_cast<int32_t>(j));
+                free_length.push_back(free_m.data()[table.back()]);
+            }
+        }
+        beside(elastic.data(), n, table, elastic_by);
+        beside(pull.data(), n * volts, table, pull_by);
+        beside(capacitance.data(), n * volts, table, capacitance_by);
         c.columns = static_cast<int32_t>(kind.size());
-        c.laws = static_cast<int32_t>(laws);
+        c.laws = static_cast<int32_t>(table.size());
         c.kind = kind.data();
-        c.elastic = elastic.data();
-        c.pull = pull.data();
-        c.capacitance = capacitance.data();
-        c.free_length = free_m.data();
+        c.law_column = law_column.data();
+        c.elastic = elastic_by.data();
+        c.pull = pull_by.data();
+        c.capacitance = capacitance_by.data();
+        c.free_length = free_length.data();
         c.work = work.data();
     }
-    std::vector<double> work, kept;
+    static void beside(const double *rows, size_t knots, const std::vector<size_t> &table,
+                       std::vector<double> &out)
+    {
+        out.resize(knots * table.size());
+        for (size_t l = 0; l < table.size(); ++l) {
+            for (size_t i = 0; i < knots; ++i) {
+                out[i * table.size() + l] = rows[table[l] * knots + i];
+            }
+        }
+    }
+    std::vector<double> work, kept, elastic_by, pull_by, capacitance_by, free_length;
+    std::vector<int32_t> law_column;
     motion_tangent c{};
 };
 

@@ -80,6 +80,36 @@ static double value_at(const motion_law *law, const double *rows, int64_t stride
     return sum;
 }
 
+/* Values of `n` tables whose knots lie side by side. */
+HS_CLONES static void add_knots(const double *weight, const double *first, int32_t n, double *out)
+{
+    int32_t j;
+    for (j = 0; j < n; ++j) {
+        out[j] += weight[0] * first[j] + weight[1] * first[n + j] + weight[2] * first[2 * n + j] +
+                  weight[3] * first[3 * n + j];
+    }
+}
+
+static void values_by(const motion_law *law, const double *tables, int32_t n, const place *at,
+                      double *out)
+{
+    const int64_t row = (int64_t)law->lengths * n;
+    const double *first = tables + (int64_t)at->along.first * n;
+    int k, i;
+    memset(out, 0, (size_t)n * sizeof *out);
+    if (law->voltages == 1) {
+        add_knots(at->along.weight, first, n, out);
+        return;
+    }
+    for (k = 0; k < 4; ++k) {
+        double weight[4];
+        for (i = 0; i < 4; ++i) {
+            weight[i] = at->across.weight[k] * at->along.weight[i];
+        }
+        add_knots(weight, first + (at->across.first + k) * row, n, out);
+    }
+}
+
 /* Value of a table of the law, and its slopes. */
 typedef struct {
     double value, per_m, per_v;
@@ -125,19 +155,12 @@ double motion_capacitance(const motion_law *law, double length_m, double voltage
 }
 
 motion_capacitance_slopes motion_capacitance_by(const motion_law *law, const motion_tangent *t,
-                                                double length_m, double voltage_v, double *by,
-                                                double share)
+                                                double length_m, double voltage_v, double *by)
 {
     const place at = place_at(law, length_m, voltage_v);
     const surface found = surface_at(law, law->capacitance_f, &at, voltage_v);
-    const motion_capacitance_slopes slopes = {found.per_m, found.per_v};
-    int32_t j;
-    for (j = 0; j < t->columns; ++j) {
-        if (t->kind[j] < t->laws) {
-            const int64_t table = (int64_t)t->kind[j] * law->voltages * law->lengths;
-            by[j] += share * value_at(law, t->capacitance + table, law->lengths, &at);
-        }
-    }
+    const motion_capacitance_slopes slopes = {found.value, found.per_m, found.per_v};
+    values_by(law, t->capacitance, t->laws, &at, by);
     return slopes;
 }
 
@@ -165,44 +188,59 @@ void motion_rest(const motion_law *law, const motion_parameters *p, motion_state
 
 /* ---- rates ---- */
 
+/* What a step takes from the parameters again and again. */
+typedef struct {
+    double held;                       /* 1 + all branch shares */
+    double per_branch_s[MOTION_BRANCHES]; /* 0 where there is no branch */
+    double per_kg, per_charge_s;       /* per_charge_s: 0 where no voltage acts late */
+} constants;
+
+static constants constants_of(const motion_parameters *p)
+{
+    constants c = {1.0, {0.0}, 1.0 / p->inertia_kg, 0.0};
+    int k;
+    for (k = 0; k < MOTION_BRANCHES; ++k) {
+        if (p->branch_share[k] > 0.0) {
+            c.held += p->branch_share[k];
+            c.per_branch_s[k] = 1.0 / p->branch_s[k];
+        }
+    }
+    c.per_charge_s = p->charge_share > 0.0 ? 1.0 / p->charge_s : 0.0;
+    return c;
+}
+
 /* Rates of the state, and what their derivatives need. */
 typedef struct {
     double speed, acceleration, relaxed[MOTION_BRANCHES], charge;
     place at;
-    double elastic, softening;      /* their product is the elastic force */
-    double elastic_per_m;
-    surface pull;
-    double square;                  /* mean square of the voltage that acts */
+    double elastic, softening; /* their product is the elastic force */
+    double pull;               /* electric force over the voltage squared */
+    double square;             /* mean square of the voltage that acts */
     double acting_v;
 } rates;
 
-static rates rates_of(const motion_law *law, const motion_parameters *p, const motion_state *s,
-                      double softening, const motion_input *in)
+static rates rates_of(const motion_law *law, const motion_parameters *p, const constants *c,
+                      const motion_state *s, double softening, const motion_input *in)
 {
-    const double longest = s->length_m > s->longest_m ? s->length_m : s->longest_m;
-    double force, held = 1.0;
+    double force;
     rates r;
     int k;
-    r.softening = s->length_m > s->longest_m ? motion_softening(p, longest) : softening;
+    r.softening =
+        s->length_m > s->longest_m ? motion_softening(p, s->length_m) : softening;
     r.acting_v = (1.0 - p->charge_share) * in->volt + p->charge_share * s->charge_v;
     r.square = r.acting_v * r.acting_v + in->ripple_v2;
-    r.at = place_at(law, s->length_m, sqrt(r.square));
+    r.at = place_at(law, s->length_m, law->voltages > 1 ? sqrt(r.square) : 0.0);
     r.elastic = dot4(r.at.along.weight, law->elastic_n + r.at.along.first);
-    r.elastic_per_m = dot4(r.at.along.slope, law->elastic_n + r.at.along.first) / law->step_m;
-    r.pull = surface_at(law, law->pull_n_v2, &r.at, sqrt(r.square));
+    r.pull = value_at(law, law->pull_n_v2[0], MOTION_LENGTHS, &r.at);
     force = r.elastic * r.softening;
-    r.acceleration = in->load_n + r.square * r.pull.value - p->damping_n_s_m * s->speed_m_s;
+    r.acceleration = in->load_n + r.square * r.pull - p->damping_n_s_m * s->speed_m_s;
     for (k = 0; k < MOTION_BRANCHES; ++k) {
-        r.relaxed[k] = 0.0;
-        if (p->branch_share[k] > 0.0) {
-            held += p->branch_share[k];
-            r.acceleration += p->branch_share[k] * s->relaxed_n[k];
-            r.relaxed[k] = (force - s->relaxed_n[k]) / p->branch_s[k];
-        }
+        r.acceleration += p->branch_share[k] * s->relaxed_n[k];
+        r.relaxed[k] = (force - s->relaxed_n[k]) * c->per_branch_s[k];
     }
-    r.acceleration = (r.acceleration - held * force) / p->inertia_kg;
+    r.acceleration = (r.acceleration - c->held * force) * c->per_kg;
     r.speed = s->speed_m_s;
-    r.charge = p->charge_share > 0.0 ? (in->volt - s->charge_v) / p->charge_s : 0.0;
+    r.charge = (in->volt - s->charge_v) * c->per_charge_s;
     return r;
 }
 
@@ -227,21 +265,17 @@ enum { LENGTH, SPEED, CHARGE, LONGEST, RELAXED };
 typedef struct {
     double elastic, softening;  /* of the elastic force by length and by longest length */
     double pull, acting;        /* of the electric force by length and by the acting voltage */
-    double held;                /* 1 + all branch shares */
     double share, stretch, width, reached; /* of the factor of softening */
     double longest_m;
 } slopes;
 
-static slopes slopes_of(const motion_parameters *p, const motion_state *s, const rates *r)
+static slopes slopes_of(const motion_law *law, const motion_parameters *p, const motion_state *s,
+                        const rates *r)
 {
-    const double root = sqrt(r->square);
+    const double root = law->voltages > 1 ? sqrt(r->square) : 0.0;
+    const surface pull = surface_at(law, law->pull_n_v2, &r->at, root);
     slopes d = {0};
-    int k;
     d.longest_m = s->length_m > s->longest_m ? s->length_m : s->longest_m;
-    d.held = 1.0;
-    for (k = 0; k < MOTION_BRANCHES; ++k) {
-        d.held += p->branch_share[k];
-    }
     if (p->softening_share > 0.0) {
         const double at = (d.longest_m / p->free_length_m - p->softening_stretch);
         d.share = (r->softening - 1.0) / p->softening_share;
@@ -249,91 +283,101 @@ static slopes slopes_of(const motion_parameters *p, const motion_state *s, const
         d.stretch = -d.reached;
         d.width = -d.reached * at / p->softening_width;
     }
-    d.elastic = r->softening * r->elastic_per_m;
+    d.elastic = dot4(r->at.along.slope, law->elastic_n + r->at.along.first) / law->step_m;
+    d.elastic *= r->softening;
     d.softening = r->elastic * d.reached / p->free_length_m;
-    d.pull = r->square * r->pull.per_m;
-    d.acting = 2.0 * r->acting_v * (r->pull.value + 0.5 * root * r->pull.per_v);
+    d.pull = r->square * pull.per_m;
+    d.acting = 2.0 * r->acting_v * (r->pull + 0.5 * root * pull.per_v);
     return d;
 }
 
-/* Rates of the derivatives `z`, without what the parameters do directly. Row LONGEST of `out` has
- * no rate: the longest length follows the length. */
-HS_CLONES static void linear_rates(const motion_parameters *p, const slopes *d, int above, int32_t n,
-                         const double *z, double *out)
+/* What each parameter does directly, at equal states: to the forces (pull less elastic ones), to
+ * the elastic force alone, and to the rate of the charge. One value a column. */
+typedef struct {
+    double *force, *elastic, *charge;
+} direct;
+
+static void direct_rates(const motion_law *law, const motion_parameters *p, const constants *c,
+                         const motion_state *s, const motion_tangent *tangent, const rates *r,
+                         const slopes *d, const motion_input *in, const direct *to)
 {
-    const double *x = z + LENGTH * n, *v = z + SPEED * n, *c = z + CHARGE * n;
+    const int32_t n = tangent->columns, laws = tangent->laws;
+    double *by_elastic = to->charge + n, *by_pull = by_elastic + laws;
+    const double softens =
+        -d->reached * d->longest_m / (p->free_length_m * p->free_length_m) * r->elastic;
+    int32_t j;
+    memset(to->force, 0, 3 * (size_t)n * sizeof(double)); /* all three: they lie side by side */
+    for (j = 0; j < n; ++j) {
+        const int32_t kind = tangent->kind[j];
+        if (kind <= MOTION_START) {
+            continue;
+        }
+        if (kind >= MOTION_BRANCH_SHARE && kind < MOTION_BRANCH_S) {
+            to->force[j] = s->relaxed_n[kind - MOTION_BRANCH_SHARE] - r->elastic * r->softening;
+        } else if (kind == MOTION_DAMPING) {
+            to->force[j] = -s->speed_m_s;
+        } else if (kind == MOTION_INERTIA) {
+            to->force[j] = -r->acceleration;
+        } else if (kind == MOTION_SOFTENING_SHARE) {
+            to->elastic[j] = d->share * r->elastic;
+        } else if (kind == MOTION_SOFTENING_STRETCH) {
+            to->elastic[j] = d->stretch * r->elastic;
+        } else if (kind == MOTION_SOFTENING_WIDTH) {
+            to->elastic[j] = d->width * r->elastic;
+        } else if (kind == MOTION_CHARGE_SHARE) {
+            to->force[j] = d->acting * (s->charge_v - in->volt);
+        } else if (kind == MOTION_CHARGE_S) {
+            to->charge[j] = -r->charge * c->per_charge_s;
+        } else if (kind == MOTION_VOLTAGE_SCALE) {
+            to->force[j] = d->acting * (1.0 - p->charge_share) * in->volt;
+            to->charge[j] = in->volt * c->per_charge_s;
+        }
+    }
+    memset(by_elastic, 0, (size_t)laws * sizeof(double));
+    add_knots(r->at.along.weight, tangent->elastic + (int64_t)r->at.along.first * laws, laws,
+              by_elastic);
+    values_by(law, tangent->pull, laws, &r->at, by_pull);
+    for (j = 0; j < laws; ++j) {
+        const int32_t column = tangent->law_column[j];
+        to->elastic[column] = r->softening * by_elastic[j] + softens * tangent->free_length[j];
+        to->force[column] = r->square * by_pull[j];
+    }
+    for (j = 0; j < n; ++j) {
+        to->force[j] -= c->held * to->elastic[j];
+    }
+}
+
+/* Rates of the derivatives `z`. Row LONGEST of `out` has no rate: the longest length follows the
+ * length. */
+HS_CLONES static void linear_rates(const motion_parameters *p, const constants *c, const slopes *d,
+                                   const direct *by, int above, int32_t n, const double *z,
+                                   double *out)
+{
+    const double *x = z + LENGTH * n, *v = z + SPEED * n, *charge = z + CHARGE * n;
     const double *longest = above ? x : z + LONGEST * n;
     const double acting = d->acting * p->charge_share, damping = p->damping_n_s_m;
-    const double held_x = d->held * d->elastic, held_m = d->held * d->softening;
-    const double per_kg = 1.0 / p->inertia_kg;
-    const double decay = p->charge_share > 0.0 ? 1.0 / p->charge_s : 0.0;
+    const double stiff = d->pull - c->held * d->elastic, held_m = c->held * d->softening;
+    const double per_kg = c->per_kg;
     int32_t j;
     int k;
     for (j = 0; j < n; ++j) {
         out[LENGTH * n + j] = v[j];
-        out[SPEED * n + j] = (d->pull - held_x) * x[j] - held_m * longest[j] - damping * v[j] +
-                             acting * c[j];
-        out[CHARGE * n + j] = -decay * c[j];
+        out[SPEED * n + j] = by->force[j] + stiff * x[j] - held_m * longest[j] - damping * v[j] +
+                             acting * charge[j];
+        out[CHARGE * n + j] = by->charge[j] - c->per_charge_s * charge[j];
         out[LONGEST * n + j] = 0.0;
     }
     for (k = 0; k < MOTION_BRANCHES; ++k) {
         const double *y = z + (RELAXED + k) * n;
-        const double share = p->branch_share[k], rate = share > 0.0 ? 1.0 / p->branch_s[k] : 0.0;
+        const double share = p->branch_share[k], rate = c->per_branch_s[k];
         for (j = 0; j < n; ++j) {
             out[SPEED * n + j] += share * y[j];
             out[(RELAXED + k) * n + j] =
-                rate * (d->elastic * x[j] + d->softening * longest[j] - y[j]);
+                rate * (by->elastic[j] + d->elastic * x[j] + d->softening * longest[j] - y[j]);
         }
     }
     for (j = 0; j < n; ++j) {
         out[SPEED * n + j] *= per_kg;
-    }
-}
-
-/* What the parameter of column j does directly, at equal states. */
-static void direct_rates(const motion_law *law, const motion_parameters *p, const motion_state *s,
-                         const motion_tangent *tangent, const rates *r, const slopes *d,
-                         const motion_input *in, int32_t j, double *out)
-{
-    const int32_t kind = tangent->kind[j], n = tangent->columns;
-    double elastic = 0.0, softening = 0.0, force = 0.0, acting = 0.0, dforce;
-    int k;
-    if (kind < tangent->laws) {
-        const double *elastic_n = tangent->elastic + (int64_t)kind * law->lengths;
-        const int64_t table = (int64_t)kind * law->voltages * law->lengths;
-        elastic = dot4(r->at.along.weight, elastic_n + r->at.along.first);
-        force = r->square * value_at(law, tangent->pull + table, law->lengths, &r->at);
-        softening = -d->reached * d->longest_m * tangent->free_length[kind] /
-                    (p->free_length_m * p->free_length_m);
-    } else if (kind == MOTION_DAMPING) {
-        force = -s->speed_m_s;
-    } else if (kind == MOTION_INERTIA) {
-        force = -r->acceleration;
-    } else if (kind == MOTION_SOFTENING_SHARE) {
-        softening = d->share;
-    } else if (kind == MOTION_SOFTENING_STRETCH) {
-        softening = d->stretch;
-    } else if (kind == MOTION_SOFTENING_WIDTH) {
-        softening = d->width;
-    } else if (kind == MOTION_CHARGE_SHARE) {
-        acting = s->charge_v - in->volt;
-    } else if (kind == MOTION_CHARGE_S) {
-        out[CHARGE * n + j] -= r->charge / p->charge_s;
-    } else if (kind == MOTION_VOLTAGE_SCALE) {
-        acting = (1.0 - p->charge_share) * in->volt;
-        out[CHARGE * n + j] += p->charge_share > 0.0 ? in->volt / p->charge_s : 0.0;
-    } else if (kind >= MOTION_BRANCH_S) {
-        k = kind - MOTION_BRANCH_S;
-        out[(RELAXED + k) * n + j] -= r->relaxed[k] / p->branch_s[k];
-    } else if (kind >= MOTION_BRANCH_SHARE) {
-        force = s->relaxed_n[kind - MOTION_BRANCH_SHARE] - r->elastic * r->softening;
-    }
-    dforce = r->softening * elastic + softening * r->elastic;
-    out[SPEED * n + j] += (force + d->acting * acting - d->held * dforce) / p->inertia_kg;
-    for (k = 0; k < MOTION_BRANCHES; ++k) {
-        if (p->branch_share[k] > 0.0) {
-            out[(RELAXED + k) * n + j] += dforce / p->branch_s[k];
-        }
     }
 }
 
@@ -350,20 +394,23 @@ HS_CLONES static void add_stage(int32_t size, const double *rows, const double *
     }
 }
 
-static void tangent_stage(const motion_law *law, const motion_parameters *p, const motion_state *s,
-                          motion_tangent *t, const rates *r, const motion_input *in, int stage,
-                          double dt)
+static void tangent_stage(const motion_law *law, const motion_parameters *p, const constants *c,
+                          const motion_state *s, motion_tangent *t, const rates *r,
+                          const motion_input *in, int stage, double dt)
 {
     static const double next[4] = {0.5, 0.5, 1.0, 0.0};
     static const double share[4] = {1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0};
     const int32_t n = t->columns, size = MOTION_ROWS * n;
     double *rate = t->work, *at = t->work + size, *sum = t->work + 2 * size;
-    const slopes d = slopes_of(p, s, r);
+    const direct by = {sum + size, sum + size + n, sum + size + 2 * n};
+    const slopes d = slopes_of(law, p, s, r);
     int32_t j;
-    linear_rates(p, &d, s->length_m > s->longest_m, n, stage == 0 ? t->rows : at, rate);
+    direct_rates(law, p, c, s, t, r, &d, in, &by);
+    linear_rates(p, c, &d, &by, s->length_m > s->longest_m, n, stage == 0 ? t->rows : at, rate);
     for (j = 0; j < n; ++j) {
-        if (t->kind[j] != MOTION_START) {
-            direct_rates(law, p, s, t, r, &d, in, j, rate);
+        const int32_t k = t->kind[j] - MOTION_BRANCH_S;
+        if (k >= 0) {
+            rate[(RELAXED + k) * n + j] -= r->relaxed[k] * c->per_branch_s[k];
         }
     }
     add_stage(size, t->rows, rate, dt * next[stage], dt * share[stage], stage == 0, at, sum);
@@ -378,14 +425,15 @@ static void smooth_step(const motion_law *law, const motion_parameters *p, motio
 {
     static const double to[4] = {0.5, 0.5, 1.0, 0.0};
     const double softening = motion_softening(p, s->longest_m);
+    const constants c = constants_of(p);
     const motion_state start = *s;
     motion_state at = *s;
     rates r[4];
     int stage, k;
     for (stage = 0; stage < 4; ++stage) {
-        r[stage] = rates_of(law, p, &at, softening, in);
+        r[stage] = rates_of(law, p, &c, &at, softening, in);
         if (tangent != NULL) {
-            tangent_stage(law, p, &at, tangent, &r[stage], in, stage, dt);
+            tangent_stage(law, p, &c, &at, tangent, &r[stage], in, stage, dt);
         }
         at = moved(&start, &r[stage], dt * to[stage]);
     }

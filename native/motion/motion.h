@@ -51,10 +51,10 @@ typedef struct {
     double volt, ripple_v2, load_n;
 } motion_input;
 
-/* Derivatives by `columns` numbers. `kind` states the number a column is for: index of a parameter
- * of the law (below `laws`) or one of enum motion_column. `rows` holds MOTION_ROWS rows of the
+/* Derivatives by `columns` numbers. `kind` states the number a column is for: a parameter of the law
+ * (any value below MOTION_START) or one of enum motion_column. `rows` holds MOTION_ROWS rows of the
  * state's derivatives, each `columns` wide; `work` MOTION_WORK rows. The tables of the law's
- * derivatives have the law's knots, without gaps between the rows. */
+ * derivatives have the law's knots; those of the `laws` parameters lie side by side at each knot. */
 enum motion_column {
     MOTION_START = 1000, /* a start value: derivatives enter through `rows` alone */
     MOTION_DAMPING,
@@ -68,14 +68,15 @@ enum motion_column {
     MOTION_BRANCH_SHARE = 1100, /* + branch */
     MOTION_BRANCH_S = 1200      /* + branch */
 };
-enum { MOTION_ROWS = 4 + MOTION_BRANCHES, MOTION_WORK = 3 * MOTION_ROWS };
+enum { MOTION_ROWS = 4 + MOTION_BRANCHES, MOTION_WORK = 3 * MOTION_ROWS + 5 };
 
 typedef struct {
     int32_t columns, laws;
     const int32_t *kind;
-    const double *elastic;            /* [laws][lengths] */
-    const double *pull, *capacitance; /* [laws][voltages][lengths] */
-    const double *free_length;                  /* [laws]: derivative of the free length */
+    const int32_t *law_column;        /* [laws]: their columns */
+    const double *elastic;            /* [lengths][laws] */
+    const double *pull, *capacitance; /* [voltages][lengths][laws] */
+    const double *free_length;        /* [laws]: derivative of the free length */
     double *rows;
     double *work;
 } motion_tangent;
@@ -84,14 +85,13 @@ typedef struct {
 double motion_elastic(const motion_law *law, double length_m);
 double motion_gap(const motion_law *law, double length_m);
 double motion_capacitance(const motion_law *law, double length_m, double voltage_v);
-/* Slopes of the capacitance; adds share times its direct derivatives by the law's parameters to
- * `by`, which has one value a column. */
+/* The capacitance with its slopes; `by` gets its direct derivatives by the parameters of the law, in
+ * the order of the tables. */
 typedef struct {
-    double per_m, per_v;
+    double value, per_m, per_v;
 } motion_capacitance_slopes;
 motion_capacitance_slopes motion_capacitance_by(const motion_law *law, const motion_tangent *t,
-                                                double length_m, double voltage_v, double *by,
-                                                double share);
+                                                double length_m, double voltage_v, double *by);
 /* Factor of softening on the elastic force. */
 double motion_softening(const motion_parameters *p, double longest_m);
 

@@ -5,6 +5,10 @@
 #include <stddef.h>
 #include <string.h>
 
+#ifndef HS_CLONES
+#define HS_CLONES
+#endif
+
 /* Where nobody looks and nothing swings any more, only slow creep is left: long steps follow it. A
  * swing of that speed decays by the same number of steps, without growing. */
 #define SLOW_M_S 1e-4
@@ -43,13 +47,13 @@ typedef struct {
     double start_s, dt;
 } step;
 
-static void blend_rows(const ends *e, const motion_tangent *t, const double *kept, double *out)
+HS_CLONES static void blend_rows(const ends *e, int32_t n, const double *kept, const double *rows,
+                                 double *out)
 {
-    const int32_t n = t->columns;
     int32_t j;
     for (j = 0; j < n; ++j) {
-        out[j] = e->from_m * kept[j] + e->from_m_s * kept[n + j] + e->to_m * t->rows[j] +
-                 e->to_m_s * t->rows[n + j];
+        out[j] = e->from_m * kept[j] + e->from_m_s * kept[n + j] + e->to_m * rows[j] +
+                 e->to_m_s * rows[n + j];
     }
 }
 
@@ -62,7 +66,8 @@ static int32_t sample(const step *now, const motion_tangent *t, const motion_rec
         output->length_m[next] = blend(&e, now->a, now->b);
         output->speed_m_s[next] = blend(&slope, now->a, now->b);
         if (t != NULL) {
-            blend_rows(&e, t, output->kept, output->length_by + (int64_t)next * t->columns);
+            blend_rows(&e, t->columns, output->kept, t->rows,
+                       output->length_by + (int64_t)next * t->columns);
         }
     }
     return next;
@@ -77,19 +82,24 @@ static void integrate(const motion_law *law, const step *now, const motion_tange
     for (i = 0; i < 3; ++i) {
         const ends e = hermite(at[i], now->dt);
         const double length_m = blend(&e, now->a, now->b), share = now->dt * weight[i];
-        output->mean_f[interval] += share * motion_capacitance(law, length_m, volt);
-        if (t != NULL) {
+        if (t == NULL) {
+            output->mean_f[interval] += share * motion_capacitance(law, length_m, volt);
+        } else {
             double *by = output->mean_by + (int64_t)interval * t->columns;
-            double *rows = output->kept + 2 * t->columns;
-            int32_t j;
+            double *rows = output->kept + 2 * t->columns, *own = rows + t->columns;
             const motion_capacitance_slopes c =
-                motion_capacitance_by(law, t, length_m, volt, by, share);
-            blend_rows(&e, t, output->kept, rows);
+                motion_capacitance_by(law, t, length_m, volt, own);
+            int32_t j;
+            output->mean_f[interval] += share * c.value;
+            blend_rows(&e, t->columns, output->kept, t->rows, rows);
             for (j = 0; j < t->columns; ++j) {
                 by[j] += share * c.per_m * rows[j];
-                if (t->kind[j] == MOTION_VOLTAGE_SCALE) {
-                    by[j] += share * c.per_v * volt;
-                }
+            }
+            for (j = 0; j < t->laws; ++j) {
+                by[t->law_column[j]] += share * own[j];
+            }
+            for (j = 0; c.per_v != 0.0 && j < t->columns; ++j) {
+                by[j] += t->kind[j] == MOTION_VOLTAGE_SCALE ? share * c.per_v * volt : 0.0;
             }
         }
     }
@@ -103,25 +113,29 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
     for (k = 0; k < record->intervals; ++k) {
         const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
         const double volt = record->input[k].volt;
-        double before_f, at_s = from_s;
+        double before_f = 0.0, at_s = from_s;
         int32_t j;
         moving.inertia_kg = p->inertia_kg + record->mass_kg[k];
         output->mean_f[k] = output->drift_f_s[k] = 0.0;
-        before_f = motion_capacitance(law, s->length_m, volt);
+        if (record->sensed[k]) {
+            before_f = motion_capacitance(law, s->length_m, volt);
+        }
         if (tangent != NULL) {
             memset(output->mean_by + (int64_t)k * tangent->columns, 0,
                    (size_t)tangent->columns * sizeof(double));
         }
         while (at_s < to_s) {
-            const int unseen = !record->sensed[k] &&
-                               (next >= record->times || record->time_s[next] > to_s);
+            const double next_s =
+                next < record->times && record->time_s[next] < to_s ? record->time_s[next] : to_s;
+            const int unseen = !record->sensed[k] && next_s > at_s && fabs(s->speed_m_s) < SLOW_M_S;
+            const double end_s = unseen ? next_s : to_s;
             const motion_state start = *s;
             step now = {&start, s, at_s, 0.0};
             double until_s;
-            moving.phase = unseen && fabs(s->speed_m_s) < SLOW_M_S ? LONG_PHASE : p->phase;
-            moving.step_s = moving.phase > p->phase ? LONG_STEP_S : p->step_s;
-            now.dt = (to_s - at_s) / (double)motion_steps(law, &moving, s, to_s - at_s);
-            until_s = to_s - at_s - now.dt > 1e-9 * now.dt ? at_s + now.dt : to_s;
+            moving.phase = unseen ? LONG_PHASE : p->phase;
+            moving.step_s = unseen ? LONG_STEP_S : p->step_s;
+            now.dt = (end_s - at_s) / (double)motion_steps(law, &moving, s, end_s - at_s);
+            until_s = end_s - at_s - now.dt > 1e-9 * now.dt ? at_s + now.dt : end_s;
             if (tangent != NULL) {
                 const size_t n = (size_t)tangent->columns;
                 memcpy(output->kept, tangent->rows, 2 * n * sizeof(double));

@@ -95,9 +95,15 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
         }
         watch_field(p, s, in.volt);
         move_on(p, s, &in, dt * (double)steps);
-        for (i = 0; lengths != NULL && i < steps; ++i) {
-            const double share = (double)(i + 1) / (double)steps;
-            lengths[k + i] = motion_between(&before, &s->motion, dt * (double)steps, share);
+        if (lengths != NULL) { /* Hermite's cubic, by its powers */
+            const double whole = dt * (double)steps, per = 1.0 / (double)steps;
+            const double from = whole * before.speed_m_s, to = whole * s->motion.speed_m_s;
+            const double rise = s->motion.length_m - before.length_m;
+            for (i = 0; i < steps; ++i) {
+                const double t = (double)(i + 1) * per;
+                const double bend = 3.0 * rise - 2.0 * from - to + t * (from + to - 2.0 * rise);
+                lengths[k + i] = before.length_m + t * (from + t * bend);
+            }
         }
         k += steps;
     }

@@ -281,15 +281,24 @@ class SampledLaw:
             changed[_INERTIA] += width if name == ADDED_INERTIA else 0.0
             losses.append(changed / width)
         count = len(self.by)
-        self._elastic = np.reshape(elastic, (count, knots.size))
-        self._pull = np.reshape(pull, (count, rows, knots.size))
-        self._capacitance = np.reshape(capacitance, (count, rows, knots.size))
-        self.free_by = np.reshape(free, count).astype(np.float64)
         losses_by = np.reshape(losses, (count, len(_LOSSES)))
         used = np.flatnonzero((losses_by != 0.0).any(axis=0))
-        self._kinds = np.array([*range(count), *(_LOSSES[k][2] for k in used)], dtype=np.int32)
+        tables = [any(np.any(part) for part in parts)
+                  for parts in zip(elastic, pull, capacitance, free, strict=True)]  # fmt: skip
+        # a parameter that is one loss, which is its alone, needs no columns but that of the loss
+        alone = (losses_by != 0.0).sum(axis=0) == 1
+        self._own = np.array(
+            [table or list(alone[row != 0.0]) != [True]
+             for table, row in zip(tables, losses_by, strict=True)], dtype=bool,
+        )  # fmt: skip
+        own = np.flatnonzero(self._own)
+        self._elastic = np.reshape([elastic[k] for k in own], (own.size, knots.size))
+        self._pull = np.reshape([pull[k] for k in own], (own.size, rows, knots.size))
+        self._capacitance = np.reshape([capacitance[k] for k in own], self._pull.shape)
+        self._free_by = np.array([free[k] for k in own], dtype=np.float64)
+        self._kinds = np.array([*range(own.size), *(_LOSSES[k][2] for k in used)], dtype=np.int32)
         # derivatives by the columns of the motion, to those by the parameters
-        self._joined = np.vstack([np.eye(count), losses_by[:, used].T])
+        self._joined = np.vstack([np.eye(count)[own], losses_by[:, used].T])
 
     def at_rest(
         self, voltage_v: float, ripple_v2: float, load_n: float, *, longest_m: float = 0.0
@@ -369,11 +378,11 @@ class SampledLaw:
         acts["load_n"] = drive.load_n
         given = np.zeros((_motion.ROWS, count)) if start_by is None else start_by
         extra = given.shape[1] - count
-        own = self._kinds.size - count
         kinds = np.concatenate([self._kinds, np.full(extra, _motion.START, dtype=np.int32)])
-        rows = np.ascontiguousarray(
-            np.hstack([given[:, :count], np.zeros((_motion.ROWS, own)), given[:, count:]])
-        )
+        # a column that stands for one parameter alone begins with its start
+        shares = np.divide(1.0, self._joined, where=self._joined != 0.0, out=0.0 * self._joined)
+        shares[self._free_by.size :, self._own] = 0.0
+        rows = np.ascontiguousarray(np.hstack([given[:, :count] @ shares.T, given[:, count:]]))
         columns = kinds.size
         wanted = np.ones(intervals, np.uint8) if sensed is None else np.asarray(sensed, np.uint8)
         length_by, mean_by = np.empty((times.size, columns)), np.empty((intervals, columns))
@@ -392,7 +401,7 @@ class SampledLaw:
             _motion.play(
                 self._native, self.parameters, moved, drive.edge_s, acts, drive.mass_kg, wanted,
                 times, *seen, kinds[chosen], self._elastic, self._pull, self._capacitance,
-                self.free_by, own_rows, lengths, means,
+                self._free_by, own_rows, lengths, means,
             )  # fmt: skip
             rows[:, chosen], length_by[:, chosen], mean_by[:, chosen] = own_rows, lengths, means
             return moved, seen

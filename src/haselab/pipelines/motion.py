@@ -40,6 +40,7 @@ class _Blocks:
             seen.
         rise: of the voltage monitor at each switch but the first, see `_rise`. Shape
             `(4, N - 1)`.
+        later_s: of each capacitance, see `_later_s`.
     """
 
     start_s: Floats
@@ -50,6 +51,7 @@ class _Blocks:
     used: NDArray[np.bool_]
     carrier_v: float
     rise: Floats
+    later_s: Floats
 
 
 def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
@@ -88,8 +90,8 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
     order = np.argsort(time_s[inside], kind="stable")
     chosen = np.flatnonzero(inside)[order]
     none, no = np.zeros(0, dtype=np.int64), np.zeros(0)
-    window, window_of, of_block, farad, std_f = [none], [none], [none], [no], [no]
-    block = [none]
+    window, window_of, of_block, block = [none], [none], [none], [none]
+    farad, std_f, later_s = [no], [no], [no]
     count = 0
     for k, name in enumerate(names):
         if name not in blocks:
@@ -100,6 +102,7 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
         window_of.append(values + count)
         farad.append(part.capacitance_f[part.used])
         std_f.append(part.std_f[part.used])
+        later_s.append(part.later_s[part.used])
         of_block.append(np.full(farad[-1].size, k))
         block.append(np.flatnonzero(part.used))
         count += farad[-1].size
@@ -108,6 +111,7 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
         np.concatenate(window), np.concatenate(window_of), np.concatenate(farad),
         np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
         float(rig.get("exposure_s", 0.0)), float(rig["scale_m_per_px"]),
+        np.concatenate(later_s),
         np.concatenate(block),
     )  # fmt: skip
 
@@ -143,7 +147,7 @@ def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s
     return _Blocks(
         record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
         sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v,
-        _rise(record.codes[:, :, 0], lockin),
+        _rise(record.codes[:, :, 0], lockin), _later_s(record.codes[:, :, 0], lockin),
     )  # fmt: skip
 
 
@@ -214,6 +218,30 @@ def _carrier_gain(conditions: NDArray[np.void], blocks: Collection[_Blocks], gai
         if sent_v > 0.0 and np.isfinite(part.carrier_v):
             found.append(part.carrier_v / sent_v)
     return float(np.median(found)) if found else gain
+
+
+def _later_s(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
+    r"""How much later than the middle of its samples the capacitance of each block is.
+
+    In a number of carrier periods that is not whole, a capacitance that rises with the time from
+    the middle, $t - t_m$, changes the fitted carrier of the current, by the carrier's phase.
+    """
+    at = np.flatnonzero(lockin.counted)
+    config = lockin.config
+    time_s = at / config.rate_hz
+    turn = np.exp(1j * config.omega_rad_s * time_s)
+    ramp_s = time_s - time_s.mean()
+    # the update of the output moves the level
+    side = at >= config.blank[1]
+    basis = np.stack([turn.real, turn.imag, side, ~side, ramp_s / np.ptp(ramp_s)], axis=1)
+    fit = np.linalg.pinv(basis)[:2]  # to the coefficients of cosine and sine
+    cosine, sine = fit @ np.stack([ramp_s * turn.real, ramp_s * turn.imag], axis=1)
+    voltage = codes[:, at].astype(np.float32) @ fit.T.astype(np.float32)
+    current = 1j * (voltage[:, 0] - 1j * voltage[:, 1])  # ahead by a quarter of a period
+    size = np.maximum(np.abs(current), np.finfo(np.float32).tiny)
+    c, s = current.real / size, -current.imag / size  # c cos + s sin is the current
+    found = (cosine[0] * c + cosine[1] * s) * c + (sine[0] * c + sine[1] * s) * s
+    return np.asarray(found, dtype=np.float64)
 
 
 def _rise(codes: NDArray[np.int16], lockin: Lockin) -> Floats:

@@ -94,7 +94,8 @@ def modelled(
     scale = unknowns.value(SENSING_SCALE)
     latency_s = unknowns.value(SENSING_LATENCY)
     drift = record.over_windows(response.drift_f_s)
-    inside = record.over_windows(response.capacitance_f) - latency_s * drift
+    later_s = record.capacitance_later_s - latency_s
+    inside = record.over_windows(response.capacitance_f) + later_s * drift
     shown = unknowns.value(CAMERA_SCALE)
     length_m = shown * response.length_m + unknowns.value(CAMERA_OFFSET)
     if not derivatives:

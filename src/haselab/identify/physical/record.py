@@ -37,6 +37,8 @@ class MotionRecord:
         exposure_s: of the frames, whose times are the middle of it; 0 if it is not known.
         pixel_m: size of a pixel at the actuator, over which the tracker's errors are similar; 0:
             the errors of all lengths are independent.
+        capacitance_later_s: by how much later than the middle of its intervals each capacitance
+            was sensed, for all of them or for each. Shape `()` or `(C,)`.
         block: of each capacitance within its experiment, shape `(C,)`; empty if it is not known.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
@@ -57,6 +59,7 @@ class MotionRecord:
     capacitance_experiment: Integers
     exposure_s: float = 0.0
     pixel_m: float = 0.0
+    capacitance_later_s: Floats | float = 0.0
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def over_windows(self, values: Floats) -> Floats:

@@ -146,6 +146,9 @@ NB_MODULE(_motion, m)
         FIELD(motion_parameters, inertia_kg),
         FIELD(motion_parameters, charge_share),
         FIELD(motion_parameters, charge_s),
+        FIELD(motion_parameters, hysteresis_n),
+        FIELD(motion_parameters, hysteresis_width),
+        FIELD(motion_parameters, elastic_scale),
         FIELD(motion_parameters, step_s),
         FIELD(motion_parameters, phase),
     });
@@ -155,6 +158,7 @@ NB_MODULE(_motion, m)
         FIELD(motion_state, relaxed_n),
         FIELD(motion_state, charge_v),
         FIELD(motion_state, longest_m),
+        FIELD(motion_state, hysteresis_n),
     });
     m.attr("INPUT") = dtype_of<motion_input>({
         FIELD(motion_input, volt),
@@ -171,6 +175,8 @@ NB_MODULE(_motion, m)
     m.attr("SOFTENING_WIDTH") = static_cast<int>(MOTION_SOFTENING_WIDTH);
     m.attr("CHARGE_SHARE") = static_cast<int>(MOTION_CHARGE_SHARE);
     m.attr("CHARGE_S") = static_cast<int>(MOTION_CHARGE_S);
+    m.attr("HYSTERESIS_N") = static_cast<int>(MOTION_HYSTERESIS_N);
+    m.attr("HYSTERESIS_WIDTH") = static_cast<int>(MOTION_HYSTERESIS_WIDTH);
     m.attr("VOLTAGE_SCALE") = static_cast<int>(MOTION_VOLTAGE_SCALE);
     m.attr("BRANCH_SHARE") = static_cast<int>(MOTION_BRANCH_SHARE);
     m.attr("BRANCH_S") = static_cast<int>(MOTION_BRANCH_S);

@@ -48,6 +48,13 @@ const Value kValues[] = {
     {"lsb_v", &twin_parameters::lsb_v},
     {"v_noise_v", &twin_parameters::v_noise_v},
     {"i_noise_v", &twin_parameters::i_noise_v},
+    {"capacitance_rise", &twin_parameters::capacitance_rise},
+    {"warming_s", &twin_parameters::warming_s},
+    {"stiffness_loss", &twin_parameters::stiffness_loss},
+    {"ageing_s", &twin_parameters::ageing_s},
+    {"second_kg", &twin_parameters::second_kg},
+    {"second_rad_s", &twin_parameters::second_rad_s},
+    {"second_damping", &twin_parameters::second_damping},
 };
 
 class Bench {

@@ -5,136 +5,16 @@
 #include <stddef.h>
 #include <string.h>
 
+#define KINK_SHARE 1e-6 /* of a step: a kink nearer to its ends does not cut it */
+#define TURNING_STEPS 3
+
 #ifndef HS_CLONES
 #define HS_CLONES
 #endif
 
-/* ---- the law between its knots ---- */
+#include "motion/knots.h"
 
-typedef struct {
-    int32_t first;
-    double weight[4], slope[4]; /* slope: of the weights, per knot */
-} cubic;
-
-/* Lagrange's cubic through the four knots about `at`, counted in knots; constant beyond the ends. */
-static cubic cubic_at(double at, int32_t knots)
-{
-    const double last = (double)(knots - 1);
-    const double inside = at > 0.0 ? (at < last ? at : last) : 0.0;
-    int32_t i = (int32_t)inside;
-    cubic c;
-    double t, u, v, w;
-    i = i < 1 ? 1 : i > knots - 3 ? knots - 3 : i;
-    t = inside - (double)i;
-    u = t - 1.0;
-    v = t - 2.0;
-    w = t + 1.0;
-    c.first = i - 1;
-    c.weight[0] = -t * u * v / 6.0;
-    c.weight[1] = w * u * v / 2.0;
-    c.weight[2] = -w * t * v / 2.0;
-    c.weight[3] = w * t * u / 6.0;
-    c.slope[0] = -(u * v + t * v + t * u) / 6.0;
-    c.slope[1] = (u * v + w * v + w * u) / 2.0;
-    c.slope[2] = -(t * v + w * v + w * t) / 2.0;
-    c.slope[3] = (t * u + w * u + w * t) / 6.0;
-    return c;
-}
-
-static double dot4(const double *w, const double *v)
-{
-    return w[0] * v[0] + w[1] * v[1] + w[2] * v[2] + w[3] * v[3];
-}
-
-static cubic at_length(const motion_law *law, double length_m)
-{
-    return cubic_at((length_m - law->low_m) / law->step_m, law->lengths);
-}
-
-/* Where a length and a voltage lie in the tables. */
-typedef struct {
-    cubic along, across; /* across: unused where nothing depends on the voltage */
-} place;
-
-static place place_at(const motion_law *law, double length_m, double voltage_v)
-{
-    place at = {at_length(law, length_m), {0, {0.0}, {0.0}}};
-    if (law->voltages > 1) {
-        at.across = cubic_at(fabs(voltage_v) / law->step_v, law->voltages);
-    }
-    return at;
-}
-
-/* Value of rows of `stride` knots each. */
-static double value_at(const motion_law *law, const double *rows, int64_t stride, const place *at)
-{
-    const double *first = rows + at->along.first;
-    double sum = 0.0;
-    int k;
-    if (law->voltages == 1) {
-        return dot4(at->along.weight, first);
-    }
-    for (k = 0; k < 4; ++k) {
-        sum += at->across.weight[k] * dot4(at->along.weight, first + (at->across.first + k) * stride);
-    }
-    return sum;
-}
-
-/* Values of `n` tables whose knots lie side by side. */
-HS_CLONES static void add_knots(const double *weight, const double *first, int32_t n, double *out)
-{
-    int32_t j;
-    for (j = 0; j < n; ++j) {
-        out[j] += weight[0] * first[j] + weight[1] * first[n + j] + weight[2] * first[2 * n + j] +
-                  weight[3] * first[3 * n + j];
-    }
-}
-
-static void values_by(const motion_law *law, const double *tables, int32_t n, const place *at,
-                      double *out)
-{
-    const int64_t row = (int64_t)law->lengths * n;
-    const double *first = tables + (int64_t)at->along.first * n;
-    int k, i;
-    memset(out, 0, (size_t)n * sizeof *out);
-    if (law->voltages == 1) {
-        add_knots(at->along.weight, first, n, out);
-        return;
-    }
-    for (k = 0; k < 4; ++k) {
-        double weight[4];
-        for (i = 0; i < 4; ++i) {
-            weight[i] = at->across.weight[k] * at->along.weight[i];
-        }
-        add_knots(weight, first + (at->across.first + k) * row, n, out);
-    }
-}
-
-/* Value of a table of the law, and its slopes. */
-typedef struct {
-    double value, per_m, per_v;
-} surface;
-
-static surface surface_at(const motion_law *law, const double rows[][MOTION_LENGTHS],
-                          const place *at, double voltage_v)
-{
-    surface s = {0.0, 0.0, 0.0};
-    int k;
-    if (law->voltages == 1) {
-        s.value = dot4(at->along.weight, rows[0] + at->along.first);
-        s.per_m = dot4(at->along.slope, rows[0] + at->along.first) / law->step_m;
-        return s;
-    }
-    for (k = 0; k < 4; ++k) {
-        const double *values = rows[at->across.first + k] + at->along.first;
-        const double along = dot4(at->along.weight, values);
-        s.value += at->across.weight[k] * along;
-        s.per_m += at->across.weight[k] * dot4(at->along.slope, values) / law->step_m;
-        s.per_v += at->across.slope[k] * along / law->step_v;
-    }
-    s.per_v = voltage_v < 0.0 ? -s.per_v : s.per_v;
-    return s;
-}
+/* ---- the law ---- */
 
 double motion_elastic(const motion_law *law, double length_m)
 {
@@ -209,9 +89,12 @@ static constants constants_of(const motion_parameters *p)
     return c;
 }
 
+/* Length over which the hysteretic force follows a reversal. */
+static double slip_m(const motion_parameters *p) { return p->hysteresis_width * p->free_length_m; }
+
 /* Rates of the state, and what their derivatives need. */
 typedef struct {
-    double speed, acceleration, relaxed[MOTION_BRANCHES], charge;
+    double speed, acceleration, relaxed[MOTION_BRANCHES], charge, hysteresis;
     place at;
     double elastic, softening; /* their product is the elastic force */
     double pull;               /* electric force over the voltage squared */
@@ -219,24 +102,34 @@ typedef struct {
     double acting_v;
 } rates;
 
+/* What one smooth step takes for granted: softening at its begin, and the sign of the speed. */
+typedef struct {
+    double softening, sign;
+} course;
+
 static rates rates_of(const motion_law *law, const motion_parameters *p, const constants *c,
-                      const motion_state *s, double softening, const motion_input *in)
+                      const motion_state *s, const course *along, const motion_input *in)
 {
     double force;
     rates r;
     int k;
     r.softening =
-        s->length_m > s->longest_m ? motion_softening(p, s->length_m) : softening;
+        s->length_m > s->longest_m ? motion_softening(p, s->length_m) : along->softening;
     r.acting_v = (1.0 - p->charge_share) * in->volt + p->charge_share * s->charge_v;
     r.square = r.acting_v * r.acting_v + in->ripple_v2;
     r.at = place_at(law, s->length_m, law->voltages > 1 ? sqrt(r.square) : 0.0);
-    r.elastic = dot4(r.at.along.weight, law->elastic_n + r.at.along.first);
+    r.elastic = p->elastic_scale * dot4(r.at.along.weight, law->elastic_n + r.at.along.first);
     r.pull = value_at(law, law->pull_n_v2[0], MOTION_LENGTHS, &r.at);
     force = r.elastic * r.softening;
     r.acceleration = in->load_n + r.square * r.pull - p->damping_n_s_m * s->speed_m_s;
     for (k = 0; k < MOTION_BRANCHES; ++k) {
         r.acceleration += p->branch_share[k] * s->relaxed_n[k];
         r.relaxed[k] = (force - s->relaxed_n[k]) * c->per_branch_s[k];
+    }
+    r.hysteresis = 0.0;
+    if (p->hysteresis_n > 0.0) {
+        r.acceleration -= s->hysteresis_n;
+        r.hysteresis = (p->hysteresis_n - along->sign * s->hysteresis_n) * s->speed_m_s / slip_m(p);
     }
     r.acceleration = (r.acceleration - c->held * force) * c->per_kg;
     r.speed = s->speed_m_s;
@@ -254,23 +147,31 @@ static motion_state moved(const motion_state *s, const rates *r, double dt)
         m.relaxed_n[k] += dt * r->relaxed[k];
     }
     m.charge_v += dt * r->charge;
+    m.hysteresis_n += dt * r->hysteresis;
     return m;
 }
 
 /* ---- derivatives ---- */
 
-enum { LENGTH, SPEED, CHARGE, LONGEST, RELAXED };
+enum { LENGTH, SPEED, CHARGE, LONGEST, RELAXED, HYSTERESIS = RELAXED + MOTION_BRANCHES };
+
+/* Rows in use: without hysteresis, its derivatives are 0. */
+static int32_t rows_of(const motion_parameters *p)
+{
+    return p->hysteresis_n > 0.0 ? MOTION_ROWS : HYSTERESIS;
+}
 
 /* Slopes that all columns share. */
 typedef struct {
     double elastic, softening;  /* of the elastic force by length and by longest length */
     double pull, acting;        /* of the electric force by length and by the acting voltage */
     double share, stretch, width, reached; /* of the factor of softening */
+    double turning, slipping;   /* of the rate of hysteresis by speed; less that by its force */
     double longest_m;
 } slopes;
 
 static slopes slopes_of(const motion_law *law, const motion_parameters *p, const motion_state *s,
-                        const rates *r)
+                        const rates *r, double sign)
 {
     const double root = law->voltages > 1 ? sqrt(r->square) : 0.0;
     const surface pull = surface_at(law, law->pull_n_v2, &r->at, root);
@@ -284,17 +185,21 @@ static slopes slopes_of(const motion_law *law, const motion_parameters *p, const
         d.width = -d.reached * at / p->softening_width;
     }
     d.elastic = dot4(r->at.along.slope, law->elastic_n + r->at.along.first) / law->step_m;
-    d.elastic *= r->softening;
+    d.elastic *= p->elastic_scale * r->softening;
     d.softening = r->elastic * d.reached / p->free_length_m;
     d.pull = r->square * pull.per_m;
     d.acting = 2.0 * r->acting_v * (r->pull + 0.5 * root * pull.per_v);
+    if (p->hysteresis_n > 0.0) {
+        d.turning = (p->hysteresis_n - sign * s->hysteresis_n) / slip_m(p);
+        d.slipping = sign * s->speed_m_s / slip_m(p);
+    }
     return d;
 }
 
 /* What each parameter does directly, at equal states: to the forces (pull less elastic ones), to
- * the elastic force alone, and to the rate of the charge. One value a column. */
+ * the elastic force alone, and to the rates of charge and hysteresis. One value a column. */
 typedef struct {
-    double *force, *elastic, *charge;
+    double *force, *elastic, *charge, *hysteresis;
 } direct;
 
 static void direct_rates(const motion_law *law, const motion_parameters *p, const constants *c,
@@ -302,11 +207,11 @@ static void direct_rates(const motion_law *law, const motion_parameters *p, cons
                          const slopes *d, const motion_input *in, const direct *to)
 {
     const int32_t n = tangent->columns, laws = tangent->laws;
-    double *by_elastic = to->charge + n, *by_pull = by_elastic + laws;
+    double *by_elastic = to->hysteresis + n, *by_pull = by_elastic + laws;
     const double softens =
         -d->reached * d->longest_m / (p->free_length_m * p->free_length_m) * r->elastic;
     int32_t j;
-    memset(to->force, 0, 3 * (size_t)n * sizeof(double)); /* all three: they lie side by side */
+    memset(to->force, 0, 4 * (size_t)n * sizeof(double)); /* all four: they lie side by side */
     for (j = 0; j < n; ++j) {
         const int32_t kind = tangent->kind[j];
         if (kind <= MOTION_START) {
@@ -328,6 +233,10 @@ static void direct_rates(const motion_law *law, const motion_parameters *p, cons
             to->force[j] = d->acting * (s->charge_v - in->volt);
         } else if (kind == MOTION_CHARGE_S) {
             to->charge[j] = -r->charge * c->per_charge_s;
+        } else if (kind == MOTION_HYSTERESIS_N) {
+            to->hysteresis[j] = s->speed_m_s / slip_m(p);
+        } else if (kind == MOTION_HYSTERESIS_WIDTH) {
+            to->hysteresis[j] = -r->hysteresis / p->hysteresis_width;
         } else if (kind == MOTION_VOLTAGE_SCALE) {
             to->force[j] = d->acting * (1.0 - p->charge_share) * in->volt;
             to->charge[j] = in->volt * c->per_charge_s;
@@ -339,8 +248,12 @@ static void direct_rates(const motion_law *law, const motion_parameters *p, cons
     values_by(law, tangent->pull, laws, &r->at, by_pull);
     for (j = 0; j < laws; ++j) {
         const int32_t column = tangent->law_column[j];
-        to->elastic[column] = r->softening * by_elastic[j] + softens * tangent->free_length[j];
+        to->elastic[column] =
+            r->softening * p->elastic_scale * by_elastic[j] + softens * tangent->free_length[j];
         to->force[column] = r->square * by_pull[j];
+        if (p->hysteresis_n > 0.0) {
+            to->hysteresis[column] = -r->hysteresis * tangent->free_length[j] / p->free_length_m;
+        }
     }
     for (j = 0; j < n; ++j) {
         to->force[j] -= c->held * to->elastic[j];
@@ -376,6 +289,14 @@ HS_CLONES static void linear_rates(const motion_parameters *p, const constants *
                 rate * (by->elastic[j] + d->elastic * x[j] + d->softening * longest[j] - y[j]);
         }
     }
+    if (p->hysteresis_n > 0.0) {
+        const double *h = z + HYSTERESIS * n;
+        for (j = 0; j < n; ++j) {
+            out[SPEED * n + j] -= h[j];
+            out[HYSTERESIS * n + j] =
+                by->hysteresis[j] + d->turning * v[j] - d->slipping * h[j];
+        }
+    }
     for (j = 0; j < n; ++j) {
         out[SPEED * n + j] *= per_kg;
     }
@@ -395,15 +316,15 @@ HS_CLONES static void add_stage(int32_t size, const double *rows, const double *
 }
 
 static void tangent_stage(const motion_law *law, const motion_parameters *p, const constants *c,
-                          const motion_state *s, motion_tangent *t, const rates *r,
+                          const motion_state *s, motion_tangent *t, const rates *r, double sign,
                           const motion_input *in, int stage, double dt)
 {
     static const double next[4] = {0.5, 0.5, 1.0, 0.0};
     static const double share[4] = {1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0};
-    const int32_t n = t->columns, size = MOTION_ROWS * n;
+    const int32_t n = t->columns, size = rows_of(p) * n;
     double *rate = t->work, *at = t->work + size, *sum = t->work + 2 * size;
-    const direct by = {sum + size, sum + size + n, sum + size + 2 * n};
-    const slopes d = slopes_of(law, p, s, r);
+    const direct by = {sum + size, sum + size + n, sum + size + 2 * n, sum + size + 3 * n};
+    const slopes d = slopes_of(law, p, s, r, sign);
     int32_t j;
     direct_rates(law, p, c, s, t, r, &d, in, &by);
     linear_rates(p, c, &d, &by, s->length_m > s->longest_m, n, stage == 0 ? t->rows : at, rate);
@@ -419,21 +340,22 @@ static void tangent_stage(const motion_law *law, const motion_parameters *p, con
     }
 }
 
-/* One step without looking for events; the state's longest length follows at the end. */
+/* One step without looking for events, in which the speed has a sign; the state's longest length
+ * follows at the end. */
 static void smooth_step(const motion_law *law, const motion_parameters *p, motion_state *s,
-                        motion_tangent *tangent, const motion_input *in, double dt)
+                        motion_tangent *tangent, double sign, const motion_input *in, double dt)
 {
     static const double to[4] = {0.5, 0.5, 1.0, 0.0};
-    const double softening = motion_softening(p, s->longest_m);
+    const course along = {motion_softening(p, s->longest_m), sign};
     const constants c = constants_of(p);
     const motion_state start = *s;
     motion_state at = *s;
     rates r[4];
     int stage, k;
     for (stage = 0; stage < 4; ++stage) {
-        r[stage] = rates_of(law, p, &c, &at, softening, in);
+        r[stage] = rates_of(law, p, &c, &at, &along, in);
         if (tangent != NULL) {
-            tangent_stage(law, p, &c, &at, tangent, &r[stage], in, stage, dt);
+            tangent_stage(law, p, &c, &at, tangent, &r[stage], sign, in, stage, dt);
         }
         at = moved(&start, &r[stage], dt * to[stage]);
     }
@@ -444,6 +366,7 @@ static void smooth_step(const motion_law *law, const motion_parameters *p, motio
         s->relaxed_n[k] += MEAN(relaxed[k]);
     }
     s->charge_v += MEAN(charge);
+    s->hysteresis_n += MEAN(hysteresis);
 #undef MEAN
     if (s->length_m > s->longest_m) {
         s->longest_m = s->length_m;
@@ -461,46 +384,96 @@ double motion_between(const motion_state *a, const motion_state *b, double dt, d
            t * t * ((1.0 + 2.0 * u) * b->length_m - u * dt * b->speed_m_s);
 }
 
-/* Share of the step from a to b at which the length passes the longest one, or at which it turns;
- * 1 where neither happens inside. */
-static double event_between(const motion_state *a, const motion_state *b, double dt)
+/* Share of the step from a to b at which the length passes the longest one (`turns` 0), or at which
+ * it turns. */
+static double share_before(const motion_state *a, const motion_state *b, double dt, int turns)
 {
     double low = 0.0, high = 1.0;
-    const int above = !(a->length_m < a->longest_m) && a->speed_m_s > 0.0;
     int k;
-    if (above ? b->speed_m_s >= 0.0 : !(a->length_m < a->longest_m && b->length_m > a->longest_m)) {
-        return 1.0;
-    }
     for (k = 0; k < 40; ++k) {
         const double middle = 0.5 * (low + high);
         const double near = motion_between(a, b, dt, middle - 1e-4);
         const double far = motion_between(a, b, dt, middle + 1e-4);
-        const int before = above ? far > near : 0.5 * (near + far) < a->longest_m;
+        const int grows = a->speed_m_s < 0.0 ? far < near : far > near;
+        const int before = turns ? grows : 0.5 * (near + far) < a->longest_m;
         low = before ? middle : low;
         high = before ? high : middle;
     }
     return 0.5 * (low + high);
 }
 
+/* Share at which the softening begins or ends; 1 where it does neither inside. */
+static double softening_between(const motion_state *a, const motion_state *b, double dt)
+{
+    const int above = !(a->length_m < a->longest_m) && a->speed_m_s > 0.0;
+    if (above ? b->speed_m_s >= 0.0 : !(a->length_m < a->longest_m && b->length_m > a->longest_m)) {
+        return 1.0;
+    }
+    return share_before(a, b, dt, above);
+}
+
+/* Share of the step to b at which the speed is 0, by the secant from where Hermite's cubic turns. */
+static double turning_between(const motion_law *law, const motion_parameters *p,
+                              const motion_state *a, const motion_state *b, double sign,
+                              const motion_input *in, double dt)
+{
+    double share = share_before(a, b, dt, 1), last = 1.0, last_m_s = b->speed_m_s;
+    int k;
+    for (k = 0; k < TURNING_STEPS && share > 0.0 && share < 1.0; ++k) {
+        motion_state at = *a;
+        double next;
+        smooth_step(law, p, &at, NULL, sign, in, share * dt);
+        if (at.speed_m_s == last_m_s) {
+            break;
+        }
+        next = share - at.speed_m_s * (share - last) / (at.speed_m_s - last_m_s);
+        last = share;
+        last_m_s = at.speed_m_s;
+        share = next;
+    }
+    return share;
+}
+
+/* One step, cut where the softening or the hysteresis has a kink. */
+static void cut_step(const motion_law *law, const motion_parameters *p, motion_state *s,
+                     motion_tangent *tangent, const motion_input *in, double dt)
+{
+    const double sign = s->speed_m_s < 0.0 ? -1.0 : 1.0;
+    double after = sign, share = 1.0;
+    motion_state end = *s;
+    smooth_step(law, p, &end, NULL, sign, in, dt);
+    if (p->softening_share > 0.0) {
+        share = softening_between(s, &end, dt);
+    }
+    if (p->hysteresis_n > 0.0 && sign * end.speed_m_s < 0.0) {
+        const double turns = turning_between(law, p, s, &end, sign, in, dt);
+        if (s->length_m < s->longest_m && share < turns && share > KINK_SHARE) {
+            smooth_step(law, p, s, tangent, sign, in, share * dt);
+            cut_step(law, p, s, tangent, in, (1.0 - share) * dt);
+            return;
+        }
+        share = turns; /* which is also where the softening ends, beyond the longest length */
+        after = -sign;
+    }
+    if (share > KINK_SHARE && share < 1.0 - KINK_SHARE) {
+        smooth_step(law, p, s, tangent, sign, in, share * dt);
+        smooth_step(law, p, s, tangent, after, in, (1.0 - share) * dt);
+    } else if (tangent == NULL && (after == sign || share > 0.5)) {
+        *s = end;
+    } else {
+        smooth_step(law, p, s, tangent, share < 0.5 ? after : sign, in, dt);
+    }
+}
+
 void motion_step(const motion_law *law, const motion_parameters *p, motion_state *s,
                  motion_tangent *tangent, const motion_input *in, double dt)
 {
-    if (p->softening_share > 0.0 && s->length_m + 2.0 * dt * fabs(s->speed_m_s) > s->longest_m) {
-        motion_state end = *s;
-        double share;
-        smooth_step(law, p, &end, NULL, in, dt);
-        share = event_between(s, &end, dt);
-        if (share > 1e-6 && share < 1.0 - 1e-6) {
-            smooth_step(law, p, s, tangent, in, share * dt);
-            smooth_step(law, p, s, tangent, in, (1.0 - share) * dt);
-            return;
-        }
-        if (tangent == NULL) {
-            *s = end;
-            return;
-        }
+    if (p->hysteresis_n > 0.0 ||
+        (p->softening_share > 0.0 && s->length_m + 2.0 * dt * fabs(s->speed_m_s) > s->longest_m)) {
+        cut_step(law, p, s, tangent, in, dt);
+    } else {
+        smooth_step(law, p, s, tangent, 1.0, in, dt);
     }
-    smooth_step(law, p, s, tangent, in, dt);
 }
 
 int32_t motion_steps(const motion_law *law, const motion_parameters *p, const motion_state *s,
@@ -517,6 +490,10 @@ int32_t motion_steps(const motion_law *law, const motion_parameters *p, const mo
         }
     }
     stiffness = fabs(dot4(c.slope, law->elastic_n + c.first)) / law->step_m * taut;
+    if (p->hysteresis_n > 0.0) {
+        stiffness += 2.0 * p->hysteresis_n / slip_m(p);
+        fastest = fmax(fastest, fabs(s->speed_m_s) / slip_m(p));
+    }
     fastest = fmax(fastest, sqrt(stiffness / p->inertia_kg));
     step_s = fmin(step_s, p->phase / fastest);
     wanted = ceil(duration_s / step_s - 1e-9);

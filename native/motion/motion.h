@@ -1,8 +1,10 @@
-/* The motion of an actuator that follows a law: its length, branches, charge and softening in time.
+/* The motion of an actuator that follows a law: its length, branches, charge, softening and
+ * hysteresis in time.
  *
  * The law is a table of its forces over lengths and voltages (haselab.actuators.table), so that one
  * code moves every kind. Classic Runge-Kutta of order 4; the caller ends a step wherever an input
- * jumps. A crossing of the longest length so far ends a step as well.
+ * jumps. A crossing of the longest length so far ends a step as well, and so does a reversal where
+ * there is hysteresis.
  *
  * With a tangent, the derivatives of the state by parameters and start values follow with it; they
  * are those of the numbers computed, not of another scheme. SI units throughout. The caller owns
@@ -35,6 +37,8 @@ typedef struct {
     double branch_share[MOTION_BRANCHES], branch_s[MOTION_BRANCHES]; /* share 0: none */
     double damping_n_s_m, inertia_kg;
     double charge_share, charge_s; /* of the voltage that acts late; share 0: none */
+    double hysteresis_n, hysteresis_width; /* largest force; stretch that it needs; 0 N: none */
+    double elastic_scale;          /* of the law's elastic force: 1 unless it ages */
     double step_s;                 /* longest step */
     double phase;                  /* of the fastest motion in a step, at most; rad */
 } motion_parameters;
@@ -44,6 +48,7 @@ typedef struct {
     double relaxed_n[MOTION_BRANCHES]; /* elastic force to which a branch has relaxed */
     double charge_v;                   /* late part of the voltage */
     double longest_m;                  /* longest length so far: the memory of softening */
+    double hysteresis_n;               /* its present force, against elongation */
 } motion_state;
 
 /* What acts during a step. The voltage's mean square is volt^2 + ripple_v2. */
@@ -64,11 +69,13 @@ enum motion_column {
     MOTION_SOFTENING_WIDTH,
     MOTION_CHARGE_SHARE,
     MOTION_CHARGE_S,
+    MOTION_HYSTERESIS_N,
+    MOTION_HYSTERESIS_WIDTH,
     MOTION_VOLTAGE_SCALE, /* of volt; the present scale is 1 */
     MOTION_BRANCH_SHARE = 1100, /* + branch */
     MOTION_BRANCH_S = 1200      /* + branch */
 };
-enum { MOTION_ROWS = 4 + MOTION_BRANCHES, MOTION_WORK = 3 * MOTION_ROWS + 5 };
+enum { MOTION_ROWS = 5 + MOTION_BRANCHES, MOTION_WORK = 3 * MOTION_ROWS + 6 };
 
 typedef struct {
     int32_t columns, laws;

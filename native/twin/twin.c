@@ -45,11 +45,49 @@ static void normal_pair(uint64_t *r, float *a, float *b)
 
 /* ---- motion ---- */
 
-/* Moves on under a voltage and its ripple; the law is valid inside its table only. */
-static void move_on(const twin_parameters *p, twin_state *s, const motion_input *in, double dt)
+/* 1 + share of a change that approaches its end within a time constant. */
+static double changed(double share, double time_s, double constant_s)
+{
+    return share != 0.0 ? 1.0 - share * expm1(-time_s / constant_s) : 1.0;
+}
+
+static double permittivity(const twin_parameters *p, double time_s)
+{
+    return changed(p->capacitance_rise, time_s, p->warming_s);
+}
+
+/* Motion of the actuator with ageing, warming and the second mass, of which the force on the moving
+ * end is that at the beginning: dt must be short against its period. */
+static void move_further(const twin_parameters *p, twin_state *s, const motion_input *in,
+                         double time_s, double dt)
+{
+    const double share = permittivity(p, time_s), before_m_s = s->motion.speed_m_s;
+    const double spring = p->second_kg * p->second_rad_s * p->second_rad_s;
+    const double damper = 2.0 * p->second_damping * p->second_kg * p->second_rad_s;
+    const double force = spring * s->second_m + damper * s->second_m_s;
+    motion_parameters moving = p->motion;
+    motion_input pull = *in;
+    moving.elastic_scale = changed(-p->stiffness_loss, time_s, p->ageing_s);
+    pull.volt *= sqrt(share);
+    pull.ripple_v2 *= share;
+    pull.load_n += force;
+    motion_advance(&p->law, &moving, &s->motion, NULL, &pull, dt);
+    if (p->second_kg > 0.0) {
+        s->second_m_s -= s->motion.speed_m_s - before_m_s + dt * force / p->second_kg;
+        s->second_m += dt * s->second_m_s;
+    }
+}
+
+/* Moves on from a time under a voltage and its ripple; the law is valid inside its table only. */
+static void move_on(const twin_parameters *p, twin_state *s, const motion_input *in, double time_s,
+                    double dt)
 {
     const motion_law *law = &p->law;
-    motion_advance(law, &p->motion, &s->motion, NULL, in, dt);
+    if (p->capacitance_rise != 0.0 || p->stiffness_loss > 0.0 || p->second_kg > 0.0) {
+        move_further(p, s, in, time_s, dt);
+    } else {
+        motion_advance(law, &p->motion, &s->motion, NULL, in, dt);
+    }
     if (!(s->motion.length_m >= law->low_m &&
           s->motion.length_m <= law->low_m + law->step_m * (double)(law->lengths - 1))) {
         s->outside = s->broken = 1;
@@ -85,7 +123,7 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
         const int32_t held = value < last ? (value + 1) * steps_per_value - k : n_steps - k;
         const int32_t left = held < n_steps - k ? held : n_steps - k;
         const int32_t parts = motion_steps(&p->law, &p->motion, &s->motion, dt * (double)left);
-        const int32_t steps = parts < left ? left / parts : 1;
+        const int32_t steps = parts < left && !(p->second_kg > 0.0) ? left / parts : 1;
         const motion_state before = s->motion;
         motion_input in = {0.0, 0.0, load_n};
         int32_t i;
@@ -94,7 +132,7 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
             in.ripple_v2 = 0.5 * carrier * carrier;
         }
         watch_field(p, s, in.volt);
-        move_on(p, s, &in, dt * (double)steps);
+        move_on(p, s, &in, s->time_s + dt * (double)k, dt * (double)steps);
         if (lengths != NULL) { /* Hermite's cubic, by its powers */
             const double whole = dt * (double)steps, per = 1.0 / (double)steps;
             const double from = whole * before.speed_m_s, to = whole * s->motion.speed_m_s;
@@ -183,20 +221,20 @@ static void amplify(const twin_parameters *p, twin_state *s, double held_v, doub
     s->amp_v_s = rate;
 }
 
-/* What is connected to the output. */
+/* What is connected to the output; `warm`: factor on the actuator's capacitance. */
 typedef struct {
     double farad, series_ohm, leakage_ohm;
     double decay, decay_read; /* of what is left of a lag: over a sample, and to the second channel */
 } element;
 
-static element connected(const twin_parameters *p, const twin_state *s)
+static element connected(const twin_parameters *p, const twin_state *s, double warm)
 {
     element load = {s->reference_f, s->reference_ohm, INFINITY, 0.0, 0.0};
     double rc;
     if (!(s->reference_f > 0.0)) { /* as it will be in the middle of the next mechanical step */
         const double ahead_s = 0.5 * TWIN_SUB * p->sample_s;
         const double middle_m = s->motion.length_m + ahead_s * s->motion.speed_m_s;
-        load.farad = motion_capacitance(&p->law, middle_m, s->plate_v);
+        load.farad = motion_capacitance(&p->law, middle_m, s->plate_v) * warm;
         load.series_ohm = p->series_ohm;
         load.leakage_ohm = p->leakage_ohm;
     }
@@ -248,11 +286,12 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
     const double turn_s = sin(p->carrier_rad_s * p->sample_s);
     const double phase = fmod(p->carrier_rad_s * s->time_s, 6.283185307179586);
     const int noisy = p->v_noise_v != 0.0 || p->i_noise_v != 0.0;
+    const double warm = permittivity(p, s->time_s);
     double c = cos(phase), q = sin(phase);
     int32_t n = 0, step;
 
     for (step = 0; step < n_samples / TWIN_SUB; ++step) {
-        const element load = connected(p, s);
+        const element load = connected(p, s, warm);
         const double by_current = p->current_limit_a / (load.farad + p->stray_f);
         const double reach =
             p->sample_s * (by_current < p->slew_v_s ? by_current : p->slew_v_s);
@@ -288,7 +327,7 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
         watch_field(p, s, pulls * s->plate_v);
         pull.volt = sum / TWIN_SUB;
         pull.ripple_v2 = sum2 / TWIN_SUB - pull.volt * pull.volt;
-        move_on(p, s, &pull, dt);
+        move_on(p, s, &pull, s->time_s + dt * (double)step, dt);
         lengths[step] = s->motion.length_m;
     }
     s->time_s += n_samples * p->sample_s;

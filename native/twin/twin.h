@@ -31,6 +31,10 @@ typedef struct {
     double v_offset_v, i_offset_v;           /* readings at 0 V, 0 A */
     /* converters */
     double sample_s, skew_s, lsb_v, v_noise_v, i_noise_v;
+    /* What no law has, all off at 0: the permittivity rises by capacitance_rise as the bench warms
+     * up, ageing takes stiffness_loss of the elastic force, and a second mass hangs on a spring. */
+    double capacitance_rise, warming_s, stiffness_loss, ageing_s;
+    double second_kg, second_rad_s, second_damping;
     /* of the amplifier for sample_s, filled by twin_prepare; amp_r: response to an input that rises
      * to 1 in a straight line */
     double amp_a[2][2], amp_b[2], amp_r[2];
@@ -44,6 +48,7 @@ typedef struct {
     double v_seen, v_shown;      /* voltage monitor: its last input and output, V of the amplifier */
     double i_seen, i_shown;      /* current monitor, A */
     double reference_f, reference_ohm; /* in the actuator's place; 0 F: the actuator is connected */
+    double second_m, second_m_s; /* of the second mass, from where it hangs on the moving end */
     double time_s, field_v_m;    /* field: largest since it was last cleared */
     uint64_t random[4];
     int32_t broken;              /* 1 after a dielectric breakdown, until the state is made anew */

@@ -110,3 +110,15 @@ def test_a_name_with_a_control_character_is_refused_in_one_line(manual, section,
     with pytest.raises(InputError, match=reported) as error:
         load_rig(manual)
     assert len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "path", sorted((_RIGS / "hard").glob("*.toml")), ids=lambda path: path.stem
+)
+def test_each_hard_twin_differs_in_one_table(path):
+    own = tomllib.loads(path.read_text())
+    assert own.pop("name") != "twin" and len(own) == 1
+    found, usual = load_twin(path), twin_of_reading("hz")
+    (table,) = own
+    assert getattr(found, table) != getattr(usual, table)
+    assert found.model_copy(update={"name": "twin", table: getattr(usual, table)}) == usual

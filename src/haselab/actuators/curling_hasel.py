@@ -62,6 +62,8 @@ class CurlingHasel(ActuatorLaw):
         branch_relaxation_s: see `Losses`.
         charge_share: see `Losses`.
         charge_relaxation_s: see `Losses`.
+        hysteresis_n: see `Losses`.
+        hysteresis_width: see `Losses`.
         series_ohm: see `Circuit`.
         leakage_ohm: see `Circuit`.
         breakdown_v_per_m: see `Circuit`.
@@ -119,6 +121,10 @@ class CurlingHasel(ActuatorLaw):
         0.0, unit="", low=0.0, high=1.0, description="of the voltage that acts late")
     charge_relaxation_s: float = parameter(
         5.0, unit="s", low=0.01, high=1e4, description="of that part")
+    hysteresis_n: float = parameter(0.0, unit="N", low=0.0, high=1e3,
+        description="largest force of the hysteresis, 0: none")
+    hysteresis_width: float = parameter(0.02, unit="", low=1e-4, high=1.0,
+        description="stretch within which it follows a reversal")
     series_ohm: float = parameter(
         5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes", fitted=False)
     leakage_ohm: float = parameter(
@@ -249,6 +255,7 @@ class CurlingHasel(ActuatorLaw):
         return Losses(
             self.damping_n_s_per_m, self.branch_share, self.branch_relaxation_s,
             charge_share=self.charge_share, charge_relaxation_s=self.charge_relaxation_s,
+            hysteresis_n=self.hysteresis_n, hysteresis_width=self.hysteresis_width,
         )  # fmt: skip
 
     @property

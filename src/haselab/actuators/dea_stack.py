@@ -46,6 +46,8 @@ class DeaStack(ActuatorLaw):
         damping_n_s_per_m: see `Losses`.
         branch_share: see `Losses`.
         branch_relaxation_s: see `Losses`.
+        hysteresis_n: see `Losses`.
+        hysteresis_width: see `Losses`.
         series_ohm: see `Circuit`.
         leakage_ohm: see `Circuit`.
         breakdown_v_per_m: see `Circuit`.
@@ -80,6 +82,10 @@ class DeaStack(ActuatorLaw):
         (0.05, 0.1), unit="", low=0.0, high=10.0, description="of each viscoelastic branch")
     branch_relaxation_s: tuple[float, ...] = parameter(
         (0.1, 3.0), unit="s", low=1e-3, high=1e6, description="of each branch")
+    hysteresis_n: float = parameter(0.0, unit="N", low=0.0, high=1e3,
+        description="largest force of the hysteresis, 0: none")
+    hysteresis_width: float = parameter(0.02, unit="", low=1e-4, high=1.0,
+        description="stretch within which it follows a reversal")
     series_ohm: float = parameter(
         5e3, unit="ohm", low=0.0, high=1e8, description="of the electrodes", fitted=False)
     leakage_ohm: float = parameter(
@@ -149,7 +155,10 @@ class DeaStack(ActuatorLaw):
     @property
     def losses(self) -> Losses:
         """Viscoelastic rubber; neither softening nor charge creep."""
-        return Losses(self.damping_n_s_per_m, self.branch_share, self.branch_relaxation_s)
+        return Losses(
+            self.damping_n_s_per_m, self.branch_share, self.branch_relaxation_s,
+            hysteresis_n=self.hysteresis_n, hysteresis_width=self.hysteresis_width,
+        )  # fmt: skip
 
     @property
     def circuit(self) -> Circuit:

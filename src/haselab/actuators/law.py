@@ -252,6 +252,13 @@ class ActuatorLaw(abc.ABC):
         ]
         return np.asarray(sum(parts) / step_v)
 
+    def elastic_rivals(self) -> Mapping[str, ActuatorLaw]:
+        """Laws that differ in the elastic energy alone, with the same parameters, by their words.
+
+        `identify actuator` compares them with this law.
+        """
+        return {}
+
     @classmethod
     def described(cls) -> tuple[Parameter, ...]:
         """All parameters of the law, with units and limits."""

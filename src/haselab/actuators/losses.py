@@ -16,11 +16,18 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Losses:
-    r"""Losses of an actuator: damping, viscoelasticity, softening and charge creep.
+    r"""Losses of an actuator: damping, viscoelasticity, softening, charge creep, hysteresis.
 
     Viscoelastic branches act on the elastic force $F_e$: $\dot b = g\,\dot F_e - b/\tau$. Softening
     (Mullins effect) makes the elastic force of a new actuator larger until the length has been
     reached once. Charge creep delays the effect of a fraction of the voltage.
+
+    Hysteresis depends on the path of the length and not on its speed. Its force $h$ has the largest
+    value $F_h$ and follows a reversal within a length $W$, the width times the free length:
+
+    $\dot h = (F_h\,\dot x - h\,|\dot x|)/W$
+
+    It stores the energy $\tfrac12 h^2 W/F_h$ and dissipates $|\dot x|\,h^2/F_h \ge 0$.
 
     Args:
         damping_n_s_per_m: linear damper beside the actuator.
@@ -31,8 +38,11 @@ class Losses:
         softening_transition: of that transition, in stretch.
         charge_share: part of the voltage that acts with a delay; 0: none.
         charge_relaxation_s: time constant of that part.
+        hysteresis_n: largest force of the hysteresis; 0: none.
+        hysteresis_width: change of stretch within which that force follows a reversal.
     Raises:
         LimitError: A branch has no time constant, or a share or time is not positive.
+    Source: Dahl, The Aerospace Corporation TOR-0158(3107-18)-1 (1968), for the hysteresis.
     """
 
     damping_n_s_per_m: float = 0.1
@@ -43,6 +53,8 @@ class Losses:
     softening_transition: float = 0.02
     charge_share: float = 0.0
     charge_relaxation_s: float = 1.0
+    hysteresis_n: float = 0.0
+    hysteresis_width: float = 0.02
 
     def __post_init__(self) -> None:
         if len(self.branch_share) != len(self.branch_relaxation_s):
@@ -55,6 +67,12 @@ class Losses:
             raise LimitError(
                 "A relaxation time, softening_transition or a branch share is negative or zero. "
                 "Use positive numbers."
+            )
+        if self.hysteresis_n < 0.0 or self.hysteresis_width <= 0.0:
+            raise LimitError(
+                f"The hysteresis has a force of {self.hysteresis_n:g} N and a width of "
+                f"{self.hysteresis_width:g}. The force must not be negative, and the width must be "
+                "above 0."
             )
 
     def softening(self, stretch: ArrayLike) -> Floats:

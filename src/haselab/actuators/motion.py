@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -28,6 +28,7 @@ class ActuatorState:
         relaxed_n: force to which each branch has relaxed. Shape `(..., B)`.
         charge_v: present value of the delayed part of the voltage.
         longest_m: largest length so far, for the softening.
+        hysteresis_n: present force of the hysteresis, see `Losses`.
     """
 
     length_m: Floats
@@ -35,6 +36,7 @@ class ActuatorState:
     relaxed_n: Floats
     charge_v: Floats
     longest_m: Floats
+    hysteresis_n: Floats = field(default_factory=lambda: np.zeros(()))
 
     @classmethod
     def at_rest(
@@ -58,7 +60,7 @@ class ActuatorState:
         force = _elastic_n(law, length, longest)
         relaxed = np.repeat(force[..., None], len(law.losses.branch_share), axis=-1)
         none = np.zeros_like(length)
-        return cls(length, none, relaxed, none + np.asarray(charge_v), longest)
+        return cls(length, none, relaxed, none + np.asarray(charge_v), longest, none)
 
 
 def _elastic_n(law: ActuatorLaw, length_m: Floats, longest_m: Floats) -> Floats:
@@ -93,6 +95,10 @@ def rates(
     lag = elastic[..., None] - state.relaxed_n
     force = np.asarray(load_n) + law.electric_force_n(state.length_m, acting_v) - elastic
     force = force - (share * lag).sum(axis=-1) - losses.damping_n_s_per_m * state.speed_m_s
+    slip_m = losses.hysteresis_width * law.free_length_m
+    if losses.hysteresis_n > 0.0:
+        force = force - state.hysteresis_n
+    turned = losses.hysteresis_n * state.speed_m_s - state.hysteresis_n * np.abs(state.speed_m_s)
     none = np.zeros_like(state.length_m)
     grows = (state.length_m >= state.longest_m) & (state.speed_m_s > 0.0)
     return ActuatorState(
@@ -101,4 +107,5 @@ def rates(
         lag / relaxation_s,
         (voltage - state.charge_v) / losses.charge_relaxation_s + none,
         np.where(grows, state.speed_m_s, 0.0),
+        np.asarray(turned / slip_m) if losses.hysteresis_n > 0.0 else none,
     )

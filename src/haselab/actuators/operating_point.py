@@ -141,6 +141,8 @@ def linearise(
 ) -> OperatingPoint:
     """Linearise about the equilibrium, for motion within the lengths reached before.
 
+    With hysteresis, the motion must be small against its width: its force then acts like a spring.
+
     Args:
         law: of the actuator.
         voltage_v: at equilibrium.
@@ -163,6 +165,7 @@ def linearise(
     step_m, step_v = _STEP * law.free_length_m, max(1e-4 * abs(voltage_v), 1e-3)
     ends = length + step_m * np.array([-1.0, 1.0])
     stiffness = softening * float(np.diff(law.elastic_force_n(ends))[0]) / (2.0 * step_m)
+    held = losses.hysteresis_n / (losses.hysteresis_width * law.free_length_m)
     softer = float(np.diff(law.electric_force_n(ends, voltage_v))[0]) / (2.0 * step_m)
     values = voltage_v + step_v * np.array([-1.0, 1.0])
     per_v = float(np.diff(law.electric_force_n(length, values))[0]) / (2.0 * step_v)
@@ -170,7 +173,7 @@ def linearise(
     inertia = mass_kg + law.moving_mass_kg
     a = np.zeros((3 + count, 3 + count))
     a[0, 1] = 1.0
-    a[1] = [softer - stiffness, -losses.damping_n_s_per_m, *[-1.0] * count, per_v * late]
+    a[1] = [softer - stiffness - held, -losses.damping_n_s_per_m, *[-1.0] * count, per_v * late]
     a[1] /= inertia
     a[2 : 2 + count, 1] = stiffness * np.array(losses.branch_share)
     decay = [-1.0 / value for value in (*losses.branch_relaxation_s, losses.charge_relaxation_s)]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.base import LimitError, Limits
 from haselab.models import ArrudaBoyceSeries
+from haselab.models.hyperelastic import Gent, HyperelasticLaw
 
 __all__ = ["PlanarHasel"]
 
@@ -48,6 +50,8 @@ class PlanarHasel(ActuatorLaw):
         oil_volume_m3: of the liquid dielectric.
         permittivity: of oil and shell together, relative.
         capacitance_exponent: n; 2 in pure shear, 4 in equal biaxial stretch.
+        hysteresis_n: see `Losses`.
+        hysteresis_width: see `Losses`.
         series_ohm: see `Circuit`.
         leakage_ohm: see `Circuit`.
         charge_share: see `Losses`.
@@ -108,6 +112,12 @@ class PlanarHasel(ActuatorLaw):
     charge_relaxation_s: float = parameter(
         5.7, unit="s", low=0.01, high=1e4, description="of that part",
         key="dielectric.relaxation_s")
+    hysteresis_n: float = parameter(0.0, unit="N", low=0.0, high=1e3,
+        description="largest force of the hysteresis, 0: none",
+        key="hysteresis.force_n")
+    hysteresis_width: float = parameter(0.02, unit="", low=1e-4, high=1.0,
+        description="stretch within which it follows a reversal",
+        key="hysteresis.width")
     breakdown_v_per_m: float = parameter(40e6, unit="V/m", low=1e5, high=1e18,
         description="field that destroys it", key="dielectric.breakdown_v_per_m", fitted=False)
     # fmt: on
@@ -165,13 +175,21 @@ class PlanarHasel(ActuatorLaw):
         """Of the shell, fixed by the clamps."""
         return self.shell_lateral_stretch
 
+    def _shell_energy_pa(self, invariant: Floats) -> Floats:
+        """Energy density of the shell."""
+        terms = self.series_coefficients_pa / _ORDER
+        density = sum(c * (invariant**i - 3.0**i) for c, i in zip(terms, _ORDER, strict=True))
+        return np.asarray(density)
+
+    @property
+    def _shell(self) -> HyperelasticLaw:
+        return ArrudaBoyceSeries(self.shear_modulus_pa, self.locking_stretch)
+
     def elastic_energy_j(self, length_m: ArrayLike) -> Floats:
         """Of shell and electrodes."""
         length = np.asarray(length_m, dtype=np.float64)
         square, lateral = (length / self.length_m) ** 2, self.shell_lateral_stretch**2
-        invariant = square + lateral + 1.0 / (square * lateral)
-        terms = self.series_coefficients_pa / _ORDER
-        density = sum(c * (invariant**i - 3.0**i) for c, i in zip(terms, _ORDER, strict=True))
+        density = self._shell_energy_pa(square + lateral + 1.0 / (square * lateral))
         strain = length / self.free_length_m - 1.0
         spring = 0.5 * strain**2 + 0.25 * self.electrode_stiffening * strain**4
         stiffness_j = self.electrode_stiffness_n_per_m * self.free_length_m**2
@@ -180,8 +198,7 @@ class PlanarHasel(ActuatorLaw):
     def elastic_force_n(self, length_m: ArrayLike) -> Floats:
         """Of shell and electrodes, in closed form."""
         length = np.asarray(length_m, dtype=np.float64)
-        shell = ArrudaBoyceSeries(self.shear_modulus_pa, self.locking_stretch)
-        stress = shell.nominal_stress_pa(length / self.length_m, self.shell_lateral_stretch)
+        stress = self._shell.nominal_stress_pa(length / self.length_m, self.shell_lateral_stretch)
         strain = length / self.free_length_m - 1.0
         spring_n = self.electrode_stiffness_n_per_m * self.free_length_m * strain
         return np.asarray(
@@ -216,9 +233,36 @@ class PlanarHasel(ActuatorLaw):
             self.softening_transition,
             self.charge_share,
             self.charge_relaxation_s,
+            self.hysteresis_n,
+            self.hysteresis_width,
         )
 
     @property
     def circuit(self) -> Circuit:
         """Gel electrodes in series."""
         return Circuit(self.series_ohm, self.leakage_ohm, self.breakdown_v_per_m)
+
+    def elastic_rivals(self) -> Mapping[str, ActuatorLaw]:
+        """See `ActuatorLaw`."""
+        return {"Gent's law of the shell": _GentHasel(**asdict(self))}
+
+
+@dataclass(frozen=True)
+class _GentHasel(PlanarHasel):
+    """The same with Gent's law, whose chains are straight at the same first invariant."""
+
+    @property
+    def _extension_limit(self) -> float:
+        return 3.0 * self.locking_stretch**2 - 3.0
+
+    @property
+    def _shell(self) -> HyperelasticLaw:
+        return Gent(self.shear_modulus_pa, self._extension_limit)
+
+    def _shell_energy_pa(self, invariant: Floats) -> Floats:
+        limit = self._extension_limit
+        used = (invariant - 3.0) / limit
+        return np.asarray(-0.5 * self.shear_modulus_pa * limit * np.log1p(-used))
+
+    def elastic_rivals(self) -> Mapping[str, ActuatorLaw]:
+        return {}

@@ -75,6 +75,9 @@ def motion_parameters(law: ActuatorLaw) -> NDArray[np.void]:
     found["inertia_kg"] = law.moving_mass_kg
     found["charge_share"] = losses.charge_share
     found["charge_s"] = losses.charge_relaxation_s
+    found["hysteresis_n"] = losses.hysteresis_n
+    found["hysteresis_width"] = losses.hysteresis_width
+    found["elastic_scale"] = 1.0
     found["step_s"], found["phase"] = _LONGEST_STEP_S, _PHASE
     return found
 
@@ -187,6 +190,8 @@ _LOSSES = (
     ("softening_width", 0, _motion.SOFTENING_WIDTH),
     ("charge_share", 0, _motion.CHARGE_SHARE),
     ("charge_s", 0, _motion.CHARGE_S),
+    ("hysteresis_n", 0, _motion.HYSTERESIS_N),
+    ("hysteresis_width", 0, _motion.HYSTERESIS_WIDTH),
     *(("branch_share", k, _motion.BRANCH_SHARE + k) for k in range(_motion.BRANCHES)),
     *(("branch_s", k, _motion.BRANCH_S + k) for k in range(_motion.BRANCHES)),
 )

@@ -18,6 +18,7 @@ from haselab.actuators import (
 from haselab.base import InputError
 from haselab.identify.physical import MotionRecord, fit_actuator
 from haselab.identify.physical.misfit import SHARED_PX, SharedErrors
+from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
 MASS_KG = 0.25
@@ -188,3 +189,34 @@ def test_shared_errors_of_tracking_are_whitened(lengths, std_m):
     covariance = np.diag(stds**2) + shared
     both = white @ (covariance / np.outer(stds, stds)) @ white.T
     np.testing.assert_allclose(both, np.eye(count), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_hysteresis_that_the_law_lacks_is_found():
+    more = replace(TRUE, hysteresis_n=0.05, hysteresis_width=0.02)
+    fit = fit_actuator(START, [record(more, 3)], mass_kg=MASS_KG)
+    assert fit.status == "ok"
+    assert "without hysteresis" in [rival.law for rival in fit.rejected_laws]
+    far = deviations(fit, more)
+    assert "hysteresis.force_n" in far and max(map(abs, far.values())) < 4.0, far
+
+
+def test_a_model_error_that_is_hidden_by_as_much_as_it_shows_is_one_deviation():
+    """A line fitted to a line and a parabola that has equal parts along and across the line."""
+    x = np.linspace(0.0, 1.0, 400)
+    jacobian = np.column_stack([x, np.zeros(400)])
+    across = x**2 - x * (x**2 @ x) / (x @ x)
+    error = x / np.linalg.norm(x) + across / np.linalg.norm(across)
+    moved = float(error @ x / (x @ x))
+    residuals = error - moved * x
+    std = hidden_std(jacobian, excess_energy([([residuals[:100], residuals[100:]], 0.0)]))
+    assert std[0] == pytest.approx(abs(moved), rel=1e-9)
+    assert std[1] == np.inf
+    noisy = excess_energy([([np.full(50, 2.0)], 1.0), ([np.full(10, 1.0)], 2.0)])
+    assert noisy == pytest.approx(50.0 * 3.0 - 10.0 * 3.0)
+
+
+def test_covariances_only_grow():
+    covariance = np.array([[4.0, 1.0], [1.0, 1.0]])
+    grown = widened(covariance, np.array([1.0, 3.0]))
+    np.testing.assert_allclose(grown, [[4.0, 3.0], [3.0, 9.0]])

@@ -6,7 +6,8 @@ $r^\top r$, and its covariance is
 
 $\Sigma = (J^\top J)^{-1}$
 
-where the standard deviations are those of the residuals themselves, channel by channel.
+where the standard deviations are those of the residuals themselves, channel by channel. Coloured
+residuals and a model error (`model_error`) make it larger.
 """
 
 from __future__ import annotations
@@ -24,13 +25,15 @@ from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import Fit
 from haselab.identify.noise import coloured_covariance, whiteness_p
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
+from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.rivals import Rival, richer, simpler
+from haselab.identify.physical.rivals import Rival, other_elastic, richer, simpler
 from haselab.identify.physical.search import Found, refine, search
 from haselab.identify.physical.unknowns import (
     CAMERA_OFFSET,
     CAMERA_SCALE,
     SENSING_SCALE,
+    START_HYSTERESIS,
     Unknowns,
 )
 
@@ -220,7 +223,11 @@ def fit_actuator(
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
-    return _result(misfit, _ordered(found), rejected)
+    # beside a model error, the evidence for another elastic law would mean nothing
+    others = other_elastic(misfit, found) if _seen(misfit, found).explained else []
+    rejected += [rival for rival in others if rival.log_evidence < 0.0]
+    preferred = [rival for rival in others if rival.log_evidence > 0.0]
+    return _result(misfit, _ordered(found), rejected, preferred)
 
 
 def _ordered(found: Found) -> Found:
@@ -291,14 +298,31 @@ def _typical(parts: Sequence[Floats]) -> float:
     return float(np.median(joined)) if joined.size else math.nan
 
 
-def _result(misfit: Misfit, found: Found, rejected: Sequence[Rival]) -> ActuatorFit:
+def _result(
+    misfit: Misfit, found: Found, rejected: Sequence[Rival], preferred: Sequence[Rival]
+) -> ActuatorFit:
     unknowns = found.unknowns
     segments = misfit.segments
+    seen = _seen(misfit, found)
+    lengths, capacitances = seen.lengths, seen.capacitances
+    length_noise, capacitance_noise = _neighbours(lengths), _neighbours(capacitances)
+    status, usable = _status(
+        seen, unknowns.value(SENSING_SCALE), preferred, converged=found.converged
+    )
+    if not usable:
+        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
     covariance = _covariance(found, segments)
+    if status != "ok":
+        energy = excess_energy(
+            [(part, noise) for part, noise in (
+                (lengths, length_noise), (capacitances, capacitance_noise)) if part]
+        )  # fmt: skip
+        covariance = widened(covariance, hidden_std(found.jacobian, energy))
     std = np.sqrt(np.diag(covariance))
     units = {about.key: about.unit for about in unknowns.law.described()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
-              "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": ""}  # fmt: skip
+              "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": "",
+              START_HYSTERESIS: "N"}  # fmt: skip
     slopes = unknowns.slopes
     parameters, weak = {}, []
     for k, name in enumerate(unknowns.names):
@@ -312,21 +336,8 @@ def _result(misfit: Misfit, found: Found, rejected: Sequence[Rival]) -> Actuator
             parameters[name] = Estimate.lognormal(unknowns.values[k], share, unit)
         else:
             parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
-    lengths = _channel(segments, LENGTH, found.residuals)
-    capacitances = _channel(segments, CAPACITANCE, found.residuals)
     std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])
     std_f = misfit.capacitance_factor * _typical([r.capacitance_std_f for r in misfit.records])
-    length_noise, capacitance_noise = _neighbours(lengths), _neighbours(capacitances)
-    whiteness = min(whiteness_p(lengths), whiteness_p(capacitances))
-    excess = {
-        "lengths": _rms(lengths) / length_noise,
-        "capacitances": _rms(capacitances) / capacitance_noise,
-    }
-    status, usable = _status(
-        excess, whiteness, unknowns.value(SENSING_SCALE), converged=found.converged
-    )
-    if not usable:
-        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
     law = unknowns.present_law()
     values = covariance * np.outer(slopes, slopes)
     return ActuatorFit(
@@ -340,7 +351,7 @@ def _result(misfit: Misfit, found: Found, rejected: Sequence[Rival]) -> Actuator
         length_noise_m=std_m * length_noise,
         capacitance_rms_f=std_f * _rms(capacitances),
         capacitance_noise_f=std_f * capacitance_noise,
-        residual_whiteness_p=whiteness,
+        residual_whiteness_p=seen.whiteness_p,
         law=law,
         kind=law.kind,
         mass_kg=unknowns.mass_kg,
@@ -365,19 +376,58 @@ def _covariance(found: Found, segments: Sequence[Segment]) -> Floats:
     return covariance
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """Residuals of both channels, experiment by experiment."""
+
+    lengths: list[Floats]
+    capacitances: list[Floats]
+
+    @property
+    def whiteness_p(self) -> float:
+        """Of the less probable channel."""
+        return min(whiteness_p(self.lengths), whiteness_p(self.capacitances))
+
+    @property
+    def excess(self) -> tuple[float, str]:
+        """Largest rms of a channel over its noise, and its name."""
+        both = {"lengths": self.lengths, "capacitances": self.capacitances}
+        found = {
+            name: float(np.nan_to_num(_rms(part) / _neighbours(part)))
+            for name, part in both.items()
+        }
+        largest = max(found, key=lambda name: found[name])
+        return found[largest], largest
+
+    @property
+    def explained(self) -> bool:
+        """Whether the law leaves nothing but noise."""
+        return not (self.excess[0] > _SLIGHT and self.whiteness_p < _WHITE)
+
+
+def _seen(misfit: Misfit, found: Found) -> _Seen:
+    return _Seen(
+        _channel(misfit.segments, LENGTH, found.residuals),
+        _channel(misfit.segments, CAPACITANCE, found.residuals),
+    )
+
+
 def _status(
-    excess: dict[str, float], whiteness: float, scale: float, *, converged: bool
+    seen: _Seen,
+    scale: float,
+    preferred: Sequence[Rival],
+    *,
+    converged: bool,
 ) -> tuple[str, bool]:
     """ "ok", a model error, or why there is no result; and whether there is one.
 
     Args:
-        excess: rms of the residuals over their noise, of each channel.
-        whiteness: probability of the residuals under white noise.
+        seen: residuals.
         scale: measured over true capacitance.
+        preferred: laws that the records prefer to the chosen one.
         converged: whether the search did.
     """
-    largest = max(excess, key=lambda name: np.nan_to_num(excess[name]))
-    ratio = float(np.nan_to_num(excess[largest]))
+    ratio, largest = seen.excess
     if ratio > _GROSS:
         return (
             f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
@@ -391,10 +441,15 @@ def _status(
             f"the records contradict each other: the capacitances are {scale:.3g} times those that "
             "the forces need. Check the mass, the amplifier's gain and the calibration"
         ), False
-    if ratio > _SLIGHT and whiteness < _WHITE:
+    if not seen.explained:
         return (
             f"model error: the {largest} are off by {ratio:.3g} times the noise, and the "
             "intervals are wider for it"
+        ), True
+    if preferred:
+        return (
+            f"model error: {preferred[0].law} explains the records better (logarithm of evidence "
+            f"{preferred[0].log_evidence:.3g}), so the values of the elastic force may be wrong"
         ), True
     return "ok", True
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
+from haselab import _motion
 from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
 from haselab.base import HaselabError, LimitError
 from haselab.identify.physical.record import MotionRecord
@@ -20,6 +21,7 @@ from haselab.identify.physical.unknowns import (
     CAMERA_SCALE,
     SENSING_LATENCY,
     SENSING_SCALE,
+    START_HYSTERESIS,
     Unknowns,
     usual,
 )
@@ -38,6 +40,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 LENGTH, CAPACITANCE = "length", "capacitance"
 SHARED_PX = 1.5e-3  # error of tracking that all frames with the same pixels share
+_LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
 
@@ -86,7 +89,8 @@ def modelled(
         names,
         added_inertia_kg=added_kg,
     )
-    response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY))
+    held_n = unknowns.value(START_HYSTERESIS) if START_HYSTERESIS in unknowns.names else None
+    response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY), held_n)
     if strict and record.length_m.size:
         low_m, high_m = float(response.length_m.min()), float(response.length_m.max())
         if low_m < sampled.table.low_m or high_m > sampled.table.high_m:
@@ -108,11 +112,16 @@ def modelled(
         SENSING_LATENCY: (0.0, -scale * drift),
         SENSING_SCALE: (0.0, inside),
     }
+    if held_n is not None:
+        columns[START_HYSTERESIS] = (
+            shown * response.length_by[:, -1],
+            scale * record.over_windows(response.capacitance_by[:, -1]),
+        )
     length_by = np.empty((length_m.size, len(unknowns.names)))
     capacitance_by = np.empty((inside.size, len(unknowns.names)))
     count = len(unknowns.law_names)
-    length_by[:, :count] = shown * response.length_by
-    capacitance_by[:, :count] = scale * record.over_windows(response.capacitance_by)
+    length_by[:, :count] = shown * response.length_by[:, :count]
+    capacitance_by[:, :count] = scale * record.over_windows(response.capacitance_by[:, :count])
     for k, name in enumerate(unknowns.names[count:], start=count):
         length_by[:, k] = np.asarray(columns[name][0])
         capacitance_by[:, k] = np.asarray(columns[name][1])
@@ -126,7 +135,9 @@ def _highest_v(record: MotionRecord) -> float:
     return float(np.ceil(peak_v.max() / 1e3 + 1.0) * 1e3)
 
 
-def _respond(sampled: SampledLaw, record: MotionRecord, latency_s: float) -> Response:
+def _respond(
+    sampled: SampledLaw, record: MotionRecord, latency_s: float, held_n: float | None
+) -> Response:
     drive = record.drive
     low, high = drive.edge_s[0], drive.edge_s[-1]
     middle_s = record.length_time_s - latency_s
@@ -134,9 +145,7 @@ def _respond(sampled: SampledLaw, record: MotionRecord, latency_s: float) -> Res
     half_s = record.exposure_s / np.sqrt(12.0)
     both_s = np.clip(np.concatenate([middle_s - half_s, middle_s + half_s]), low, high)
     order = np.argsort(both_s, kind="stable")
-    start, start_by = sampled.at_rest(
-        float(drive.voltage_v[0]), float(drive.ripple_v2[0]), float(drive.load_n[0])
-    )
+    start, start_by = _at_rest(sampled, record, held_n)
     sensed = np.zeros(drive.voltage_v.size, np.uint8)
     sensed[record.window] = 1
     found = sampled.respond(drive, both_s[order], start, sensed=sensed, start_by=start_by)
@@ -148,6 +157,28 @@ def _respond(sampled: SampledLaw, record: MotionRecord, latency_s: float) -> Res
             for name in ("length_m", "speed_m_s", "length_by")
         },
     )
+
+
+def _at_rest(
+    sampled: SampledLaw, record: MotionRecord, held_n: float | None
+) -> tuple[NDArray[np.void], Floats]:
+    """State at the first edge with its derivatives, the last by the force of the hysteresis."""
+    acts = float(record.drive.voltage_v[0]), float(record.drive.ripple_v2[0])
+    load_n = float(record.drive.load_n[0])
+    if held_n is None:
+        return sampled.at_rest(*acts, load_n)
+    state, by = sampled.at_rest(*acts, load_n - held_n)
+    low, high = (sampled.at_rest(*acts, load_n - held_n + s * _LITTLE_N)[0] for s in (1.0, -1.0))
+    column = np.zeros((_motion.ROWS, 1))
+    column[0] = (high["length_m"] - low["length_m"]) / (2.0 * _LITTLE_N)
+    column[3] = (high["longest_m"] - low["longest_m"]) / (2.0 * _LITTLE_N)
+    branches = len(sampled.law.losses.branch_share)
+    column[4 : 4 + branches, 0] = (
+        (high["relaxed_n"] - low["relaxed_n"])[0, :branches] / (2.0 * _LITTLE_N)
+    )  # fmt: skip
+    column[-1] = 1.0
+    state["hysteresis_n"] = held_n
+    return state, np.hstack([by, column])
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ present law is
 $\tfrac12 (a/\sigma)^2 - \tfrac12 k \ln N$
 
 for $k$ parameters more and $N$ values (Schwarz's criterion). A law with one effect less is judged
-likewise by the size of that effect.
+likewise by the size of that effect. A law with another elastic energy has as many parameters; it is
+fitted, and half the difference of the sums of squares counts.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from haselab import _motion
 from haselab.actuators import ADDED_INERTIA, ActuatorLaw, with_parameters
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.physical.misfit import Misfit
-from haselab.identify.physical.search import Found
+from haselab.identify.physical.search import Found, refine
 from haselab.identify.physical.unknowns import INSTRUMENTS, Unknowns
 
-__all__ = ["DECISIVE", "Richer", "Rival", "richer", "simpler"]
+__all__ = ["DECISIVE", "Richer", "Rival", "other_elastic", "richer", "simpler"]
 
 Floats = NDArray[np.float64]
 DECISIVE = 5.0  # logarithm of evidence: 150 to 1
@@ -34,8 +35,12 @@ _LITTLE = 1e-6  # size of an effect at which its derivative is taken
 _LARGEST = 0.5  # size of an effect from which to refine
 _TIMES = 9  # relaxation times of a further branch that are tried
 _SHORTEST_S, _SHARE_OF_RECORD = 0.03, 0.1  # of them: shortest, and longest over the record
-_EFFECTS = ("branch_share", "softening_share", "charge_share")
-_NAMES = {"softening_share": "softening", "charge_share": "charge creep"}
+_WIDTHS = (0.005, 0.02, 0.08)  # of a hysteresis that are tried
+_NAMES = {
+    "softening_share": "softening",
+    "charge_share": "charge creep",
+    "hysteresis_n": "hysteresis",
+}
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,27 @@ class Rival:
 
     law: str
     log_evidence: float
+
+
+def other_elastic(misfit: Misfit, found: Found) -> list[Rival]:
+    """Compare laws of another elastic energy, each fitted to the records.
+
+    Args:
+        misfit: that was minimised.
+        found: its minimum.
+    Returns:
+        Laws that differ decisively; the logarithm of evidence of better ones is positive.
+    """
+    rivals = []
+    for words, law in found.unknowns.present_law().elastic_rivals().items():
+        other = refine(misfit, dataclasses.replace(found.unknowns, law=law))
+        if other is None or not other.converged:
+            continue
+        squares = (found.residuals**2).sum() - (other.residuals**2).sum()
+        evidence = 0.5 * float(squares)
+        if abs(evidence) > DECISIVE:
+            rivals.append(Rival(words, evidence))
+    return rivals
 
 
 @dataclass(frozen=True)
@@ -87,7 +113,7 @@ def simpler(found: Found, covariance: Floats) -> list[Rival]:
             effect, size, std = f"{about.key} (infinite)", size**-2.0, 2.0 * std / size**3
         elif about.name == "branch_share":
             effect = f"the branch {name}"
-        elif about.name in _EFFECTS:
+        elif about.name in _NAMES:
             effect = _NAMES[about.name]
         else:
             continue
@@ -151,6 +177,10 @@ def _candidates(law: ActuatorLaw, duration_s: float) -> list[tuple[ActuatorLaw, 
         if field in fields and getattr(law, field) == 0.0:
             more = dataclasses.replace(law, **{field: _LITTLE})
             found.append((more, fields[field], _NAMES[field]))
+    if "hysteresis_n" in fields and law.losses.hysteresis_n == 0.0:
+        for width in _WIDTHS:
+            more = dataclasses.replace(law, hysteresis_n=_LITTLE, hysteresis_width=width)
+            found.append((more, fields["hysteresis_n"], _NAMES["hysteresis_n"]))
     if "branch_share" in fields and "branch_relaxation_s" in fields:
         shares, times = law.losses.branch_share, law.losses.branch_relaxation_s
         if len(shares) < _motion.BRANCHES:

@@ -17,6 +17,7 @@ __all__ = [
     "INSTRUMENTS",
     "SENSING_LATENCY",
     "SENSING_SCALE",
+    "START_HYSTERESIS",
     "Unknowns",
     "fitted_parameters",
     "usual",
@@ -28,12 +29,13 @@ CAMERA_OFFSET = "camera.offset_m"
 CAMERA_SCALE = "camera.scale"
 SENSING_LATENCY = "sensing.latency_s"
 SENSING_SCALE = "sensing.scale"
+START_HYSTERESIS = "start.hysteresis_n"  # force at the first edge, which the loading left behind
 INSTRUMENTS = (CAMERA_LATENCY, CAMERA_OFFSET, CAMERA_SCALE, SENSING_LATENCY, SENSING_SCALE)
 _SCALES = {CAMERA_SCALE, SENSING_SCALE}  # 1 where they are not estimated; 0 for the others
 # how far a start value may be off: of a logarithm, or in the unit
 _WIDTH = 0.4
 _WIDTHS = {CAMERA_LATENCY: 2e-3, CAMERA_OFFSET: 1e-3, CAMERA_SCALE: 1e-3, SENSING_LATENCY: 2e-3,
-           SENSING_SCALE: 0.05}  # fmt: skip
+           SENSING_SCALE: 0.05, START_HYSTERESIS: 0.1}  # fmt: skip
 _INERTIA_WIDTH = 0.1  # of the mass
 
 
@@ -41,7 +43,7 @@ def fitted_parameters(law: ActuatorLaw) -> dict[str, float]:
     """Parameters of a law that a joint fit estimates, with their present values.
 
     A parameter of 0 switches its effect off and stays 0; so do the time constants of branches and
-    charge without a share.
+    charge without a share, and the width of a hysteresis without a force.
 
     Args:
         law: to start from.
@@ -66,8 +68,13 @@ def fitted_parameters(law: ActuatorLaw) -> dict[str, float]:
 
 
 def _shares_of(name: str) -> tuple[str, ...]:
-    """The share without which a time constant has no effect."""
-    return (name.replace("relaxation_s", "share"), name.replace("relaxation_s", "relaxation_share"))
+    """The share or force without which a time constant or width has no effect."""
+    return (
+        name.replace("relaxation_s", "share"),
+        name.replace("relaxation_s", "relaxation_share"),
+        name.replace("hysteresis.width", "hysteresis.force_n"),
+        name.replace("hysteresis_width", "hysteresis_n"),
+    )
 
 
 def usual(name: str) -> float:
@@ -84,7 +91,8 @@ class Unknowns:
 
     Args:
         law: to start from; parameters that are not estimated stay those of this law.
-        names: of the parameters of the law, of `ADDED_INERTIA` and of `INSTRUMENTS`.
+        names: of the parameters of the law, of `ADDED_INERTIA`, of `INSTRUMENTS` and, with
+            hysteresis, of `START_HYSTERESIS`.
         values: in their units. Shape `(P,)`.
         mass_kg: hung mass, the scale of an added inertia.
     """
@@ -98,14 +106,16 @@ class Unknowns:
     def of(cls, law: ActuatorLaw, *, added_inertia_kg: float, mass_kg: float) -> Unknowns:
         """All numbers that can be estimated for a law."""
         values = fitted_parameters(law)
-        names = (*values, ADDED_INERTIA, *INSTRUMENTS)
-        start = [*values.values(), added_inertia_kg, *map(usual, INSTRUMENTS)]
+        more = (START_HYSTERESIS,) if law.losses.hysteresis_n > 0.0 else ()
+        names = (*values, ADDED_INERTIA, *INSTRUMENTS, *more)
+        start = [*values.values(), added_inertia_kg, *map(usual, (*INSTRUMENTS, *more))]
         return cls(law, names, np.array(start, dtype=np.float64), mass_kg)
 
     @property
     def law_names(self) -> tuple[str, ...]:
         """Those of which the motion depends, in order; they come first."""
-        return tuple(name for name in self.names if name not in INSTRUMENTS)
+        others = (*INSTRUMENTS, START_HYSTERESIS)
+        return tuple(name for name in self.names if name not in others)
 
     @property
     def _scales(self) -> Scales:

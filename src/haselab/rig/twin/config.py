@@ -20,16 +20,18 @@ __all__ = [
     "Amplifier",
     "Dielectric",
     "Electrodes",
+    "Hysteresis",
     "Load",
     "Mullins",
     "Origin",
     "Shell",
     "TwinConfig",
+    "Unmodelled",
     "Viscosity",
     "twin_of_reading",
 ]
 
-_PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "dielectric")
+_PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "hysteresis", "dielectric")
 
 
 class Shell(Section):
@@ -72,6 +74,31 @@ class Mullins(Section):
     share: float = Field(0.06, ge=0, lt=2)
     stretch: float = Field(1.45, gt=1, lt=5, description="where half of it is lost, over free")
     width: float = Field(0.02, gt=0.001, lt=1)
+
+
+class Hysteresis(Section):
+    """Rate-independent hysteresis: a force that follows each reversal of the length."""
+
+    force_n: float = Field(0.0, ge=0, lt=1e3, description="largest force of it, 0: off")
+    width: float = Field(0.02, gt=1e-4, lt=1, description="stretch within which it reverses")
+
+
+class Unmodelled(Section):
+    """Effects that no actuator law has; each is off by default. Times count from the start."""
+
+    capacitance_rise: float = Field(
+        0.0, gt=-0.5, lt=0.5, description="relative rise of the permittivity as the bench warms up"
+    )
+    warming_s: float = Field(600.0, gt=0, description="time constant of that")
+    stiffness_loss: float = Field(
+        0.0, ge=0, lt=0.5, description="share of the elastic force that ageing takes away"
+    )
+    ageing_s: float = Field(600.0, gt=0, description="time constant of that")
+    resonance_mass_kg: float = Field(
+        0.0, ge=0, lt=20, description="mass on a spring at the moving end, 0: off"
+    )
+    resonance_hz: float = Field(12.0, gt=0.1, lt=200, description="its natural frequency")
+    resonance_damping_ratio: float = Field(0.05, gt=0, lt=1)
 
 
 class Load(Section):
@@ -176,11 +203,13 @@ class TwinConfig(Section):
     electrodes: Electrodes = Electrodes()
     viscosity: Viscosity = Viscosity()
     mullins: Mullins = Mullins()
+    hysteresis: Hysteresis = Hysteresis()
     load: Load = Load()
     dielectric: Dielectric = Dielectric()
     amplifier: Amplifier = Amplifier()
     acquisition: AcquisitionConfig = AcquisitionConfig()
     camera: TwinCameraConfig = TwinCameraConfig()
+    unmodelled: Unmodelled = Unmodelled()
     origin: Origin | None = None
 
     @model_validator(mode="after")

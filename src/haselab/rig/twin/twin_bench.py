@@ -66,8 +66,8 @@ def native_bench(
 
 
 def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:
-    """Parameters of generator, amplifier, monitors and converters."""
-    daq, amplifier = config.acquisition, config.amplifier
+    """Parameters of generator, amplifier, monitors, converters and of what no law has."""
+    daq, amplifier, extra = config.acquisition, config.amplifier, config.unmodelled
     return {
         "carrier_v": 0.0,
         "carrier_rad_s": 0.0,
@@ -88,6 +88,13 @@ def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:
         "lsb_v": 2.0 * daq.range_v / 2**daq.bits,
         "v_noise_v": daq.v_noise_v if noise else 0.0,
         "i_noise_v": daq.i_noise_v if noise else 0.0,
+        "capacitance_rise": extra.capacitance_rise,
+        "warming_s": extra.warming_s,
+        "stiffness_loss": extra.stiffness_loss,
+        "ageing_s": extra.ageing_s,
+        "second_kg": extra.resonance_mass_kg,
+        "second_rad_s": 2.0 * math.pi * extra.resonance_hz,
+        "second_damping": extra.resonance_damping_ratio,
     }
 
 

@@ -55,7 +55,8 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     """Fit the load as a function of the elongation of the whole actuator.
 
     Stretch counts from the free length, where the shell itself is stretched by 1/sqrt(lateral).
-    Only a planar HASEL has that shell; for other kinds there are no results S16.
+    Only a planar HASEL has that shell; for other kinds there are no results S16, nor where the fit
+    of its law has none.
 
     Args:
         seen: the static load test.
@@ -64,7 +65,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     Returns:
         Results S16 and S17, data for figure 4.
     Raises:
-        ResultError: fewer than seven loads, or the law of the shell could not be fitted.
+        ResultError: fewer than seven loads.
     Source: reference study, rows S16 and S17.
     """
     masses_kg = np.unique(seen.mass_kg)
@@ -78,7 +79,12 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
     load_n = masses_kg * GRAVITY_M_S2
     free_length_m = float(length_m[0])
     stretch = length_m / free_length_m
-    shell = _fit_shell(stretch, load_n, rig) if rig.actuator_kind == PLANAR_HASEL else None
+    shell, left_out = None, ""
+    if rig.actuator_kind == PLANAR_HASEL:
+        try:
+            shell = _fit_shell(stretch, load_n, rig)
+        except ResultError as error:
+            left_out = str(error)
     regions = find_regions(stretch, load_n, pieces=study.static_load.pieces)
     chosen = regions.regions[regions.chosen]
     finest = POSITION_PX * rig.scale_m_per_px / free_length_m
@@ -100,6 +106,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
                 "stretch_std": spread_m / free_length_m,
                 "load_n": load_n,
                 **({} if shell is None else shell.curve),
+                **({"left_out": left_out} if left_out else {}),
                 "regions": [
                     {
                         "stretch": [r.low.value, r.high.value],
@@ -138,7 +145,7 @@ def _fit_shell(stretch: Floats, load_n: Floats, rig: RigDescription) -> _Shell:
         electrode_stiffening=True,
     )
     if not law.succeeded:
-        raise ResultError(f"Static load test: {law.status}")
+        raise ResultError(f"the shell's law has {law.status}.")
     grid = np.linspace(1.0, stretch[-1], 150)
     found = law.best.parameters
     return _Shell(

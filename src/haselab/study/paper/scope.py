@@ -68,6 +68,8 @@ def _reason(key: str, figures: Mapping[str, Any], study: Study) -> str:
             section = figures.get(name)
             reason = section.get("left_out") if isinstance(section, Mapping) else ""
             return str(reason or "not played")
+    if row == "S16" and (left_out := figures.get("static", {}).get("left_out")):
+        return str(left_out)
     for setting, keys in _COUNTED.items():
         if key in keys and study.has("steps") and not getattr(study.steps, setting):
             return f"steps.{setting} is 0 in this study."

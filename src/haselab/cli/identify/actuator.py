@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -73,9 +74,17 @@ def law_of_section(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
 
 
 def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
-    """`[model.physical]`: estimates with their covariance."""
+    """`[model.physical]`: estimates with their covariance, and the noise of the records."""
     finite = np.isfinite(np.diag(fit.covariance))
     names = [name for name, known in zip(fit.parameters, finite, strict=True) if known]
+    noise = {
+        "length_noise_m": fit.length_noise_m,
+        "length_rms_m": fit.length_rms_m,
+        "length_factor": fit.length_factor,
+        "capacitance_noise_f": fit.capacitance_noise_f,
+        "capacitance_rms_f": fit.capacitance_rms_f,
+        "capacitance_factor": fit.capacitance_factor,
+    }
     return {
         "kind": fit.kind,
         "status": fit.status,
@@ -84,4 +93,5 @@ def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
         "std": {name: estimate.std for name, estimate in fit.parameters.items()},
         "not_identifiable": list(fit.not_identifiable),
         "covariance": {"names": names, "matrix": fit.covariance[np.ix_(finite, finite)].tolist()},
+        "residuals": {key: value for key, value in noise.items() if math.isfinite(value)},
     }

@@ -71,6 +71,8 @@ class ActuatorFit(Fit):
         capacitance_rms_f: of those of the capacitances.
         length_noise_m: from differences of neighbours, which a slow misfit does not change.
         capacitance_noise_f: likewise.
+        length_factor: true over stated standard deviation of the noise of the lengths.
+        capacitance_factor: the same of the capacitances.
         evaluations: of the model, until it was found.
         chi_squared_ratio: mean square of the residuals over their standard deviations.
         residual_whiteness_p: probability of the less probable channel under white noise.
@@ -88,6 +90,8 @@ class ActuatorFit(Fit):
     capacitance_rms_f: float = float("nan")
     length_noise_m: float = float("nan")
     capacitance_noise_f: float = float("nan")
+    length_factor: float = float("nan")
+    capacitance_factor: float = float("nan")
     evaluations: int = 0
     chi_squared_ratio: float = float("nan")
     residual_whiteness_p: float = float("nan")
@@ -351,6 +355,8 @@ def _result(
         length_noise_m=std_m * length_noise,
         capacitance_rms_f=std_f * _rms(capacitances),
         capacitance_noise_f=std_f * capacitance_noise,
+        length_factor=misfit.length_factor * length_noise,
+        capacitance_factor=misfit.capacitance_factor * capacitance_noise,
         residual_whiteness_p=seen.whiteness_p,
         law=law,
         kind=law.kind,

@@ -29,6 +29,7 @@ __all__ = [
     "ModelSection",
     "PhysicalCovariance",
     "PhysicalTable",
+    "ResidualTable",
     "SensingSection",
     "StrainMapTable",
     "VoltageMapTable",
@@ -226,6 +227,17 @@ class PhysicalCovariance(_Section):
         return self
 
 
+class ResidualTable(_Section):
+    """`[model.physical.residuals]`: noise of the records of the fit, and what the model left."""
+
+    length_noise_m: Annotated[Number, Field(ge=0)] | None = None
+    length_rms_m: Annotated[Number, Field(ge=0)] | None = None
+    length_factor: _Positive | None = None  # true over stated standard deviation of the noise
+    capacitance_noise_f: Annotated[Number, Field(ge=0)] | None = None
+    capacitance_rms_f: Annotated[Number, Field(ge=0)] | None = None
+    capacitance_factor: _Positive | None = None
+
+
 class PhysicalTable(_Section):
     """`[model.physical]`: the physical model that `identify actuator` writes."""
 
@@ -238,6 +250,7 @@ class PhysicalTable(_Section):
     std: Annotated[dict[str, float], BeforeValidator(_by_full_name)] = {}
     not_identifiable: tuple[str, ...] = ()
     covariance: PhysicalCovariance | None = None
+    residuals: ResidualTable = ResidualTable()
 
 
 class ModelSection(_Section):

@@ -1,0 +1,70 @@
+"""A table of voltage and length, or capacitance, as one motion that a physical model predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.actuators import GRAVITY_M_S2, Drive
+from haselab.base import InputError
+from haselab.identify.physical import MotionRecord
+
+__all__ = ["motion_of_table"]
+
+Floats = NDArray[np.float64]
+
+
+def motion_of_table(
+    name: str,
+    time_s: Floats,
+    voltage_v: Floats,
+    *,
+    mass_kg: float,
+    length_m: Floats | None = None,
+    capacitance_f: Floats | None = None,
+    std: float,
+) -> MotionRecord:
+    """Make a motion of the samples of a table.
+
+    Each voltage acts from its time to the next one, and what was measured belongs to the same time.
+    Before the first row, the actuator has been at rest under the first voltage.
+
+    Args:
+        name: for messages; the one experiment is called so, too.
+        time_s: of the rows, rising. Shape `(N,)`.
+        voltage_v: of the actuator. Shape `(N,)`.
+        mass_kg: that hangs.
+        length_m: measured; None: it was not. Shape `(N,)`.
+        capacitance_f: likewise. Shape `(N,)`.
+        std: standard deviation of the measured values, in m or F.
+    Returns:
+        The motion.
+    Raises:
+        InputError: Fewer than 2 rows, times that do not rise, or nothing measured.
+    """
+    if time_s.size < 2 or not (np.diff(time_s) > 0.0).all():
+        raise InputError(
+            f"{name} has {time_s.size} rows whose times must rise. Sort it, and remove repeated "
+            "times."
+        )
+    count = time_s.size
+    step_s = np.diff(time_s)
+    edge_s = np.append(time_s, time_s[-1] + step_s[-1])
+    drive = Drive(
+        edge_s, voltage_v, np.full(count, mass_kg * GRAVITY_M_S2), np.full(count, mass_kg),
+        np.zeros(count),
+    )  # fmt: skip
+    no, none = np.zeros(0), np.zeros(0, dtype=np.int64)
+    rows = np.arange(count)
+    lengths = (time_s, length_m, np.full(count, std), np.zeros(count, dtype=np.int64))
+    if length_m is None:
+        lengths = (no, no, no, none)
+    sensed = (rows, rows, capacitance_f, np.full(count, std))
+    if capacitance_f is None:
+        sensed = (none, none, no, no)
+    return MotionRecord(
+        name, drive, lengths[0], lengths[1], lengths[2], *sensed, (name,), lengths[3],
+        np.zeros(sensed[2].size, dtype=np.int64),
+        # the mean over an interval belongs to its middle, the row to its beginning
+        capacitance_later_s=-0.5 * np.append(step_s, step_s[-1])[: sensed[2].size],
+    )  # fmt: skip

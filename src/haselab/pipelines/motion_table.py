@@ -55,16 +55,13 @@ def motion_of_table(
         np.zeros(count),
     )  # fmt: skip
     no, none = np.zeros(0), np.zeros(0, dtype=np.int64)
-    rows = np.arange(count)
-    lengths = (time_s, length_m, np.full(count, std), np.zeros(count, dtype=np.int64))
-    if length_m is None:
-        lengths = (no, no, no, none)
-    sensed = (rows, rows, capacitance_f, np.full(count, std))
-    if capacitance_f is None:
-        sensed = (none, none, no, no)
+    rows, stds = np.arange(count), np.full(count, std)
+    frames, length_m = (no, no) if length_m is None else (time_s, length_m)
+    window, capacitance_f = (none, no) if capacitance_f is None else (rows, capacitance_f)
+    sizes = frames.size, window.size
     return MotionRecord(
-        name, drive, lengths[0], lengths[1], lengths[2], *sensed, (name,), lengths[3],
-        np.zeros(sensed[2].size, dtype=np.int64),
+        name, drive, frames, length_m, stds[: sizes[0]], window, window, capacitance_f,
+        stds[: sizes[1]], (name,), np.zeros(sizes[0], np.int64), np.zeros(sizes[1], np.int64),
         # the mean over an interval belongs to its middle, the row to its beginning
-        capacitance_later_s=-0.5 * np.append(step_s, step_s[-1])[: sensed[2].size],
+        capacitance_later_s=-0.5 * np.append(step_s, step_s[-1])[: sizes[1]],
     )  # fmt: skip

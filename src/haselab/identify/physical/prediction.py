@@ -20,6 +20,7 @@ from haselab.actuators import ActuatorLaw, with_parameters
 from haselab.base import InputError, LimitError, ResultError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.base.estimate import Z95
+from haselab.identify.physical.fit import ActuatorFit
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, SHARED_PX, modelled
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Unknowns
@@ -124,6 +125,27 @@ class IdentifiedModel:
         covariance[np.ix_(at, at)] = 0.5 * (matrix + matrix.T)
         return cls(
             unknowns, covariance, length or ChannelNoise(), capacitance or ChannelNoise()
+        )  # fmt: skip
+
+    @classmethod
+    def of_fit(cls, fit: ActuatorFit) -> IdentifiedModel:
+        """The model of a fit.
+
+        Args:
+            fit: of other records.
+        Returns:
+            The model.
+        Raises:
+            ResultError: the fit has no result.
+        """
+        unknowns = fit.unknowns()
+        return cls(
+            unknowns,
+            fit.covariance,
+            ChannelNoise(fit.length_factor, fit.length_noise_m, fit.length_rms_m),
+            ChannelNoise(
+                fit.capacitance_factor, fit.capacitance_noise_f, fit.capacitance_rms_f
+            ),
         )  # fmt: skip
 
     @property
@@ -327,7 +349,7 @@ def predict_motion(
     spread = model.covariance[np.ix_(known, known)] / np.outer(slopes[known], slopes[known])
 
     def std_of(by: Floats) -> Floats:
-        return np.sqrt(np.maximum(((by @ spread) * by).sum(axis=1), 0.0))
+        return np.asarray(np.sqrt(np.maximum(((by @ spread) * by).sum(axis=1), 0.0)))
 
     pixel_m = SHARED_PX * record.pixel_m
     noise_m = np.hypot(model.length.factor * record.length_std_m, pixel_m)

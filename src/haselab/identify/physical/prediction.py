@@ -5,7 +5,8 @@ noise $\sigma$ of the measured ones, the 95 % band is
 
 $\pm 1.96 \sqrt{\mathrm{diag}(J S J^\top) + \sigma^2}$
 
-Correlated parameters matter: their errors can be large and still cancel in what is predicted.
+Correlated parameters matter: their errors can be large and still cancel in what is predicted. The
+tracker finds the marks of each session anew, so all lengths of a session share an error of 2 µm.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ _INSIDE = 0.9  # of the values of a channel, below which the band does not hold
 _PART_INSIDE = 0.8  # the same of one experiment, whose values share an error of the parameters
 _FEW = 20  # values of an experiment that are too few to judge it
 _MOST_POINTS = 4000  # of a curve in a chart
+_SESSION_OFFSET_M = 2e-6  # by which tracks of 0.02 px move the zero from one session to the next
 _MATTERS = 0.5  # of the noise: effect of a parameter without a standard deviation
 
 
@@ -165,7 +167,8 @@ class PredictedPart:
         measured: in m or F. Shape `(M,)`.
         predicted: likewise. Shape `(M,)`.
         std: of measured minus predicted: of the parameters and of the noise. Shape `(M,)`.
-        parameter_std: the part of it that the parameters cause. Shape `(M,)`.
+        parameter_std: the part of it that the parameters cause, and of a length, the error that
+            all lengths of a session share. Shape `(M,)`.
     """
 
     experiment: str
@@ -361,15 +364,15 @@ def predict_motion(
               if not experiments or name in experiments]  # fmt: skip
     frames = np.isin(record.length_experiment, wanted)
     length_by, offset_m = found.length_by, 0.0
+    zero_m = 0.0 if free_offset else _SESSION_OFFSET_M
     if free_offset and frames.any():
         weights = np.where(frames, noise_m**-2.0, 0.0)
         weights /= weights.sum()
         offset_m = float(weights @ (record.length_m - found.length_m))
         found = replace(found, length_m=found.length_m + offset_m)
         length_by = length_by - weights @ length_by
-    length_std, capacitance_std = (
-        std_of(length_by[:, known]), std_of(found.capacitance_by[:, known])
-    )  # fmt: skip
+    length_std = np.hypot(std_of(length_by[:, known]), zero_m)
+    capacitance_std = std_of(found.capacitance_by[:, known])
     idle = np.flatnonzero(~known)
     effects = np.vstack([
         length_by[np.ix_(frames, idle)] / noise_m[frames, None],

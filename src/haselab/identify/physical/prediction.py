@@ -29,9 +29,8 @@ from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Un
 __all__ = ["ChannelNoise", "IdentifiedModel", "MotionPrediction", "PredictedPart", "predict_motion"]
 
 Floats = NDArray[np.float64]
-_INSIDE = 0.9  # of the values of a channel, below which the band does not hold
-_PART_INSIDE = 0.8  # the same of one experiment, whose values share an error of the parameters
-_FEW = 20  # values of an experiment that are too few to judge it
+_FAR = 3.5  # standard deviations of an error that all values share, beyond which it is no chance
+_NOISE_OFF = 0.1  # relative error of the stated variance of the noise
 _MOST_POINTS = 4000  # of a curve in a chart
 _SESSION_OFFSET_M = 2e-6  # by which tracks of 0.02 px move the zero from one session to the next
 _MATTERS = 0.5  # of the noise: effect of a parameter without a standard deviation
@@ -200,6 +199,19 @@ class PredictedPart:
         return float(np.mean(np.abs(self.error) <= Z95 * self.std))
 
     @property
+    def is_outside(self) -> bool:
+        r"""Whether the error is larger than its standard deviation explains.
+
+        With the share $\rho$ of the variance that the parameters cause, the mean of
+        $(e/\sigma)^2$ is $1-\rho$ by the noise and $\rho k^2$ by an error of k standard deviations
+        that all values share.
+        """
+        found = float(np.mean((self.error / self.std) ** 2))
+        share = float(np.mean((self.parameter_std / self.std) ** 2))
+        chance = _FAR * np.sqrt(2.0 / self.error.size)
+        return found > (1.0 - share) * (1.0 + _NOISE_OFF + chance) + share * _FAR**2
+
+    @property
     def span(self) -> float:
         """Range of the measured values."""
         return float(np.ptp(self.measured))
@@ -246,9 +258,8 @@ class MotionPrediction:
 
     @property
     def outside(self) -> tuple[PredictedPart, ...]:
-        """Experiments whose error is larger than the band."""
-        return tuple(part for part in self.parts
-                     if part.time_s.size >= _FEW and part.inside_band < _PART_INSIDE)  # fmt: skip
+        """Experiments whose error is larger than its standard deviation explains."""
+        return tuple(part for part in self.parts if part.is_outside)
 
     @property
     def status(self) -> str:
@@ -259,21 +270,21 @@ class MotionPrediction:
                 "determine. Identify the actuator from records that do"
             )
         for part in self.all_parts:
-            if part.rms_error > part.std.max() and part.fit_percent < 0.0:
+            if part.is_outside and part.fit_percent < 0.0:
                 return (
                     f"the predicted {part.channel} is worse than the mean of the record. Check the "
                     "voltage, its unit, the mass and that this is the actuator of the model"
                 )
-        few = [part for part in self.all_parts if part.inside_band < _INSIDE]
-        worst = min(few or self.outside, key=lambda part: part.inside_band, default=None)
+        whole = [part for part in self.all_parts if part.is_outside]
+        worst = min(self.outside or whole, key=lambda part: part.inside_band, default=None)
         if worst is None:
             return "ok"
-        names = [part.experiment for part in self.outside if part.channel == worst.channel]
-        where = f" (experiments {', '.join(names)})" if any(names) else ""
+        where = f" of {worst.experiment}" if worst.experiment else ""
         return (
-            f"model error: only {100.0 * worst.inside_band:.0f} % of the {worst.channel} values "
-            f"are inside the 95 % band{where}. Identify the actuator from records of such drives "
-            "and loads too"
+            f"model error: only {100.0 * worst.inside_band:.0f} % of the {worst.channel} values"
+            f"{where} are inside the 95 % band ({len(self.outside)} of {len(self.parts)} "
+            "experiments and channels have a larger error than it explains). Identify the actuator "
+            "from records of such drives and loads too"
         )
 
     def chart(self, title: str) -> Chart:

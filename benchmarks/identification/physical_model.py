@@ -37,6 +37,7 @@ from benchmarks.identification.physical_twins import (
 from benchmarks.rows import Row
 from haselab.actuators import ActuatorLaw, PlanarHasel, SampledLaw, with_parameters
 from haselab.base import HaselabError
+from haselab.base.estimate import Z95
 from haselab.identify.physical import ActuatorFit, MotionRecord, fit_actuator
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.unknowns import (
@@ -128,10 +129,11 @@ def summary_of(fit: ActuatorFit, truth: dict[str, float]) -> dict[str, Any]:
     """What is kept of a fit."""
     z, inside = {}, {}
     for name, found in fit.parameters.items():
-        if name in NOT_JUDGED or name in fit.not_identifiable or not found.std:
+        if name in NOT_JUDGED or name in fit.not_identifiable or name not in truth:
             continue
         low, high = found.ci95
-        z[name] = (found.value - truth[name]) / found.std
+        half = found.value - low if truth[name] < found.value else high - found.value
+        z[name] = Z95 * (found.value - truth[name]) / half
         inside[name] = bool(low <= truth[name] <= high)
     return {
         "status": fit.status,

@@ -47,6 +47,23 @@ class Estimate:
         low, high = sorted((value / factor, value * factor))
         return cls(value, abs(value) * relative_std, (low, high), unit)
 
+    @classmethod
+    def inverse_square(
+        cls, value: float, relative_std: float, unit: str, largest: float
+    ) -> Estimate:
+        """Estimate of a positive quantity whose inverse square has a normal error.
+
+        Args:
+            value: best value.
+            relative_std: standard deviation of the quantity over its value, for small errors.
+            unit: of both.
+            largest: upper end of the interval where the inverse square may as well be 0.
+        """
+        spread = 2.0 * Z95 * float(relative_std)
+        high = value / math.sqrt(1.0 - spread) if spread < 1.0 else math.inf
+        ends = value / math.sqrt(1.0 + spread), max(min(high, largest), value)
+        return cls(float(value), value * relative_std, ends, unit)
+
     def scaled(self, factor: float, unit: str) -> Estimate:
         """Multiply by an exactly known factor, in another unit."""
         low, high = sorted((self.ci95[0] * factor, self.ci95[1] * factor))

@@ -217,12 +217,16 @@ def fit_actuator(
     misfit, found = _weighed(
         Misfit(records, known=known, strict=True), start.at(found.unknowns), found
     )
+    anew = _from_start(misfit, start, found)
+    if anew is not None and anew is not found:
+        misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
     rejected = []
     for _ in range(_MOST_ADDED):
         better = richer(misfit, found)
         if better is None:
             break
         again = refine(misfit, better.start, found.evaluations)
+        again = _from_start(misfit, better.start.at(start), again)
         if again is None or _rms([again.residuals]) > _rms([found.residuals]):
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
@@ -254,6 +258,17 @@ def _ordered(found: Found) -> Found:
         jacobian=found.jacobian[:, moved],
         left=found.left[moved],
     )
+
+
+def _from_start(misfit: Misfit, start: Unknowns, found: Found | None) -> Found | None:
+    """The better of what was found without convergence and a new search; under the noise that it
+    left, the first stages go gentler ways."""
+    if found is not None and found.converged:
+        return found
+    anew = search(misfit, start, 0 if found is None else found.evaluations)
+    if found is None or (anew is not None and _rms([anew.residuals]) < _rms([found.residuals])):
+        return anew
+    return found
 
 
 def _weighed(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Misfit, Found]:
@@ -323,7 +338,8 @@ def _result(
         )  # fmt: skip
         covariance = widened(covariance, hidden_std(found.jacobian, energy))
     std = np.sqrt(np.diag(covariance))
-    units = {about.key: about.unit for about in unknowns.law.described()}
+    described = {about.key: about for about in unknowns.law.described()}
+    units = {key: about.unit for key, about in described.items()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
               "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": "",
               START_HYSTERESIS: "N"}  # fmt: skip
@@ -337,7 +353,11 @@ def _result(
             share = std[k] * abs(slopes[k]) / unknowns.values[k]
             if share > _WEAK or not np.abs(found.jacobian[:, k]).any():
                 weak.append(name)
-            parameters[name] = Estimate.lognormal(unknowns.values[k], share, unit)
+            parameters[name] = (
+                Estimate.inverse_square(unknowns.values[k], share, unit, described[name].high)
+                if unknowns.by_inverse_square[k]
+                else Estimate.lognormal(unknowns.values[k], share, unit)
+            )
         else:
             parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
     std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])

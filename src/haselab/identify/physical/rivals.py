@@ -179,7 +179,8 @@ def _candidates(law: ActuatorLaw, duration_s: float) -> list[tuple[ActuatorLaw, 
             found.append((more, fields[field], _NAMES[field]))
     if "hysteresis_n" in fields and law.losses.hysteresis_n == 0.0:
         for width in _WIDTHS:
-            more = dataclasses.replace(law, hysteresis_n=_LITTLE, hysteresis_width=width)
+            little = {"hysteresis_n": _LITTLE, "hysteresis_width": width}
+            more = dataclasses.replace(law, **little)
             found.append((more, fields["hysteresis_n"], _NAMES["hysteresis_n"]))
     if "branch_share" in fields and "branch_relaxation_s" in fields:
         shares, times = law.losses.branch_share, law.losses.branch_relaxation_s

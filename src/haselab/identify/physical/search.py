@@ -14,8 +14,8 @@ from haselab.identify.physical.unknowns import Unknowns
 __all__ = ["Found", "refine", "search"]
 
 Floats = NDArray[np.float64]
-_STAGES = 3  # before the last one; in each, the noise is assumed a tenth of that before
-_FIRST_SHARE = 0.3  # of the signals' spread: noise of the first stage
+_STAGES = 4  # before the last one; in each, the noise is assumed a tenth of that before
+_FIRST_SHARE = 3.0  # of the signals' spread: noise of the first stage
 _STEPS = 20  # of one stage
 _LAST_STEPS = 40
 _BEND = 3.0  # standard deviations from which a residual counts less, while the start counts
@@ -30,6 +30,7 @@ _GLIMPSE = 0.1  # of a step, where the second order is measured
 _ENOUGH = 1e-3  # relative decrease to be expected that ends a stage
 _NEAR = 4.0  # decrease to be expected, in the same, above which nothing was found
 _DONE = 1e-2  # the same of the last one, in the mean square of the residuals
+_VAGUE = 10.0  # widths of the start in the last stage: a share of 0.1 may be 0.002 as well
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Found:
     evaluations: int
 
 
-def search(misfit: Misfit, start: Unknowns) -> Found | None:
+def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | None:
     """Minimise the misfit: first smoothly near the start, then by the data alone.
 
     A path of growing confidence in the data: in each stage the noise is assumed ten times smaller,
@@ -62,11 +63,13 @@ def search(misfit: Misfit, start: Unknowns) -> Found | None:
     the strongly curved valley of the last stage is entered near its floor. Parts of the records
     that the model misses altogether, such as a collapse that the start predicts, count little
     there; if much of the records remains so after the first stage, another start is drawn within
-    the widths. The last stage is Levenberg-Marquardt without the start.
+    the widths. In the last stage, Levenberg-Marquardt, the start counts with ten times the widths:
+    too little to move what the data determine, enough to end the search for what they do not.
 
     Args:
         misfit: to minimise.
         start: first values.
+        evaluations: of the model, made before.
     Returns:
         What was found; None if no motion exists near the start.
     """
@@ -78,8 +81,7 @@ def search(misfit: Misfit, start: Unknowns) -> Found | None:
         noise = max(1.0, 0.1 * noise)
         now, used = _descend(misfit, now, start, noise, _STEPS)
         count += used
-    now, used = _descend(misfit, now, None, 1.0, _LAST_STEPS)
-    return _found(now, count + used)
+    return _last_stage(misfit, now, start, evaluations + count)
 
 
 def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | None:
@@ -95,19 +97,21 @@ def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | Non
     first = misfit.linearised(start)
     if first is None:
         return None
-    now = _State(start, *first)
-    now, used = _descend(misfit, now, None, 1.0, _LAST_STEPS)
-    return _found(now, evaluations + used + 1)
+    return _last_stage(misfit, _State(start, *first), start, evaluations + 1)
 
 
-def _found(now: _State, evaluations: int) -> Found:
-    scale = np.maximum(np.linalg.norm(now.jacobian, axis=0), 1e-150)
-    left = np.linalg.lstsq(now.jacobian / scale, now.residuals, rcond=1e-12)[0]
-    expected = float(np.sum((now.jacobian @ (left / scale)) ** 2))
+def _last_stage(misfit: Misfit, now: _State, start: Unknowns, evaluations: int) -> Found:
+    now, used = _descend(misfit, now, start, 1.0, _LAST_STEPS, last=True)
+    pull = 1.0 / (_VAGUE * now.unknowns.widths)
+    jacobian = np.vstack([now.jacobian, np.diag(pull)])
+    rest = np.concatenate([now.residuals, -pull * now.unknowns.distance(start)])
+    scale = np.linalg.norm(jacobian, axis=0)
+    left = np.linalg.lstsq(jacobian / scale, rest, rcond=1e-12)[0] / scale
+    expected = float(np.sum((jacobian @ left) ** 2))
     usual = float(np.mean(now.residuals**2))
     return Found(
-        now.unknowns, now.residuals, now.jacobian, left / scale,
-        expected < _NEAR * max(1.0, usual), evaluations,
+        now.unknowns, now.residuals, now.jacobian, left,
+        expected < _NEAR * max(1.0, usual), evaluations + used,
     )  # fmt: skip
 
 
@@ -163,34 +167,30 @@ class _State:
 
 
 def _descend(
-    misfit: Misfit, now: _State, start: Unknowns | None, noise: float, most: int
+    misfit: Misfit, now: _State, start: Unknowns, noise: float, most: int, *, last: bool = False
 ) -> tuple[_State, int]:
     """One stage: state, evaluations used."""
     widths = now.unknowns.widths
-    pull = np.zeros(widths.size) if start is None else 1.0 / widths**2
+    pull = 1.0 / ((_VAGUE if last else 1.0) * widths) ** 2
 
     def cost_of(unknowns: Unknowns, residuals: Floats) -> float:
-        if start is None:
-            return float(residuals @ residuals)
         away = float((pull * unknowns.distance(start) ** 2).sum())
-        return _bounded(residuals, noise) + away
+        return away + (float(residuals @ residuals) if last else _bounded(residuals, noise))
 
-    damping = _DAMPING if start is None else _FIRST_DAMPING
+    damping = _DAMPING if last else _FIRST_DAMPING
     cost, count = cost_of(now.unknowns, now.residuals), 0
     for _ in range(most):
         weights = np.ones(now.residuals.size)
-        if start is not None:
+        if not last:
             weights = 1.0 / (noise**2 + (now.residuals / _BEND) ** 2)
         weighed = now.jacobian * weights[:, None]
         normal = weighed.T @ now.jacobian + np.diag(pull)
-        slope = weighed.T @ now.residuals
-        if start is not None:
-            slope = slope - pull * now.unknowns.distance(start)
+        slope = weighed.T @ now.residuals - pull * now.unknowns.distance(start)
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         correlation, slope = normal / np.outer(scale, scale), slope / scale
         left = float(slope @ np.linalg.lstsq(correlation, slope, rcond=1e-15)[0])
         done = _DONE * max(1.0, cost / now.residuals.size)
-        if left < (done if start is None else max(_ENOUGH * cost, 1.0)):
+        if left < (done if last else max(_ENOUGH * cost, 1.0)):
             return now, count
         better: tuple[Unknowns, float] | None = None
         while better is None and damping < 1e6:

@@ -32,8 +32,9 @@ SENSING_SCALE = "sensing.scale"
 START_HYSTERESIS = "start.hysteresis_n"  # force at the first edge, which the loading left behind
 INSTRUMENTS = (CAMERA_LATENCY, CAMERA_OFFSET, CAMERA_SCALE, SENSING_LATENCY, SENSING_SCALE)
 _SCALES = {CAMERA_SCALE, SENSING_SCALE}  # 1 where they are not estimated; 0 for the others
-# how far a start value may be off: of a logarithm, or in the unit
+# how far a start value may be off: over its distance from its lower bound, or in the unit
 _WIDTH = 0.4
+_LEAST_WIDTH = 0.02
 _WIDTHS = {CAMERA_LATENCY: 2e-3, CAMERA_OFFSET: 1e-3, CAMERA_SCALE: 1e-3, SENSING_LATENCY: 2e-3,
            SENSING_SCALE: 0.05, START_HYSTERESIS: 0.1}  # fmt: skip
 _INERTIA_WIDTH = 0.1  # of the mass
@@ -137,6 +138,10 @@ class Unknowns:
     def widths(self) -> Floats:
         """How far the start may be off, in what varies. Shape `(P,)`."""
         widths = {ADDED_INERTIA: _INERTIA_WIDTH * self._inertia_kg, **_WIDTHS}
+        about = {one.key: one for one in self.law.described()}
+        for name, value in zip(self.names, self.values.tolist(), strict=True):
+            if value > 0.0 and (known := about.get(name.partition("[")[0])) is not None:
+                widths[name] = max(_WIDTH * (1.0 - known.low / value), _LEAST_WIDTH)
         found = np.array([widths.get(name, _WIDTH) for name in self.names])
         inverse = self.by_inverse_square
         found[inverse] *= 2.0 / self.values[inverse] ** 2

@@ -122,12 +122,13 @@ def identified(twin: str, folder: Path, seed: int) -> Path:
     """The actuator file of a twin's quick reference study, as the commands write it."""
     run, path = folder / "study", folder / "actuator.toml"
     if not path.exists():
-        config = config_of(twin)
-        rig = guard(make_twin(config, seed), Safety(SafetySettings()))
-        arm_simulated(rig)
-        options = RunOptions(run, seed, "none", config.model_dump(mode="json"))
-        with contextlib.suppress(ResultError):  # of a fit of the study: the recording is complete
-            run_study(builtin_study(quick=True), rig, options, SilentProgress())
+        if not run.exists():
+            config = config_of(twin)
+            rig = guard(make_twin(config, seed), Safety(SafetySettings()))
+            arm_simulated(rig)
+            options = RunOptions(run, seed, "none", config.model_dump(mode="json"))
+            with contextlib.suppress(ResultError):  # of a fit; the recording is complete
+                run_study(builtin_study(quick=True), rig, options, SilentProgress())
         draft = folder / "draft.toml"
         cli.main(["init", twin, "--out", str(draft)], standalone_mode=False)
         cli.main(

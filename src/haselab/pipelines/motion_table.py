@@ -12,6 +12,7 @@ from haselab.identify.physical import MotionRecord
 __all__ = ["motion_of_table"]
 
 Floats = NDArray[np.float64]
+_GLIMPSE = 0.01  # of the time to the next row
 
 
 def motion_of_table(
@@ -48,20 +49,22 @@ def motion_of_table(
             "times."
         )
     count = time_s.size
-    step_s = np.diff(time_s)
-    edge_s = np.append(time_s, time_s[-1] + step_s[-1])
+    step_s = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])
+    # a capacitance is the mean over an interval, so each row begins with a short one
+    glimpse_s = _GLIMPSE * step_s
+    starts_s = np.stack([time_s, time_s + glimpse_s], axis=1).ravel()
+    pairs = 2 * count
     drive = Drive(
-        edge_s, voltage_v, np.full(count, mass_kg * GRAVITY_M_S2), np.full(count, mass_kg),
-        np.zeros(count),
+        np.append(starts_s, time_s[-1] + step_s[-1]), np.repeat(voltage_v, 2),
+        np.full(pairs, mass_kg * GRAVITY_M_S2), np.full(pairs, mass_kg), np.zeros(pairs),
     )  # fmt: skip
     no, none = np.zeros(0), np.zeros(0, dtype=np.int64)
     rows, stds = np.arange(count), np.full(count, std)
     frames, length_m = (no, no) if length_m is None else (time_s, length_m)
-    window, capacitance_f = (none, no) if capacitance_f is None else (rows, capacitance_f)
-    sizes = frames.size, window.size
+    sensed, capacitance_f = (none, no) if capacitance_f is None else (rows, capacitance_f)
+    sizes = frames.size, sensed.size
     return MotionRecord(
-        name, drive, frames, length_m, stds[: sizes[0]], window, window, capacitance_f,
+        name, drive, frames, length_m, stds[: sizes[0]], 2 * sensed, sensed, capacitance_f,
         stds[: sizes[1]], (name,), np.zeros(sizes[0], np.int64), np.zeros(sizes[1], np.int64),
-        # the mean over an interval belongs to its middle, the row to its beginning
-        capacitance_later_s=-0.5 * np.append(step_s, step_s[-1])[: sizes[1]],
+        capacitance_later_s=-0.5 * glimpse_s[: sizes[1]],
     )  # fmt: skip

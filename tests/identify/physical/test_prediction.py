@@ -22,7 +22,7 @@ from haselab.identify.physical.unknowns import CAMERA_OFFSET, CAMERA_SCALE, Unkn
 MASS_KG, BLOCK_S = 0.25, 0.01
 LENGTH_STD_M, CAPACITANCE_STD_F = 4e-6, 3e-13
 TRUE = PlanarHasel()
-NOISE = ChannelNoise(1.0, LENGTH_STD_M, LENGTH_STD_M)
+NOISE = ChannelNoise(1.0, LENGTH_STD_M)
 
 
 def seen(law, seed, *, mass_kg=MASS_KG, duration_s=20.0, noise=1.0, longest_m=0.0):
@@ -136,11 +136,11 @@ def test_a_model_error_outside_the_band_is_named(name):
     assert {part.experiment for part in found.outside} == {"first", "second"}
 
 
-def test_an_error_as_large_as_in_the_records_of_the_fit_widens_the_band():
+def test_an_error_as_large_as_in_an_experiment_of_the_fit_widens_the_band():
     other = with_parameters(TRUE, {"viscosity.damping_n_s_per_m": 2.0})
     record = seen(other, 3)
     error = predict_motion(model(), record, free_offset=True).together(LENGTH).rms_error
-    noise = ChannelNoise(1.0, LENGTH_STD_M, error)
+    noise = ChannelNoise(1.0, LENGTH_STD_M, error, explained=False)
     wide = predict_motion(model(length=noise), record, free_offset=True).together(LENGTH)
     assert wide.inside_band > 0.85 and not wide.is_outside
     assert noise.model_error == pytest.approx(np.sqrt(error**2 - LENGTH_STD_M**2))

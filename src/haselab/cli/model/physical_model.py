@@ -73,27 +73,33 @@ def read_physical_model(path: Path) -> tuple[IdentifiedModel, ActuatorTables]:
         raise InputError(f"[model.physical] has no mass_kg, the hung mass of its records. {path}")
     names, left = model.covariance.names, model.residuals
     if model.status != "ok":
-        if left.length_rms_m is None and left.capacitance_rms_f is None:
+        if left.length_worst_m is None and left.capacitance_worst_f is None:
             raise InputError(
                 f"[model.physical] has the status {model.status!r}, but no residuals that say how "
                 f"large its error is. Identify the actuator again with: {again}"
             )
         click.echo(
             f"haselab: warning: [model.physical] has the status {model.status!r}. The band allows "
-            f"for an error as large as in the records of the fit. {path}",
+            f"for an error as large as in the worst experiment of the fit. {path}",
             err=True,
         )
+    matrix = np.array(model.covariance.matrix, dtype=np.float64).reshape(len(names), len(names))
+    widening = np.array(model.covariance.widening or [1.0] * len(names))
+    explained = model.status == "ok"
     try:
         law = with_parameters(ACTUATORS.find(model.kind)(), about.parameters)
         found = IdentifiedModel.of(
             law,
             model.parameters,
             names,
-            np.array(model.covariance.matrix, dtype=np.float64).reshape(len(names), len(names)),
+            matrix / np.outer(widening, widening),
             mass_kg=mass_kg,
-            length=_noise(left.length_factor, left.length_noise_m, left.length_rms_m),
+            length=_noise(left.length_factor, left.length_noise_m, left.length_worst_m, explained),
             capacitance=_noise(
-                left.capacitance_factor, left.capacitance_noise_f, left.capacitance_rms_f
+                left.capacitance_factor,
+                left.capacitance_noise_f,
+                left.capacitance_worst_f,
+                explained,
             ),
         )
     except (InputError, LimitError) as error:
@@ -101,10 +107,13 @@ def read_physical_model(path: Path) -> tuple[IdentifiedModel, ActuatorTables]:
     return found, tables
 
 
-def _noise(factor: float | None, noise: float | None, rms: float | None) -> ChannelNoise:
+def _noise(
+    factor: float | None, noise: float | None, worst: float | None, explained: bool
+) -> ChannelNoise:
     nan = float("nan")
     return ChannelNoise(
         1.0 if factor is None else factor,
         nan if noise is None else noise,
-        nan if rms is None else rms,
+        nan if worst is None else worst,
+        explained,
     )

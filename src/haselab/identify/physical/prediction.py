@@ -3,7 +3,11 @@ r"""Predict a motion that an identified physical model was not fitted to.
 With the derivatives $J$ of the predicted values by the parameters, whose covariance is $S$, and the
 noise $\sigma$ of the measured ones, the 95 % band is
 
-$\pm 1.96 \sqrt{\mathrm{diag}(J S J^\top) + \sigma^2}$
+$\pm 1.96 \sqrt{\mathrm{diag}(J S J^\top) + \sigma^2 + m^2}$
+
+where m is 0, or beside a model error, its rms in the worst experiment of the fit. $S$ is then
+without the widening by `model_error`: that allows for the worst of all directions, whereas a motion
+that resembles those of the fit is off by about as much as they are.
 
 Correlated parameters matter: their errors can be large and still cancel in what is predicted. The
 tracker finds the marks of each session anew, so all lengths of a session share an error of 2 µm.
@@ -43,17 +47,20 @@ class ChannelNoise:
     Args:
         factor: true over stated standard deviation of its noise.
         noise: rms of the noise, in the unit of the channel; NaN if it is not known.
-        rms: of the residuals, which is larger beside a model error; NaN if it is not known.
+        worst: rms of the residuals in the experiment that the model explains least; NaN if it is
+            not known.
+        explained: whether the model leaves nothing but noise.
     """
 
     factor: float = 1.0
     noise: float = float("nan")
-    rms: float = float("nan")
+    worst: float = float("nan")
+    explained: bool = True
 
     @property
     def model_error(self) -> float:
-        """Rms of what the model did not explain."""
-        excess = self.rms**2 - self.noise**2
+        """Rms of what the model did not explain of the worst experiment."""
+        excess = 0.0 if self.explained else self.worst**2 - self.noise**2
         return float(np.sqrt(excess)) if excess > 0.0 else 0.0
 
 
@@ -139,15 +146,15 @@ class IdentifiedModel:
         Raises:
             ResultError: the fit has no result.
         """
-        unknowns = fit.unknowns()
+        unknowns, explained = fit.unknowns(), fit.status == "ok"
         return cls(
             unknowns,
-            fit.covariance,
-            ChannelNoise(fit.length_factor, fit.length_noise_m, fit.length_rms_m),
+            fit.covariance / np.outer(fit.widening, fit.widening),
+            ChannelNoise(fit.length_factor, fit.length_noise_m, fit.length_worst_m, explained),
             ChannelNoise(
-                fit.capacitance_factor, fit.capacitance_noise_f, fit.capacitance_rms_f
+                fit.capacitance_factor, fit.capacitance_noise_f, fit.capacitance_worst_f, explained
             ),
-        )  # fmt: skip
+        )
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -209,7 +216,7 @@ class PredictedPart:
         found = float(np.mean((self.error / self.std) ** 2))
         share = float(np.mean((self.parameter_std / self.std) ** 2))
         chance = _FAR * np.sqrt(2.0 / self.error.size)
-        return found > (1.0 - share) * (1.0 + _NOISE_OFF + chance) + share * _FAR**2
+        return bool(found > (1.0 - share) * (1.0 + _NOISE_OFF + chance) + share * _FAR**2)
 
     @property
     def span(self) -> float:

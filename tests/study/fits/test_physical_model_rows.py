@@ -51,7 +51,7 @@ def test_the_intervals_shrink_and_contain_the_noise_free_results(analysed):
         rounding = ROUNDED.get(row["id"], 0.0) * row["noise_free"]
         std = math.hypot(row["measured"]["std"], rounding)
         off[row["id"]] = abs(row["measured"]["value"] - row["noise_free"]) / std
-    assert max(off.values()) < 4.0, sorted(off.items(), key=lambda one: -one[1])[:8]
+    assert max(off.values()) < 5.0, sorted(off.items(), key=lambda one: -one[1])[:8]
     for key in ("S14.a1", "S15.slope", "S20.omega_n", "S20.gain", "S20.zeta"):
         (row,) = (row for row in rows if row["id"] == key)
         assert row["measured"]["std"] < 0.05 * row["direct"]["std"], key

@@ -37,6 +37,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
             "identification.physical_model",
             quick={"twins": 0, "starts": 2, "planted": 1, "short": 3},
         ),
+        Measurement("identification.prediction", quick={"twins": (), "short": 1}),
     ),
     "identify-board": (
         Measurement("identification.random_plants", quick={"plants": 200}),

@@ -191,7 +191,7 @@ def load_record(path: Path) -> MotionRecord:
         )  # fmt: skip
 
 
-def short_drive(seed: int) -> Drive:
+def short_drive(seed: int, mass_kg: float = MASS_KG) -> Drive:
     """A minute of held random voltages, with lifts of the mass: blocks of 10 ms."""
     rng = np.random.default_rng([seed, 4])
     edge_s = 0.01 * np.arange(_SHORT_BLOCKS + 1)
@@ -200,24 +200,27 @@ def short_drive(seed: int) -> Drive:
     held = np.maximum.accumulate(changes * block)
     volt = rng.uniform(0.0, 8000.0, block.size)[held]
     volt[:100] = 0.0
-    pull_n = np.full(block.size, MASS_KG * GRAVITY_M_S2)
+    pull_n = np.full(block.size, mass_kg * GRAVITY_M_S2)
     for k in range(1, 9):  # loads tell the shell from the electrodes
         pull_n[block.size * k // 10 :][:300] *= 0.35 * k
     volt[pull_n > 1.2 * pull_n[0]] = 0.0
-    return Drive(edge_s, volt, pull_n, np.full(block.size, MASS_KG), np.full(block.size, 5e3))
+    return Drive(edge_s, volt, pull_n, np.full(block.size, mass_kg), np.full(block.size, 5e3))
 
 
-def short_record(law: ActuatorLaw, seed: int, scale: float = 1.0) -> MotionRecord:
+def short_record(
+    law: ActuatorLaw, seed: int, scale: float = 1.0, mass_kg: float = MASS_KG
+) -> MotionRecord:
     """What a camera and monitors would see of a law in a minute: the law itself, with noise.
 
     Args:
         law: of the actuator.
         seed: of drive and noise.
         scale: measured over true capacitance.
+        mass_kg: that hangs.
     Raises:
         LimitError: The drive takes the actuator beyond the limits of its law.
     """
-    drive, rng = short_drive(seed), np.random.default_rng([seed, 5])
+    drive, rng = short_drive(seed, mass_kg), np.random.default_rng([seed, 5])
     sampled = SampledLaw(law, 11e3)
     start, _ = sampled.at_rest(0.0, float(drive.ripple_v2[0]), float(drive.load_n[0]))
     times_s = np.arange(0.0, float(drive.edge_s[-1]), 0.02)

@@ -195,7 +195,8 @@ def _drive(
     changes: list[tuple[float, float]] = [
         (float(row["time_s"]), float(row["drive_v"])) for row in conditions
     ]
-    edges = [conditions["time_s"]]
+    # the run begins at rest under its first row, even if another one has the same time
+    edges = [conditions["time_s"][:1] - block_s, conditions["time_s"]]
     for part, late in zip(blocks, late_s, strict=True):
         acts_s = part.start_s + switch_s + late
         changes += zip(acts_s.tolist(), part.drive_v.tolist(), strict=True)
@@ -207,8 +208,8 @@ def _drive(
     middle_s = 0.5 * (edge_s[1:] + edge_s[:-1])
     changes.sort(key=lambda change: change[0])  # stable: at one time, the later entry counts
     change_s, change_v = np.array(changes).T
-    drive_v = change_v[np.searchsorted(change_s, middle_s, side="right") - 1]
-    row = np.searchsorted(conditions["time_s"], middle_s, side="right") - 1
+    drive_v = change_v[np.maximum(np.searchsorted(change_s, middle_s, side="right") - 1, 0)]
+    row = np.maximum(np.searchsorted(conditions["time_s"], middle_s, side="right") - 1, 0)
     pull_n = np.interp(middle_s, *_steps(conditions["time_s"], conditions["pull_n"]))
     carrier_v = _carrier_gain(conditions, blocks, gain) * conditions["carrier_v"][row]
     # nobody sees how fast an actuator without mass moves

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -73,9 +74,22 @@ def law_of_section(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
 
 
 def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
-    """`[model.physical]`: estimates with their covariance."""
+    """`[model.physical]`: estimates with their covariance, and the noise of the records."""
     finite = np.isfinite(np.diag(fit.covariance))
     names = [name for name, known in zip(fit.parameters, finite, strict=True) if known]
+    noise = {
+        "length_noise_m": fit.length_noise_m,
+        "length_rms_m": fit.length_rms_m,
+        "length_worst_m": fit.length_worst_m,
+        "length_factor": fit.length_factor,
+        "capacitance_noise_f": fit.capacitance_noise_f,
+        "capacitance_rms_f": fit.capacitance_rms_f,
+        "capacitance_worst_f": fit.capacitance_worst_f,
+        "capacitance_factor": fit.capacitance_factor,
+    }
+    covariance = {"names": names, "matrix": fit.covariance[np.ix_(finite, finite)].tolist()}
+    if (fit.widening[finite] > 1.0).any():
+        covariance["widening"] = fit.widening[finite].tolist()
     return {
         "kind": fit.kind,
         "status": fit.status,
@@ -83,5 +97,6 @@ def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
         "parameters": {name: estimate.value for name, estimate in fit.parameters.items()},
         "std": {name: estimate.std for name, estimate in fit.parameters.items()},
         "not_identifiable": list(fit.not_identifiable),
-        "covariance": {"names": names, "matrix": fit.covariance[np.ix_(finite, finite)].tolist()},
+        "covariance": covariance,
+        "residuals": {key: value for key, value in noise.items() if math.isfinite(value)},
     }

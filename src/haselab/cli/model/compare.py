@@ -8,11 +8,12 @@ from pathlib import Path
 
 import click
 import numpy as np
+from click.core import ParameterSource
 from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
 from haselab.cli.columns import column_options
-from haselab.cli.common import REAL, SEED, answer_options, emit
+from haselab.cli.common import POSITIVE, REAL, SEED, answer_options, emit, unverified_option
 from haselab.cli.identify.common import (
     FILES,
     INPUT,
@@ -25,6 +26,12 @@ from haselab.cli.identify.common import (
 )
 from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_origin, read_posterior
+from haselab.cli.model.physical_comparison import (
+    PhysicalOptions,
+    compare_physical,
+    refuse_for_linear,
+)
+from haselab.cli.model.physical_model import has_physical_model
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
@@ -45,13 +52,33 @@ _NO_BAND = "no uncertainty: the model has no covariance"
 @INPUT
 @OUTPUT
 @RATE
+@shared_option(
+    "--model", "which", type=click.Choice(["auto", "physical", "linear"]), default="auto",
+    show_default=True,
+    detail="auto: [model.physical] if MODEL has it, unless an option of linear models is given.",
+)  # fmt: skip
 @shared_option("--at-rest", is_flag=True, detail="Its state and offset are then taken as 0.")
 @shared_option("--through-voltage-map", is_flag=True)
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
+@shared_option("--experiment", "experiments", multiple=True,
+               detail="Repeat the option for more. Default: all.")  # fmt: skip
+@click.option("--free-offset", is_flag=True,
+              help="Estimate a constant that all measured lengths differ by, such as after the "
+              "camera was moved.")  # fmt: skip
+@click.option("--longest-m", type=POSITIVE,
+              help="State the length to which the actuator was stretched before, in m. Default: no "
+              "longer than at the start of the record.")  # fmt: skip
+@shared_option("--mass-kg", type=REAL, detail="For tables. Default: that of MODEL.")
+@shared_option("--gain-v-per-v", type=POSITIVE, detail="For tables. Default: that of MODEL.")
+@shared_option("--zero-length-m", type=POSITIVE,
+               detail="For tables with strains. Default: that of MODEL.")  # fmt: skip
+@unverified_option
 @shared_option("--seed", type=SEED, default=1, show_default=True, detail="For the 95 % band.")
 @column_options
 @answer_options(plot=True)
+@click.pass_context
 def command(
+    context: click.Context,
     model: Path,
     files: tuple[Path, ...],
     source: str,
@@ -59,7 +86,15 @@ def command(
     rate_hz: float | None,
     at_rest: bool,
     through_voltage_map: bool,
+    which: str,
     held_at_hz: float | None,
+    experiments: tuple[str, ...],
+    free_offset: bool,
+    longest_m: float | None,
+    mass_kg: float | None,
+    gain_v_per_v: float | None,
+    zero_length_m: float | None,
+    unverified: bool,
     seed: int,
     columns: ColumnOptions,
     *,
@@ -69,7 +104,12 @@ def command(
 ) -> None:
     """Predict records in FILES that were not used for the fit of MODEL.
 
-    MODEL is an actuator file or a model.json. The command reports the fit in percent, the rms error
+    MODEL is an actuator file or a model.json. With the physical model of 'identify actuator', FILES
+    are sessions, folders of runs, or tables with a voltage and a length, strain or capacitance; the
+    recorded voltage is put through the model, experiment by experiment. The exit code is 3 if the
+    error is larger than the band, or if the model was identified from one of the files.
+
+    With a linear model, FILES are tables. The command reports the fit in percent, the rms error
     and the share of samples inside the 95 % band. It first estimates the initial state and the
     offset of each record, unless --at-rest is given. Samples that were used for the fit are
     recognised by their values, also in a part of a record, in another format and with fewer digits.
@@ -77,6 +117,21 @@ def command(
     a copy or a repetition. The exit code is 3 if this share is above 5 %, or if the prediction is
     worse than the mean of the record.
     """
+    linear = at_rest or through_voltage_map or held_at_hz is not None
+    options = PhysicalOptions(
+        experiments, free_offset, longest_m, unverified,
+        _given(context, "source", source), _given(context, "output", output), rate_hz,
+        mass_kg, gain_v_per_v, zero_length_m, columns,
+    )  # fmt: skip
+    if which == "physical" and linear:
+        raise InputError(
+            "--at-rest, --through-voltage-map and --held-at-hz are for linear models. Leave them "
+            "out, or use --model linear."
+        )
+    if which == "physical" or (which == "auto" and not linear and has_physical_model(model)):
+        compare_physical(model, files, options, as_json=as_json, out=out, plot=plot)
+        return
+    refuse_for_linear(options)
     plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
     through = model if through_voltage_map else None
     records = []
@@ -111,6 +166,12 @@ def command(
     save_plot(plot, lambda: prediction_chart(prediction, _times(records), title))
     if prediction.status != "ok":
         raise ResultError(f"{prediction.status}. {' '.join(map(str, files))}")
+
+
+def _given(context: click.Context, parameter: str, value: str) -> str | None:
+    """The value of an option that the user gave; None for the default."""
+    usual = context.get_parameter_source(parameter) is ParameterSource.DEFAULT
+    return None if usual else value
 
 
 def _training_output(origin: OriginTable) -> TrainingOutput | None:

@@ -64,7 +64,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
     "--kind", default="planar-hasel", show_default=True, metavar="KIND",
     detail="planar-hasel, peano-hasel, curling-hasel, dea-stack or your own.",
 )  # fmt: skip
-@click.option("--mass-kg", type=REAL, help="Write the hung mass in kg. Default: as a comment.")
+@shared_option("--mass-kg", type=REAL, detail="Default: as a comment.")
 @shared_option("--zero-length-m", type=POSITIVE, detail="Default: as a comment.")
 @click.option(
     "--low-v",
@@ -76,11 +76,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
 @click.option("--high-v", type=REAL,
               help="Write the highest drive voltage, before the amplifier, in V. Default: as a "
               "comment.")  # fmt: skip
-@click.option(
-    "--gain-v-per-v",
-    type=POSITIVE,
-    help="Write the gain of the amplifier in V/V. Default: as a comment.",
-)
+@shared_option("--gain-v-per-v", type=POSITIVE, detail="Default: as a comment.")
 @answer_options(None, "An actuator file, for example leg.toml.  [required]")
 def command(
     name: str,

@@ -1,6 +1,22 @@
 """One physical model of an actuator, identified jointly from all its experiments."""
 
 from haselab.identify.physical.fit import ActuatorFit, fit_actuator
+from haselab.identify.physical.prediction import (
+    ChannelNoise,
+    IdentifiedModel,
+    MotionPrediction,
+    PredictedPart,
+    predict_motion,
+)
 from haselab.identify.physical.record import MotionRecord
 
-__all__ = ["ActuatorFit", "MotionRecord", "fit_actuator"]
+__all__ = [
+    "ActuatorFit",
+    "ChannelNoise",
+    "IdentifiedModel",
+    "MotionPrediction",
+    "MotionRecord",
+    "PredictedPart",
+    "fit_actuator",
+    "predict_motion",
+]

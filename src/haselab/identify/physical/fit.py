@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,7 @@ _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contr
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _GOOD_SCALE = 0.01  # and a careful one
 _WHITE = 1e-3  # probability of the residuals under white noise
+_ENOUGH = 20  # values of an experiment, for an rms of its own
 _POINTS = 5  # voltages of the linear models
 _UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
 _WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
@@ -71,6 +72,11 @@ class ActuatorFit(Fit):
         capacitance_rms_f: of those of the capacitances.
         length_noise_m: from differences of neighbours, which a slow misfit does not change.
         capacitance_noise_f: likewise.
+        length_factor: true over stated standard deviation of the noise of the lengths.
+        capacitance_factor: the same of the capacitances.
+        length_worst_m: rms of the residuals in the experiment that the model explains least.
+        capacitance_worst_f: the same of the capacitances.
+        widening: of the standard deviations, by which a model error raised those of `covariance`.
         evaluations: of the model, until it was found.
         chi_squared_ratio: mean square of the residuals over their standard deviations.
         residual_whiteness_p: probability of the less probable channel under white noise.
@@ -88,6 +94,11 @@ class ActuatorFit(Fit):
     capacitance_rms_f: float = float("nan")
     length_noise_m: float = float("nan")
     capacitance_noise_f: float = float("nan")
+    length_factor: float = float("nan")
+    capacitance_factor: float = float("nan")
+    length_worst_m: float = float("nan")
+    capacitance_worst_f: float = float("nan")
+    widening: Floats = field(default_factory=lambda: np.ones(0), repr=False)
     evaluations: int = 0
     chi_squared_ratio: float = float("nan")
     residual_whiteness_p: float = float("nan")
@@ -301,6 +312,11 @@ def _rms(parts: Sequence[Floats]) -> float:
     return math.sqrt(float(np.mean(np.concatenate(parts) ** 2))) if parts else 1.0
 
 
+def _worst(parts: Sequence[Floats]) -> float:
+    """Largest rms of an experiment with enough values."""
+    return max((_rms([part]) for part in parts if part.size >= _ENOUGH), default=math.nan)
+
+
 def _neighbours(parts: Sequence[Floats]) -> float:
     """Noise by the differences of neighbours, which a slow misfit does not change."""
     steps = [np.diff(part) for part in parts if part.size > 1]
@@ -327,6 +343,7 @@ def _result(
     if not usable:
         return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
     covariance = _covariance(found, segments)
+    own_std = np.sqrt(np.diag(covariance))
     if status != "ok":
         energy = excess_energy(
             [(part, noise) for part, noise in (
@@ -334,6 +351,7 @@ def _result(
         )  # fmt: skip
         covariance = widened(covariance, hidden_std(found.jacobian, energy))
     std = np.sqrt(np.diag(covariance))
+    widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
     described = {about.key: about for about in unknowns.law.described()}
     units = {key: about.unit for key, about in described.items()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
@@ -371,6 +389,11 @@ def _result(
         length_noise_m=std_m * length_noise,
         capacitance_rms_f=std_f * _rms(capacitances),
         capacitance_noise_f=std_f * capacitance_noise,
+        length_factor=misfit.length_factor * length_noise,
+        capacitance_factor=misfit.capacitance_factor * capacitance_noise,
+        length_worst_m=std_m * _worst(lengths),
+        capacitance_worst_f=std_f * _worst(capacitances),
+        widening=widening,
         residual_whiteness_p=seen.whiteness_p,
         law=law,
         kind=law.kind,

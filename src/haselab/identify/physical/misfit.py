@@ -62,7 +62,12 @@ class Modelled:
 
 
 def modelled(
-    unknowns: Unknowns, record: MotionRecord, *, derivatives: bool = True, strict: bool = False
+    unknowns: Unknowns,
+    record: MotionRecord,
+    *,
+    derivatives: bool = True,
+    strict: bool = False,
+    longest_m: float = 0.0,
 ) -> Modelled:
     """Simulate a record.
 
@@ -72,6 +77,7 @@ def modelled(
         derivatives: whether they are wanted.
         strict: whether all lengths must be within the limits of the law. Outside, such as after a
             collapse, the simulated motion is rough and its derivatives are wrong.
+        longest_m: length that the actuator had reached before the record, if it was longer.
     Returns:
         Lengths and capacitances at the times of the record.
     Raises:
@@ -90,7 +96,7 @@ def modelled(
         added_inertia_kg=added_kg,
     )
     held_n = unknowns.value(START_HYSTERESIS) if START_HYSTERESIS in unknowns.names else None
-    response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY), held_n)
+    response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY), held_n, longest_m)
     if strict and record.length_m.size:
         low_m, high_m = float(response.length_m.min()), float(response.length_m.max())
         if low_m < sampled.table.low_m or high_m > sampled.table.high_m:
@@ -136,7 +142,11 @@ def _highest_v(record: MotionRecord) -> float:
 
 
 def _respond(
-    sampled: SampledLaw, record: MotionRecord, latency_s: float, held_n: float | None
+    sampled: SampledLaw,
+    record: MotionRecord,
+    latency_s: float,
+    held_n: float | None,
+    longest_m: float,
 ) -> Response:
     drive = record.drive
     low, high = drive.edge_s[0], drive.edge_s[-1]
@@ -145,7 +155,7 @@ def _respond(
     half_s = record.exposure_s / np.sqrt(12.0)
     both_s = np.clip(np.concatenate([middle_s - half_s, middle_s + half_s]), low, high)
     order = np.argsort(both_s, kind="stable")
-    start, start_by = _at_rest(sampled, record, held_n)
+    start, start_by = _at_rest(sampled, record, held_n, longest_m)
     sensed = np.zeros(drive.voltage_v.size, np.uint8)
     sensed[record.window] = 1
     found = sampled.respond(drive, both_s[order], start, sensed=sensed, start_by=start_by)
@@ -160,15 +170,18 @@ def _respond(
 
 
 def _at_rest(
-    sampled: SampledLaw, record: MotionRecord, held_n: float | None
+    sampled: SampledLaw, record: MotionRecord, held_n: float | None, longest_m: float
 ) -> tuple[NDArray[np.void], Floats]:
     """State at the first edge with its derivatives, the last by the force of the hysteresis."""
     acts = float(record.drive.voltage_v[0]), float(record.drive.ripple_v2[0])
     load_n = float(record.drive.load_n[0])
     if held_n is None:
-        return sampled.at_rest(*acts, load_n)
-    state, by = sampled.at_rest(*acts, load_n - held_n)
-    low, high = (sampled.at_rest(*acts, load_n - held_n + s * _LITTLE_N)[0] for s in (1.0, -1.0))
+        return sampled.at_rest(*acts, load_n, longest_m=longest_m)
+    state, by = sampled.at_rest(*acts, load_n - held_n, longest_m=longest_m)
+    low, high = (
+        sampled.at_rest(*acts, load_n - held_n + s * _LITTLE_N, longest_m=longest_m)[0]
+        for s in (1.0, -1.0)
+    )
     column = np.zeros((_motion.ROWS, 1))
     column[0] = (high["length_m"] - low["length_m"]) / (2.0 * _LITTLE_N)
     column[3] = (high["longest_m"] - low["longest_m"]) / (2.0 * _LITTLE_N)

@@ -29,6 +29,7 @@ __all__ = [
     "ModelSection",
     "PhysicalCovariance",
     "PhysicalTable",
+    "ResidualTable",
     "SensingSection",
     "StrainMapTable",
     "VoltageMapTable",
@@ -217,13 +218,29 @@ class PhysicalCovariance(_Section):
     matrix: tuple[tuple[float, ...], ...] = Field(
         description="covariance of their values", examples=[[[1e-6]]]
     )
+    widening: tuple[_Positive, ...] = ()  # of the standard deviations, by a model error
 
     @model_validator(mode="after")
     def _square(self) -> Self:
         sizes = [len(row) for row in self.matrix]
         if sizes != [len(self.names)] * len(self.names):
             raise ValueError(f"{len(self.names)} names need as many rows of as many numbers")
+        if self.widening and len(self.widening) != len(self.names):
+            raise ValueError(f"{len(self.names)} names need as many values of widening")
         return self
+
+
+class ResidualTable(_Section):
+    """`[model.physical.residuals]`: noise of the records of the fit, and what the model left."""
+
+    length_noise_m: Annotated[Number, Field(ge=0)] | None = None
+    length_rms_m: Annotated[Number, Field(ge=0)] | None = None
+    length_worst_m: Annotated[Number, Field(ge=0)] | None = None  # of the worst experiment
+    length_factor: _Positive | None = None  # true over stated standard deviation of the noise
+    capacitance_noise_f: Annotated[Number, Field(ge=0)] | None = None
+    capacitance_rms_f: Annotated[Number, Field(ge=0)] | None = None
+    capacitance_worst_f: Annotated[Number, Field(ge=0)] | None = None
+    capacitance_factor: _Positive | None = None
 
 
 class PhysicalTable(_Section):
@@ -238,6 +255,7 @@ class PhysicalTable(_Section):
     std: Annotated[dict[str, float], BeforeValidator(_by_full_name)] = {}
     not_identifiable: tuple[str, ...] = ()
     covariance: PhysicalCovariance | None = None
+    residuals: ResidualTable = ResidualTable()
 
 
 class ModelSection(_Section):

@@ -1,0 +1,191 @@
+"""`haselab compare` by the physical model of an actuator file, as a user runs it."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from haselab.actuators import PlanarHasel
+from haselab.cli.main import main
+from haselab.pipelines.motion import motion_of_session
+from haselab.store.session.reader import SessionReader
+from tests.cli.model.physical_files import (
+    CAPACITANCE_STD_F,
+    GAIN,
+    LENGTH_STD_M,
+    MASS_KG,
+    played,
+    table,
+    written,
+)
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as stop:
+        main([str(item) for item in arguments])
+    printed = capsys.readouterr()
+    return stop.value.code, printed.out, printed.err
+
+
+@pytest.fixture
+def actuator(tmp_path):
+    return written(tmp_path / "A.toml")
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    return played(tmp_path_factory.mktemp("predicted") / "run")
+
+
+def share(part, samples):
+    """Four standard deviations of the share of so many independent values."""
+    return pytest.approx(part, abs=4.0 * np.sqrt(part * (1.0 - part) / samples))
+
+
+@pytest.mark.long
+def test_a_session_that_was_not_fitted_is_inside_the_band(actuator, session, tmp_path, capsys):
+    figure = tmp_path / "prediction.svg"
+    code, text, error = run(capsys, "compare", actuator, session, "--json", "--plot", figure)
+    answer = json.loads(text)
+    assert (code, error, answer["status"], answer["model"]) == (0, "", "ok", "physical")
+    assert [(one["experiment"], one["signal"]) for one in answer["experiments"]] == [
+        (name, signal) for signal in ("length", "capacitance") for name in ("held", "step")
+    ]
+    assert answer["length"]["rms_error_percent_of_span"] < 0.3
+    assert answer["rms_error"] == answer["length"]["rms_error_m"] == pytest.approx(4e-6, rel=0.3)
+    assert answer["capacitance"]["inside_band"] == share(0.95, answer["capacitance"]["samples"])
+    assert answer["inside_band"] > 0.93 and answer["fit_percent"] > 99.0
+    assert answer["experiments"][0]["samples"] < answer["samples"] == answer["length"]["samples"]
+    assert b"Prediction of run by the physical model" in figure.read_bytes()
+    code, text, _ = run(capsys, "compare", actuator, session, "--experiment", "held", "--json")
+    assert code == 0
+    assert {one["experiment"] for one in json.loads(text)["experiments"]} == {"held"}
+
+
+@pytest.mark.long
+def test_a_session_that_begins_under_voltage_was_at_rest_at_0_v(session):
+    with SessionReader(session) as reader:
+        first_s = reader.conditions()["time_s"][0]
+        record = motion_of_session(reader, session)
+    assert record.drive.edge_s[0] < first_s and record.drive.voltage_v[0] == 0.0
+    begins = np.searchsorted(record.drive.edge_s, first_s)
+    assert record.drive.voltage_v[begins] == pytest.approx(1.2 * GAIN)
+
+
+@pytest.mark.long
+def test_a_model_error_outside_the_band_ends_with_code_3_and_its_place(session, tmp_path, capsys):
+    wrong = written(tmp_path / "B.toml", viscosity__damping_n_s_per_m=2.2)
+    code, text, error = run(capsys, "compare", wrong, session, "--json")
+    assert code == 3 and "model error: only " in error and error.count("\n") == 1
+    answer = json.loads(text)
+    assert answer["status"].startswith("model error: only ")
+    inside = {one["experiment"]: one["inside_band"] for one in answer["experiments"]
+              if one["signal"] == "length"}  # fmt: skip
+    assert inside["step"] < 0.8
+
+
+@pytest.mark.long
+def test_the_session_of_the_fit_is_no_validation(actuator, session, capsys):
+    found = hashlib.sha256((session / "session.h5").read_bytes()).hexdigest()
+    actuator.write_text(
+        actuator.read_text() + f'\n[provenance.model.physical]\nsha256 = ["{found}"]\n'
+    )
+    code, _, error = run(capsys, "compare", actuator, session)
+    assert code == 3 and "not a validation: the model was identified from this recording" in error
+
+
+@pytest.mark.parametrize("unit", ["m", "1", "F"])
+def test_a_table_is_predicted(actuator, tmp_path, capsys, unit):
+    file = table(tmp_path / "new.csv", unit=unit, first_v=0.7)
+    code, text, error = run(capsys, "compare", actuator, file, "--json")
+    answer = json.loads(text)
+    assert (code, error, answer["status"]) == (0, "", "ok")
+    noise = CAPACITANCE_STD_F if unit == "F" else LENGTH_STD_M
+    assert answer["rms_error"] == pytest.approx(noise, rel=4.0 / np.sqrt(2.0 * 800))
+    assert answer["fit_percent"] > 99.0 and answer["inside_band"] > 0.93
+
+
+def test_what_the_user_states_counts_before_the_file(actuator, tmp_path, capsys):
+    file = table(tmp_path / "new.csv")
+    assert run(capsys, "compare", actuator, file, "--mass-kg", "0.2")[0] == 0
+    code, _, error = run(capsys, "compare", actuator, file, "--mass-kg", "0.25")
+    assert code == 3 and "the predicted length" in error
+    assert run(capsys, "compare", actuator, file, "--gain-v-per-v", "5250")[0] == 3
+    names = "--input", "voltage_v", "--output", "length_m"
+    assert run(capsys, "compare", actuator, file, *names, "--free-offset")[0] == 0
+    assert run(capsys, "compare", actuator, file, "--longest-m", "0.0985")[0] == 3
+
+
+def test_a_model_of_another_actuator_is_worse_than_the_mean(actuator, tmp_path, capsys):
+    file = table(tmp_path / "new.csv", law=PlanarHasel(length_m=0.068))
+    code, _, error = run(capsys, "compare", actuator, file)
+    assert code == 3 and "the predicted length is worse than the mean of the record" in error
+
+
+def test_several_tables_are_compared_together(actuator, tmp_path, capsys):
+    files = [table(tmp_path / f"{k}.csv", seed=k) for k in (1, 2)]
+    code, text, _ = run(capsys, "compare", actuator, *files, "--json")
+    answer = json.loads(text)
+    assert code == 0 and answer["samples"] == 1600
+    assert [one["experiment"] for one in answer["experiments"]] == ["1.csv", "2.csv"]
+
+
+@pytest.mark.parametrize(
+    ("left_out", "unit", "options", "message"),
+    [
+        ("physical", "m", ["--model", "physical"], "The actuator file has no [model.physical]."),
+        ("covariance", "m", [], "[model.physical] has no covariance"),
+        ("residuals", "m", [], "does not state the noise of values in m"),
+        (
+            "geometry",
+            "1",
+            [],
+            "the length at zero strain is not known. State it with --z",
+        ),
+        ("drive", "m", [], "The gain from column voltage_v to the actuator's voltage is"),
+        ("", "N", ["--output", "force_n"], "Column force_n is without a unit, but the physical"),
+        ("", "m", ["--experiment", "step"], "--experiment is for sessions"),
+        ("", "m", ["--model", "physical", "--at-rest"], "are for linear models. Leave them out"),
+        ("", "m", ["--model", "linear", "--free-offset"], "--free-offset needs a physical model"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path, capsys, left_out, unit, options, message):
+    actuator = written(tmp_path / "A.toml", left_out=left_out)
+    code, _, error = run(
+        capsys, "compare", actuator, table(tmp_path / "n.csv", unit=unit), *options
+    )
+    assert code == 2 and message in error and error.count("\n") == 1, error
+
+
+def test_an_unknown_mass_is_named(actuator, tmp_path, capsys):
+    text = actuator.read_text().replace(f"mass_kg = {MASS_KG}\n", "", 1)
+    actuator.write_text(text)
+    code, _, error = run(capsys, "compare", actuator, table(tmp_path / "new.csv"))
+    assert code == 2 and "The hung mass of this table is not known. State it with --mass" in error
+
+
+def test_a_status_that_is_not_ok_needs_the_size_of_the_error(tmp_path, capsys):
+    file = table(tmp_path / "new.csv")
+    model = written(tmp_path / "A.toml", status="model error: lengths", residuals=False)
+    code, _, error = run(capsys, "compare", model, file)
+    assert code == 2 and "but no residuals that say how large its error is" in error
+    model = written(tmp_path / "B.toml", status="model error: lengths")
+    code, _, error = run(capsys, "compare", model, file)
+    assert code == 0 and "warning: [model.physical] has the status 'model error" in error
+
+
+def test_another_kind_of_actuator_is_refused(tmp_path, capsys):
+    model = written(tmp_path / "A.toml", kind="dea-stack")
+    code, _, error = run(capsys, "compare", model, table(tmp_path / "new.csv"))
+    assert code == 2 and "is of the kind 'planar-hasel', but [actuator] of 'dea-stack'" in error
+
+
+@pytest.mark.long
+def test_options_of_tables_and_unknown_experiments_are_refused_for_sessions(
+    actuator, session, capsys
+):
+    code, _, error = run(capsys, "compare", actuator, session, "--mass-kg", "0.2")
+    assert code == 2 and "--mass-kg is for tables, but a session states this itself" in error
+    code, _, error = run(capsys, "compare", actuator, session, "--experiment", "chirp")
+    assert code == 2 and "has no experiment chirp" in error and "It has held, step." in error

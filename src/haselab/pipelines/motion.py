@@ -54,7 +54,9 @@ class _Blocks:
     later_s: Floats
 
 
-def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
+def motion_of_session(
+    reader: SessionReader, path: Path, lockin: Lockin | None = None
+) -> MotionRecord:
     """Join all experiments of a session to one uninterrupted motion.
 
     Between the experiments the session's conditions state what acted: drive, carrier and load. In
@@ -63,6 +65,7 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
     Args:
         reader: of the session, open.
         path: of the session, for messages.
+        lockin: whose capacitances are wanted; None: that which uses the most samples.
     Returns:
         The motion, which begins when the run began, after the mass has hung for long.
     Raises:
@@ -79,7 +82,7 @@ def motion_of_session(reader: SessionReader, path: Path) -> MotionRecord:
     switch_s = rig["switch_sample"] / rig["rate_hz"]
     records = [reader.experiment(name) for name in reader.names]
     records = [record for record in records if record.name != "particles"]
-    blocks = {r.name: _sensed(reader, r, path, block_s) for r in records if len(r.codes)}
+    blocks = {r.name: _sensed(reader, r, path, lockin) for r in records if len(r.codes)}
     drive = _drive(
         conditions, blocks.values(), _late_s(blocks.values(), rig["rate_hz"]),
         (block_s, switch_s), float(rig["amplifier_gain"]),
@@ -132,10 +135,14 @@ def _windows(drive: Drive, blocks: _Blocks) -> tuple[NDArray[np.int64], NDArray[
     return np.concatenate([none, *intervals]), np.concatenate([none, *values])
 
 
-def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s: float) -> _Blocks:
+def _sensed(
+    reader: SessionReader, record: ExperimentRecord, path: Path, lockin: Lockin | None
+) -> _Blocks:
     config = session_config(reader, record.codes.shape[1], DEFAULT_REQUEST, path)
-    lockin = Lockin(config)
+    whole = Lockin(config)  # knows when the output is updated
+    lockin = lockin or whole
     sensed = lockin.sense(record.codes)
+    block_s = config.block_samples / config.rate_hz
     middle_s = sensed.time_s - block_s * np.arange(len(record.codes))
     # other models than the plain one use other samples
     plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz
@@ -147,7 +154,7 @@ def _sensed(reader: SessionReader, record: ExperimentRecord, path: Path, block_s
     return _Blocks(
         record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
         sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v,
-        _rise(record.codes[:, :, 0], lockin), _later_s(record.codes[:, :, 0], lockin),
+        _rise(record.codes[:, :, 0], whole), _later_s(record.codes[:, :, 0], lockin),
     )  # fmt: skip
 
 

@@ -12,6 +12,9 @@ from haselab.store.actuator_file import read_actuator
 
 # Of the reference study's rows, those that the model replaces but for S21, which follow from S20.
 MODELLED = ("S14.", "S15.slope", "S16.", "S17.", "S18.rest", "S19.", "S20.")
+# The noise-free study rounds its codes as well: 0.27 pF rms a block, the same in both cycles, over
+# a spread of 90 pF and about 1,000 blocks a cycle. So it knows the slope to 1e-4, the model to 3e-5.
+ROUNDED = {"S15.slope": 1e-4, "S15.offset": 1e-4}
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +46,12 @@ def test_the_intervals_shrink_and_contain_the_noise_free_results(analysed):
     inside = [row["measured"]["ci95"][0] <= row["noise_free"] <= row["measured"]["ci95"][1]
               for row in rows]  # fmt: skip
     assert sum(inside) / len(inside) > 0.9 - 3.0 * math.sqrt(0.9 * 0.1 / 10.0)
-    off = [abs(row["measured"]["value"] - row["noise_free"]) / row["measured"]["std"]
-           for row in rows]  # fmt: skip
-    assert max(off) < 5.0
+    off = {}
+    for row in rows:
+        rounding = ROUNDED.get(row["id"], 0.0) * row["noise_free"]
+        std = math.hypot(row["measured"]["std"], rounding)
+        off[row["id"]] = abs(row["measured"]["value"] - row["noise_free"]) / std
+    assert max(off.values()) < 5.0, sorted(off.items(), key=lambda one: -one[1])[:8]
     for key in ("S14.a1", "S15.slope", "S20.omega_n", "S20.gain", "S20.zeta"):
         (row,) = (row for row in rows if row["id"] == key)
         assert row["measured"]["std"] < 0.05 * row["direct"]["std"], key
@@ -69,4 +75,5 @@ def test_the_actuator_file_of_the_run_has_the_model(analysed):
     _, out = analysed
     model = read_actuator(out / "actuator.toml")["model"]["physical"]
     assert model["status"] == "ok"
-    assert model["parameters"]["shell.shear_modulus_pa"] == pytest.approx(15.6e3, rel=0.01)
+    found, std = (model[key]["electrodes.stiffness_n_per_m"] for key in ("parameters", "std"))
+    assert std < 0.5 and found == pytest.approx(150.0, abs=4.0 * std)

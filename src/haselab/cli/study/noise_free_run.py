@@ -131,8 +131,8 @@ class SentValues(Mapping[type, object]):
         while True:
             try:
                 values = pickle.load(source)
-            except EOFError:
-                return ended()
+            except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+                return ended()  # a message may have been cut, or the source closed
             with self._news:
                 self._complete = self._complete or values is None
                 self._values |= {type(value): value for value in values or ()}

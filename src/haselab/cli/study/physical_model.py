@@ -103,6 +103,7 @@ def identified(
             click.echo(f"haselab: no results of a physical model: {fit.status}", err=True)
             return PhysicalModel(fit, {})
         lockin = lockin_of(rig, study.sensing.carrier_hz)
+        record = motion_of_session(reader, session_file(session), lockin)  # as the study senses
         events = reader.events()
 
         def source(name: str) -> Observation:

@@ -27,6 +27,7 @@ from benchmarks.identification.physical_twins import (
     short_record,
 )
 from benchmarks.rows import CHECKOUT, Row
+from haselab.actuators import ADDED_INERTIA
 from haselab.base import ResultError, SilentProgress
 from haselab.cli.main import cli
 from haselab.cli.model.physical_model import read_physical_model
@@ -123,6 +124,17 @@ def played(config: TwinConfig, point: tuple[float, float, float], seed: int, fol
             runner.play(name, drive_v, FRAME_HZ, mass_kg)
 
 
+def started(twin: str, folder: Path) -> dict[str, float]:
+    """Where the search starts: at the identified plain twin, if DIR has it, else at defaults."""
+    plain = folder.parent / folder.name.replace(twin, PLAIN) / "actuator.toml"
+    known = {}
+    if twin != PLAIN and plain.exists():
+        unknowns = read_physical_model(plain)[0].unknowns
+        values = dict(zip(unknowns.names, unknowns.values.tolist(), strict=True))
+        known = {name: values[name] for name in unknowns.law_names if name != ADDED_INERTIA}
+    return known | STARTS.get(twin, {})
+
+
 def identified(twin: str, folder: Path, seed: int) -> Path:
     """The actuator file of a twin's quick reference study, as the commands write it."""
     run, path = folder / "study", folder / "actuator.toml"
@@ -136,7 +148,7 @@ def identified(twin: str, folder: Path, seed: int) -> Path:
                 run_study(builtin_study(quick=True), rig, options, SilentProgress())
         draft = folder / "draft.toml"
         cli.main(["init", twin, "--out", str(draft)], standalone_mode=False)
-        start = "".join(f'"{key}" = {value}\n' for key, value in STARTS.get(twin, {}).items())
+        start = "".join(f'"{key}" = {value}\n' for key, value in started(twin, folder).items())
         draft.write_text(f"{draft.read_text()}\n[actuator.parameters]\n{start}")
         cli.main(
             ["identify", "actuator", str(run), "--actuator", str(draft),

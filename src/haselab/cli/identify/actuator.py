@@ -83,5 +83,10 @@ def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
         "parameters": {name: estimate.value for name, estimate in fit.parameters.items()},
         "std": {name: estimate.std for name, estimate in fit.parameters.items()},
         "not_identifiable": list(fit.not_identifiable),
+        "determined_by": {
+            name: [source.text for source in sources]
+            for name, sources in fit.determined_by.items()
+            if sources
+        },
         "covariance": {"names": names, "matrix": fit.covariance[np.ix_(finite, finite)].tolist()},
     }

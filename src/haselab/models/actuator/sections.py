@@ -237,6 +237,8 @@ class PhysicalTable(_Section):
     )
     std: Annotated[dict[str, float], BeforeValidator(_by_full_name)] = {}
     not_identifiable: tuple[str, ...] = ()
+    # experiments and channels that determine each parameter
+    determined_by: Annotated[dict[str, tuple[str, ...]], BeforeValidator(_by_table)] = {}
     covariance: PhysicalCovariance | None = None
 
 

@@ -342,7 +342,7 @@ def _result(
               "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": "",
               START_HYSTERESIS: "N"}  # fmt: skip
     slopes = unknowns.slopes
-    weak = (std > largest_std(unknowns)) | (np.abs(_left(found, prior)) > _UNSETTLED * std)
+    weak = (std > largest_std(unknowns)) | (np.abs(found.left) > _UNSETTLED * std)
     parameters = {}
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
@@ -394,14 +394,6 @@ def _covariance(found: Found, segments: Sequence[Segment], prior: Floats) -> Flo
         found.unknowns.values.size,
         prior=prior,
     )
-
-
-def _left(found: Found, prior: Floats) -> Floats:
-    """Step that the search would still make, of what varies. Shape `(P,)`."""
-    columns = np.vstack([found.jacobian, np.diag(np.sqrt(prior))])
-    wanted = np.concatenate([found.residuals, np.zeros(prior.size)])
-    scale = np.linalg.norm(columns, axis=0)
-    return np.asarray(np.linalg.lstsq(columns / scale, wanted, rcond=None)[0] / scale)
 
 
 def _excess_variance(covariance: Floats, white: Floats, known: NDArray[np.bool_]) -> float:

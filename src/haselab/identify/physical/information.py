@@ -110,7 +110,9 @@ def determined_by(
     """
     widths = unknowns.widths
     prior = np.eye(widths.size) / _VAGUE
-    factors = {name: np.linalg.qr(part * widths, mode="r") for name, part in parts.items()}
+    factors: dict[tuple[str, str], Floats] = {
+        name: np.asarray(np.linalg.qr(part * widths, mode="r")) for name, part in parts.items()
+    }
     joint = np.diag(covariance_of([*factors.values(), prior]))
     growth = {}
     for left_out in factors:

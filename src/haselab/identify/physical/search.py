@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.identify.physical.information import vague_information
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.unknowns import Unknowns
 
@@ -40,7 +41,8 @@ class Found:
         unknowns: at the smallest misfit.
         residuals: over their standard deviations. Shape `(N,)`.
         jacobian: of the model over the standard deviations. Shape `(N, P)`.
-        left: step of Gauss and Newton that remains, of what varies. Shape `(P,)`.
+        left: step of Gauss and Newton that remains, of what varies, as far as it is not longer than
+            ten widths. Shape `(P,)`.
         converged: whether it is hardly expected to lower the misfit.
         evaluations: of the model.
     """
@@ -101,9 +103,13 @@ def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | Non
 
 
 def _found(now: _State, evaluations: int) -> Found:
-    scale = np.maximum(np.linalg.norm(now.jacobian, axis=0), 1e-150)
-    left = np.linalg.lstsq(now.jacobian / scale, now.residuals, rcond=1e-12)[0]
-    expected = float(np.sum((now.jacobian @ (left / scale)) ** 2))
+    # what a step of many widths would lower the misfit by does not count: it will never be made
+    vague = np.diag(np.sqrt(vague_information(now.unknowns)))
+    columns = np.vstack([now.jacobian, vague])
+    wanted = np.concatenate([now.residuals, np.zeros(vague.shape[0])])
+    scale = np.linalg.norm(columns, axis=0)
+    left = np.linalg.lstsq(columns / scale, wanted, rcond=None)[0]
+    expected = float(np.sum((columns @ (left / scale)) ** 2))
     usual = float(np.mean(now.residuals**2))
     return Found(
         now.unknowns, now.residuals, now.jacobian, left / scale,
@@ -186,9 +192,11 @@ def _descend(
         slope = weighed.T @ now.residuals
         if start is not None:
             slope = slope - pull * now.unknowns.distance(start)
+        vague = np.diag(vague_information(now.unknowns))
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         correlation, slope = normal / np.outer(scale, scale), slope / scale
-        left = float(slope @ np.linalg.lstsq(correlation, slope, rcond=1e-15)[0])
+        certain = correlation if start is not None else correlation + vague / np.outer(scale, scale)
+        left = float(slope @ np.linalg.lstsq(certain, slope, rcond=1e-15)[0])
         done = _DONE * max(1.0, cost / now.residuals.size)
         if left < (done if start is None else max(_ENOUGH * cost, 1.0)):
             return now, count

@@ -28,6 +28,7 @@ __all__ = [
     "LoopTable",
     "ModelSection",
     "PhysicalCovariance",
+    "PhysicalRecords",
     "PhysicalTable",
     "SensingSection",
     "StrainMapTable",
@@ -226,6 +227,26 @@ class PhysicalCovariance(_Section):
         return self
 
 
+class PhysicalRecords(_Section):
+    """`[model.physical.records]`: what the physical model was fitted to.
+
+    The covariance of the model is the information of these records; with the noise stated here,
+    that of a further experiment can be computed and added.
+    """
+
+    experiments: tuple[str, ...] = ()
+    duration_s: Annotated[Number, Field(ge=0)] = 0.0
+    gain_v_per_v: _Positive = Field(description="gain of the amplifier", examples=[5000.0])
+    highest_drive_v: Annotated[Number, Field(ge=0)] = 0.0  # before the amplifier
+    heaviest_kg: Annotated[Number, Field(ge=0, le=1e4)] = 0.0
+    carrier_v: Annotated[Number, Field(ge=0)] = 0.0  # peak at the actuator
+    length_std_m: _Positive | None = None  # None: no lengths were seen
+    capacitance_std_f: _Positive | None = None
+    exposure_s: Annotated[Number, Field(ge=0)] = 0.0
+    pixel_m: Annotated[Number, Field(ge=0)] = 0.0
+    excess_variance: Annotated[Number, Field(ge=1)] = 1.0  # over that with white residuals
+
+
 class PhysicalTable(_Section):
     """`[model.physical]`: the physical model that `identify actuator` writes."""
 
@@ -240,6 +261,7 @@ class PhysicalTable(_Section):
     # experiments and channels that determine each parameter
     determined_by: Annotated[dict[str, tuple[str, ...]], BeforeValidator(_by_table)] = {}
     covariance: PhysicalCovariance | None = None
+    records: PhysicalRecords | None = None
 
 
 class ModelSection(_Section):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,13 +110,39 @@ def _found(now: _State, evaluations: int) -> Found:
     columns = np.vstack([now.jacobian, vague])
     wanted = np.concatenate([now.residuals, np.zeros(vague.shape[0])])
     scale = np.linalg.norm(columns, axis=0)
-    left = np.linalg.lstsq(columns / scale, wanted, rcond=None)[0]
+    left, _ = _inside(
+        now.unknowns,
+        lambda free: np.linalg.lstsq(np.where(free, columns / scale, 0.0), wanted, rcond=None)[0],
+    )
     expected = float(np.sum((columns @ (left / scale)) ** 2))
     usual = float(np.mean(now.residuals**2))
     return Found(
         now.unknowns, now.residuals, now.jacobian, left / scale,
         expected < _NEAR * max(1.0, usual), evaluations,
     )  # fmt: skip
+
+
+def _solution(matrix: Floats, slope: Floats, free: NDArray[np.bool_]) -> Floats:
+    """Solve normal equations for some of the unknowns; the others stay."""
+    some = np.ix_(free, free)
+    found = np.zeros(slope.size)
+    found[free] = np.linalg.lstsq(matrix[some], slope[free], rcond=1e-15)[0]
+    return found
+
+
+def _inside(
+    unknowns: Unknowns, solution: Callable[[NDArray[np.bool_]], Floats]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Step that crosses no limit, and which of the unknowns it moves.
+
+    An unknown that the records hardly determine may end at its limit; the others go on.
+    """
+    free = np.ones(unknowns.values.size, dtype=np.bool_)
+    step = solution(free)
+    while (stopped := free & unknowns.at_limit(step)).any():
+        free = free & ~stopped
+        step = solution(free)
+    return step, free
 
 
 def _first_stage(misfit: Misfit, start: Unknowns, noise: float) -> tuple[_State | None, int]:
@@ -196,26 +224,27 @@ def _descend(
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         correlation, slope = normal / np.outer(scale, scale), slope / scale
         certain = correlation if start is not None else correlation + vague / np.outer(scale, scale)
-        left = float(slope @ np.linalg.lstsq(certain, slope, rcond=1e-15)[0])
+        left = float(slope @ _inside(now.unknowns, partial(_solution, certain, slope))[0])
         done = _DONE * max(1.0, cost / now.residuals.size)
         if left < (done if start is None else max(_ENOUGH * cost, 1.0)):
             return now, count
         better: tuple[Unknowns, float] | None = None
         while better is None and damping < 1e6:
             damped = correlation + damping * np.eye(scale.size)
-            step = np.linalg.lstsq(damped, slope, rcond=1e-15)[0] / scale
+            step, free = _inside(now.unknowns, partial(_solution, damped, slope))
+            step = step / scale
             longest = float(np.abs(np.where(now.unknowns.by_logarithm, step, step / widths)).max())
             step *= min(1.0, _LONGEST / max(longest, 1e-300))
-            near = misfit.residuals(now.unknowns.moved(_GLIMPSE * step))
+            near = misfit.residuals(now.unknowns.moved(_GLIMPSE * step).within_limits())
             count += 1
             residuals = None
             if near is not None:
                 # residuals of the second order, which bend the step along a curved valley
                 bend = near - now.residuals + _GLIMPSE * (now.jacobian @ step)
                 turn = weighed.T @ bend * (1.0 / _GLIMPSE**2) / scale
-                bent = np.linalg.lstsq(damped, turn, rcond=1e-15)[0] / scale
+                bent = _solution(damped, turn, free) / scale
                 if np.linalg.norm(bent * scale) < np.linalg.norm(step * scale):
-                    trial = now.unknowns.moved(step + bent)
+                    trial = now.unknowns.moved(step + bent).within_limits()
                     residuals = misfit.residuals(trial)
                     count += 1
             if residuals is not None and np.isfinite(residuals).all():

@@ -68,7 +68,7 @@ class Source:
 
 def vague_information(unknowns: Unknowns) -> Floats:
     """Information on what varies before any record. Shape `(P,)`."""
-    return (_VAGUE * unknowns.widths) ** -2.0
+    return (_VAGUE * unknowns.vague_widths) ** -2.0
 
 
 def largest_std(unknowns: Unknowns) -> Floats:
@@ -109,7 +109,7 @@ def determined_by(
         at least one; none for a parameter that is not identifiable.
     """
     widths = unknowns.widths
-    prior = np.eye(widths.size) / _VAGUE
+    prior = np.diag(np.sqrt(vague_information(unknowns)) * widths)
     factors: dict[tuple[str, str], Floats] = {
         name: np.asarray(np.linalg.qr(part * widths, mode="r")) for name, part in parts.items()
     }

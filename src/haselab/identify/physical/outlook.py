@@ -36,7 +36,7 @@ class Outlook:
 
     Args:
         unknowns: at the present estimate.
-        present: square root of the present information, in widths. Shape `(M, P)`.
+        present: square root of the present information, in vague widths. Shape `(M, P)`.
         excess_variance: of the records over that with white residuals.
     """
 
@@ -45,7 +45,12 @@ class Outlook:
     excess_variance: float = 1.0
 
     @classmethod
-    def of(cls, unknowns: Unknowns, covariance: Floats, excess_variance: float = 1.0) -> Outlook:
+    def of(
+        cls,
+        unknowns: Unknowns,
+        covariance: Floats,
+        excess_variance: float = 1.0,
+    ) -> Outlook:
         """Start from the covariance of the present values.
 
         Args:
@@ -55,7 +60,7 @@ class Outlook:
         Raises:
             ResultError: The covariance is none.
         """
-        unit = unknowns.slopes * unknowns.widths
+        unit = unknowns.slopes * unknowns.vague_widths
         relative = covariance / np.outer(unit, unit)
         std = np.sqrt(np.diag(relative))
         if not (np.isfinite(relative).all() and (std > 0.0).all()):
@@ -73,7 +78,7 @@ class Outlook:
         return cls(unknowns, root.T / std, excess_variance)
 
     def information(self, record: MotionRecord) -> Floats:
-        """Square root of the information of an experiment, in widths.
+        """Square root of the information of an experiment, in vague widths.
 
         Args:
             record: when and how well lengths and capacitances would be seen; their values are not
@@ -92,7 +97,7 @@ class Outlook:
                 found.capacitance_by / record.capacitance_std_f[:, None],
             ]
         )
-        scale = self.unknowns.widths / np.sqrt(self.excess_variance)
+        scale = self.unknowns.vague_widths / np.sqrt(self.excess_variance)
         return np.asarray(np.linalg.qr(rows * scale, mode="r"))
 
     def relative_std(self, added: Sequence[Floats] = ()) -> Floats:
@@ -102,7 +107,8 @@ class Outlook:
             added: square roots of the informations of further experiments.
         Returns:
             Standard deviations of what varies over 2.5 widths: those of the logarithms, of
-            latencies over 5 ms, and so on. Shape `(P,)`.
+            latencies over 5 ms, and so on; of an inverse square, that of at most the default value.
+            Shape `(P,)`.
         """
         covariance = covariance_of([self.present, *added])
         return np.asarray(np.sqrt(np.diag(covariance)) / RELATIVE)

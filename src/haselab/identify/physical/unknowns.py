@@ -144,6 +144,20 @@ class Unknowns:
         return found
 
     @property
+    def vague_widths(self) -> Floats:
+        """The same, but of an inverse square at least that at the default of the kind.
+
+        Near its highest value, where an inverse square is 0, its own width would be as good as 0,
+        and a parameter that nobody knows would look known. Shape `(P,)`.
+        """
+        usual_law, found = type(self.law)(), self.widths
+        fields = {about.key: about.name for about in self.law.described()}
+        for k in np.flatnonzero(self.by_inverse_square):
+            default = float(getattr(usual_law, fields[self.names[k]]))
+            found[k] = max(found[k], 2.0 * _WIDTH / default**2)
+        return found
+
+    @property
     def _inertia_kg(self) -> float:
         return self.mass_kg + self.value(ADDED_INERTIA)
 

@@ -141,7 +141,8 @@ class Unknowns:
         widths = {ADDED_INERTIA: _INERTIA_WIDTH * self._inertia_kg, **_WIDTHS}
         about = {one.key: one for one in self.law.described()}
         for name, value in zip(self.names, self.values.tolist(), strict=True):
-            if value > 0.0 and (known := about.get(name.partition("[")[0])) is not None:
+            known = about.get(name.partition("[")[0])
+            if known is not None and value > 0.0 and not known.inverse_square:
                 widths[name] = max(_WIDTH * (1.0 - known.low / value), _LEAST_WIDTH)
         found = np.array([widths.get(name, _WIDTH) for name in self.names])
         inverse = self.by_inverse_square

@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 _SERIES = np.array([1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750])
 _ORDER = np.arange(1, 6)
 _SHORTEST = 0.5  # of the free length: a sheet that is pushed folds
+_LONGEST = 15.0  # of the free length: no elastomer stretches so far, and a table resolves it
 _OF_LOCKING = 0.9  # stretch up to which the series of five terms follows the chains
 
 
@@ -129,7 +130,7 @@ class PlanarHasel(ActuatorLaw):
 
     @property
     def length_limits_m(self) -> Limits:
-        """From half the free length to 90 % of the stretch at which the chains lock."""
+        """From half the free length to 90 % of the stretch at which the chains lock, at most 15."""
         squared = 3.0 * self.locking_stretch**2 - self.shell_lateral_stretch**2
         if squared <= 0.0:
             raise LimitError(
@@ -139,6 +140,7 @@ class PlanarHasel(ActuatorLaw):
             )
         locked = math.sqrt(squared)
         high = _OF_LOCKING * locked * math.sqrt(self.shell_lateral_stretch) * self.free_length_m
+        high = min(high, _LONGEST * self.free_length_m)
         return Limits("length", _SHORTEST * self.free_length_m, high, "m")
 
     @property

@@ -33,7 +33,7 @@ _COMMANDS = {
     "plan": ("haselab.cli.bench.plan", "Choose the carrier and check a study's feasibility."),
     "plan-experiment": (
         "haselab.cli.identify.plan_experiment",
-        "Design the drive signal of the next experiment.",
+        "Design the next experiment.",
     ),
     "track": ("haselab.cli.data.track", "Measure displacements and strain in a video."),
     "identify": ("haselab.cli.identify.group", "Identify models, with intervals, from records."),

@@ -132,6 +132,8 @@ def coloured_covariance(
     residuals: Sequence[Floats],
     parameters: int,
     own: Sequence[Floats] | None = None,
+    *,
+    prior: Floats | None = None,
 ) -> Floats:
     r"""Covariance of least-squares estimates when the noise may be coloured.
 
@@ -145,21 +147,25 @@ def coloured_covariance(
         parameters: all fitted parameters, nuisances included.
         own: orthonormal functions of one record only, to which its columns are orthogonal.
             Shape `(M_r, Q)`. None: none.
+        prior: information on each estimate before the records, whose residuals then have a
+            variance of about 1. Positive, shape `(P,)`; None: none.
     Returns:
-        Covariance. Shape `(P, P)`; a variance is infinite where a parameter is not identifiable.
+        Covariance. Shape `(P, P)`; without a prior, a variance is infinite where a parameter
+            is not identifiable.
     Source: White, Econometrica 48 (1980), 817, with a parametric noise covariance.
     """
     count = sum(e.size for e in residuals)
     polynomial, variance = autoregression(residuals)
     size = columns[0].shape[1]
-    scale = np.sqrt(sum(((z**2).sum(axis=0) for z in columns), np.zeros(size)))
+    before = np.zeros(size) if prior is None else prior
+    scale = np.sqrt(sum(((z**2).sum(axis=0) for z in columns), before))
     if not (scale > 0.0).all():
         return np.full((size, size), np.inf)
     if polynomial.size > 1:
         polynomial, variance = noise_behind(residuals, columns, own)
     else:
         variance *= count / max(count - parameters, 1)
-    gram, middle = np.zeros((size, size)), np.zeros((size, size))
+    gram, middle = np.diag(before / scale**2), np.zeros((size, size))
     for z in columns:
         z = z / scale
         gram += z.T @ z
@@ -169,8 +175,15 @@ def coloured_covariance(
             padded = np.vstack([z[::-1], np.zeros_like(z)])
             filtered = np.asarray(lfilter([1.0], polynomial, padded, axis=0))
         middle += filtered.T @ filtered
-    inverse, blind = _inverse(gram)
-    covariance = variance * inverse @ middle @ inverse / np.outer(scale, scale)
+    middle = variance * middle + np.diag(before / scale**2)
+    if prior is None:
+        inverse, blind = _inverse(gram)
+    else:
+        # of the factor, not of the sum, which would lose the weak directions
+        factor = np.vstack([*columns, np.diag(np.sqrt(prior))]) / scale
+        upper = np.linalg.inv(np.linalg.qr(factor, mode="r"))
+        inverse, blind = upper @ upper.T, np.zeros(size, dtype=bool)
+    covariance = inverse @ middle @ inverse / np.outer(scale, scale)
     covariance[blind, blind] = np.inf
     return np.asarray(covariance)
 

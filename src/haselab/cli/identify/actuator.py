@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -15,10 +15,14 @@ from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import actuator_option, answer_options, unverified_option, warn_unverified
 from haselab.cli.identify.common import give
 from haselab.cli.plot import save_plot
-from haselab.identify.physical import ActuatorFit, fit_actuator
-from haselab.models.actuator.sections import ActuatorSection
+from haselab.identify.physical import ActuatorFit, MotionRecord, fit_actuator
+from haselab.models.actuator.sections import ActuatorSection, ActuatorTables, PhysicalTable
 from haselab.pipelines.motion import motion_of_session
+from haselab.pipelines.planning.actuator_file import planner_of
+from haselab.pipelines.planning.proposal import DETERMINED, Proposal
+from haselab.pipelines.planning.records import summary_of
 from haselab.store.session.reader import SessionReader, session_file
+from haselab.store.toml import validated
 
 __all__ = ["actuator", "law_of_section", "section_of_fit"]
 
@@ -50,17 +54,36 @@ def actuator(
         )
     tables = load_actuator(actuator, to_write=True)
     law = law_of_section(tables.actuator, actuator)
-    records = []
+    records, gains_v_per_v = [], []
     for session in sessions:
         with SessionReader(session, unverified=unverified) as reader:
             warn_unverified(reader.doubt, session)
             records.append(motion_of_session(reader, session))
+            gains_v_per_v.append(float(reader.header["rig"]["amplifier_gain"]))
     mass_kg = max(float(record.drive.mass_kg[0]) for record in records)
     fit = fit_actuator(law, records, mass_kg=mass_kg)
     files = [session_file(session) for session in sessions]
-    give(fit, files, as_json, out)
+    if not fit.succeeded:
+        give(fit, files, as_json, out)
+    section = section_of_fit(fit, records, gains_v_per_v[0])
+    proposals = _proposals(tables, section, fit, actuator)
+    listed = {"experiments": [proposal.answer() for proposal in proposals]}
+    give(fit, files, as_json, out, listed)
     save_plot(plot, fit.chart)
-    save_section(actuator, "model.physical", section_of_fit(fit), files, status=fit.status)
+    save_section(actuator, "model.physical", section, files, status=fit.status)
+
+
+def _proposals(
+    tables: ActuatorTables, section: Mapping[str, object], fit: ActuatorFit, path: Path
+) -> list[Proposal]:
+    """For each parameter that is not identifiable, the experiment that would determine it."""
+    if not fit.not_identifiable:
+        return []
+    physical = validated(PhysicalTable, section, path)
+    planner = planner_of(tables.actuator, physical, tables.drive_ends_v, path)
+    unknown = [name for name in fit.not_identifiable if planner.before()[name] > DETERMINED]
+    found = (planner.propose(name, pairs=False) for name in unknown)
+    return [proposal for proposal in found if proposal is not None]
 
 
 def law_of_section(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
@@ -73,8 +96,10 @@ def law_of_section(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
         raise InputError(f"[actuator.parameters]: {error} {path}") from error
 
 
-def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
-    """`[model.physical]`: estimates with their covariance, and the noise of the records."""
+def section_of_fit(
+    fit: ActuatorFit, records: Sequence[MotionRecord], gain_v_per_v: float
+) -> Mapping[str, object]:
+    """`[model.physical]`: estimates with their covariance, and what they were made from."""
     finite = np.isfinite(np.diag(fit.covariance))
     names = [name for name, known in zip(fit.parameters, finite, strict=True) if known]
     noise = {
@@ -97,6 +122,12 @@ def section_of_fit(fit: ActuatorFit) -> Mapping[str, object]:
         "parameters": {name: estimate.value for name, estimate in fit.parameters.items()},
         "std": {name: estimate.std for name, estimate in fit.parameters.items()},
         "not_identifiable": list(fit.not_identifiable),
+        "determined_by": {
+            name: [source.text for source in sources]
+            for name, sources in fit.determined_by.items()
+            if sources
+        },
         "covariance": covariance,
         "residuals": {key: value for key, value in noise.items() if math.isfinite(value)},
+        "records": summary_of(fit, records, gain_v_per_v).model_dump(exclude_none=True),
     }

@@ -8,6 +8,7 @@ from haselab.cli.identify.actuator import actuator
 from haselab.cli.identify.arx import arx, subspace
 from haselab.cli.identify.hysteresis import creep, hysteresis
 from haselab.cli.identify.model_comparison import verdict
+from haselab.cli.identify.plan_experiment import command as plan_experiment
 from haselab.cli.identify.response import free_response, frequency_response
 from haselab.cli.identify.static_map import spline_map
 from haselab.cli.identify.statics import capacitance_map, hyperelastic, regions, voltage_map
@@ -40,5 +41,6 @@ for _method in (
     hysteresis,
     creep,
     verdict,
+    plan_experiment,
 ):
     command.add_command(_method)

@@ -1,4 +1,4 @@
-"""`haselab plan-experiment`: design the next drive signal within the limits of the bench."""
+"""`haselab plan-experiment`: design the next experiment within the limits of the bench."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Any
 
 import click
 import numpy as np
+from click.core import ParameterSource
 
 from haselab.base import InputError, ResultError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
+from haselab.cli.identify.plan_for_actuator import plan_for_actuator
 from haselab.cli.model.model_file import read_plant
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -34,15 +36,27 @@ __all__ = ["command"]
 
 _SHOWN = 8  # rows of the table
 _BLOCK_DIGITS = 6
+_OF_SIGNAL = (
+    "duration_s", "baseline_v", "capacitance_f", "largest_output", "noise_std", "samples_per_s",
+    "systematic", "plot",
+)  # fmt: skip
 
 
 @click.command("plan-experiment")
 @click.argument("model", type=click.Path(path_type=Path))
-@shared_option("--rig", required=True, type=click.Path(path_type=Path))
+@shared_option(
+    "--rig", type=click.Path(path_type=Path),
+    detail="Default: none; MODEL is then an actuator file with [model.physical].",
+)  # fmt: skip
 @click.option(
     "--goal", required=True,
     help="Choose the goal. creep, reading, modes: separate the candidate models; all, or the name "
     "of a parameter: reduce its interval.",
+)  # fmt: skip
+@click.option(
+    "--std", type=LIMIT, default=None,
+    help="Set the relative standard deviation that the parameter of an actuator file shall reach. "
+    "Default: 0.1.",
 )  # fmt: skip
 @shared_option(
     "--duration-s", type=REAL, default=40.0, show_default=True, detail="Length of the drive signal."
@@ -70,22 +84,43 @@ _BLOCK_DIGITS = 6
     "--systematic", type=REAL, default=0.05, show_default=True,
     help="Set the rms error of the models themselves, relative to the output's standard deviation.",
 )  # fmt: skip
-@answer_options(None, "A CSV file of the drive signal: time_s, drive_v. Default: none.", plot=True)
+@answer_options(
+    None,
+    "A CSV file of the drive signal: time_s, drive_v; or, without --rig, a study file. "
+    "Default: none.",
+    plot=True,
+)
+@click.pass_context
 def command(
+    context: click.Context,
+    /,
     model: Path,
-    rig: Path,
+    rig: Path | None,
     goal: str,
+    std: float | None,
     as_json: bool,
     out: Path | None,
     plot: Path | None,
     **options: float,
 ) -> None:
-    """Design the drive signal of the next experiment.
+    """Design the next experiment.
 
-    Within the limits of the bench, the signal separates candidate models, or reduces the confidence
-    interval of a parameter, as well as possible. MODEL is a JSON answer of `identify verdict` or
-    `identify transfer`, or the model.json of a run.
+    With --rig: a drive signal that, within the limits of the bench, separates candidate models, or
+    reduces the confidence interval of a parameter, as well as possible. MODEL is a JSON answer of
+    `identify verdict` or `identify transfer`, or the model.json of a run.
+
+    Without --rig: the shortest study that determines a parameter of the physical model, within the
+    limits of [drive]. MODEL is an actuator file with [model.physical].
     """
+    if rig is None:
+        _only_with_rig(context, model)
+        plan_for_actuator(model, goal, std, as_json=as_json, out=out)
+        return
+    if std is not None:
+        raise InputError(
+            "--std has no effect with --rig. Leave out --rig to plan for the physical model of an "
+            "actuator file, or leave out --std."
+        )
     plant = _plant(model, options["baseline_v"])
     if goal not in goals_of(plant):
         raise InputError(f"--goal is {goal}, but must be one of {', '.join(goals_of(plant))}.")
@@ -107,6 +142,25 @@ def command(
     else:
         click.echo("\n".join(_page(plan)))
     save_plot(plot, lambda: _chart(plan))
+
+
+def _only_with_rig(context: click.Context, model: Path) -> None:
+    """Refuse options that need a rig where none is given.
+
+    Raises:
+        InputError: One of them is given, or MODEL is not an actuator file.
+    """
+    if model.suffix != ".toml":
+        raise InputError(
+            f"{model} is not an actuator file (.toml), so the bench must be known. Add --rig "
+            "RIG.toml."
+        )
+    for name in _OF_SIGNAL:
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            raise InputError(
+                f"--{name.replace('_', '-')} describes a drive signal, which needs --rig. Add "
+                "--rig, or leave it out."
+            )
 
 
 def _chart(plan: ExperimentPlan) -> Chart:

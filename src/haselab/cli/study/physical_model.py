@@ -12,7 +12,7 @@ from haselab.actuators import ACTUATORS
 from haselab.base import Estimate, ResultError
 from haselab.cli.actuator_file import save_section
 from haselab.cli.identify.actuator import section_of_fit
-from haselab.identify.physical import ActuatorFit, fit_actuator
+from haselab.identify.physical import ActuatorFit, MotionRecord, fit_actuator
 from haselab.models.actuator import ActuatorTables
 from haselab.pipelines.model_results import results_of_model
 from haselab.pipelines.motion import motion_of_session
@@ -38,10 +38,14 @@ class PhysicalModel:
     Args:
         fit: of the model.
         results: rows that follow from it, by id; none if it does not explain the recording.
+        record: of the session, which was fitted.
+        gain_v_per_v: of the amplifier.
     """
 
     fit: ActuatorFit
     results: Mapping[str, Estimate]
+    record: MotionRecord
+    gain_v_per_v: float
 
     def joined(self, found: Findings) -> Findings:
         """Replace results of the experiments' own fits by those of the model.
@@ -72,8 +76,9 @@ class PhysicalModel:
             folder: of the results.
             session: that was analysed.
         """
+        section = section_of_fit(self.fit, [self.record], self.gain_v_per_v)
         save_section(
-            folder / ACTUATOR, "model.physical", section_of_fit(self.fit),
+            folder / ACTUATOR, "model.physical", section,
             [session_file(session)], status=self.fit.status,
         )  # fmt: skip
 
@@ -101,9 +106,9 @@ def identified(
         fit = fit_actuator(start, [record], mass_kg=float(record.drive.mass_kg[0]))
         if fit.status != "ok":
             click.echo(f"haselab: no results of a physical model: {fit.status}", err=True)
-            return PhysicalModel(fit, {})
+            return PhysicalModel(fit, {}, record, rig.amplifier_gain)
         lockin = lockin_of(rig, study.sensing.carrier_hz)
-        record = motion_of_session(reader, session_file(session), lockin)  # as the study senses
+        observed = motion_of_session(reader, session_file(session), lockin)  # as the study senses
         events = reader.events()
 
         def source(name: str) -> Observation:
@@ -111,8 +116,8 @@ def identified(
 
         known = known_values(validated(ActuatorTables, header.get("actuator", {}), session))
         try:
-            rows = results_of_model(fit, record, source, study, rig, found, known)
+            rows = results_of_model(fit, observed, source, study, rig, found, known)
         except ResultError as error:
             click.echo(f"haselab: no results of the physical model: {error}", err=True)
-            return PhysicalModel(fit, {})
-    return PhysicalModel(fit, rows)
+            return PhysicalModel(fit, {}, record, rig.amplifier_gain)
+    return PhysicalModel(fit, rows, record, rig.amplifier_gain)

@@ -13,7 +13,7 @@ residuals and a model error (`model_error`) make it larger.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,13 @@ from haselab.base import Estimate, InputError, JsonObject, LimitError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import Fit
 from haselab.identify.noise import coloured_covariance, whiteness_p
+from haselab.identify.physical.information import (
+    Source,
+    covariance_of,
+    determined_by,
+    largest_std,
+    vague_information,
+)
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
 from haselab.identify.physical.record import MotionRecord
@@ -51,7 +58,6 @@ _WHITE = 1e-3  # probability of the residuals under white noise
 _ENOUGH = 20  # values of an experiment, for an rms of its own
 _POINTS = 5  # voltages of the linear models
 _UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
-_WEAK = 1.0  # standard deviation of a logarithm above which a parameter is not identifiable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +66,10 @@ class ActuatorFit(Fit):
 
     Args:
         status: "ok"; what the model does not explain; or why there is no result.
-        parameters: by the names of TWIN.toml, and of the instruments.
+        parameters: by the names of TWIN.toml, and of the instruments; the standard deviation of one
+            that is not identifiable is infinite.
         covariance: of `parameters`, in their order. It grows by what the model does not explain.
+            It is finite: before the records, each is assumed to be within ten widths of its start.
         residuals: over their standard deviations, one array for each of `channels`.
         notes: remarks for the user, one sentence each.
         law: with the estimated parameters.
@@ -84,6 +92,8 @@ class ActuatorFit(Fit):
         linear_models: at the hung mass and some voltages up to the highest that acted.
         mass_kg: that hangs.
         rejected_laws: those that the records contradict decisively.
+        determined_by: by parameter, the segments that determine it; none if it is not identifiable.
+        excess_variance: typical variance of the parameters over that with white residuals.
     """
 
     law: ActuatorLaw | None = None
@@ -106,6 +116,8 @@ class ActuatorFit(Fit):
     linear_models: tuple[OperatingPoint, ...] = ()
     mass_kg: float = float("nan")
     rejected_laws: tuple[Rival, ...] = ()
+    determined_by: Mapping[str, tuple[Source, ...]] = field(default_factory=dict)
+    excess_variance: float = 1.0
 
     @property
     def succeeded(self) -> bool:
@@ -130,6 +142,10 @@ class ActuatorFit(Fit):
             "kind": self.kind,
             "parameters": self.parameters,
             "not_identifiable": list(self.not_identifiable),
+            "determined_by": {
+                name: [source.answer() for source in sources]
+                for name, sources in self.determined_by.items()
+            },
             "linear_models": [
                 {
                     "voltage_v": point.voltage_v,
@@ -342,14 +358,16 @@ def _result(
     )
     if not usable:
         return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
-    covariance = _covariance(found, segments)
+    prior = vague_information(unknowns)
+    covariance = _covariance(found, segments, prior)
     own_std = np.sqrt(np.diag(covariance))
+    white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
     if status != "ok":
         energy = excess_energy(
             [(part, noise) for part, noise in (
                 (lengths, length_noise), (capacitances, capacitance_noise)) if part]
         )  # fmt: skip
-        covariance = widened(covariance, hidden_std(found.jacobian, energy))
+        covariance = widened(covariance, hidden_std(found.jacobian, energy, prior))
     std = np.sqrt(np.diag(covariance))
     widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
     described = {about.key: about for about in unknowns.law.described()}
@@ -358,22 +376,22 @@ def _result(
               "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": "",
               START_HYSTERESIS: "N"}  # fmt: skip
     slopes = unknowns.slopes
-    parameters, weak = {}, []
+    weak = (std > largest_std(unknowns)) | (np.abs(found.left) > _UNSETTLED * std)
+    parameters = {}
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
-        if abs(found.left[k]) > _UNSETTLED * std[k]:
-            weak.append(name)
         if unknowns.by_logarithm[k] or unknowns.by_inverse_square[k]:
-            share = std[k] * abs(slopes[k]) / unknowns.values[k]
-            if share > _WEAK or not np.abs(found.jacobian[:, k]).any():
-                weak.append(name)
+            share = np.inf if weak[k] else std[k] * abs(slopes[k]) / unknowns.values[k]
             parameters[name] = (
                 Estimate.inverse_square(unknowns.values[k], share, unit, described[name].high)
                 if unknowns.by_inverse_square[k]
                 else Estimate.lognormal(unknowns.values[k], share, unit)
             )
         else:
-            parameters[name] = Estimate.normal(unknowns.values[k], std[k], unit)
+            known_std = np.inf if weak[k] else std[k]
+            parameters[name] = Estimate.normal(unknowns.values[k], known_std, unit)
+    sources = determined_by(unknowns, _by_segment(segments, found.jacobian))
+    names = np.array(unknowns.names)
     std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])
     std_f = misfit.capacitance_factor * _typical([r.capacitance_std_f for r in misfit.records])
     law = unknowns.present_law()
@@ -400,23 +418,39 @@ def _result(
         mass_kg=unknowns.mass_kg,
         added_inertia_kg=unknowns.value(ADDED_INERTIA),
         linear_models=_linear_models(law, unknowns, misfit.records),
-        not_identifiable=tuple(dict.fromkeys(weak)),
+        not_identifiable=tuple(names[weak].tolist()),
+        determined_by={
+            name: () if weak[k] else sources[name] for k, name in enumerate(unknowns.names)
+        },
+        excess_variance=_excess_variance(covariance, white, ~weak),
         evaluations=found.evaluations,
         rejected_laws=(*rejected, *simpler(found, values)),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
 
 
-def _covariance(found: Found, segments: Sequence[Segment]) -> Floats:
-    """Of what varies; infinite for what has no effect on the records."""
-    acts = np.abs(found.jacobian).any(axis=0)
-    covariance = np.diag(np.where(acts, 0.0, np.inf))
-    covariance[np.ix_(acts, acts)] = coloured_covariance(
-        [found.jacobian[part.rows][:, acts] for part in segments],
+def _covariance(found: Found, segments: Sequence[Segment], prior: Floats) -> Floats:
+    """Of what varies."""
+    return coloured_covariance(
+        [found.jacobian[part.rows] for part in segments],
         [found.residuals[part.rows] for part in segments],
-        int(acts.sum()),
+        found.unknowns.values.size,
+        prior=prior,
     )
-    return covariance
+
+
+def _excess_variance(covariance: Floats, white: Floats, known: NDArray[np.bool_]) -> float:
+    """Typical ratio of the variances of what is identifiable; at least 1."""
+    ratio = (np.diag(covariance) / np.diag(white))[known]
+    return max(1.0, float(np.median(ratio))) if ratio.size else 1.0
+
+
+def _by_segment(segments: Sequence[Segment], values: Floats) -> dict[tuple[str, str], Floats]:
+    """Rows of each experiment and channel; those of experiments of one name together."""
+    found: dict[tuple[str, str], list[Floats]] = {}
+    for part in segments:
+        found.setdefault((part.experiment, part.channel), []).append(values[part.rows])
+    return {name: np.vstack(parts) for name, parts in found.items()}
 
 
 @dataclass(frozen=True)

@@ -18,24 +18,31 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.identify.physical.information import covariance_of
+
 __all__ = ["excess_energy", "hidden_std", "widened"]
 
 Floats = NDArray[np.float64]
 _SINGULAR = 1e-12
 
 
-def hidden_std(jacobian: Floats, excess: float) -> Floats:
+def hidden_std(jacobian: Floats, excess: float, prior: Floats | None = None) -> Floats:
     """Standard deviation of what varies, if a fit hides as much of a model error as it shows.
 
     Args:
         jacobian: of the model over the standard deviations. Shape `(N, P)`.
         excess: sum of the squares of the residuals, without that of their noise.
+        prior: information on what varies before the records. Positive, shape `(P,)`; None: none.
     Returns:
-        Standard deviations. Shape `(P,)`; infinite for what has no effect on the records.
+        Standard deviations. Shape `(P,)`; without a prior, infinite for what has no
+            effect on the records.
     Example:
         >>> hidden_std(np.ones((100, 1)), 25.0).tolist()
         [0.5]
     """
+    if prior is not None:
+        factors = [jacobian, np.diag(np.sqrt(prior))]
+        return np.asarray(np.sqrt(max(excess, 0.0) * np.diag(covariance_of(factors))))
     scale = np.linalg.norm(jacobian, axis=0)
     acts = scale > 0.0
     columns = jacobian[:, acts] / scale[acts]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.identify.physical.information import vague_information
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.unknowns import Unknowns
 
@@ -30,7 +33,6 @@ _GLIMPSE = 0.1  # of a step, where the second order is measured
 _ENOUGH = 1e-3  # relative decrease to be expected that ends a stage
 _NEAR = 4.0  # decrease to be expected, in the same, above which nothing was found
 _DONE = 1e-2  # the same of the last one, in the mean square of the residuals
-_VAGUE = 10.0  # widths of the start in the last stage: a share of 0.1 may be 0.002 as well
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class Found:
         unknowns: at the smallest misfit.
         residuals: over their standard deviations. Shape `(N,)`.
         jacobian: of the model over the standard deviations. Shape `(N, P)`.
-        left: step of Gauss and Newton that remains, of what varies. Shape `(P,)`.
+        left: step of Gauss and Newton that remains, of what varies, as far as it is not longer than
+            ten widths. Shape `(P,)`.
         converged: whether it is hardly expected to lower the misfit.
         evaluations: of the model.
     """
@@ -102,17 +105,43 @@ def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | Non
 
 def _last_stage(misfit: Misfit, now: _State, start: Unknowns, evaluations: int) -> Found:
     now, used = _descend(misfit, now, start, 1.0, _LAST_STEPS, last=True)
-    pull = 1.0 / (_VAGUE * now.unknowns.widths)
-    jacobian = np.vstack([now.jacobian, np.diag(pull)])
-    rest = np.concatenate([now.residuals, -pull * now.unknowns.distance(start)])
-    scale = np.linalg.norm(jacobian, axis=0)
-    left = np.linalg.lstsq(jacobian / scale, rest, rcond=1e-12)[0] / scale
-    expected = float(np.sum((jacobian @ left) ** 2))
+    pull = np.sqrt(vague_information(now.unknowns))
+    columns = np.vstack([now.jacobian, np.diag(pull)])
+    wanted = np.concatenate([now.residuals, -pull * now.unknowns.distance(start)])
+    scale = np.linalg.norm(columns, axis=0)
+    left, _ = _inside(
+        now.unknowns,
+        lambda free: np.linalg.lstsq(np.where(free, columns / scale, 0.0), wanted, rcond=None)[0],
+    )
+    expected = float(np.sum((columns @ (left / scale)) ** 2))
     usual = float(np.mean(now.residuals**2))
     return Found(
-        now.unknowns, now.residuals, now.jacobian, left,
+        now.unknowns, now.residuals, now.jacobian, left / scale,
         expected < _NEAR * max(1.0, usual), evaluations + used,
     )  # fmt: skip
+
+
+def _solution(matrix: Floats, slope: Floats, free: NDArray[np.bool_]) -> Floats:
+    """Solve normal equations for some of the unknowns; the others stay."""
+    some = np.ix_(free, free)
+    found = np.zeros(slope.size)
+    found[free] = np.linalg.lstsq(matrix[some], slope[free], rcond=1e-15)[0]
+    return found
+
+
+def _inside(
+    unknowns: Unknowns, solution: Callable[[NDArray[np.bool_]], Floats]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Step that crosses no limit, and which of the unknowns it moves.
+
+    An unknown that the records hardly determine may end at its limit; the others go on.
+    """
+    free = np.ones(unknowns.values.size, dtype=np.bool_)
+    step = solution(free)
+    while (stopped := free & unknowns.at_limit(step)).any():
+        free = free & ~stopped
+        step = solution(free)
+    return step, free
 
 
 def _first_stage(misfit: Misfit, start: Unknowns, noise: float) -> tuple[_State | None, int]:
@@ -171,7 +200,7 @@ def _descend(
 ) -> tuple[_State, int]:
     """One stage: state, evaluations used."""
     widths = now.unknowns.widths
-    pull = 1.0 / ((_VAGUE if last else 1.0) * widths) ** 2
+    pull = vague_information(now.unknowns) if last else widths**-2.0
 
     def cost_of(unknowns: Unknowns, residuals: Floats) -> float:
         away = float((pull * unknowns.distance(start) ** 2).sum())
@@ -188,26 +217,27 @@ def _descend(
         slope = weighed.T @ now.residuals - pull * now.unknowns.distance(start)
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         correlation, slope = normal / np.outer(scale, scale), slope / scale
-        left = float(slope @ np.linalg.lstsq(correlation, slope, rcond=1e-15)[0])
+        left = float(slope @ _inside(now.unknowns, partial(_solution, correlation, slope))[0])
         done = _DONE * max(1.0, cost / now.residuals.size)
         if left < (done if last else max(_ENOUGH * cost, 1.0)):
             return now, count
         better: tuple[Unknowns, float] | None = None
         while better is None and damping < 1e6:
             damped = correlation + damping * np.eye(scale.size)
-            step = np.linalg.lstsq(damped, slope, rcond=1e-15)[0] / scale
+            step, free = _inside(now.unknowns, partial(_solution, damped, slope))
+            step = step / scale
             longest = float(np.abs(np.where(now.unknowns.by_logarithm, step, step / widths)).max())
             step *= min(1.0, _LONGEST / max(longest, 1e-300))
-            near = misfit.residuals(now.unknowns.moved(_GLIMPSE * step))
+            near = misfit.residuals(now.unknowns.moved(_GLIMPSE * step).within_limits())
             count += 1
             residuals = None
             if near is not None:
                 # residuals of the second order, which bend the step along a curved valley
                 bend = near - now.residuals + _GLIMPSE * (now.jacobian @ step)
                 turn = weighed.T @ bend * (1.0 / _GLIMPSE**2) / scale
-                bent = np.linalg.lstsq(damped, turn, rcond=1e-15)[0] / scale
+                bent = _solution(damped, turn, free) / scale
                 if np.linalg.norm(bent * scale) < np.linalg.norm(step * scale):
-                    trial = now.unknowns.moved(step + bent)
+                    trial = now.unknowns.moved(step + bent).within_limits()
                     residuals = misfit.residuals(trial)
                     count += 1
             if residuals is not None and np.isfinite(residuals).all():

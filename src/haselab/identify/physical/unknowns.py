@@ -38,6 +38,7 @@ _LEAST_WIDTH = 0.02
 _WIDTHS = {CAMERA_LATENCY: 2e-3, CAMERA_OFFSET: 1e-3, CAMERA_SCALE: 1e-3, SENSING_LATENCY: 2e-3,
            SENSING_SCALE: 0.05, START_HYSTERESIS: 0.1}  # fmt: skip
 _INERTIA_WIDTH = 0.1  # of the mass
+_AT_LIMIT = 1e-6  # relative distance from a limit
 
 
 def fitted_parameters(law: ActuatorLaw) -> dict[str, float]:
@@ -140,11 +141,26 @@ class Unknowns:
         widths = {ADDED_INERTIA: _INERTIA_WIDTH * self._inertia_kg, **_WIDTHS}
         about = {one.key: one for one in self.law.described()}
         for name, value in zip(self.names, self.values.tolist(), strict=True):
-            if value > 0.0 and (known := about.get(name.partition("[")[0])) is not None:
+            known = about.get(name.partition("[")[0])
+            if known is not None and value > 0.0 and not known.inverse_square:
                 widths[name] = max(_WIDTH * (1.0 - known.low / value), _LEAST_WIDTH)
         found = np.array([widths.get(name, _WIDTH) for name in self.names])
         inverse = self.by_inverse_square
         found[inverse] *= 2.0 / self.values[inverse] ** 2
+        return found
+
+    @property
+    def vague_widths(self) -> Floats:
+        """The same, but of an inverse square at least that at the default of the kind.
+
+        Near its highest value, where an inverse square is 0, its own width would be as good as 0,
+        and a parameter that nobody knows would look known. Shape `(P,)`.
+        """
+        usual_law, found = type(self.law)(), self.widths
+        fields = {about.key: about.name for about in self.law.described()}
+        for k in np.flatnonzero(self.by_inverse_square):
+            default = float(getattr(usual_law, fields[self.names[k]]))
+            found[k] = max(found[k], 2.0 * _WIDTH / default**2)
         return found
 
     @property
@@ -155,6 +171,30 @@ class Unknowns:
     def slopes(self) -> Floats:
         """Change of the values per change of what varies. Shape `(P,)`."""
         return self._scales.slopes(self.values)
+
+    @property
+    def limits(self) -> tuple[Floats, Floats]:
+        """Smallest and largest value of each; infinite where there is no limit. Shapes `(P,)`."""
+        ends = {about.key: (about.low, about.high) for about in self.law.described()}
+        found = [ends.get(name.partition("[")[0], (-np.inf, np.inf)) for name in self.names]
+        low, high = np.array(found, dtype=np.float64).reshape(-1, 2).T
+        return low, high
+
+    def at_limit(self, step: Floats) -> NDArray[np.bool_]:
+        """Which of them are at a limit that a step would cross.
+
+        Args:
+            step: changes of what varies. Shape `(P,)`.
+        """
+        (low, high), change = self.limits, self.slopes * step
+        near = 1.0 + _AT_LIMIT
+        return ((self.values <= low * near) & (change < 0.0)) | (
+            (self.values * near >= high) & (change > 0.0)
+        )
+
+    def within_limits(self) -> Unknowns:
+        """The same with values beyond a limit moved to it."""
+        return Unknowns(self.law, self.names, np.clip(self.values, *self.limits), self.mass_kg)
 
     def value(self, name: str) -> float:
         """Value of one of them; an instrument's default where it is not estimated."""

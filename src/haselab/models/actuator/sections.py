@@ -28,6 +28,7 @@ __all__ = [
     "LoopTable",
     "ModelSection",
     "PhysicalCovariance",
+    "PhysicalRecords",
     "PhysicalTable",
     "ResidualTable",
     "SensingSection",
@@ -243,6 +244,26 @@ class ResidualTable(_Section):
     capacitance_factor: _Positive | None = None
 
 
+class PhysicalRecords(_Section):
+    """`[model.physical.records]`: what the physical model was fitted to.
+
+    The covariance of the model is the information of these records; with the noise stated here,
+    that of a further experiment can be computed and added.
+    """
+
+    experiments: tuple[str, ...] = ()
+    duration_s: Annotated[Number, Field(ge=0)] = 0.0
+    gain_v_per_v: _Positive = Field(description="gain of the amplifier", examples=[5000.0])
+    highest_drive_v: Annotated[Number, Field(ge=0)] = 0.0  # before the amplifier
+    heaviest_kg: Annotated[Number, Field(ge=0, le=1e4)] = 0.0
+    carrier_v: Annotated[Number, Field(ge=0)] = 0.0  # peak at the actuator
+    length_std_m: _Positive | None = None  # None: no lengths were seen
+    capacitance_std_f: _Positive | None = None
+    exposure_s: Annotated[Number, Field(ge=0)] = 0.0
+    pixel_m: Annotated[Number, Field(ge=0)] = 0.0
+    excess_variance: Annotated[Number, Field(ge=1)] = 1.0  # over that with white residuals
+
+
 class PhysicalTable(_Section):
     """`[model.physical]`: the physical model that `identify actuator` writes."""
 
@@ -254,8 +275,11 @@ class PhysicalTable(_Section):
     )
     std: Annotated[dict[str, float], BeforeValidator(_by_full_name)] = {}
     not_identifiable: tuple[str, ...] = ()
+    # experiments and channels that determine each parameter
+    determined_by: Annotated[dict[str, tuple[str, ...]], BeforeValidator(_by_table)] = {}
     covariance: PhysicalCovariance | None = None
     residuals: ResidualTable = ResidualTable()
+    records: PhysicalRecords | None = None
 
 
 class ModelSection(_Section):

@@ -1,0 +1,1 @@
+"""The experiment that would determine a parameter of a physical model."""

@@ -86,7 +86,9 @@ def _lines(config: TwinConfig) -> Iterator[str]:
     yield f"name = {json.dumps(config.name)}"
     yield f"kind = {json.dumps(config.kind)}"
     section = ""
-    for about in law.described():
+    described = list(law.described())
+    tables = list(dict.fromkeys(about.key.partition(".")[0] for about in described))
+    for about in sorted(described, key=lambda one: tables.index(one.key.partition(".")[0])):
         table, _, entry = about.key.partition(".")
         if table != section:
             section = table

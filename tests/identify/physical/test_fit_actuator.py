@@ -124,6 +124,8 @@ def test_softening_that_the_law_lacks_is_found():
     assert fit.status == "ok"
     assert fit.rejected_laws[0].law == "without softening"
     assert fit.rejected_laws[0].log_evidence < -5.0
+    laws = [rival.law for rival in fit.rejected_laws]
+    assert len(set(laws)) == len(laws)
     far = deviations(fit, TRUE)
     assert "mullins.share" in far and max(map(abs, far.values())) < 4.0, far
     assert fit.answer()["rejected_laws"][0]["law"] == "without softening"

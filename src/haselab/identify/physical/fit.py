@@ -424,9 +424,14 @@ def _result(
         },
         excess_variance=_excess_variance(covariance, white, ~weak),
         evaluations=found.evaluations,
-        rejected_laws=(*rejected, *simpler(found, values)),
+        rejected_laws=_each_once([*rejected, *simpler(found, values)]),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
+
+
+def _each_once(rivals: Sequence[Rival]) -> tuple[Rival, ...]:
+    """The first of those with the same law: of an added effect, the evidence at its addition."""
+    return tuple({rival.law: rival for rival in reversed(rivals)}.values())[::-1]
 
 
 def _covariance(found: Found, segments: Sequence[Segment], prior: Floats) -> Floats:

@@ -37,7 +37,7 @@ def hidden_std(jacobian: Floats, excess: float, prior: Floats | None = None) -> 
         Standard deviations. Shape `(P,)`; without a prior, infinite for what has no
             effect on the records.
     Example:
-        >>> hidden_std(np.ones((100, 1)), 25.0).tolist()
+        >>> hidden_std(np.ones((100, 1)), 25.0).round(6).tolist()
         [0.5]
     """
     if prior is not None:

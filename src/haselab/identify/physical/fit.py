@@ -431,7 +431,10 @@ def _result(
 
 def _each_once(rivals: Sequence[Rival]) -> tuple[Rival, ...]:
     """The first of those with the same law: of an added effect, the evidence at its addition."""
-    return tuple({rival.law: rival for rival in reversed(rivals)}.values())[::-1]
+    found: dict[str, Rival] = {}
+    for rival in rivals:
+        found.setdefault(rival.law, rival)
+    return tuple(found.values())
 
 
 def _covariance(found: Found, segments: Sequence[Segment], prior: Floats) -> Floats:

@@ -253,7 +253,7 @@ class ActuatorLaw(abc.ABC):
         return np.asarray(sum(parts) / step_v)
 
     def elastic_rivals(self) -> Mapping[str, ActuatorLaw]:
-        """Laws that differ in the elastic energy alone, with the same parameters, by their words.
+        """Laws with the same parameters and another elastic energy, by their description.
 
         `identify actuator` compares them with this law.
         """

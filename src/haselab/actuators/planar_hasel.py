@@ -251,7 +251,7 @@ class PlanarHasel(ActuatorLaw):
 
 @dataclass(frozen=True)
 class _GentHasel(PlanarHasel):
-    """The same with Gent's law, whose chains are straight at the same first invariant."""
+    """A planar HASEL whose shell follows Gent's law, with the same largest first invariant."""
 
     @property
     def _extension_limit(self) -> float:

@@ -1,7 +1,7 @@
 """Results of a study by the physical model of its actuator, with the study's own fits.
 
-The fits get the lengths and capacitances of the model's motion instead of the recorded ones. What
-they leave, such as the creep that a second order does not have, is then part of the result and no
+The fits get the lengths and capacitances of the model's motion instead of the recorded ones. Their
+misfit, such as the creep that a second-order model does not have, is then part of the result and no
 longer counts as noise: the uncertainty is that of the model's parameters.
 """
 
@@ -158,7 +158,7 @@ class _Motion:
 
 
 def _matched(time_s: Floats, known_s: Floats) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which of the times are among the known ones, and their places there."""
+    """Whether each time is a known one, and the indices of those that are."""
     if not known_s.size:
         return np.zeros(time_s.size, dtype=np.bool_), np.zeros(0, dtype=np.int64)
     at = np.minimum(np.searchsorted(known_s, time_s), known_s.size - 1)

@@ -45,8 +45,8 @@ def motion_of_table(
     """
     if time_s.size < 2 or not (np.diff(time_s) > 0.0).all():
         raise InputError(
-            f"{name} has {time_s.size} rows whose times must rise. Sort it, and remove repeated "
-            "times."
+            f"{name} has {time_s.size} rows. A prediction needs at least 2 rows whose times rise. "
+            "Sort the rows by time, and remove repeated times."
         )
     count = time_s.size
     step_s = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])

@@ -55,7 +55,7 @@ _OF_SIGNAL = (
 )  # fmt: skip
 @click.option(
     "--std", type=LIMIT, default=None,
-    help="Set the relative standard deviation that the parameter of an actuator file shall reach. "
+    help="Set the relative standard deviation to reach for the parameter; only without --rig. "
     "Default: 0.1.",
 )  # fmt: skip
 @shared_option(
@@ -105,12 +105,13 @@ def command(
 ) -> None:
     """Design the next experiment.
 
-    With --rig: a drive signal that, within the limits of the bench, separates candidate models, or
-    reduces the confidence interval of a parameter, as well as possible. MODEL is a JSON answer of
-    `identify verdict` or `identify transfer`, or the model.json of a run.
+    With --rig, the command designs a drive signal within the limits of the bench. The signal
+    separates candidate models, or reduces the confidence interval of a parameter, as well as
+    possible. MODEL is a JSON answer of `identify verdict` or `identify transfer`, or the model.json
+    of a run.
 
-    Without --rig: the shortest study that determines a parameter of the physical model, within the
-    limits of [drive]. MODEL is an actuator file with [model.physical].
+    Without --rig, it finds the shortest study that determines a parameter of the physical model,
+    within the limits of [drive]. MODEL is an actuator file with [model.physical].
     """
     if rig is None:
         _only_with_rig(context, model)

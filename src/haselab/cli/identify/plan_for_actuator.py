@@ -53,7 +53,7 @@ def plan_for_actuator(
         raise ResultError(
             f"No experiment of the catalogue reduces the standard deviation of {goal} by a tenth "
             f"within a drive of {planner.within.highest_v:g} V. Raise drive.high_v if the actuator "
-            f"withstands more, or measure it otherwise: {path}"
+            f"withstands more, or measure {goal} in another way. {path}"
         )
     text = toml_text(proposal.candidate.file(f"experiment for {goal}"))
     if out is not None:

@@ -63,11 +63,11 @@ _NO_BAND = "no uncertainty: the model has no covariance"
 @shared_option("--experiment", "experiments", multiple=True,
                detail="Repeat the option for more. Default: all.")  # fmt: skip
 @click.option("--free-offset", is_flag=True,
-              help="Estimate a constant that all measured lengths differ by, such as after the "
+              help="Estimate a constant offset of all measured lengths, for example after the "
               "camera was moved.")  # fmt: skip
 @click.option("--longest-m", type=POSITIVE,
-              help="State the length to which the actuator was stretched before, in m. Default: no "
-              "longer than at the start of the record.")  # fmt: skip
+              help="State the longest length of the actuator before the record, in m. Default: its "
+              "length at the start of the record.")  # fmt: skip
 @shared_option("--mass-kg", type=REAL, detail="For tables. Default: that of MODEL.")
 @shared_option("--gain-v-per-v", type=POSITIVE, detail="For tables. Default: that of MODEL.")
 @shared_option("--zero-length-m", type=POSITIVE,
@@ -105,9 +105,10 @@ def command(
     """Predict records in FILES that were not used for the fit of MODEL.
 
     MODEL is an actuator file or a model.json. With the physical model of 'identify actuator', FILES
-    are sessions, folders of runs, or tables with a voltage and a length, strain or capacitance; the
-    recorded voltage is put through the model, experiment by experiment. The exit code is 3 if the
-    error is larger than the band, or if the model was identified from one of the files.
+    are sessions, folders of runs, or tables with a voltage and a length, strain or capacitance. The
+    command simulates the model with the recorded voltage and compares experiment by experiment. The
+    exit code is 3 if the error is larger than the band explains, or if the model was identified
+    from one of the files.
 
     With a linear model, FILES are tables. The command reports the fit in percent, the rms error
     and the share of samples inside the 95 % band. It first estimates the initial state and the

@@ -64,8 +64,8 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
     "--kind", default="planar-hasel", show_default=True, metavar="KIND",
     detail="planar-hasel, peano-hasel, curling-hasel, dea-stack or your own.",
 )  # fmt: skip
-@shared_option("--mass-kg", type=REAL, detail="Default: as a comment.")
-@shared_option("--zero-length-m", type=POSITIVE, detail="Default: as a comment.")
+@shared_option("--mass-kg", type=REAL, detail="Default: written as a comment.")
+@shared_option("--zero-length-m", type=POSITIVE, detail="Default: written as a comment.")
 @click.option(
     "--low-v",
     type=REAL,
@@ -74,9 +74,9 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
     help="Write the lowest drive voltage, before the amplifier, in V.",
 )
 @click.option("--high-v", type=REAL,
-              help="Write the highest drive voltage, before the amplifier, in V. Default: as a "
-              "comment.")  # fmt: skip
-@shared_option("--gain-v-per-v", type=POSITIVE, detail="Default: as a comment.")
+              help="Write the highest drive voltage, before the amplifier, in V. Default: written "
+              "as a comment.")  # fmt: skip
+@shared_option("--gain-v-per-v", type=POSITIVE, detail="Default: written as a comment.")
 @answer_options(None, "An actuator file, for example leg.toml.  [required]")
 def command(
     name: str,

@@ -33,7 +33,7 @@ _DIFFERENCE = "S19.chirp_difference"
 
 @dataclass(frozen=True)
 class PhysicalModel:
-    """What was identified.
+    """The identified model of a run, and the results that follow from it.
 
     Args:
         fit: of the model.

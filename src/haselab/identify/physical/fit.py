@@ -284,8 +284,10 @@ def _ordered(found: Found) -> Found:
 
 
 def _from_start(misfit: Misfit, start: Unknowns, found: Found | None) -> Found | None:
-    """The better of what was found without convergence and a new search; under the noise that it
-    left, the first stages go gentler ways."""
+    """Search again if the search did not converge, and return the better result.
+
+    The noise is now that of the first result, so the first stages take smaller steps.
+    """
     if found is not None and found.converged:
         return found
     anew = search(misfit, start, 0 if found is None else found.evaluations)

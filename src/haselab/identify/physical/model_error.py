@@ -1,14 +1,14 @@
 r"""How far a model error may have moved the parameters.
 
-What a law lacks is a signal $e$ over the standard deviations. The fit shows the part of it that no
-parameter can imitate, as residuals beyond the noise with the energy
-$E = r^\top r - N\sigma^2$. The other part moves the parameters. If it has an energy of $E$ as well,
-it moves a parameter by at most
+What a law lacks is a signal $e$, in units of the standard deviations. The part of it that no
+parameter can imitate appears in the residuals; its energy is $E = r^\top r - N\sigma^2$. The
+other part is hidden and moves the parameters. If it has the energy $E$ as well, it moves a
+parameter by at most
 
 $\sqrt{E\,(J^\top J)^{-1}_{kk}}$
 
-which counts as one standard deviation: at 1.96 of them, the fit would hide almost four times the
-energy that it shows.
+This counts as one standard deviation: at 1.96 standard deviations, the hidden energy would be
+almost four times the visible one.
 """
 
 from __future__ import annotations

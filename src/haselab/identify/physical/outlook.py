@@ -58,7 +58,7 @@ class Outlook:
             covariance: of the values, finite. Shape `(P, P)`.
             excess_variance: of the records over that with white residuals.
         Raises:
-            ResultError: The covariance is none.
+            ResultError: The covariance is not finite and positive.
         """
         unit = unknowns.slopes * unknowns.vague_widths
         relative = covariance / np.outer(unit, unit)

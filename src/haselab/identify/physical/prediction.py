@@ -5,11 +5,12 @@ noise $\sigma$ of the measured ones, the 95 % band is
 
 $\pm 1.96 \sqrt{\mathrm{diag}(J S J^\top) + \sigma^2 + m^2}$
 
-where m is 0, or beside a model error, its rms in the worst experiment of the fit. $S$ is then
-without the widening by `model_error`: that allows for the worst of all directions, whereas a motion
-that resembles those of the fit is off by about as much as they are.
+where $m$ is the rms of a model error in the worst experiment of the fit, or 0 if the fit has no
+model error. $S$ does not include the widening by `model_error`. That allows for the worst of all
+directions, whereas the error of a motion that resembles those of the fit is about as large as
+theirs.
 
-Correlated parameters matter: their errors can be large and still cancel in what is predicted. The
+Correlations matter: errors of the parameters can be large and still cancel in the prediction. The
 tracker finds the marks of each session anew, so all lengths of a session share an error of 2 µm.
 """
 
@@ -42,7 +43,7 @@ _MATTERS = 0.5  # of the noise: effect of a parameter without a standard deviati
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """What a fit left of one channel.
+    """Noise and model error of one channel in the records of a fit.
 
     Args:
         factor: true over stated standard deviation of its noise.
@@ -59,7 +60,7 @@ class ChannelNoise:
 
     @property
     def model_error(self) -> float:
-        """Rms of what the model did not explain of the worst experiment."""
+        """Rms of the error beyond the noise, in the experiment that the model explains least."""
         excess = 0.0 if self.explained else self.worst**2 - self.noise**2
         return float(np.sqrt(excess)) if excess > 0.0 else 0.0
 
@@ -105,7 +106,8 @@ class IdentifiedModel:
         Returns:
             The model.
         Raises:
-            InputError: A name is unknown, or the covariance is no such matrix.
+            InputError: A name is unknown, or the covariance is not finite
+                and symmetric.
             LimitError: A value is outside its limits.
         """
         bench = (*INSTRUMENTS, START_HYSTERESIS)
@@ -340,7 +342,7 @@ def predict_motion(
     free_offset: bool = False,
     longest_m: float = 0.0,
 ) -> MotionPrediction:
-    """Predict a record from what acted, and compare it with what was seen.
+    """Predict a record from its voltages and loads, and compare it with what was measured.
 
     Args:
         model: that was identified from other records.

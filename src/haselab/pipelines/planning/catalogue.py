@@ -28,7 +28,7 @@ _FASTEST_HZ, _SLOWEST_HZ = 200.0, 5.0
 
 @dataclass(frozen=True)
 class Range:
-    """What the actuator may be exposed to.
+    """Drive and masses from which studies are planned.
 
     Args:
         highest_v: drive, before the amplifier.

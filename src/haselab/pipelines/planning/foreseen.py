@@ -1,4 +1,4 @@
-"""A study as the motion that it would record: what acts when, and what is seen of it."""
+"""The motion that a study would record: what acts on the actuator, and when it is measured."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class _Bench:
         self.add(duration_s, drive_v, self.pull_n)
 
     def pull(self, pull_n: float) -> None:
-        """Change the load in a straight line."""
+        """Change the load linearly in time."""
         part = (np.arange(_RAMP_STEPS) + 0.5) / _RAMP_STEPS
         steps = self.pull_n + part * (pull_n - self.pull_n)
         self.add(_HANG_S / _RAMP_STEPS, np.full(steps.size, self.drive_v), steps)
@@ -87,7 +87,7 @@ class _Bench:
         self.add(1.0 / _UPDATE_HZ, drive_v, self.pull_n, of)
 
     def record(self) -> MotionRecord:
-        """All of it."""
+        """The whole record."""
         acts = np.vstack(self.acts)
         edge_s = np.concatenate([[0.0], np.cumsum(acts[:, 0])])
         mass_kg = np.maximum(acts[:, 3], _EMPTY * acts[:, 3].max())

@@ -249,7 +249,7 @@ def fit_actuator(
         if better is None:
             break
         again = refine(misfit, better.start, found.evaluations)
-        again = _from_start(misfit, better.start.at(start), again)
+        again = _from_start(misfit, better.start.at(start), again, explained=True)
         if again is None or _rms([again.residuals]) > _rms([found.residuals]):
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
@@ -283,12 +283,21 @@ def _ordered(found: Found) -> Found:
     )
 
 
-def _from_start(misfit: Misfit, start: Unknowns, found: Found | None) -> Found | None:
+def _from_start(
+    misfit: Misfit, start: Unknowns, found: Found | None, *, explained: bool = False
+) -> Found | None:
     """Search again if the search did not converge, and return the better result.
 
     The noise is now that of the first result, so the first stages take smaller steps.
+
+    Args:
+        misfit: to minimise.
+        start: where the user began.
+        found: before; None: nothing.
+        explained: search again also if the result leaves more than noise.
     """
-    if found is not None and found.converged:
+    left = found is not None and explained and not _seen(misfit, found).explained
+    if found is not None and found.converged and not left:
         return found
     anew = search(misfit, start, 0 if found is None else found.evaluations)
     if found is None or (anew is not None and _rms([anew.residuals]) < _rms([found.residuals])):

@@ -42,7 +42,7 @@ def study_with(folder: Path, control: str, trials: int = 2) -> Study:
     start, end = text.index("[control]"), text.index("[quick.triangle]")
     text = f"{text[:start]}[control]\n{control}\n{text[end:]}"
     path = folder / "study.toml"
-    path.write_text(text.replace("[control]", f"own_trials = {trials}\n[control]", 1))
+    path.write_text(text.replace("[control]", f"custom_trials = {trials}\n[control]", 1))
     return load_study(path)
 
 

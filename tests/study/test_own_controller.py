@@ -145,7 +145,7 @@ def test_a_study_without_pi_and_pid_trials_has_all_the_rest(tmp_path, capsys):
     for old, new in (
         ('"mycontroller"\ngain_per_s = 1.0\nsmoothing_s = 0.1', '"pi"\nkp = 0.3\nki = 1.0'),
         ("pi_trials = 1\npid_trials = 1", "pi_trials = 0\npid_trials = 0\nsaturating_trials = 1\n"
-         "extra_delay_trials = 1\nprinted_chain_trials = 1"),
+         "extra_delay_trials = 1\npaper_chain_trials = 1"),
     ):  # fmt: skip
         assert old in text
         text = text.replace(old, new)

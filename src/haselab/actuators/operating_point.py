@@ -73,6 +73,8 @@ def _net_force_n(
 ) -> Floats:
     reached = np.maximum(length_m, longest_m) / law.free_length_m
     elastic = law.elastic_force_n(length_m) * law.losses.softening(reached)
+    if voltage_v == 0.0:
+        return np.asarray(load_n - elastic)
     return np.asarray(load_n + law.electric_force_n(length_m, voltage_v) - elastic)
 
 

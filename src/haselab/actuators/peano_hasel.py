@@ -24,7 +24,6 @@ _SLACK, _TAUT = 0.05, 0.10  # of the rest length, beyond the ideal pouch's short
 _STEEPEST = 60.0  # ln of (1 - cos) / cos at the end of the electrodes
 _GRID = np.geomspace(1e-9, 40.0, 250)  # of ln(ds/dz) above its first value
 _ITERATIONS = 200
-_NEAR = 2  # Newton's steps from the solution of a similar law
 _CLOSE, _CLOSEST = 1e-10, 1e-13  # last step of Newton's iteration, and of halving
 _SMALL = 0.15  # of half_zipped_v: below it a difference of two forces would lose digits
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -367,22 +366,21 @@ class PeanoHasel(ActuatorLaw):
         r"""Solve the balance of zipping, $T\,ds/dz = \tfrac12\kappa V^2 + \theta/z - U'$.
 
         In $y = \ln(ds/dz)$ the tension is explicit, and so is the length, which falls with y.
-        The solution of a similar law is near enough for Newton's steps alone.
+        The solution of a similar law is near enough for two steps of Newton.
         """
         length, pull_n = np.broadcast_arrays(length, self._pull_n(voltage_v))
         wanted_m, pulls_n = length.ravel(), pull_n.ravel()
         with np.errstate(all="ignore"):  # outside the bracket some terms are infinite
-            if near is None:
-                y = self._solved(wanted_m, pulls_n)
-            else:
-                y = near.ravel()
-                for _ in range(_NEAR):
-                    new = self._newton(y, self._balance(y, pulls_n), wanted_m)[0]
-                    y = np.where(np.isfinite(new), new, y)
+            y = self._solved(wanted_m, pulls_n) if near is None else near.ravel()
+            if near is not None:
+                y = y + self._left(y, self._balance(y, pulls_n), wanted_m)
             found = self._balance(y, pulls_n)
+            left = 0.0 if near is None else self._left(y, found, wanted_m)
         stretch_m = wanted_m - found.pouch_m
         tension_n, rise_n, slope_n = self._tension(found, stretch_m)
-        parts = (y, found.zipped_m, stretch_m, tension_n, rise_n / slope_n)
+        # what is left of a similar law's solution counts linearly
+        zipped_m, tension_n = found.zipped_m + found.zipped_by * left, tension_n + rise_n * left
+        parts = (y + left, zipped_m, stretch_m, tension_n, rise_n / slope_n)
         return _State(*(np.reshape(part, length.shape) for part in parts))
 
     def _solved(self, wanted_m: Floats, pulls_n: Floats) -> Floats:
@@ -405,6 +403,11 @@ class PeanoHasel(ActuatorLaw):
             if left.size == 0:
                 break
         return y
+
+    def _left(self, y: Floats, balance: _Balance, wanted_m: Floats) -> Floats:
+        """Newton's step, where there is one."""
+        step = self._newton(y, balance, wanted_m)[0] - y
+        return np.where(np.isfinite(step), step, 0.0)
 
     def _newton(
         self, y: Floats, balance: _Balance, wanted_m: Floats

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab import _motion
 from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.operating_point import equilibrium_m
-from haselab.actuators.table import law_table, law_values
+from haselab.actuators.table import law_table
 from haselab.base import InputError, LimitError
 
 __all__ = [
@@ -273,14 +273,14 @@ class SampledLaw:
         lengths_m = np.asarray(self.table.low_m + self.table.step_m * knots)
         rows = self.table.capacitance_f.shape[0]
         voltages_v = np.asarray(self.table.step_v * np.arange(rows, dtype=np.float64))
+        near = self.table.values if rows > 1 else None  # otherwise of more voltages
         elastic, pull, capacitance, free, losses = [], [], [], [], []
         for name in self.by:
             low, high, width = _beside(law, name)
-            from_n, from_f, from_v2 = law_values(low, lengths_m, voltages_v)
-            to_n, to_f, to_v2 = law_values(high, lengths_m, voltages_v)
-            elastic.append((to_n - from_n) / width)
-            capacitance.append((to_f - from_f) / width)
-            pull.append((to_v2 - from_v2) / width)
+            first, last = (part.on_grid(lengths_m, voltages_v, near) for part in (low, high))
+            elastic.append((last.elastic_n - first.elastic_n) / width)
+            capacitance.append((last.capacitance_f - first.capacitance_f) / width)
+            pull.append((last.pull_n_v2 - first.pull_n_v2) / width)
             free.append((high.free_length_m - low.free_length_m) / width)
             changed = _losses_of(motion_parameters(high)) - _losses_of(motion_parameters(low))
             changed[_INERTIA] += width if name == ADDED_INERTIA else 0.0

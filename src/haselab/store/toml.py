@@ -180,7 +180,7 @@ def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
     if fault["type"] == "model_type":
         return f"Input should be a table, headed [{_path('', fault['loc'])}]"
     if fault["type"] != "extra_forbidden":
-        return str(fault["msg"])
+        return str(fault["msg"]).removeprefix("Value error, ")
     table = _table_of(model, fault["loc"][:-1], data)
     former = getattr(table, "former_names", {}).get(fault["loc"][-1])
     if former is not None:

@@ -217,7 +217,7 @@ def fit_actuator(
         camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
             is usual.
         camera_scale_std: relative standard deviation of the camera's scale, with the slow
-            errors of tracking over the picture, such as that of uneven light.
+            errors of tracking over the picture.
     Returns:
         The model, with the covariance of its parameters.
     Raises:

@@ -259,12 +259,9 @@ def fit_actuator(
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
     if len(records) > 1 and _seen(misfit, found).excess[0] > _APART and _each_alone(misfit, found):
-        return ActuatorFit(
-            status="the records contradict each other: the law explains each alone, but not all "
-            "together. Check that all are of one actuator, and mass, units and gain of each",
-            kind=law.kind,
-            evaluations=found.evaluations,
-        )
+        status = "the records contradict each other: the law explains each alone, but not all"
+        status += " together. Check that all are of one actuator, and mass, units and gain of each"
+        return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
     others = other_elastic(misfit, found) if _seen(misfit, found).explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
@@ -274,12 +271,9 @@ def fit_actuator(
 
 def _each_alone(misfit: Misfit, found: Found) -> bool:
     """Whether the law explains each record alone, with parameters of its own."""
-    for record in misfit.records:
-        own = replace(misfit, records=[record])
-        alone = search(own, found.unknowns)
-        if alone is None or not _seen(own, alone).explained:
-            return False
-    return True
+    parts = [replace(misfit, records=[record]) for record in misfit.records]
+    alone = [(own, search(own, found.unknowns)) for own in parts]
+    return all(part is not None and _seen(own, part).explained for own, part in alone)
 
 
 def _ordered(found: Found) -> Found:

@@ -53,6 +53,7 @@ _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
+_APART = 2.0  # rms over noise from which records are compared alone
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _GOOD_SCALE = 0.005  # and a careful one
 _WHITE = 1e-3  # probability of the residuals under white noise
@@ -257,11 +258,22 @@ def fit_actuator(
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
+    if len(records) > 1 and _seen(misfit, found).excess[0] > _APART and _each_alone(misfit, found):
+        status = "the records contradict each other: the law explains each alone, but not all"
+        status += " together. Check that all are of one actuator, and mass, units and gain of each"
+        return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
     others = other_elastic(misfit, found) if _seen(misfit, found).explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
     return _result(misfit, _ordered(found), rejected, preferred)
+
+
+def _each_alone(misfit: Misfit, found: Found) -> bool:
+    """Whether the law explains each record alone, with parameters of its own."""
+    parts = [replace(misfit, records=[record]) for record in misfit.records]
+    alone = [(own, search(own, found.unknowns)) for own in parts]
+    return all(part is not None and _seen(own, part).explained for own, part in alone)
 
 
 def _ordered(found: Found) -> Found:

@@ -31,7 +31,7 @@ from haselab.identify.physical.information import (
     largest_std,
     vague_information,
 )
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment, least_explained
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
 from haselab.identify.physical.plausible import implausible
 from haselab.identify.physical.record import MotionRecord
@@ -56,6 +56,7 @@ _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contr
 _APART = 2.0  # rms over noise from which records are compared alone
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _GOOD_SCALE = 0.005  # and a careful one
+_LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
 _WHITE = 1e-3  # probability of the residuals under white noise
 _ENOUGH = 20  # values of an experiment, for an rms of its own
 _POINTS = 5  # voltages of the linear models
@@ -493,6 +494,7 @@ class _Seen:
 
     lengths: list[Floats]
     capacitances: list[Floats]
+    share: float  # of the variance of the channel that is explained least
 
     @property
     def whiteness_p(self) -> float:
@@ -520,6 +522,7 @@ def _seen(misfit: Misfit, found: Found) -> _Seen:
     return _Seen(
         _channel(misfit.segments, LENGTH, found.residuals),
         _channel(misfit.segments, CAPACITANCE, found.residuals),
+        least_explained(misfit, found.residuals),
     )
 
 
@@ -544,6 +547,12 @@ def _status(
             f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
             "noise. Check the mass, the units and that all records are of one actuator, or start "
             "nearer, by [actuator.parameters]"
+        ), False
+    if not seen.explained and seen.share < _LEAST_SHARE:
+        return (
+            f"the records contradict the model: it explains only {100.0 * max(seen.share, 0.0):.0f}"
+            " % of the variance of a signal. Check the mass, the amplifier's gain, the units and "
+            "that all records are of one actuator, or start nearer, by [actuator.parameters]"
         ), False
     if not converged:
         return "the search did not converge; start nearer, by [actuator.parameters]", False

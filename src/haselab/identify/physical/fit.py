@@ -259,7 +259,7 @@ def fit_actuator(
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
-    if len(records) > 1 and _seen(misfit, found).excess[0] > _APART and _each_alone(misfit, found):
+    if len(records) > 1 and _seen(misfit, found).excess[0] > _APART and _each_alone(misfit, start):
         status = "the records contradict each other: the law explains each alone, but not all"
         status += " together. Check that all are of one actuator, and mass, units and gain of each"
         return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
@@ -270,10 +270,10 @@ def fit_actuator(
     return _result(misfit, _ordered(found), rejected, preferred)
 
 
-def _each_alone(misfit: Misfit, found: Found) -> bool:
+def _each_alone(misfit: Misfit, start: Unknowns) -> bool:
     """Whether the law explains each record alone, with parameters of its own."""
     parts = [replace(misfit, records=[record]) for record in misfit.records]
-    alone = [(own, search(own, found.unknowns)) for own in parts]
+    alone = [(own, search(own, start)) for own in parts]
     return all(part is not None and _seen(own, part).explained for own, part in alone)
 
 

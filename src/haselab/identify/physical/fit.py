@@ -19,7 +19,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import ADDED_INERTIA, GRAVITY_M_S2, ActuatorLaw, OperatingPoint, linearise
+from haselab.actuators import (
+    ADDED_INERTIA,
+    DRIFT_UNITS,
+    DRIFTS,
+    GRAVITY_M_S2,
+    ActuatorLaw,
+    OperatingPoint,
+    linearise,
+)
 from haselab.base import Estimate, InputError, JsonObject, LimitError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import Fit
@@ -34,7 +42,7 @@ from haselab.identify.physical.information import (
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.rivals import Rival, other_elastic, richer, simpler
+from haselab.identify.physical.rivals import Rival, other_elastic, richer, simpler, with_drifts
 from haselab.identify.physical.search import Found, refine, search
 from haselab.identify.physical.unknowns import (
     CAMERA_OFFSET,
@@ -48,6 +56,7 @@ __all__ = ["ActuatorFit", "fit_actuator"]
 
 Floats = NDArray[np.float64]
 _MOST_ADDED = 2  # effects that the given law lacks
+_EXPLAINS = 0.1  # of a model error, which an effect must explain to be added
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
@@ -85,6 +94,8 @@ class ActuatorFit(Fit):
         length_worst_m: rms of the residuals in the experiment that the model explains least.
         capacitance_worst_f: the same of the capacitances.
         widening: of the standard deviations, by which a model error raised those of `covariance`.
+        hidden_variance: of the parameters by a model error of no particular direction, over that
+            by the noise; see `model_error`.
         evaluations: of the model, until it was found.
         chi_squared_ratio: mean square of the residuals over their standard deviations.
         residual_whiteness_p: probability of the less probable channel under white noise.
@@ -109,6 +120,7 @@ class ActuatorFit(Fit):
     length_worst_m: float = float("nan")
     capacitance_worst_f: float = float("nan")
     widening: Floats = field(default_factory=lambda: np.ones(0), repr=False)
+    hidden_variance: float = 0.0
     evaluations: int = 0
     chi_squared_ratio: float = float("nan")
     residual_whiteness_p: float = float("nan")
@@ -132,7 +144,10 @@ class ActuatorFit(Fit):
         """
         self._require()
         assert self.law is not None
-        start = Unknowns.of(self.law, added_inertia_kg=self.added_inertia_kg, mass_kg=self.mass_kg)
+        drifts = {name: found.value for name, found in self.parameters.items() if name in DRIFTS}
+        start = Unknowns.of(
+            self.law, added_inertia_kg=self.added_inertia_kg, mass_kg=self.mass_kg, drifts=drifts
+        )
         values = np.array([self.parameters[name].value for name in start.names])
         return replace(start, values=values)
 
@@ -237,28 +252,58 @@ def fit_actuator(
             "first load and voltage",
             kind=law.kind,
         )
+    rejected: list[Rival] = []
+    if not found.converged:  # without a drift that there is, there may be no minimum to find
+        found, rejected = with_drifts(plain, start.without((CAMERA_SCALE,)), found)
+        start = start.drifting(found.unknowns.drifts)
     misfit, found = _weighed(
         Misfit(records, known=known, strict=True), start.at(found.unknowns), found
     )
     anew = _from_start(misfit, start, found)
     if anew is not None and anew is not found:
         misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
-    rejected = []
-    for _ in range(_MOST_ADDED):
-        better = richer(misfit, found)
-        if better is None:
-            break
-        again = refine(misfit, better.start, found.evaluations)
-        again = _from_start(misfit, better.start.at(start), again, explained=True)
-        if again is None or _rms([again.residuals]) > _rms([found.residuals]):
-            break
-        misfit, found = _weighed(misfit, again.unknowns, again)
-        rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
+    misfit, found, more = _with_effects(misfit, start, found)
+    rejected += more
     # beside a model error, the evidence for another elastic law would mean nothing
     others = other_elastic(misfit, found) if _seen(misfit, found).explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
     return _result(misfit, _ordered(found), rejected, preferred)
+
+
+def _with_effects(
+    misfit: Misfit, start: Unknowns, found: Found
+) -> tuple[Misfit, Found, list[Rival]]:
+    """Add effects that the law lacks, as long as the records prefer one decisively.
+
+    Args:
+        misfit: to minimise.
+        start: where the user began.
+        found: before.
+    Returns:
+        Misfit with its noise, minimum, and the laws without these effects.
+    """
+    rejected: list[Rival] = []
+    for _ in range(_MOST_ADDED):
+        better = richer(misfit, found)
+        if better is None:
+            break
+        again = refine(misfit, better.start, found.evaluations)
+        if again is None or not _explains(misfit, found, again):
+            break
+        again = _from_start(misfit, better.start.at(start), again, explained=True)
+        if again is None or _rms([again.residuals]) > _rms([found.residuals]):
+            break
+        misfit, found = _weighed(misfit, again.unknowns, again)
+        rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
+    return misfit, found, rejected
+
+
+def _explains(misfit: Misfit, before: Found, after: Found) -> bool:
+    """Whether an effect explains a part of a model error, and not only imitates a little of it."""
+    seen = _seen(misfit, before)
+    left = _seen(misfit, after).excess_energy
+    return seen.explained or left < (1.0 - _EXPLAINS) * seen.excess_energy
 
 
 def _ordered(found: Found) -> Found:
@@ -316,7 +361,7 @@ def _weighed(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Misfit, Fou
         if again is None:
             break
         start, found = again.unknowns, again
-        if same:
+        if same or not found.converged:
             break
     return misfit, found
 
@@ -373,11 +418,8 @@ def _result(
     covariance = _covariance(found, segments, prior)
     own_std = np.sqrt(np.diag(covariance))
     white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
+    energy = seen.excess_energy if status != "ok" else 0.0
     if status != "ok":
-        energy = excess_energy(
-            [(part, noise) for part, noise in (
-                (lengths, length_noise), (capacitances, capacitance_noise)) if part]
-        )  # fmt: skip
         covariance = widened(covariance, hidden_std(found.jacobian, energy, prior))
     std = np.sqrt(np.diag(covariance))
     widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
@@ -385,7 +427,7 @@ def _result(
     units = {key: about.unit for key, about in described.items()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
               "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": "",
-              START_HYSTERESIS: "N"}  # fmt: skip
+              START_HYSTERESIS: "N", **DRIFT_UNITS}  # fmt: skip
     slopes = unknowns.slopes
     weak = (std > largest_std(unknowns)) | (np.abs(found.left) > _UNSETTLED * std)
     parameters = {}
@@ -423,6 +465,7 @@ def _result(
         length_worst_m=std_m * _worst(lengths),
         capacitance_worst_f=std_f * _worst(capacitances),
         widening=widening,
+        hidden_variance=energy / std.size,
         residual_whiteness_p=seen.whiteness_p,
         law=law,
         kind=law.kind,
@@ -483,6 +526,12 @@ class _Seen:
     def whiteness_p(self) -> float:
         """Of the less probable channel."""
         return min(whiteness_p(self.lengths), whiteness_p(self.capacitances))
+
+    @property
+    def excess_energy(self) -> float:
+        """Sum of the squares beyond the noise."""
+        both = (self.lengths, self.capacitances)
+        return excess_energy([(parts, _neighbours(parts)) for parts in both if parts])
 
     @property
     def excess(self) -> tuple[float, str]:

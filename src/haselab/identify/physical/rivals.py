@@ -15,19 +15,27 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _motion
-from haselab.actuators import ADDED_INERTIA, ActuatorLaw, with_parameters
+from haselab.actuators import (
+    ADDED_INERTIA,
+    DRIFT_TIMES,
+    DRIFTS,
+    ActuatorLaw,
+    with_parameters,
+)
 from haselab.identify.noise import coloured_covariance
+from haselab.identify.physical.information import vague_information
 from haselab.identify.physical.misfit import Misfit
-from haselab.identify.physical.search import Found, refine
-from haselab.identify.physical.unknowns import INSTRUMENTS, Unknowns
+from haselab.identify.physical.search import Found, refine, search
+from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Unknowns
 
-__all__ = ["DECISIVE", "Richer", "Rival", "other_elastic", "richer", "simpler"]
+__all__ = ["DECISIVE", "Richer", "Rival", "other_elastic", "richer", "simpler", "with_drifts"]
 
 Floats = NDArray[np.float64]
 DECISIVE = 5.0  # logarithm of evidence: 150 to 1
@@ -36,6 +44,9 @@ _LARGEST = 0.5  # size of an effect from which to refine
 _TIMES = 9  # relaxation times of a further branch that are tried
 _SHORTEST_S, _SHARE_OF_RECORD = 0.03, 0.1  # of them: shortest, and longest over the record
 _WIDTHS = (0.005, 0.02, 0.08)  # of a hysteresis that are tried
+_DRIFTS = {"stiffness": DRIFTS[:2], "permittivity": DRIFTS[2:]}
+_DRIFTING = (0.3, 1.0, 3.0)  # time constants of a drift that are tried, over the record
+_FASTEST = 1e-3  # drift from which to refine, 1/s
 _NAMES = {
     "softening_share": "softening",
     "charge_share": "charge creep",
@@ -139,8 +150,8 @@ def richer(misfit: Misfit, found: Found) -> Richer | None:
         That law; None if there is none.
     """
     best: Richer | None = None
-    for law, name, effect in _candidates(found.unknowns.present_law(), _duration_s(misfit)):
-        column = _column(misfit, found, law, name)
+    for more in _candidates(found.unknowns, _duration_s(misfit)):
+        column = _column(misfit, found, more)
         if column is None or not column.any():
             continue
         columns = np.column_stack([found.jacobian, column])
@@ -155,13 +166,9 @@ def richer(misfit: Misfit, found: Found) -> Richer | None:
         )
         size, std = float(step[-1] / scale[-1]), math.sqrt(covariance[-1, -1])
         evidence = _log_evidence(size, std, 2, rest.size)
-        if size > 0.0 and evidence > (DECISIVE if best is None else best.log_evidence):
-            start = Unknowns.of(
-                with_parameters(law, {name: min(size, _LARGEST)}),
-                added_inertia_kg=found.unknowns.value(ADDED_INERTIA),
-                mass_kg=found.unknowns.mass_kg,
-            )
-            best = Richer(start.at(found.unknowns), effect, evidence)
+        possible = size > 0.0 or more.name in DRIFTS
+        if possible and evidence > (DECISIVE if best is None else best.log_evidence):
+            best = Richer(more.sized(size, found.unknowns), more.effect, evidence)
     return best
 
 
@@ -169,19 +176,87 @@ def _duration_s(misfit: Misfit) -> float:
     return max(float(np.ptp(record.drive.edge_s)) for record in misfit.records)
 
 
-def _candidates(law: ActuatorLaw, duration_s: float) -> list[tuple[ActuatorLaw, str, str]]:
-    """Laws with one effect more, of hardly any size: law, name of that size, words."""
+def with_drifts(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Found, list[Rival]]:
+    """Search again with slow changes of stiffness and permittivity, and keep those that matter.
+
+    Args:
+        misfit: to minimise.
+        start: first values, without drifts.
+        found: by a search without them, which did not converge.
+    Returns:
+        The new result with the laws without these drifts; the old one if it is no better.
+    """
+    duration_s = _duration_s(misfit)
+    none = {name: duration_s if name in DRIFT_TIMES else 0.0 for name in DRIFTS}
+    drifting = search(misfit, start.drifting(none), found.evaluations)
+    if drifting is None or not drifting.converged:
+        return found, []
+    covariance = coloured_covariance(
+        [drifting.jacobian[part.rows] for part in misfit.segments],
+        [drifting.residuals[part.rows] for part in misfit.segments],
+        drifting.left.size,
+        prior=vague_information(drifting.unknowns),
+    )
+    rejected: list[Rival] = []
+    idle: list[str] = []
+    for what, pair in _DRIFTS.items():
+        k = drifting.unknowns.names.index(pair[0])
+        size, std = drifting.unknowns.values[k], math.sqrt(covariance[k, k])
+        evidence = _log_evidence(size, std, 2, drifting.residuals.size)
+        if evidence > DECISIVE:
+            rejected.append(Rival(f"without drift of the {what}", -evidence))
+        else:
+            idle += pair
+    if not rejected:
+        return found, []
+    kept = refine(misfit, drifting.unknowns.without(idle), drifting.evaluations)
+    return (found, []) if kept is None else (kept, rejected)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A law with one effect more, of hardly any size.
+
+    Args:
+        law: with it, unless it is a drift.
+        drifts: with it, if it is one.
+        name: of its size.
+        effect: in words.
+    """
+
+    law: ActuatorLaw
+    drifts: Mapping[str, float]
+    name: str
+    effect: str
+
+    def sized(self, size: float, present: Unknowns) -> Unknowns:
+        """Where to refine with an effect of about that size."""
+        law, drifts = self.law, dict(self.drifts)
+        if self.name in drifts:
+            drifts[self.name] = min(max(size, -_FASTEST), _FASTEST)
+        else:
+            law = with_parameters(law, {self.name: min(size, _LARGEST)})
+        start = Unknowns.of(
+            law, added_inertia_kg=present.value(ADDED_INERTIA), mass_kg=present.mass_kg,
+            drifts=drifts,
+        )  # fmt: skip
+        return start.at(present)
+
+
+def _candidates(unknowns: Unknowns, duration_s: float) -> list[_Candidate]:
+    """All effects that the law lacks."""
+    law, drifts = unknowns.present_law(), unknowns.drifts
     fields = {about.name: about.key for about in law.described() if about.fitted}
     found = []
     for field in ("softening_share", "charge_share"):
         if field in fields and getattr(law, field) == 0.0:
             more = dataclasses.replace(law, **{field: _LITTLE})
-            found.append((more, fields[field], _NAMES[field]))
+            found.append(_Candidate(more, drifts, fields[field], _NAMES[field]))
     if "hysteresis_n" in fields and law.losses.hysteresis_n == 0.0:
         for width in _WIDTHS:
             little = {"hysteresis_n": _LITTLE, "hysteresis_width": width}
             more = dataclasses.replace(law, **little)
-            found.append((more, fields["hysteresis_n"], _NAMES["hysteresis_n"]))
+            found.append(_Candidate(more, drifts, fields["hysteresis_n"], _NAMES["hysteresis_n"]))
     if "branch_share" in fields and "branch_relaxation_s" in fields:
         shares, times = law.losses.branch_share, law.losses.branch_relaxation_s
         if len(shares) < _motion.BRANCHES:
@@ -193,15 +268,23 @@ def _candidates(law: ActuatorLaw, duration_s: float) -> list[tuple[ActuatorLaw, 
                     "branch_relaxation_s": (*times, time_s),
                 }
                 more = dataclasses.replace(law, **added)
-                found.append((more, name, f"a branch of about {time_s:.2g} s"))
+                effect = f"a branch of about {time_s:.2g} s"
+                found.append(_Candidate(more, drifts, name, effect))
+    for what, (rate, time) in _DRIFTS.items():
+        for share in _DRIFTING if rate not in drifts else ():
+            slow = {**drifts, rate: _LITTLE, time: share * duration_s}
+            found.append(_Candidate(law, slow, rate, f"drift of the {what}"))
     return found
 
 
-def _column(misfit: Misfit, found: Found, law: ActuatorLaw, name: str) -> Floats | None:
+def _column(misfit: Misfit, found: Found, more: _Candidate) -> Floats | None:
     """Derivative of the modelled, over the standard deviations, by the size of an effect."""
-    instruments = [other for other in found.unknowns.names if other in INSTRUMENTS]
-    names = (name, ADDED_INERTIA, *instruments)
-    values = [_LITTLE, *(found.unknowns.value(other) for other in names[1:])]
-    unknowns = Unknowns(law, names, np.array(values), found.unknowns.mass_kg)
+    present = found.unknowns
+    beside = [*more.drifts, *INSTRUMENTS, START_HYSTERESIS]
+    others = [name for name in beside if name in (*present.names, *more.drifts)]
+    values = {ADDED_INERTIA: 0.0, **dict.fromkeys(others, 0.0)}
+    values |= {name: present.value(name) for name in values if name in present.names}
+    values = {more.name: _LITTLE, **values, **more.drifts}
+    unknowns = Unknowns(more.law, tuple(values), np.array([*values.values()]), present.mass_kg)
     linear = misfit.linearised(unknowns)
     return None if linear is None else linear[1][:, 0] / unknowns.slopes[0]

@@ -21,19 +21,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.identification.physical_model import summary_of
-from benchmarks.identification.physical_twins import (
+from benchmarks.identification.physical_kinds import (
     CAMERA_BIAS_M,
-    MASS_KG,
     default_start,
     seen,
     shifted,
-    true_values,
 )
+from benchmarks.identification.physical_model import summary_of
 from benchmarks.identification.prediction import (
     HARD_GOAL,
     HIGH,
     LOW,
+    PLANAR,
     POINTS,
     TWINS,
     beyond_noise,
@@ -65,6 +64,7 @@ CARRIER_V = 0.02
 LENGTH_STD_M, CAPACITANCE_STD_F = 4e-6, 3e-13
 DRAWS = 100
 STUDY_V = 1.0
+MASS_KG = PLANAR.mass_kg
 
 
 def hidden(twin: str, seed: int, attempt: int) -> tuple[TwinConfig, dict[str, float]]:
@@ -127,7 +127,8 @@ def simulated(config: TwinConfig, parts: Sequence[Part], mass_kg: float, seed: i
     rest = round(SETTLE_S / STEP_S) - HUNG_BLOCKS * STEPS
     bench.move(np.zeros(1), 1, weight_n, np.empty(rest))
     bench.carrier_v = CARRIER_V
-    names, drive, load, member = [], [np.zeros(200)], [np.ones(200)], [np.full(200, -1)]
+    names: list[str] = []
+    drive, load, member = [np.zeros(200)], [np.ones(200)], [np.full(200, -1)]
     for k, (name, drive_v, share) in enumerate(parts):
         names.append(name)
         drive += [np.full(wait, drive_v[0]), drive_v]
@@ -179,7 +180,7 @@ def drawn(twin: str, seed: int) -> tuple[dict[str, float], MotionRecord, list[Mo
                 points.append(replace(point, length_m=length_m))
         except (HaselabError, ValueError):
             continue
-        return true_values(truth, camera), session, points
+        return truth | camera | {"sensing.scale": 1.0}, session, points
     raise RuntimeError(f"None of {DRAWS} draws of seed {seed} can be simulated.")
 
 

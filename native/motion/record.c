@@ -76,17 +76,26 @@ static int32_t sample(const step *now, const motion_tangent *t, const motion_rec
 /* Factor of a drift; `by`: its relative derivatives by rate and time constant. */
 static double drifted(const double d[2], double time_s, double by[2])
 {
-    const double share = d[1] > 0.0 ? time_s / d[1] : 0.0, gone = d[1] > 0.0 ? -expm1(-share) : 0.0;
+    const double share = d[1] > 0.0 ? time_s / d[1] : 0.0;
+    const double gone = d[1] > 0.0 ? -expm1(-share) : 0.0;
     const double factor = 1.0 + d[0] * d[1] * gone;
     by[0] = d[1] * gone / factor;
     by[1] = d[0] * (gone - share * (1.0 - gone)) / factor;
     return factor;
 }
 
+/* Voltage on which the capacitance depends. */
+static double root_v(const motion_input *in)
+{
+    return sqrt(in->volt * in->volt + in->ripple_v2);
+}
+
 /* Adds the integral of the capacitance over the step by Simpson's rule; `scale` multiplies it. */
 static void integrate(const motion_law *law, const step *now, const motion_tangent *t,
-                      double scale, double volt, const motion_output *output, int32_t interval)
+                      double scale, const motion_input *in, const motion_output *output,
+                      int32_t interval)
 {
+    const double volt = root_v(in);
     static const double at[3] = {0.0, 0.5, 1.0}, weight[3] = {1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0};
     int i;
     for (i = 0; i < 3; ++i) {
@@ -109,8 +118,8 @@ static void integrate(const motion_law *law, const step *now, const motion_tange
             for (j = 0; j < t->laws; ++j) {
                 by[t->law_column[j]] += share * own[j];
             }
-            for (j = 0; c.per_v != 0.0 && j < t->columns; ++j) {
-                by[j] += t->kind[j] == MOTION_VOLTAGE_SCALE ? share * c.per_v * volt : 0.0;
+            for (j = 0; volt > 0.0 && c.per_v != 0.0 && j < t->columns; ++j) {
+                by[j] += t->kind[j] == MOTION_VOLTAGE_SCALE ? share * c.per_v * in->volt * in->volt / volt : 0.0;
             }
             for (j = 0; j < t->columns; ++j) {
                 const int32_t k = t->kind[j] - MOTION_ELECTRIC_DRIFT;
@@ -129,7 +138,7 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
     int32_t k, next = 0;
     for (k = 0; k < record->intervals; ++k) {
         const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
-        const double volt = record->input[k].volt;
+        const double volt = root_v(&record->input[k]);
         double before_f = 0.0, at_s = from_s, drift[4];
         int32_t j;
         moving.inertia_kg = p->inertia_kg + record->mass_kg[k];
@@ -168,7 +177,7 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
             motion_step(law, &moving, s, tangent, &in, now.dt);
             next = sample(&now, tangent, record, output, next, until_s);
             if (record->sensed[k]) {
-                integrate(law, &now, tangent, scale, in.volt, output, k);
+                integrate(law, &now, tangent, scale, &in, output, k);
             }
             at_s = until_s;
         }

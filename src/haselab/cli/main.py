@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import importlib
 import os
 import select
 import sys
@@ -19,6 +18,7 @@ from haselab.base.exits import SignalExit
 from haselab.base.foreign_code import foreign_failure
 from haselab.cli.bench.revoke_first import revoke_first
 from haselab.cli.invocation import Invocation
+from haselab.cli.lazy_group import LazyGroup
 
 __all__ = ["cli", "main"]
 
@@ -69,17 +69,8 @@ class _BrokenPipe(Exception):  # noqa: N818 -- never seen outside of this file
         self.error = error
 
 
-class _LazyGroup(click.Group):
-    """A group that imports its commands on demand, so that --help is fast."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in _COMMANDS:
-            return None
-        command: click.Command = importlib.import_module(_COMMANDS[cmd_name][0]).command
-        return command
+class _Root(LazyGroup):
+    """All commands, with their lines of help, so that --help imports none."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         """Parse the options; wrap a broken pipe, for which click would exit with 1."""
@@ -95,21 +86,16 @@ class _LazyGroup(click.Group):
         except BrokenPipeError as error:
             raise _BrokenPipe(error) from error
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Import the command, then call `on_command`."""
-        found = super().resolve_command(ctx, args)
-        if isinstance(ctx.obj, Invocation):
-            ctx.obj.on_command()
-        return found
-
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
 
-@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=_Root,
+    places={name: f"{module}:command" for name, (module, _) in _COMMANDS.items()},
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.version_option(__version__, prog_name="haselab")
 def cli() -> None:
     """Measure, model and control soft electrostatic actuators (HASEL, DEA).

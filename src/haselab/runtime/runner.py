@@ -121,6 +121,7 @@ class Runner:
             if not self._arms:
                 self._rig.check_idle()
                 self._safety.heartbeat(_SETUP_S)  # instruments are set up, still at 0 V
+            self._conditions.carrier(0.0)  # it hung for long without one
             self._rig.generator.sine(*self._carrier)
             self._conditions.carrier(self._carrier[1])
             self._entered = True

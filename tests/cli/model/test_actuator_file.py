@@ -2,12 +2,14 @@
 
 import json
 import re
+import shutil
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from haselab.cli.main import main
+from haselab.cli.main import cli, main
 from haselab.control import PidGains, margins
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
@@ -34,20 +36,31 @@ def record(path, seed, plant=TRUTH, offset=0.01):
     return path
 
 
-@pytest.fixture
-def files(tmp_path, capsys):
-    actuator = tmp_path / "leg.toml"
-    assert run(capsys, "init", "my leg", "--out", actuator)[0] == 0
+def new_files(folder):
+    actuator = folder / "leg.toml"
+    cli.main(["init", "my leg", "--out", str(actuator)], standalone_mode=False)
     actuator.write_text(actuator.read_text() + '\n[mine]\ncolour = "red"  # of the shell\n')
-    return actuator, record(tmp_path / "one.csv", 1), record(tmp_path / "two.csv", 2)
+    return actuator, record(folder / "one.csv", 1), record(folder / "two.csv", 2)
 
 
 @pytest.fixture
-def known(files, capsys):
-    actuator, first, _ = files
-    code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
-    assert (code, error) == (0, "")
-    return files
+def files(tmp_path):
+    return new_files(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory):
+    """Files whose actuator has a model, identified once for all tests."""
+    found = new_files(tmp_path_factory.mktemp("identified"))
+    arguments = ["identify", "transfer", str(found[1]), "--actuator", str(found[0])]
+    cli.main(arguments, standalone_mode=False)
+    return found
+
+
+@pytest.fixture
+def known(identified, tmp_path):
+    """A test's own copy of them."""
+    return tuple(Path(shutil.copy(path, tmp_path)) for path in identified)
 
 
 def test_a_new_file_names_the_actuator_and_is_not_overwritten(files, capsys):
@@ -69,8 +82,10 @@ def test_any_printable_name_is_kept(name, tmp_path, capsys):
     assert code == 2 and "lower-case letters" in error
 
 
-def test_the_model_is_written_with_its_full_covariance_and_origin(known):
-    actuator, first, _ = known
+def test_the_model_is_written_with_its_full_covariance_and_origin(files, capsys):
+    actuator, first, _ = files
+    code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
+    assert (code, error) == (0, "")
     data = tomllib.loads(actuator.read_text())
     model = data["model"]
     assert model["natural_frequency_rad_s"] == pytest.approx(28.0, rel=0.01)

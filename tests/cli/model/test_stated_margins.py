@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from haselab.cli.main import main
+from haselab.cli.main import cli, main
 from haselab.models.plant import Plant
 
 WHOLE = """\
@@ -43,12 +44,19 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     return int(str(stop.value.code)), printed.out, printed.err
 
 
-@pytest.fixture
-def leg(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
-    path = tmp_path / "leg.toml"
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole file with a controller, designed once for all tests."""
+    path = tmp_path_factory.mktemp("designed") / "leg.toml"
     path.write_text(WHOLE)
-    assert run(capsys, "design", path)[0] == 0
+    cli.main(["design", str(path)], standalone_mode=False)
     return path
+
+
+@pytest.fixture
+def leg(designed: Path, tmp_path: Path) -> Path:
+    """A test's own copy of it."""
+    return Path(shutil.copy(designed, tmp_path))
 
 
 def changed(path: Path, *pairs: tuple[str, str]) -> None:

@@ -41,6 +41,7 @@ from haselab.identify.physical.information import (
 )
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
+from haselab.identify.physical.plausible import implausible
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.rivals import Rival, other_elastic, richer, simpler, with_drifts
 from haselab.identify.physical.search import Found, refine, search
@@ -62,7 +63,7 @@ _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
-_GOOD_SCALE = 0.01  # and a careful one
+_GOOD_SCALE = 0.005  # and a careful one
 _WHITE = 1e-3  # probability of the residuals under white noise
 _ENOUGH = 20  # values of an experiment, for an rms of its own
 _POINTS = 5  # voltages of the linear models
@@ -230,7 +231,7 @@ def fit_actuator(
         camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
             is usual.
         camera_scale_std: relative standard deviation of the camera's scale, with the slow
-            errors of tracking over the picture, such as that of uneven light.
+            errors of tracking over the picture.
     Returns:
         The model, with the covariance of its parameters.
     Raises:
@@ -238,6 +239,8 @@ def fit_actuator(
     """
     if not records:
         raise InputError("There is no record of the actuator's motion. Give at least one.")
+    if fault := implausible(law, records):
+        return ActuatorFit(status=fault, kind=law.kind)
     if added_inertia_kg is None:
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)

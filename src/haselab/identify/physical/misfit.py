@@ -39,7 +39,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 LENGTH, CAPACITANCE = "length", "capacitance"
-SHARED_PX = 1.5e-3  # error of tracking that all frames with the same pixels share
+SHARED_PX = 3e-4  # error of tracking that all frames with the same pixels share
 _LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 

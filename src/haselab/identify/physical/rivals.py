@@ -26,6 +26,7 @@ from haselab.actuators import (
     ADDED_INERTIA,
     DRIFT_TIMES,
     DRIFTS,
+    GRAVITY_M_S2,
     ActuatorLaw,
     with_parameters,
 )
@@ -35,7 +36,7 @@ from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.search import Found, refine, search
 from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Unknowns
 
-__all__ = ["DECISIVE", "Richer", "Rival", "other_elastic", "richer", "simpler", "with_drifts"]
+__all__ = ["DECISIVE", "Richer", "Rival", "other_elastic", "richer", "simpler", "with_every_effect"]
 
 Floats = NDArray[np.float64]
 DECISIVE = 5.0  # logarithm of evidence: 150 to 1
@@ -47,6 +48,7 @@ _WIDTHS = (0.005, 0.02, 0.08)  # of a hysteresis that are tried
 _DRIFTS = {"stiffness": DRIFTS[:2], "permittivity": DRIFTS[2:]}
 _DRIFTING = (0.3, 1.0, 3.0)  # time constants of a drift that are tried, over the record
 _FASTEST = 1e-3  # drift from which to refine, 1/s
+_SOME_SHARE, _SOME_WEIGHT = 0.01, 2e-3  # of the voltage and the weight: sizes of a little effect
 _NAMES = {
     "softening_share": "softening",
     "charge_share": "charge creep",
@@ -176,41 +178,70 @@ def _duration_s(misfit: Misfit) -> float:
     return max(float(np.ptp(record.drive.edge_s)) for record in misfit.records)
 
 
-def with_drifts(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Found, list[Rival]]:
-    """Search again with slow changes of stiffness and permittivity, and keep those that matter.
+def with_every_effect(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Found, list[Rival]]:
+    """Search again with a little of every effect that the law lacks, and keep those that matter.
+
+    Without an effect that there is, the search may leave the law's parameters far away, where no
+    rival can be judged.
 
     Args:
         misfit: to minimise.
-        start: first values, without drifts.
-        found: by a search without them, which did not converge.
+        start: first values.
+        found: by a search from there, which did not converge.
     Returns:
-        The new result with the laws without these drifts; the old one if it is no better.
+        The new result with the laws without these effects; the old one if it is no better.
     """
+    law, effects = _every_effect(start)
     duration_s = _duration_s(misfit)
-    none = {name: duration_s if name in DRIFT_TIMES else 0.0 for name in DRIFTS}
-    drifting = search(misfit, start.drifting(none), found.evaluations)
-    if drifting is None or not drifting.converged:
+    drifts = {name: duration_s if name in DRIFT_TIMES else 0.0 for name in DRIFTS}
+    unknowns = start.with_law(law, {**drifts, **start.drifts})
+    more = search(misfit, unknowns, found.evaluations)
+    if more is None or not more.converged:
         return found, []
     covariance = coloured_covariance(
-        [drifting.jacobian[part.rows] for part in misfit.segments],
-        [drifting.residuals[part.rows] for part in misfit.segments],
-        drifting.left.size,
-        prior=vague_information(drifting.unknowns),
+        [more.jacobian[part.rows] for part in misfit.segments],
+        [more.residuals[part.rows] for part in misfit.segments],
+        more.left.size,
+        prior=vague_information(more.unknowns),
     )
-    rejected: list[Rival] = []
-    idle: list[str] = []
-    for what, pair in _DRIFTS.items():
-        k = drifting.unknowns.names.index(pair[0])
-        size, std = drifting.unknowns.values[k], math.sqrt(covariance[k, k])
-        evidence = _log_evidence(size, std, 2, drifting.residuals.size)
+    std = np.sqrt(np.diag(covariance)) * np.abs(more.unknowns.slopes)
+    kept_law, kept_drifts = more.unknowns.present_law(), more.unknowns.drifts
+    rejected = []
+    for name, (field, words) in effects.items():
+        k = more.unknowns.names.index(name)
+        evidence = _log_evidence(more.unknowns.values[k], std[k], 2, more.residuals.size)
         if evidence > DECISIVE:
-            rejected.append(Rival(f"without drift of the {what}", -evidence))
+            rejected.append(Rival(f"without {words}", -evidence))
+        elif field:
+            kept_law = dataclasses.replace(kept_law, **{field: 0.0})
         else:
-            idle += pair
+            for other in next(pair for pair in _DRIFTS.values() if name in pair):
+                del kept_drifts[other]
     if not rejected:
         return found, []
-    kept = refine(misfit, drifting.unknowns.without(idle), drifting.evaluations)
+    kept = refine(misfit, more.unknowns.with_law(kept_law, kept_drifts), more.evaluations)
     return (found, []) if kept is None else (kept, rejected)
+
+
+def _every_effect(start: Unknowns) -> tuple[ActuatorLaw, dict[str, tuple[str, str]]]:
+    """The law with a little of charge creep and hysteresis; all effects by the names of their size.
+
+    Each has the field of the law, empty for a drift, and its words.
+    """
+    law = start.present_law()
+    fields = {about.name: about.key for about in law.described() if about.fitted}
+    effects = {}
+    for field, size in (
+        ("charge_share", _SOME_SHARE),
+        ("hysteresis_n", _SOME_WEIGHT * GRAVITY_M_S2 * start.mass_kg),
+    ):
+        if field in fields and getattr(law, field) == 0.0:
+            law = dataclasses.replace(law, **{field: size})
+            effects[fields[field]] = field, _NAMES[field]
+    for what, (rate, _) in _DRIFTS.items():
+        if rate not in start.names:
+            effects[rate] = "", f"drift of the {what}"
+    return law, effects
 
 
 @dataclass(frozen=True)
@@ -236,11 +267,7 @@ class _Candidate:
             drifts[self.name] = min(max(size, -_FASTEST), _FASTEST)
         else:
             law = with_parameters(law, {self.name: min(size, _LARGEST)})
-        start = Unknowns.of(
-            law, added_inertia_kg=present.value(ADDED_INERTIA), mass_kg=present.mass_kg,
-            drifts=drifts,
-        )  # fmt: skip
-        return start.at(present)
+        return present.with_law(law, drifts)
 
 
 def _candidates(unknowns: Unknowns, duration_s: float) -> list[_Candidate]:

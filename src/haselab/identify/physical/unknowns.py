@@ -141,12 +141,18 @@ class Unknowns:
         others = (*INSTRUMENTS, START_HYSTERESIS)
         return tuple(name for name in self.names if name not in others)
 
-    def drifting(self, drifts: Mapping[str, float]) -> Unknowns:
-        """These numbers with some of `DRIFTS` besides, which must not be among them."""
-        count = len(self.law_names)
-        names = (*self.names[:count], *drifts, *self.names[count:])
-        values = [*self.values[:count], *drifts.values(), *self.values[count:]]
-        return Unknowns(self.law, names, np.array(values), self.mass_kg)
+    def with_law(self, law: ActuatorLaw, drifts: Mapping[str, float]) -> Unknowns:
+        """All numbers of another law and other drifts, with the values of these where they are.
+
+        Args:
+            law: with effects that this one lacks, or without some of its own.
+            drifts: all that are estimated; the values of these here count.
+        """
+        full = Unknowns.of(
+            law, added_inertia_kg=self.value(ADDED_INERTIA), mass_kg=self.mass_kg, drifts=drifts
+        ).at(self)
+        known = [name for name in INSTRUMENTS if name not in self.names]
+        return full.without(known) if known else full
 
     @property
     def drifts(self) -> dict[str, float]:

@@ -142,8 +142,7 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
     faults = "; ".join(
         _missing(model, fault, data, section)
         if fault["type"] == "missing"
-        else f"{_path(section, fault['loc']) or 'file'}: "
-        f"{_said(model, fault, data)}{_got(fault['input'])}"
+        else f"{_place(section, fault['loc'])}{_said(model, fault, data)}{_got(fault['input'])}"
         for fault in shown
     )
     more = f"; and {count - len(shown)} more" if count > len(shown) else ""
@@ -153,6 +152,12 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
 
 def _path(section: str, parts: Sequence[Any]) -> str:
     return ".".join([*([section] if section else []), *(str(part)[:60] for part in parts)])
+
+
+def _place(section: str, parts: Sequence[Any]) -> str:
+    """Path of a key in front of what is wrong with it; nothing for the whole file."""
+    path = _path(section, parts)
+    return f"{path}: " if path else ""
 
 
 def _missing(model: type[BaseModel], fault: Any, data: Any, section: str) -> str:

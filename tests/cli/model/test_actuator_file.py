@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from haselab.actuators import ACTUATORS
+from haselab.cli.actuator_file import load_actuator
+from haselab.cli.identify.actuator import law_of_section
 from haselab.cli.main import cli, main
 from haselab.control import PidGains, margins
 from haselab.models.maps import VoltageMap
@@ -502,3 +505,16 @@ def test_a_model_of_a_length_is_not_designed_for_a_loop_of_strain(tmp_path, caps
     assert code == 2 and "The output of [model] is in m, but the maps of this file are for" in error
     path.write_text(path.read_text().replace('output_unit = "m"', 'output_unit = "1"'))
     assert run(capsys, "design", path)[0] == 0
+
+
+@pytest.mark.parametrize("kind", ["planar-hasel", "peano-hasel", "curling-hasel", "dea-stack"])
+def test_the_parameters_of_a_new_file_are_the_defaults_of_its_kind(kind, tmp_path, capsys):
+    path = tmp_path / "A.toml"
+    assert run(capsys, "init", "x", "--kind", kind, "--out", path)[0] == 0
+    head, mark, rest = path.read_text().partition("[actuator.parameters]\n")
+    lines, gap, tail = rest.partition("\n\n")
+    stated = [line.removeprefix("# ") if " = " in line else line for line in lines.splitlines()]
+    path.write_text(head + mark + "\n".join(stated) + gap + tail)
+    law = law_of_section(load_actuator(path).actuator, path)
+    assert law == ACTUATORS.find(kind)()
+    assert sum(" = " in line for line in stated) == len(law.described())

@@ -24,6 +24,7 @@ from haselab.cli.identify.common import (
     unit_of_name,
     unit_text,
 )
+from haselab.cli.identify.recorded_motion import TableOptions
 from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_origin, read_posterior
 from haselab.cli.model.physical_comparison import (
@@ -119,11 +120,12 @@ def command(
     worse than the mean of the record.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
-    options = PhysicalOptions(
-        experiments, free_offset, longest_m, unverified,
-        _given(context, "source", source), _given(context, "output", output), rate_hz,
+    measured = _given(context, "output", output)
+    table = TableOptions(
+        _given(context, "source", source), () if measured is None else (measured,), rate_hz,
         mass_kg, gain_v_per_v, zero_length_m, columns,
     )  # fmt: skip
+    options = PhysicalOptions(experiments, free_offset, longest_m, unverified, table)
     if which == "physical" and linear:
         raise InputError(
             "--at-rest, --through-voltage-map and --held-at-hz are for linear models. Leave them "

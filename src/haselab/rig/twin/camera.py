@@ -144,7 +144,12 @@ class TwinCamera:
         Limits("camera seed", 0, 2**63 - 1, "").check(seed)
         Limits("sheet free length", scale, 10.0, "m").check(free_length_m)
         narrowest = 2 * (_EDGE_REACH * config.edge_px + 2) * scale
-        Limits("sheet half-width", narrowest, 10.0, "m").check(half_width_m)
+        if not half_width_m >= narrowest:
+            raise LimitError(
+                f"The actuator is {1e3 * 2 * half_width_m:.3g} mm wide, but the camera needs at "
+                f"least {1e3 * 2 * narrowest:.3g} mm at camera.scale_m_per_px = {scale:g}. Lower "
+                "that scale."
+            )
         self.config = config
         self.lengths_m = _visible_lengths(config)
         self._half_width_px = half_width_m / scale

@@ -382,13 +382,14 @@ class ColumnStream(Closing):
         self._archive.close()
 
 
-def check_times(path: Path, given_hz: float, options: ColumnOptions) -> None:
-    """Refuse a rate that contradicts the column of times of a file, if it has one.
+def check_times(path: Path, given_hz: float, options: ColumnOptions, names: Sequence[str]) -> None:
+    """Refuse a rate that contradicts the column of times of some columns, if they have one.
 
     Args:
         path: of the file.
         given_hz: by the user.
         options: what the user states about its columns.
+        names: of the columns.
     Raises:
         InputError: they contradict each other.
     """
@@ -396,14 +397,18 @@ def check_times(path: Path, given_hz: float, options: ColumnOptions) -> None:
     if head is None:
         return
     name, time_s = head
+    with open_archive(path) as archive:
+        full = time_column(archive, options) or name
+        assumed = name if assumed_seconds(archive, full, options) else ""
+        try:
+            archive.rows([*archive.locate_all(names), full])
+        except InputError:
+            return  # the times of another table
     steps = np.diff(time_s)
     # Times with few digits repeat, so they state the rate less exactly.
     if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
         found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
         nearest = min(found, key=lambda rate: abs(rate / given_hz - 1.0))
-        with open_archive(path) as archive:
-            full = time_column(archive, options) or name
-            assumed = name if assumed_seconds(archive, full, options) else ""
         check_rate(given_hz, nearest, steps.size, f"column {name}", path, assumed=assumed)
 
 

@@ -109,7 +109,8 @@ def plausible_margins(
     Example:
         >>> from haselab.models import Plant
         >>> plants = [Plant(1.0, omega, 0.3) for omega in (25.0, 32.0, 40.0)]
-        >>> found = plausible_margins(plants, PidGains(0.0, 5.0), LoopSetting(), DesignSpec())
+        >>> loop = LoopSetting(100.0, 0.005)
+        >>> found = plausible_margins(plants, PidGains(0.0, 5.0), loop, DesignSpec())
         >>> found.phase_margin_deg.round(1), found.keeps_gain
         (array([81.1, 82.9, 84.1]), array([ True,  True,  True]))
     """

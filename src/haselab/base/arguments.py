@@ -212,6 +212,8 @@ def is_real(value: object) -> TypeGuard[float]:
 
     Args:
         value: anything.
+    Returns:
+        True for numbers of Python and of numpy.
     Example:
         >>> is_real(np.float32(0.1)), is_real(True), is_real("0.1"), is_real(np.ones(1))
         (True, False, False, False)

@@ -155,6 +155,22 @@ def test_a_soft_stack_collapses_where_the_literature_says():
         equilibrium_m(law, 1.0001 * critical_v, 0.0)
 
 
+@pytest.mark.parametrize("kilovolt", [0.3, 1.0])
+def test_a_stack_has_the_blocked_force_and_free_strain_of_the_pressure(kilovolt):
+    """Pelrine (1998): p = eps E^2 presses, p A blocked, and -p / Y of strain free, Y = 3 mu."""
+    law, voltage_v = DeaStack(), 1e3 * kilovolt
+    field_v_m = voltage_v / law.layer_thickness_m
+    pressure_pa = VACUUM_F_PER_M * law.permittivity * field_v_m**2
+    blocked_n = -float(law.electric_force_n(law.free_length_m, voltage_v))
+    assert blocked_n == pytest.approx(pressure_pa * law.area_m2, rel=1e-12)
+    strain = equilibrium_m(law, voltage_v, 0.0) / law.free_length_m - 1.0
+    small = pressure_pa / (3.0 * law.shear_modulus_pa)
+    # next order, neo-Hooke: 3 mu (e - e^2) = -p (1 - 3 e); Gent's limit adds e^3
+    assert strain == pytest.approx(-small, abs=5.0 * small**2)
+    layers_f = law.layers * VACUUM_F_PER_M * law.permittivity * law.area_m2 / 7e-4
+    assert float(law.capacitance_f(law.free_length_m)) == pytest.approx(layers_f, rel=1e-12)
+
+
 @pytest.mark.parametrize("voltage_v", [0.0, 3e3, 6e3])
 def test_a_neo_hookean_stack_rests_where_its_cubic_has_a_root(voltage_v):
     """mu (l - l^-2) A = -eps (V/d)^2 A l^-3 + F: a polynomial in l, solved by its companion."""

@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from haselab.actuators import ACTUATORS
+from haselab.cli.actuator_file import load_actuator
+from haselab.cli.identify.actuator import law_of_section
 from haselab.cli.main import cli, main
 from haselab.control import PidGains, margins
 from haselab.models.maps import VoltageMap
@@ -423,16 +426,16 @@ _CURVE = "[drive.voltage_map]\na1_v = 1.3\nb1 = 3.1\na2_v = -0.3\nb2 = -27.0\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (f"{_MAP}range_f = [8e-10, 5e-10]", "range_f: Value error, [8e-10, 5e-10] must have the"),
+        (f"{_MAP}range_f = [8e-10, 5e-10]", "range_f: [8e-10, 5e-10] must have the"),
         (f"{_MAP}range_f = [nan, 5e-10]", "range_f.0: Input should be a finite number (got nan)"),
-        (f"{_MAP}band = [0.01, -0.01]", "band: Value error, [0.01, -0.01] must have the lower end"),
+        (f"{_MAP}band = [0.01, -0.01]", "band: [0.01, -0.01] must have the lower end"),
         (f"{_MAP}hysteresis_strain = -0.1", "hysteresis_strain: Input should be greater than or"),
         (f"{_CURVE}strain_low = 0.2\nstrain_high = 0.1", "strain_low = 0.2 must be below strain_"),
-        ("[drive]\nlow_v = 3\nhigh_v = 1", "drive: Value error, low_v = 3 must be below high_v"),
+        ("[drive]\nlow_v = 3\nhigh_v = 1", "drive: low_v = 3 must be below high_v"),
         ("[drive]\nhighest_field_v_per_m = -1.0", "Input should be greater than 0 (got -1.0)"),
         ("[controller]\nlimits = {low = 0.1, high = -0.05}", "low = 0.1 must be below high = -0"),
         ('[[controller.alternatives]]\nkind = "x"\nlimits = {low = 0.1, high = 0.1}',
-         "alternatives.0.limits: Value error, low = 0.1 must be below high = 0.1"),
+         "alternatives.0.limits: low = 0.1 must be below high = 0.1"),
         ("[controller.demands]\nphase_margin_deg = -5.0", "phase_margin_deg = -5; must be within"),
     ],
 )  # fmt: skip
@@ -502,3 +505,16 @@ def test_a_model_of_a_length_is_not_designed_for_a_loop_of_strain(tmp_path, caps
     assert code == 2 and "The output of [model] is in m, but the maps of this file are for" in error
     path.write_text(path.read_text().replace('output_unit = "m"', 'output_unit = "1"'))
     assert run(capsys, "design", path)[0] == 0
+
+
+@pytest.mark.parametrize("kind", ["planar-hasel", "peano-hasel", "curling-hasel", "dea-stack"])
+def test_the_parameters_of_a_new_file_are_the_defaults_of_its_kind(kind, tmp_path, capsys):
+    path = tmp_path / "A.toml"
+    assert run(capsys, "init", "x", "--kind", kind, "--out", path)[0] == 0
+    head, mark, rest = path.read_text().partition("[actuator.parameters]\n")
+    lines, gap, tail = rest.partition("\n\n")
+    stated = [line.removeprefix("# ") if " = " in line else line for line in lines.splitlines()]
+    path.write_text(head + mark + "\n".join(stated) + gap + tail)
+    law = law_of_section(load_actuator(path).actuator, path)
+    assert law == ACTUATORS.find(kind)()
+    assert sum(" = " in line for line in stated) == len(law.described())

@@ -77,6 +77,7 @@ _EXPLAINS = 0.1  # of a model error, which an effect must explain to be added
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
+_APART = 2.0  # rms over noise from which records are compared alone
 _POINTS = 5  # voltages of the linear models
 _UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
 
@@ -279,6 +280,14 @@ def fit_actuator(
         misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
     misfit, found, more = _with_effects(misfit, start, found)
     rejected += more
+    if (
+        len(records) > 1
+        and seen_of(misfit, found).excess[0] > _APART
+        and _each_alone(misfit, start)
+    ):
+        status = "the records contradict each other: the law explains each alone, but not all"
+        status += " together. Check that all are of one actuator, and mass, units and gain of each"
+        return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
     others = other_elastic(misfit, found) if seen_of(misfit, found).explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
@@ -319,6 +328,13 @@ def _explains(misfit: Misfit, before: Found, after: Found) -> bool:
     seen = seen_of(misfit, before)
     left = seen_of(misfit, after).excess_energy
     return seen.explained or left < (1.0 - _EXPLAINS) * seen.excess_energy
+
+
+def _each_alone(misfit: Misfit, start: Unknowns) -> bool:
+    """Whether the law explains each record alone, with parameters of its own."""
+    parts = [replace(misfit, records=[record]) for record in misfit.records]
+    alone = [(own, search(own, start)) for own in parts]
+    return all(part is not None and seen_of(own, part).explained for own, part in alone)
 
 
 def _ordered(found: Found) -> Found:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.identify.noise import whiteness_p
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment, least_explained
 from haselab.identify.physical.model_error import excess_energy
 from haselab.identify.physical.rivals import Rival
 from haselab.identify.physical.search import Found
@@ -31,6 +31,7 @@ Floats = NDArray[np.float64]
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _GOOD_SCALE = 0.005  # and a careful one
+_LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
 _WHITE = 1e-3  # probability of the residuals under white noise
 _ENOUGH = 20  # values of an experiment, for an rms of its own
 
@@ -68,6 +69,7 @@ class Seen:
 
     lengths: list[Floats]
     capacitances: list[Floats]
+    share: float  # of the variance of the channel that is explained least
 
     @property
     def whiteness_p(self) -> float:
@@ -101,6 +103,7 @@ def seen_of(misfit: Misfit, found: Found) -> Seen:
     return Seen(
         channel_of(misfit.segments, LENGTH, found.residuals),
         channel_of(misfit.segments, CAPACITANCE, found.residuals),
+        least_explained(misfit, found.residuals),
     )
 
 
@@ -125,6 +128,12 @@ def status_of(
             f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
             "noise. Check the mass, the units and that all records are of one actuator, or start "
             "nearer, by [actuator.parameters]"
+        ), False
+    if not seen.explained and seen.share < _LEAST_SHARE:
+        return (
+            f"the records contradict the model: it explains only {100.0 * max(seen.share, 0.0):.0f}"
+            " % of the variance of a signal. Check the mass, the amplifier's gain, the units and "
+            "that all records are of one actuator, or start nearer, by [actuator.parameters]"
         ), False
     if not converged:
         return "the search did not converge; start nearer, by [actuator.parameters]", False

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from haselab.actuators import PlanarHasel
+from haselab.base import InputError
+from haselab.cli.actuator_file import load_actuator
+from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.main import main
 from haselab.pipelines.motion import motion_of_session
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.session.reader import SessionReader
 from tests.cli.model.physical_files import (
     CAPACITANCE_STD_F,
@@ -201,3 +205,18 @@ def test_options_of_tables_and_unknown_experiments_are_refused_for_sessions(
     assert code == 2 and "--mass-kg is for tables, but a session states this itself" in error
     code, _, error = run(capsys, "compare", actuator, session, "--experiment", "chirp")
     assert code == 2 and "has no experiment chirp" in error and "It has held, step." in error
+
+
+@pytest.mark.long
+def test_a_session_of_another_kind_is_warned_of(session, tmp_path, capsys):
+    columns = ColumnOptions()
+    options = TableOptions(None, (), None, None, None, None, columns)
+    for kind, words in (
+        ("planar-hasel", ""),
+        ("dea-stack", "states a planar-hasel, but [actuator]"),
+    ):
+        known = load_actuator(written(tmp_path / f"{kind}.toml", kind=kind))
+        motion_of_file(session, options, known)
+        assert words in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"--mass-kg is for tables, but a session states this"):
+        motion_of_file(session, TableOptions(None, (), None, 0.2, None, None, columns), known)

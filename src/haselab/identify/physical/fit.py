@@ -280,16 +280,13 @@ def fit_actuator(
         misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
     misfit, found, more = _with_effects(misfit, start, found)
     rejected += more
-    if (
-        len(records) > 1
-        and seen_of(misfit, found).excess[0] > _APART
-        and _each_alone(misfit, start)
-    ):
+    seen = seen_of(misfit, found)
+    if len(records) > 1 and seen.excess[0] > _APART and _each_alone(misfit, start):
         status = "the records contradict each other: the law explains each alone, but not all"
         status += " together. Check that all are of one actuator, and mass, units and gain of each"
         return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
-    others = other_elastic(misfit, found) if seen_of(misfit, found).explained else []
+    others = other_elastic(misfit, found) if seen.explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
     return _result(misfit, _ordered(found), rejected, preferred)
@@ -313,10 +310,10 @@ def _with_effects(
         if better is None:
             break
         again = refine(misfit, better.start, found.evaluations)
-        if again is None or not _explains(misfit, found, again):
+        if again is not None and again.converged and not _explains(misfit, found, again):
             break
         again = _from_start(misfit, better.start.at(start), again, explained=True)
-        if again is None or rms_of([again.residuals]) > rms_of([found.residuals]):
+        if again is None or not _explains(misfit, found, again):
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))

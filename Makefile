@@ -9,8 +9,8 @@ VENV    := .venv
 BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip --disable-pip-version-check --quiet
 OUT     ?= out/reference
-# One more than there are cores: some tests wait.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print(1 + min(os.cpu_count() or 1, 7))')
+# Two more than there are cores: many tests wait for a time limit or another process.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print(2 + min(os.cpu_count() or 1, 6))')
 # Neighbouring tests stay on one worker, which then builds what they share once.
 PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 FUZZ_S  ?= 1800
@@ -29,7 +29,7 @@ help:
 	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
-	@echo 'make bench   measure the published figures on a part of the cases: 10 minutes'
+	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment and extensions only'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'

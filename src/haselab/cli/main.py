@@ -13,8 +13,8 @@ from typing import Any, TextIO
 import click
 
 from haselab import __version__
-from haselab.base.errors import HaselabError
-from haselab.base.exits import SignalExit
+from haselab.base.errors import HaselabError, described, text_of
+from haselab.base.exits import SignalExit, exit_code_text
 from haselab.base.foreign_code import foreign_failure
 from haselab.cli.bench.revoke_first import revoke_first
 from haselab.cli.invocation import Invocation
@@ -152,7 +152,7 @@ def _exit_if_foreign(error: Exception) -> None:
     found = foreign_failure(error)
     if found is None:
         return
-    what = f"{found.place} of the package {found.package!r} failed: {type(error).__name__}: {error}"
+    what = f"{found.place} of the package {found.package!r} failed: {described(error)}"
     advice = "Repair it; run again with --debug for the traceback"
     sys.exit(_fail(f"{what}. {advice}.", 4 if "haselab.instruments" in found.groups else 2))
 
@@ -192,12 +192,12 @@ def main(
     except SystemExit as stop:  # of another package, where no one expects it
         if debug:
             raise RuntimeError("code of another package called sys.exit()") from stop
-        what = f"Code of another package called sys.exit({stop.code!r})."
+        what = f"Code of another package called sys.exit({exit_code_text(stop)})."
         sys.exit(_fail(f"{what} Run again with --debug to see which; uninstall or repair it.", 2))
     except HaselabError as error:
         if debug:
             raise
-        sys.exit(_fail(str(error), error.exit_code))
+        sys.exit(_fail(text_of(error), error.exit_code))
     except OSError as error:
         if debug:
             raise
@@ -210,6 +210,6 @@ def main(
         if debug:
             raise
         _exit_if_foreign(error)
-        what = f"A bug in haselab ({type(error).__name__}: {error})."
+        what = f"A bug in haselab ({described(error)})."
         sys.exit(_fail(f"{what} Run again with --debug and report the traceback.", 1))
     sys.exit(0)

@@ -154,10 +154,10 @@ def _fixed_by(study: Study) -> dict[str, str]:
     if study.operating_point.baseline_v is not None:
         fixed["S18.baseline"] = "operating_point.baseline_v"
         fixed["S18.centre_offset"] = "at operating_point.baseline_v"
-    if study.has("static_load") and study.static_load.pieces is not None:
-        fixed["S17.region_low"] = "number of segments: static_load.pieces"
+    if study.has("static_load") and study.static_load.segments is not None:
+        fixed["S17.region_low"] = "number of segments: static_load.segments"
         fixed["S17.region_high"] = fixed["S17.region_low"]
-        fixed.setdefault("S18.baseline", "centre of a region by static_load.pieces")
+        fixed.setdefault("S18.baseline", "centre of a region by static_load.segments")
         fixed.setdefault("S18.centre_offset", fixed["S18.baseline"])
     return fixed
 

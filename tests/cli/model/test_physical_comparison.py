@@ -179,6 +179,18 @@ def test_a_status_that_is_not_ok_needs_the_size_of_the_error(tmp_path, capsys):
     assert code == 0 and "warning: [model.physical] has the status 'model error" in error
 
 
+def test_a_drift_is_part_of_the_prediction(tmp_path, capsys):
+    """8 s of the law itself, which does not drift."""
+    file = table(tmp_path / "new.csv")
+    none = {"drift__stiffness_per_s": 1e-9, "drift__stiffness_s": 600.0}
+    code, text, _ = run(capsys, "compare", written(tmp_path / "A.toml", **none), file, "--json")
+    assert (code, json.loads(text)["status"]) == (0, "ok")
+    # 0.4 % of the force after 8 s is 40 um of 10 mm, ten times the noise
+    fast = none | {"drift__stiffness_per_s": -5e-4}
+    code, text, _ = run(capsys, "compare", written(tmp_path / "B.toml", **fast), file, "--json")
+    assert code == 3 and json.loads(text)["status"].startswith("model error: only ")
+
+
 def test_another_kind_of_actuator_is_refused(tmp_path, capsys):
     model = written(tmp_path / "A.toml", kind="dea-stack")
     code, _, error = run(capsys, "compare", model, table(tmp_path / "new.csv"))

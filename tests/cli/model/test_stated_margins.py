@@ -244,7 +244,7 @@ def test_a_run_with_such_a_file_warns_before_it_plays(
     rig.write_text('kind = "twin"\n')
     study.write_text(
         'name = "beyond the limit of the file"\n[triangle]\nlow_v = 0.0\nhigh_v = 2.0\n'
-        "frequency_hz = 0.25\ncycles = 3\nleft_out_cycles = 1\nframe_rate_hz = 100.0\n"
+        "frequency_hz = 0.25\ncycles = 3\nskipped_cycles = 1\nframe_rate_hz = 100.0\n"
     )
     arguments = ("--rig", rig, "--actuator", leg, "--out", tmp_path / "out")
     code, _, error = run(capsys, "run", study, *arguments)

@@ -35,7 +35,9 @@ STUDY = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 @pytest.mark.parametrize("reading", ["hz", "rad"])
 def test_the_reference_study_is_feasible_on_the_twin(reading: str) -> None:
     config, study = twin_of_reading(reading), builtin_study()
-    judge_study(study, describe(config), rating_of_twin(config, study)).require()
+    printed = judge_study(study, describe(config), rating_of_twin(config, study))
+    printed.require()
+    assert len(printed.checks) >= 5 and all(check.ok for check in printed.checks)
 
 
 def test_the_predicted_field_is_the_field_that_breaks_the_twin() -> None:
@@ -133,8 +135,10 @@ def test_a_recording_needs_no_confirmation(tmp_path: Path, monkeypatch) -> None:
     path.write_text('kind = "replay"\nsession = "s.h5"\n')
     plain = rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz"))
     monkeypatch.setattr(click, "confirm", lambda words, err: 1 / 0)
-    with armed_rig(plain, load_rig(path), path, builtin_study(quick=True), tmp_path, Operator()):
-        pass
+    with armed_rig(
+        plain, load_rig(path), path, builtin_study(quick=True), tmp_path, Operator()
+    ) as rig:
+        assert rig.acquisition.read().size > 0  # it plays
 
 
 def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) -> None:
@@ -162,7 +166,7 @@ low_v = 0.0
 high_v = 2.0
 frequency_hz = 0.5
 cycles = 3
-left_out_cycles = 1
+skipped_cycles = 1
 frame_rate_hz = 100.0
 """
 
@@ -180,8 +184,8 @@ frame_rate_hz = 100.0
          "only 6 frames on each edge within 0.3 V of the baseline of 5 V"),
         ("[triangle]", "hold_s = 3\n[triangle]", "has the key hold_s outside its tables"),
         ("[triangle]", "chirp = 3\n[triangle]", "chirp: Input should be a table, headed [chirp]"),
-        ("left_out_cycles = 1", "left_out_cycles = 3",
-         "left_out_cycles = 3 must be below cycles = 3"),
+        ("skipped_cycles = 1", "skipped_cycles = 3",
+         "skipped_cycles = 3 must be below cycles = 3"),
         ("high_v = 2.0", "high_v = 0.0", "low_v = 0 must be below high_v = 0"),
     ],
 )  # fmt: skip
@@ -291,7 +295,7 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
     rating = rating_of_twin(config, study)
     assert judge_study(study, describe(config), rating).ok
     for trials in (1, 0):
-        changed = {"printed_chain_carrier_v": 0.2, "printed_chain_trials": trials}
+        changed = {"paper_chain_carrier_v": 0.2, "paper_chain_trials": trials}
         loud = study.model_copy(update={"steps": study.steps.model_copy(update=changed)})
         found = judge_study(loud, describe(config), rating)
         bad = {check.name: check.where for check in found.checks if not check.ok}

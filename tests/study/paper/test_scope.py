@@ -44,7 +44,7 @@ def test_an_experiment_of_the_chip_that_is_missing_is_named_with_its_reason() ->
 @pytest.mark.parametrize(
     ("setting", "key"),
     [
-        ("printed_chain_trials", "S10.rise_printed_chain"),
+        ("paper_chain_trials", "S10.rise_printed_chain"),
         ("extra_delay_trials", "S24.rise_delayed"),
         ("saturating_trials", "S22.recovery_time"),
         ("pi_trials", "S24.rise_closed"),

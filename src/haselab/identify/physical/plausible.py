@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.actuators import ActuatorLaw, equilibrium_m
 from haselab.base import LimitError
 from haselab.identify.physical.record import MotionRecord
 
 __all__ = ["implausible"]
+
+Floats = NDArray[np.float64]
 
 _LENGTH, _CAPACITANCE = 10.0, 100.0  # factor from the start values that no start explains
 _BREAKDOWN = 3.0  # fields over that of breakdown, likewise
@@ -87,13 +90,13 @@ def _voltage(law: ActuatorLaw, record: MotionRecord) -> str:
     )
 
 
-def _at_usual_load(record: MotionRecord) -> np.ndarray:
+def _at_usual_load(record: MotionRecord) -> Floats:
     """Lengths seen under the load that acted longest."""
     drive = record.drive
     _, of = np.unique(drive.load_n, return_inverse=True)
     usual = np.argmax(np.bincount(of, np.diff(drive.edge_s)))
     at = np.clip(np.searchsorted(drive.edge_s, record.length_time_s) - 1, 0, of.size - 1)
-    return record.length_m[of[at] == usual]
+    return np.asarray(record.length_m[of[at] == usual])
 
 
 def _moved_m(law: ActuatorLaw, record: MotionRecord, voltage_v: float) -> float | None:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from haselab import _camera
 from haselab.base import InputError, LimitError, Limits
+from haselab.store.toml import Section
 
 __all__ = ["TwinCamera", "TwinCameraConfig"]
 
@@ -22,10 +23,8 @@ _SIDE_MARGIN = 0.96  # no particle sits closer to a free side, in half-widths
 _CLAMP_OVERHANG_PX = 14.0  # by which a clamp is wider than the sheet
 
 
-class TwinCameraConfig(BaseModel):
+class TwinCameraConfig(Section):
     """All settings of the twin's images except the sheet's dimensions."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     width_px: int = Field(512, ge=64, le=4096, description="Columns of a frame")
     height_px: int = Field(512, ge=64, le=4096, description="Rows of a frame")

@@ -18,6 +18,7 @@ from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
     ColumnOptions,
     assumed_seconds,
+    check_assumed_seconds,
     stated_unit,
     time_column,
 )
@@ -27,6 +28,7 @@ __all__ = [
     "FORMATS",
     "ColumnStream",
     "check_rate",
+    "check_times",
     "head_of_times",
     "open_archive",
     "open_columns",
@@ -37,6 +39,7 @@ __all__ = [
 
 _HEAD_ROWS = 4096
 _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
+_UNITS_OF_TIME = {"ms": 1e3, "us": 1e6}  # per second
 _EVEN = 0.01  # of a step: how far times may be from even ones
 
 _TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".lvm", ".prn")
@@ -155,7 +158,9 @@ def rates_agree(one_hz: float, other_hz: float, rows: int) -> bool:
     return abs(one_hz / other_hz - 1.0) <= max(1.5 / rows, 1e-3)
 
 
-def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
+def check_rate(
+    given_hz: float, found_hz: float, rows: int, where: str, file: Path, *, assumed: str = ""
+) -> None:
     """Refuse a rate that differs from the file's by more than 0.1 % and 1.5 rows in total.
 
     Args:
@@ -164,16 +169,25 @@ def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Pa
         rows: of the record.
         where: in the file it was found, for the error.
         file: path of it.
+        assumed: column of times whose unit nobody states and that was taken as seconds; "": none.
     Raises:
         InputError: they contradict each other.
     Example:
         >>> check_rate(1000.0, 1000.5, 4096, "column time_s", Path("a.csv"))
     """
-    if not rates_agree(found_hz, given_hz, rows):
-        raise InputError(
-            f"--rate-hz is {given_hz:g}, but {where} has {found_hz:.6g} rows per second. Leave out "
-            f"--rate-hz, or change the file: {file}"
-        )
+    if rates_agree(found_hz, given_hz, rows):
+        return
+    for unit, factor in _UNITS_OF_TIME.items() if assumed else ():
+        if rates_agree(found_hz * factor, given_hz, rows):
+            raise InputError(
+                f"--rate-hz is {given_hz:g}, but column {assumed}, which states no unit, has "
+                f"{found_hz:.6g} rows per second if its times are in s. They agree if it is in "
+                f"{unit}: add --unit {assumed}={unit}: {file}"
+            )
+    raise InputError(
+        f"--rate-hz is {given_hz:g}, but {where} has {found_hz:.6g} rows per second. Leave out "
+        f"--rate-hz, or change the file: {file}"
+    )
 
 
 def pairs_of(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any] | None:
@@ -278,7 +292,8 @@ class ColumnStream(Closing):
             )
         self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
-        if self._times and assumed_seconds(self._archive, full, self._options):
+        if self.rate_hz and assumed_seconds(self._archive, full, self._options):
+            check_assumed_seconds(full, self.rate_hz, self._archive.file, monitors=True)
             self.assumed_seconds = full
 
     def _check_stated_rate(self, stated_hz: float) -> None:
@@ -365,6 +380,31 @@ class ColumnStream(Closing):
     def close(self) -> None:
         """Close the file."""
         self._archive.close()
+
+
+def check_times(path: Path, given_hz: float, options: ColumnOptions) -> None:
+    """Refuse a rate that contradicts the column of times of a file, if it has one.
+
+    Args:
+        path: of the file.
+        given_hz: by the user.
+        options: what the user states about its columns.
+    Raises:
+        InputError: they contradict each other.
+    """
+    head = head_of_times(path, options, _HEAD_ROWS)
+    if head is None:
+        return
+    name, time_s = head
+    steps = np.diff(time_s)
+    # Times with few digits repeat, so they state the rate less exactly.
+    if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
+        found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
+        nearest = min(found, key=lambda rate: abs(rate / given_hz - 1.0))
+        with open_archive(path) as archive:
+            full = time_column(archive, options) or name
+            assumed = name if assumed_seconds(archive, full, options) else ""
+        check_rate(given_hz, nearest, steps.size, f"column {name}", path, assumed=assumed)
 
 
 def head_of_times(

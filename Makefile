@@ -29,7 +29,7 @@ help:
 	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
-	@echo 'make bench   measure the published figures on a part of the cases: 10 minutes'
+	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment and extensions only'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'

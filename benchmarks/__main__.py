@@ -1,20 +1,25 @@
 """Measure the published figures and compare them with other libraries: `make bench`.
 
-    python -m benchmarks [--full] [SECTION ...]
+    python -m benchmarks [--full] [--minutes M] [SECTION ...]
 
 The default takes a representative part of each section: fewer seeds, records and sizes. `--full`
 (`make bench-full`) takes all of them. Speeds are medians of several rounds of wall time, in which
 haselab and the other libraries take turns, so that another program slows down both. Trust the
-ratios. At the end every goal is listed, the missed ones last.
+ratios. At the end every goal is listed, the missed ones last. The exit code is 1 if a benchmark
+failed, and 0 otherwise: a missed goal is a result.
 """
 
 import argparse
+import math
+import sys
 import time
 
 from benchmarks.measurement import Measurement
 from benchmarks.rows import Row, summary
 
 __all__ = ["SECTIONS"]
+
+_MINUTES = 10.0
 
 SECTIONS: dict[str, tuple[Measurement, ...]] = {
     "twin": (Measurement("rig.twin"),),
@@ -39,7 +44,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         ),
         Measurement("identification.prediction", quick={"twins": (), "short": 1}),
     ),
-    "identify-board": (
+    "random-plants": (
         Measurement("identification.random_plants", quick={"plants": 200}),
         Measurement("control.margins", quick={"loops": 200}),
     ),
@@ -47,7 +52,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         Measurement("rig.recording", quick={"seconds": 20.0, "live": 10.0, "kills": 3}),
         Measurement("rig.wire", quick={"seconds": 5.0}),
     ),
-    "board": (Measurement("sensing.disturbances", quick={"blocks": 200, "seeds": 1}),),
+    "disturbances": (Measurement("sensing.disturbances", quick={"blocks": 200, "seeds": 1}),),
     "stream": (
         Measurement("sensing.stream", quick={"size_gb": 0.2, "rounds": 1}),
         Measurement(
@@ -70,6 +75,34 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
 }
 
 
+def measured(names: list[str], full: bool, most_s: float) -> bool:
+    """Run the sections and print the summary, also after Ctrl-C; whether every process ended well.
+
+    Args:
+        names: of the sections.
+        full: measure all cases.
+        most_s: what is not measured after this time, in s, is left out.
+    """
+    tables: list[tuple[str, list[Row]]] = []
+    begun = time.monotonic()
+    good = True
+    try:
+        for name in names:
+            for measurement in SECTIONS[name]:
+                start = time.monotonic()
+                found = measurement.run(full, begun + most_s - start)
+                tables.append((name, found.rows))
+                good = good and not found.failed
+                wall_s = time.monotonic() - start
+                print(
+                    f"-- {name}, {measurement.module}: {found.cpu_s:.1f} s of CPU, {wall_s:.1f} s\n"
+                )
+    finally:
+        print(summary(tables))
+        print(f"Measured in {time.monotonic() - begun:.0f} s.")
+    return good
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
@@ -78,22 +111,24 @@ def main() -> None:
     )
     parser.add_argument("sections", nargs="*", help=f"of {', '.join(SECTIONS)}; default: all")
     parser.add_argument("--full", action="store_true", help="measure all seeds, records and sizes")
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        help="end after this time; the summary lists what was left out (default: 10 without "
+        "sections and without --full, else no limit)",
+    )
     options = parser.parse_args()
     names = options.sections or list(SECTIONS)
     unknown = [name for name in names if name not in SECTIONS]
     if unknown:
         parser.error(f"no section {', '.join(unknown)}. Choose from {', '.join(SECTIONS)}.")
-    measured: list[tuple[str, list[Row]]] = []
-    begun = time.perf_counter()
-    for name in names:
-        for measurement in SECTIONS[name]:
-            start = time.perf_counter()
-            rows, cpu_s = measurement.run(options.full)
-            measured.append((name, rows))
-            wall_s = time.perf_counter() - start
-            print(f"-- {name}, {measurement.module}: {cpu_s:.1f} s of CPU, {wall_s:.1f} s\n")
-    print(summary(measured))
-    print(f"Measured in {time.perf_counter() - begun:.0f} s.")
+    minutes = options.minutes
+    if minutes is None:
+        minutes = math.inf if options.full or options.sections else _MINUTES
+    try:
+        sys.exit(0 if measured(names, options.full, 60.0 * minutes) else 1)
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -81,17 +81,18 @@ def summary(sections: Iterable[tuple[str, Iterable[Row]]]) -> str:
                       f"{total} goals: {counts}."])  # fmt: skip
 
 
-def goal_of(goal: float, ideal: float, runs: int) -> float:
-    """A statistical goal for fewer runs than the 1,000 for which it is stated.
+def goal_of(goal: float, ideal: float, runs: int, stated: int = 1000) -> float:
+    """A statistical goal for fewer runs than those for which it is stated.
 
     Args:
-        goal: for 1,000 runs.
+        goal: for `stated` runs.
         ideal: what the number would be in infinitely many.
         runs: that are made; chance moves the number away from the ideal with their root.
+        stated: runs for which the goal is stated.
     Returns:
         The goal, further from the ideal with fewer runs.
     """
-    return ideal + (goal - ideal) * math.sqrt(1000.0 / min(runs, 1000))
+    return ideal + (goal - ideal) * math.sqrt(stated / min(runs, stated))
 
 
 def seconds(job: Callable[[], object]) -> float:

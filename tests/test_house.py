@@ -6,8 +6,7 @@ import functools
 import importlib
 import re
 import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ import haselab
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "haselab"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-IDS = [str(path.relative_to(PACKAGE)) for path in MODULES]
 MAX_LINES = 600
 
 # A name may not end in one of these: the unit is missing.
@@ -52,27 +50,32 @@ def is_public(path: Path) -> bool:
 
 
 PUBLIC = [path for path in MODULES if is_public(path)]
-PUBLIC_IDS = [str(path.relative_to(PACKAGE)) for path in PUBLIC]
 
 
-@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
-def test_all_names_what_the_module_defines_or_gathers(path: Path) -> None:
-    module = importlib.import_module(module_name(path))
-    own = [
-        node.name
-        for node in tree_of(path).body
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_")
-    ]
-    if not hasattr(module, "__all__"):
-        assert not own, f"{module.__name__} has no __all__, but defines {own}"
-        return
-    missing = [name for name in module.__all__ if not hasattr(module, name)]
-    assert not missing, f"{module.__name__}.__all__ names {missing}, which are not there"
-    hidden = sorted(set(own) - set(module.__all__))
-    assert not hidden, (
-        f"{module.__name__} defines {hidden} outside __all__: name or underscore them"
-    )
-    assert list(module.__all__) == sorted(set(module.__all__)) or _ruff_order(module.__all__)
+def no_faults(check: Callable[[Path], Iterable[str]], paths: Iterable[Path]) -> None:
+    """Every file passes; one that does not is named with all its faults."""
+    found = {str(path.relative_to(ROOT)): list(check(path)) for path in paths}
+    faults = [f"{name}: {fault}" for name, each in found.items() for fault in each]
+    assert not faults, "\n".join(faults)
+
+
+def test_all_names_what_the_module_defines_or_gathers() -> None:
+    def faults(path: Path) -> Iterator[str]:
+        module = importlib.import_module(module_name(path))
+        own = {
+            node.name
+            for node in tree_of(path).body
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_")
+        }
+        named = list(getattr(module, "__all__", ()))
+        if missing := [name for name in named if not hasattr(module, name)]:
+            yield f"__all__ names {missing}, which are not there"
+        if hidden := sorted(own - set(named)):
+            yield f"defines {hidden} outside __all__: name or underscore them"
+        if named != sorted(set(named)) and not _ruff_order(named):
+            yield "__all__ is not in order"
+
+    no_faults(faults, PUBLIC)
 
 
 def _ruff_order(names: list[str]) -> bool:
@@ -84,25 +87,31 @@ def _ruff_order(names: list[str]) -> bool:
     return [rank(name) for name in names] == sorted(rank(name) for name in names)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=IDS)
-def test_a_file_is_not_too_long(path: Path) -> None:
+def too_long(path: Path) -> Iterator[str]:
     lines = len(path.read_text(encoding="utf-8").splitlines())
-    assert lines <= MAX_LINES, f"{path.name} has {lines} lines, allowed are {MAX_LINES}: split it"
+    if lines > MAX_LINES:
+        yield f"{lines} lines, but at most {MAX_LINES} are allowed: split it"
+
+
+def test_a_file_is_not_too_long() -> None:
+    no_faults(too_long, [*MODULES, *native_sources()])
+
+
+NAMES = {module_name(path) for path in MODULES}
 
 
 def imported_modules(path: Path) -> Iterator[str]:
     """Modules of the package that one imports, inside functions too; not for its types alone."""
-    names = {module_name(each) for each in MODULES}
     nodes: list[ast.AST] = [tree_of(path)]
     while nodes:
         node = nodes.pop()
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             nodes += node.orelse
         elif isinstance(node, ast.Import):
-            yield from (each.name for each in node.names if each.name in names)
-        elif isinstance(node, ast.ImportFrom) and node.module in names:
+            yield from (each.name for each in node.names if each.name in NAMES)
+        elif isinstance(node, ast.ImportFrom) and node.module in NAMES:
             inner = (f"{node.module}.{each.name}" for each in node.names)
-            yield from (each if each in names else node.module for each in inner)
+            yield from (each if each in NAMES else node.module for each in inner)
         else:
             nodes += ast.iter_child_nodes(node)
 
@@ -123,12 +132,6 @@ def native_sources() -> list[Path]:
         path for folder in folders for kind in ("*.c", "*.h", "*.cpp")
         for path in (ROOT / folder).rglob(kind)
     )  # fmt: skip
-
-
-def test_a_native_file_is_not_too_long() -> None:
-    for path in native_sources():
-        lines = len(path.read_text(encoding="utf-8").splitlines())
-        assert lines <= MAX_LINES, f"{path.relative_to(ROOT)} has {lines} lines"
 
 
 def exported_by_packages() -> set[str]:
@@ -172,26 +175,24 @@ def raised(function: ast.FunctionDef) -> set[str]:
     return {name for name in names if name.endswith("Error")}
 
 
-@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
-def test_docstrings_have_the_heads_that_apply(path: Path) -> None:
-    faults = []
-    if package_of(path) != "cli":  # there the docstring is the help text
+def test_docstrings_have_the_heads_that_apply() -> None:
+    def faults(path: Path) -> Iterator[str]:
         for name, function in public_functions(path):
             text = ast.get_docstring(function) or ""
             short = text.count("\n") < 1 and len(parameters(function)) <= 1
             if parameters(function) and "Args:" not in text and not short:
-                faults.append(f"{name}: no Args")
+                yield f"{name}: no Args"
             returns = function.returns is not None and ast.unparse(function.returns) != "None"
             if returns and not re.search(r"(Returns|Yields):", text) and not short:
-                faults.append(f"{name}: no Returns")
-            faults += [f"{name}: no Raises {error}" for error in raised(function)
-                       if f"{error}:" not in text]  # fmt: skip
-        faults += [
-            f"{node.name}: no Args"
-            for node in public_dataclasses(path)
-            if "Args:" not in (ast.get_docstring(node) or "")
-        ]
-    assert not faults, f"{path.relative_to(ROOT)}: {faults}"
+                yield f"{name}: no Returns"
+            yield from (f"{name}: no Raises {error}" for error in raised(function)
+                        if f"{error}:" not in text)  # fmt: skip
+        for node in public_dataclasses(path):
+            if "Args:" not in (ast.get_docstring(node) or ""):
+                yield f"{node.name}: no Args"
+
+    # In cli the docstring is the help text.
+    no_faults(faults, [path for path in PUBLIC if package_of(path) != "cli"])
 
 
 def heads(text: str) -> list[str]:
@@ -199,14 +200,18 @@ def heads(text: str) -> list[str]:
     return re.findall(rf"^\s*({'|'.join(order)}):", text, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
-def test_docstring_heads_come_in_one_order(path: Path) -> None:
+def test_docstring_heads_come_in_one_order() -> None:
     order = {name: k for k, name in enumerate(("Args", "Returns", "Raises", "Source", "Example"))}
     order["Yields"] = order["Returns"]
-    for node in ast.walk(tree_of(path)):
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-            found = [order[head] for head in heads(ast.get_docstring(node) or "")]
-            assert found == sorted(found), f"{path.name}: {node.name}: heads out of order"
+
+    def faults(path: Path) -> Iterator[str]:
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+                found = [order[head] for head in heads(ast.get_docstring(node) or "")]
+                if found != sorted(found):
+                    yield f"{node.name}: heads out of order"
+
+    no_faults(faults, PUBLIC)
 
 
 def is_number(annotation: ast.expr | None) -> bool:
@@ -226,17 +231,17 @@ def named_numbers(path: Path) -> Iterator[tuple[str, str]]:
                 yield name, parameter.arg
 
 
-@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
-def test_numbers_with_a_dimension_name_their_si_unit(path: Path) -> None:
-    spoken = package_of(path) in {"cli", "report"}
-    faults = []
-    for where, name in named_numbers(path):
-        words = name.split("_")
-        if words[-1] in QUANTITIES and "relative" not in words and name not in DIMENSIONLESS:
-            faults.append(f"{where}.{name}: a {words[-1]} in which unit?")
-        if not spoken and len(words) > 1 and words[-1] in DISPLAY_UNITS:
-            faults.append(f"{where}.{name}: {words[-1]} belongs in cli and report; use SI here")
-    assert not faults, f"{path.relative_to(ROOT)}: {faults}"
+def test_numbers_with_a_dimension_name_their_si_unit() -> None:
+    def faults(path: Path) -> Iterator[str]:
+        spoken = package_of(path) in {"cli", "report"}
+        for where, name in named_numbers(path):
+            words = name.split("_")
+            if words[-1] in QUANTITIES and "relative" not in words and name not in DIMENSIONLESS:
+                yield f"{where}.{name}: a {words[-1]} in which unit?"
+            if not spoken and len(words) > 1 and words[-1] in DISPLAY_UNITS:
+                yield f"{where}.{name}: {words[-1]} belongs in cli and report; use SI here"
+
+    no_faults(faults, PUBLIC)
 
 
 def public_annotations(body: list[ast.stmt]) -> Iterator[ast.expr]:
@@ -256,24 +261,13 @@ def public_annotations(body: list[ast.stmt]) -> Iterator[ast.expr]:
             yield node.annotation
 
 
-@pytest.mark.parametrize("path", PUBLIC, ids=PUBLIC_IDS)
-def test_tables_in_signatures_are_json_objects_not_anything(path: Path) -> None:
-    vague = [
-        f"line {annotation.lineno}"
-        for annotation in public_annotations(tree_of(path).body)
-        if "dict[str, Any]" in ast.unparse(annotation)
-    ]
-    assert not vague, f"{path.relative_to(ROOT)}: dict[str, Any] in {vague}; use JsonObject"
+def test_tables_in_signatures_are_json_objects_not_anything() -> None:
+    def faults(path: Path) -> Iterator[str]:
+        for annotation in public_annotations(tree_of(path).body):
+            if "dict[str, Any]" in ast.unparse(annotation):
+                yield f"line {annotation.lineno}: dict[str, Any]; use JsonObject"
 
-
-def test_imports_only_point_downward() -> None:
-    """The contract of pyproject.toml, by import-linter's own command."""
-    code = "import sys; from importlinter.cli import lint_imports_command as c; sys.exit(c())"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "0 broken" in done.stdout
+    no_faults(faults, PUBLIC)
 
 
 # Packages that may touch files, and packages that may draw.
@@ -286,8 +280,8 @@ def package_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=IDS)
-def test_only_permitted_packages_draw_or_touch_files(path: Path) -> None:
+def run_imports(path: Path) -> Iterator[tuple[ast.stmt, set[str]]]:
+    """Imports of a module with what they name; not those for type checkers alone."""
     tree = tree_of(path)
     for_checkers = {
         id(node)
@@ -296,35 +290,53 @@ def test_only_permitted_packages_draw_or_touch_files(path: Path) -> None:
         for node in ast.walk(branch)
     }
     for node in ast.walk(tree):
-        if id(node) in for_checkers:
-            continue
-        if isinstance(node, ast.Import):
-            roots = {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            roots = {(node.module or "").split(".")[0]}
-        else:
-            continue
-        if package_of(path) not in PLOT_PACKAGES:
-            assert "matplotlib" not in roots, f"{path.name} draws"
-        if package_of(path) not in FILE_PACKAGES:
-            assert not roots & FILE_MODULES, f"{path.name} touches files: {roots & FILE_MODULES}"
+        if isinstance(node, ast.Import) and id(node) not in for_checkers:
+            yield node, {each.name for each in node.names}
+        elif isinstance(node, ast.ImportFrom) and id(node) not in for_checkers:
+            module = node.module or ""
+            yield node, {module, *(f"{module}.{each.name}" for each in node.names)}
+
+
+def test_only_permitted_packages_draw_or_touch_files() -> None:
+    def faults(path: Path) -> Iterator[str]:
+        roots = {name.split(".")[0] for _, names in run_imports(path) for name in names}
+        if "matplotlib" in roots and package_of(path) not in PLOT_PACKAGES:
+            yield "draws"
+        if roots & FILE_MODULES and package_of(path) not in FILE_PACKAGES:
+            yield f"touches files: {roots & FILE_MODULES}"
+
+    no_faults(faults, MODULES)
+
+
+# What takes 0.3 s or more to import, and only some calls need.
+SLOW_IMPORTS = {"scipy.signal", "scipy.stats", "pandas", "xarray", "control"}
+
+
+def test_what_is_slow_to_import_is_imported_where_it_is_used() -> None:
+    """At the head of a module it would slow down the start of every command."""
+
+    def faults(path: Path) -> Iterator[str]:
+        for node, names in run_imports(path):
+            if node.col_offset == 0 and names & SLOW_IMPORTS:
+                yield f"line {node.lineno} imports {names & SLOW_IMPORTS} at the head of the file"
+
+    no_faults(faults, MODULES)
 
 
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 
 
-@pytest.mark.parametrize(
-    "path", TESTS, ids=[str(path.relative_to(ROOT / "tests")) for path in TESTS]
-)
-def test_every_raises_has_a_match(path: Path) -> None:
-    for node in ast.walk(tree_of(path)):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.raises":
-            keywords = {keyword.arg for keyword in node.keywords}
-            kind = ast.unparse(node.args[0])
-            # The message of SystemExit is its code; Ctrl-C has none.
-            assert kind in ("SystemExit", "KeyboardInterrupt") or "match" in keywords, (
-                f"{path.name}:{node.lineno}"
-            )
+def test_every_raises_has_a_match() -> None:
+    def faults(path: Path) -> Iterator[str]:
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.raises":
+                keywords = {keyword.arg for keyword in node.keywords}
+                # The message of SystemExit is its code; Ctrl-C has none.
+                without = ast.unparse(node.args[0]) in ("SystemExit", "KeyboardInterrupt")
+                if not without and "match" not in keywords:
+                    yield f"line {node.lineno}"
+
+    no_faults(faults, TESTS)
 
 
 def test_the_version_is_the_same_in_both_places() -> None:
@@ -337,6 +349,7 @@ PAGES = sorted(
 )
 
 
+@functools.cache
 def anchors(page: Path) -> set[str]:
     """The anchors that GitHub gives to the headings of a page."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -344,16 +357,19 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", line.strip().lower()).replace(" ", "-") for line in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_lead_to_a_file_and_a_heading_that_exist(page: Path) -> None:
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", text):
-        if re.match(r"[a-z]+:", target):
-            continue
-        other = page.parent / target if target else page
-        assert other.exists(), f"{page.name} points to {target}"
-        if anchor:
-            assert anchor in anchors(other), f"{page.name} points to {target}#{anchor}"
+def test_links_lead_to_a_file_and_a_heading_that_exist() -> None:
+    def faults(page: Path) -> Iterator[str]:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", text):
+            if re.match(r"[a-z]+:", target):
+                continue
+            other = page.parent / target if target else page
+            if not other.exists():
+                yield f"points to {target}"
+            elif anchor and anchor not in anchors(other):
+                yield f"points to {target}#{anchor}"
+
+    no_faults(faults, PAGES)
 
 
 def test_every_page_of_docs_is_reached_from_the_map() -> None:

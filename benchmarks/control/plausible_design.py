@@ -19,8 +19,8 @@ from haselab.control import (
     DesignSpec,
     LoopSetting,
     PidGains,
+    design_controller,
     design_pi,
-    design_plausible,
     margins,
     plausible_margins,
 )
@@ -124,7 +124,7 @@ def covered(seed: int, probability: float, noise: float = NOISE) -> tuple[bool, 
     fit = fit_transfer([simulated(rng, noise)])
     assert fit.succeeded, fit.status
     alone = design_pi(fit.plant, SPEC, SETTING, rng=np.random.default_rng(seed))
-    careful = design_plausible(
+    careful = design_controller(
         fit.posterior, SPEC, SETTING, structure="pi", probability=probability, rng=rng
     )
     assert careful.plausible is not None

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.identification.physical_twins import (
+from benchmarks.identification.physical_kinds import (
     CAMERA_BIAS_M,
-    MASS_KG,
+    KINDS,
     default_start,
     seen,
     short_record,
@@ -55,6 +55,7 @@ from haselab.study.run import RunOptions, recording, run_study, session_header
 
 Floats = NDArray[np.float64]
 HARD = CHECKOUT / "rigs" / "hard"
+PLANAR = KINDS["planar-hasel"]
 PLAIN = "plain"
 TWINS = (PLAIN, "retention", "hysteresis", "warming", "ageing", "second-resonance")
 # middle and half range of the drive, in V (5 kV each), and hung mass in kg; the study has 1.01 V
@@ -202,13 +203,13 @@ def short_rows(count: int) -> Iterator[Row]:
     law, inertia_kg = default_start("hz")
     found = []
     for seed in range(1, count + 1):
-        record, camera = seen(short_record(law, seed), seed)
-        fit = fit_actuator(law, [record], mass_kg=MASS_KG, added_inertia_kg=inertia_kg)
+        record, camera = seen(short_record(PLANAR, law, seed), seed)
+        fit = fit_actuator(law, [record], mass_kg=PLANAR.mass_kg, added_inertia_kg=inertia_kg)
         model = IdentifiedModel.of_fit(fit)
         moved_m = CAMERA_BIAS_M * np.random.default_rng([seed, 8]).standard_normal(len(POINTS))
         for k, (_, _, mass_kg) in enumerate(POINTS):
             # other random voltages and mass; the zero of the camera moves, its scale stays
-            other = short_record(law, 1000 * seed + k, mass_kg=mass_kg)
+            other = short_record(PLANAR, law, 1000 * seed + k, mass_kg=mass_kg)
             length_m = camera["camera.scale"] * other.length_m
             length_m += camera["camera.offset_m"] + moved_m[k]
             found.append(predict_motion(model, replace(other, length_m=length_m)))

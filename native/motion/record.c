@@ -73,10 +73,17 @@ static int32_t sample(const step *now, const motion_tangent *t, const motion_rec
     return next;
 }
 
+/* Voltage on which the capacitance depends. */
+static double root_v(const motion_input *in)
+{
+    return sqrt(in->volt * in->volt + in->ripple_v2);
+}
+
 /* Adds the integral of the capacitance over the step by Simpson's rule. */
 static void integrate(const motion_law *law, const step *now, const motion_tangent *t,
-                      double volt, const motion_output *output, int32_t interval)
+                      const motion_input *in, const motion_output *output, int32_t interval)
 {
+    const double volt = root_v(in);
     static const double at[3] = {0.0, 0.5, 1.0}, weight[3] = {1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0};
     int i;
     for (i = 0; i < 3; ++i) {
@@ -98,8 +105,8 @@ static void integrate(const motion_law *law, const step *now, const motion_tange
             for (j = 0; j < t->laws; ++j) {
                 by[t->law_column[j]] += share * own[j];
             }
-            for (j = 0; c.per_v != 0.0 && j < t->columns; ++j) {
-                by[j] += t->kind[j] == MOTION_VOLTAGE_SCALE ? share * c.per_v * volt : 0.0;
+            for (j = 0; volt > 0.0 && c.per_v != 0.0 && j < t->columns; ++j) {
+                by[j] += t->kind[j] == MOTION_VOLTAGE_SCALE ? share * c.per_v * in->volt * in->volt / volt : 0.0;
             }
         }
     }
@@ -112,7 +119,7 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
     int32_t k, next = 0;
     for (k = 0; k < record->intervals; ++k) {
         const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
-        const double volt = record->input[k].volt;
+        const double volt = root_v(&record->input[k]);
         double before_f = 0.0, at_s = from_s;
         int32_t j;
         moving.inertia_kg = p->inertia_kg + record->mass_kg[k];
@@ -143,7 +150,7 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
             motion_step(law, &moving, s, tangent, &record->input[k], now.dt);
             next = sample(&now, tangent, record, output, next, until_s);
             if (record->sensed[k]) {
-                integrate(law, &now, tangent, volt, output, k);
+                integrate(law, &now, tangent, &record->input[k], output, k);
             }
             at_s = until_s;
         }

@@ -242,20 +242,46 @@ static void amplify(const twin_parameters *p, twin_state *s, double held_v, doub
     s->amp_v_s = rate;
 }
 
-/* What is connected to the output; `warm`: factor on the actuator's capacitance. */
+/* What is connected to the output. */
 typedef struct {
     double farad, series_ohm, leakage_ohm;
     double decay, decay_read; /* of what is left of a lag: over a sample, and to the second channel */
 } element;
 
-static element connected(const twin_parameters *p, const twin_state *s, double warm)
+/* The carrier at the actuator: its parts in phase with the generator's and a quarter ahead, and its
+ * mean square. */
+typedef struct {
+    double sine, cosine, square;
+} carried;
+
+static carried carrier_behind(const twin_parameters *p, double rc)
+{
+    const double ratio = p->carrier_rad_s / p->amplifier_rad_s, lag = p->carrier_rad_s * rc;
+    const double first = 1.0 - ratio * ratio, second = 2.0 * p->amplifier_damping * ratio;
+    const double real = first - second * lag, imaginary = second + first * lag;
+    const double size = p->gain * p->carrier_v / (real * real + imaginary * imaginary);
+    carried found = {size * real, -size * imaginary, 0.0};
+    found.square = 0.5 * (found.sine * found.sine + found.cosine * found.cosine);
+    return found;
+}
+
+/* `sine`, `cosine`: of the carrier's phase. `warm`: factor on the actuator's capacitance. */
+static element connected(const twin_parameters *p, const twin_state *s, double sine, double cosine,
+                         double warm)
 {
     element load = {s->reference_f, s->reference_ohm, INFINITY, 0.0, 0.0};
     double rc;
     if (!(s->reference_f > 0.0)) { /* as it will be in the middle of the next mechanical step */
         const double ahead_s = 0.5 * TWIN_SUB * p->sample_s;
         const double middle_m = s->motion.length_m + ahead_s * s->motion.speed_m_s;
-        load.farad = motion_capacitance(&p->law, middle_m, s->plate_v) * warm;
+        double root_v = s->plate_v;
+        if (p->law.voltages > 1) { /* what it depends on, such as zipping, is too slow to follow */
+            const double near_f = motion_capacitance(&p->law, middle_m, root_v) * warm;
+            const carried c = carrier_behind(p, p->series_ohm * near_f);
+            const double slow_v = s->plate_v - c.sine * sine - c.cosine * cosine;
+            root_v = sqrt(slow_v * slow_v + c.square);
+        }
+        load.farad = motion_capacitance(&p->law, middle_m, root_v) * warm;
         load.series_ohm = p->series_ohm;
         load.leakage_ohm = p->leakage_ohm;
     }
@@ -312,19 +338,20 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
     int32_t n = 0, step;
 
     for (step = 0; step < n_samples / TWIN_SUB; ++step) {
-        const element load = connected(p, s, warm);
+        const element load = connected(p, s, q, c, warm);
+        const carried rides = carrier_behind(p, load.series_ohm * load.farad);
         const double by_current = p->current_limit_a / (load.farad + p->stray_f);
         const double reach =
             p->sample_s * (by_current < p->slew_v_s ? by_current : p->slew_v_s);
         const double gain = s->broken ? 0.0 : p->gain;
         const double pulls = s->reference_f > 0.0 ? 0.0 : 1.0; /* a reference moves nothing */
         motion_input pull = {0.0, 0.0, load_n};
-        double sum = 0.0, sum2 = 0.0;
+        double sum = 0.0, sum2 = 0.0, swing = 0.0;
         int j;
         for (j = 0; j < TWIN_SUB; ++j, ++n) {
             const double drive = n < switch_at ? before_v : after_v;
             const double v0 = s->amp_v, r0 = s->amp_v_s, plate0 = s->plate_v;
-            const double now = q;
+            const double now = q, before = c;
             float noise_v = 0.0f, noise_i = 0.0f;
             double amps;
             q = now * turn_c + c * turn_s;
@@ -344,10 +371,15 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
                         p->lsb_v);
             sum += 0.5 * pulls * (plate0 + s->plate_v);
             sum2 += 0.5 * pulls * (plate0 * plate0 + s->plate_v * s->plate_v);
+            swing += 0.5 * pulls * (rides.sine * (now + q) + rides.cosine * (before + c));
         }
         watch_field(p, s, pulls * s->plate_v);
         pull.volt = sum / TWIN_SUB;
         pull.ripple_v2 = sum2 / TWIN_SUB - pull.volt * pull.volt;
+        if (p->law.voltages > 1) {
+            pull.volt -= swing / TWIN_SUB;
+            pull.ripple_v2 = pulls * rides.square;
+        }
         move_on(p, s, &pull, s->time_s + dt * (double)step, dt);
         lengths[step] = s->motion.length_m;
     }

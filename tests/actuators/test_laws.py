@@ -11,8 +11,10 @@ from haselab.actuators import (
     ACTUATORS,
     VACUUM_F_PER_M,
     ActuatorLaw,
+    CurlingHasel,
     DeaStack,
     Losses,
+    PeanoHasel,
     PlanarHasel,
     actuator_law,
     equilibrium_m,
@@ -153,6 +155,22 @@ def test_a_soft_stack_collapses_where_the_literature_says():
         equilibrium_m(law, 1.0001 * critical_v, 0.0)
 
 
+@pytest.mark.parametrize("kilovolt", [0.3, 1.0])
+def test_a_stack_has_the_blocked_force_and_free_strain_of_the_pressure(kilovolt):
+    """Pelrine (1998): p = eps E^2 presses, p A blocked, and -p / Y of strain free, Y = 3 mu."""
+    law, voltage_v = DeaStack(), 1e3 * kilovolt
+    field_v_m = voltage_v / law.layer_thickness_m
+    pressure_pa = VACUUM_F_PER_M * law.permittivity * field_v_m**2
+    blocked_n = -float(law.electric_force_n(law.free_length_m, voltage_v))
+    assert blocked_n == pytest.approx(pressure_pa * law.area_m2, rel=1e-12)
+    strain = equilibrium_m(law, voltage_v, 0.0) / law.free_length_m - 1.0
+    small = pressure_pa / (3.0 * law.shear_modulus_pa)
+    # next order, neo-Hooke: 3 mu (e - e^2) = -p (1 - 3 e); Gent's limit adds e^3
+    assert strain == pytest.approx(-small, abs=5.0 * small**2)
+    layers_f = law.layers * VACUUM_F_PER_M * law.permittivity * law.area_m2 / 7e-4
+    assert float(law.capacitance_f(law.free_length_m)) == pytest.approx(layers_f, rel=1e-12)
+
+
 @pytest.mark.parametrize("voltage_v", [0.0, 3e3, 6e3])
 def test_a_neo_hookean_stack_rests_where_its_cubic_has_a_root(voltage_v):
     """mu (l - l^-2) A = -eps (V/d)^2 A l^-3 + F: a polynomial in l, solved by its companion."""
@@ -196,3 +214,40 @@ def test_a_shell_stretched_beyond_its_chains_is_refused():
     with pytest.raises(LimitError, match=r"shell.lateral_stretch = 3 is beyond .* 2.77"):
         _ = law.length_limits_m
     assert isinstance(PlanarHasel().length_limits_m, Limits)
+
+
+@pytest.mark.parametrize("kind", [*LAWS, PeanoHasel, CurlingHasel])
+def test_a_grid_has_the_values_of_the_functions(kind):
+    law = kind()
+    limits = law.length_limits_m
+    lengths_m, voltages_v = np.linspace(limits.low, limits.high, 7), np.array([0.0, 100.0, 6e3])
+    found = law.on_grid(lengths_m, voltages_v)
+    np.testing.assert_allclose(found.elastic_n, law.elastic_force_n(lengths_m), rtol=1e-9)
+    for k, voltage_v in enumerate([1.0, 100.0, 6e3]):  # below 1 V nothing changes
+        electric_n = law.electric_force_n(lengths_m, voltage_v)
+        np.testing.assert_allclose(
+            found.pull_n_v2[k] * voltage_v**2, electric_n, rtol=1e-8, atol=1e-9
+        )
+        known_f = law.differential_capacitance_f(lengths_m, voltages_v[k])
+        np.testing.assert_allclose(found.capacitance_f[k], known_f, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [PeanoHasel, CurlingHasel])
+def test_a_grid_solved_from_a_similar_law_is_the_same(kind):
+    """A slope over 2e-4 of a parameter: of Newton's steps, even orders of the error cancel."""
+    law = kind()
+    limits = law.length_limits_m
+    grid = np.linspace(limits.low, limits.high, 50), np.linspace(0.0, 9e3, 10)
+    near = law.on_grid(*grid)
+    for about in law.described():
+        value = getattr(law, about.name)
+        if isinstance(value, tuple) or not about.fitted or value == 0.0:
+            continue
+        both = [dataclasses.replace(law, **{about.name: value * (1.0 + h)}) for h in (1e-4, -1e-4)]
+        cold, warm = ([part.on_grid(*grid, of) for part in both] for of in (None, near))
+        for name in ("elastic_n", "capacitance_f", "pull_n_v2"):
+            exact = getattr(cold[0], name) - getattr(cold[1], name)
+            found = getattr(warm[0], name) - getattr(warm[1], name)
+            rounding = 1e-10 * np.abs(getattr(near, name)).max()
+            within = 1e-4 * np.abs(exact).max() + rounding
+            assert np.abs(found - exact).max() <= within, (about.name, name)

@@ -1,10 +1,13 @@
 """A design from a fit, and what an actuator file knows."""
 
+import json
+
 import numpy as np
 import pytest
 
 import haselab as hl
 from haselab.base import InputError
+from haselab.cli.main import main
 from haselab.controllers.builtin import pid_controller
 from haselab.models import VoltageMap
 from haselab.models.actuator.strain_map import StrainMap
@@ -47,10 +50,32 @@ def test_a_fit_brings_the_plausible_plants_with_it():
     assert "phase_margin_deg" in found._repr_html_()
 
 
+@pytest.mark.long
+def test_python_and_the_command_make_the_same_design(tmp_path, capsys):
+    u = np.random.default_rng(1).normal(size=1500)
+    time_s = np.arange(1500) / 100.0
+    y = PLANT.simulate(u, 100.0, time_s) + 0.01 * np.random.default_rng(2).normal(size=1500)
+    data, model = tmp_path / "chirp.csv", tmp_path / "model.json"
+    np.savetxt(
+        data, np.column_stack([time_s, u, y]), "%.17g", ",", header="time_s,u,y", comments=""
+    )
+    arguments = ["identify", "transfer", data, "--input", "u", "--output", "y", "--out", model]
+    for line in (arguments, ["design", model, "--json"]):
+        with pytest.raises(SystemExit) as stop:
+            main([str(word) for word in line])
+        out = capsys.readouterr().out
+        assert stop.value.code == 0
+    command = json.loads(out)
+    found = hl.design(hl.fit_transfer(hl.Record(u, 100.0, y, time_s)))
+    for name in ("kp", "ki", "kd", "derivative_filter_s"):
+        assert command[name] == pytest.approx(getattr(found.gains, name), rel=1e-6, abs=1e-12)
+    assert found.gains.kd > 0.0 and found.setting.measurement_delay_s == 0.01
+
+
 def test_what_cannot_be_designed_is_refused():
     with pytest.raises(InputError, match="controller is 'lqg'"):
         hl.design(PLANT, controller="lqg")
-    with pytest.raises(InputError, match="needs the covariance"):
+    with pytest.raises(InputError, match="covariance of the model"):
         hl.design(PLANT, probability=0.9)
 
 

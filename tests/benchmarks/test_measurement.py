@@ -2,6 +2,9 @@
 
 import ast
 import importlib
+import multiprocessing
+import re
+import sys
 
 import pytest
 
@@ -47,6 +50,44 @@ def test_the_summary_lists_every_goal_and_the_missed_ones_last(rows):
 
 
 def test_a_measurement_that_fails_is_a_missed_goal(benchmarks):
-    measurement = importlib.import_module("benchmarks.measurement")
-    found, _ = measurement.Measurement("rows").run(full=False)  # has no function `rows`
-    assert [row.outcome() for row in found] == ["missed"]
+    found = importlib.import_module("benchmarks.measurement").Measurement("rows").run(full=False)
+    assert [row.outcome() for row in found.rows] == ["missed"]  # it has no function `rows`
+    assert found.failed
+
+
+def test_a_measurement_that_takes_too_long_is_ended_and_counts_as_not_measured(benchmarks):
+    measurement = importlib.import_module("benchmarks.measurement").Measurement("rig.twin")
+    for most_s in (0.01, 0.0):  # it starts, and it does not
+        found = measurement.run(full=False, most_s=most_s)
+        assert [row.outcome() for row in found.rows] == ["not measured"]
+        assert (found.failed, found.cpu_s) == (False, 0.0)
+        assert multiprocessing.active_children() == []
+
+
+def test_the_summary_is_printed_and_the_exit_code_tells_that_a_benchmark_failed(
+    benchmarks, monkeypatch, capsys
+):
+    main = importlib.import_module("benchmarks.__main__")
+    fails = importlib.import_module("benchmarks.measurement").Measurement("rows")
+    monkeypatch.setattr(main, "SECTIONS", {"planted": (fails,)})
+    monkeypatch.setattr(sys, "argv", ["benchmarks"])
+    with pytest.raises(SystemExit) as ended:
+        main.main()
+    assert ended.value.code == 1
+    assert "1 goals: 0 reached, 0 not measured, 1 missed." in capsys.readouterr().out
+
+
+def test_the_readme_names_the_section_of_each_module(benchmarks):
+    text = (benchmarks / "README.md").read_text()
+    sections = importlib.import_module("benchmarks.__main__").SECTIONS
+    rows = {}
+    for part in re.split(r"^## ", text, flags=re.MULTILINE):
+        folder = part.partition("/")[0]
+        for names, section in re.findall(r"^\| (`.*?) \|.*\| ?([\w-]*) ?\|$", part, re.MULTILINE):
+            rows |= {f"{folder}.{name}": section for name in re.findall(r"`(\w+)`", names)}
+    for section, measurements in sections.items():
+        for one in measurements:
+            assert rows.pop(one.module, "command") == section
+    assert set(rows.values()) == {""}  # the others have none
+    for name in rows:
+        assert (benchmarks / (name.replace(".", "/") + ".py")).is_file()

@@ -102,16 +102,21 @@ def counted(*args, **kwargs):
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
 builtins.__import__ = counted
-sys.argv = ["haselab", "sense", "none.csv"]
+sys.argv = ["haselab", {command}, "none.csv"]
 entry.main()
 """
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX's")
-@pytest.mark.parametrize("at", [1, 5, 60, 300, 1000, 1800])
+@pytest.mark.parametrize(
+    ("at", "command"),
+    [*((at, '"sense"') for at in (1, 5, 60, 300, 1000, 1800)), (1800, '"identify", "transfer"')],
+)
 @pytest.mark.parametrize("more", [0, 1])
-def test_ctrl_c_while_modules_are_imported_ends_with_130_and_one_line(at: int, more: int) -> None:
-    script = IMPORTING.format(at=at, more=more)
+def test_ctrl_c_while_modules_are_imported_ends_with_130_and_one_line(
+    at: int, command: str, more: int
+) -> None:
+    script = IMPORTING.format(at=at, command=command, more=more)
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False
     )
@@ -144,7 +149,7 @@ def command():
             time.sleep(0.01)
         print("cleaned up", flush=True)
 
-line._LazyGroup.get_command = lambda self, context, name: command
+line._Root.get_command = lambda self, context, name: command
 signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.argv = ["haselab", "design"]
 entry.main()

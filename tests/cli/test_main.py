@@ -26,7 +26,7 @@ def command_that_raises(error: BaseException, monkeypatch: pytest.MonkeyPatch) -
     def failing(debug: bool) -> None:
         raise error
 
-    monkeypatch.setattr(entry._LazyGroup, "get_command", lambda self, context, name: failing)
+    monkeypatch.setattr(entry._Root, "get_command", lambda self, context, name: failing)
 
 
 @pytest.mark.parametrize(
@@ -154,6 +154,6 @@ def test_a_lost_connection_is_no_reader_that_has_seen_enough(
     def failing() -> None:
         raise BrokenPipeError(32, "Broken pipe")
 
-    monkeypatch.setattr(entry._LazyGroup, "get_command", lambda self, context, name: failing)
+    monkeypatch.setattr(entry._Root, "get_command", lambda self, context, name: failing)
     assert run(["design"]) == 4
     assert "A connection was lost (Broken pipe)" in capsys.readouterr().err

@@ -229,7 +229,10 @@ def test_loops_that_do_not_calm_down_are_those_with_a_pole_outside_the_unit_circ
 
 def test_a_loop_that_creeps_towards_its_reference_is_not_unstable():
     found = simulate_ensemble(
-        [Plant(1.0, 20.0, 0.7)], [PidGains(0.0, 0.05)], np.full(20_000, 0.04), LoopSetting(1000.0)
+        [Plant(1.0, 20.0, 0.7)],
+        [PidGains(0.0, 0.05)],
+        np.full(20_000, 0.04),
+        LoopSetting(1000.0, 0.005),
     )
     assert np.isnan(found.settling_time_s[0]) and not found.unstable[0]
 
@@ -249,7 +252,7 @@ def test_integrators_stand_still_while_their_outputs_are_clamped():
 def test_a_lost_measurement_puts_out_zero_and_stops_the_controller():
     noise = np.zeros(100)
     noise[[0, 1, 50]] = np.nan
-    setting = LoopSetting(1000.0, initial_u=0.02)
+    setting = LoopSetting(1000.0, 0.005, initial_u=0.02)
     law = PidGains(0.4, 2.0, 0.1, 0.01)
     found = trace_ensemble([CREEPING], [law], np.full(100, 0.03), setting, measurement_noise=noise)
     assert np.flatnonzero(np.isnan(found.measured[0])).tolist() == [0, 1, 50]
@@ -260,7 +263,7 @@ def test_common_noise_is_noise_for_each():
     rng = np.random.default_rng(6)
     spread, laws = random_loops(20, 6)
     noise = rng.normal(0.0, 1e-3, 300)
-    reference, setting = np.full(300, 0.04), LoopSetting(1000.0)
+    reference, setting = np.full(300, 0.04), LoopSetting(1000.0, 0.005)
     kept = noise.copy()
     one = trace_ensemble(spread, laws, reference, setting, measurement_noise=noise)
     each = trace_ensemble(
@@ -283,7 +286,7 @@ def noise_alone(loops, samples, noise):
     """Measurements of plants that do not move."""
     still = [Plant(0.0, 5.0, 0.1)] * loops
     laws = [PidGains(0.0, 0.0)] * loops
-    setting = LoopSetting(1000.0)
+    setting = LoopSetting(1000.0, 0.005)
     run = trace_ensemble(still, laws, np.zeros(samples), setting, measurement_noise=noise)
     return run.measured.astype(float)
 
@@ -320,7 +323,9 @@ def test_generated_noise_is_normal_white_and_independent():
 
 
 def test_a_constant_reference_of_zero_has_no_step():
-    found = simulate_ensemble([CREEPING], [PidGains(0.1, 1.0)], np.zeros(50), LoopSetting())
+    found = simulate_ensemble(
+        [CREEPING], [PidGains(0.1, 1.0)], np.zeros(50), LoopSetting(100.0, 0.005)
+    )
     assert np.isnan(found.overshoot[0]) and np.isnan(found.settling_time_s[0])
     assert found.absolute_error_s[0] == 0.0 and not found.unstable[0]
 
@@ -352,7 +357,7 @@ MANY_BRANCHES = Plant(0.5, 5.0, 0.1, slow_modes=(SlowMode(0.1, 1.0),) * 4)
 )
 def test_loops_that_cannot_be_are_refused_in_one_line(change, words):
     given_in = {"plants": [CREEPING], "gains": [PidGains(0.4, 1.0)], "reference": [0.0, 0.0]}
-    given_in |= {"setting": LoopSetting(1000.0)} | change
+    given_in |= {"setting": LoopSetting(1000.0, 0.005)} | change
     for run in (simulate_ensemble, trace_ensemble):
         with pytest.raises(InputError, match=words) as caught:
             run(**given_in)

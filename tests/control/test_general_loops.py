@@ -68,7 +68,7 @@ def test_a_slow_branch_of_a_thousand_does_not_hide_the_easy_loop():
 def test_a_step_beyond_the_limits_is_refused_with_what_can_be_reached():
     plant = Plant(1e-3, 30.0, 0.3)  # mm per volt, with the limits of a strain
     with pytest.raises(ResultError, match=r"saturates.*a step of -5e-05 to 0\.0001"):
-        design_pid(plant, DesignSpec(step=0.04), LoopSetting(), rng=RNG(0))
+        design_pid(plant, DesignSpec(step=0.04), LoopSetting(100.0, 0.005), rng=RNG(0))
     volts = LoopSetting(100.0, 0.01, Saturation(0.0, 5000.0))
     design = design_pid(plant, DesignSpec(step=1.0), volts, rng=RNG(0))
     assert design.nominal.margins.phase_margin_deg > 49.0
@@ -77,9 +77,12 @@ def test_a_step_beyond_the_limits_is_refused_with_what_can_be_reached():
 @pytest.mark.long
 def test_a_contraction_is_designed_like_an_elongation_and_within_the_limits():
     plant = Plant(0.8, 60.0, 0.2)
-    up, down = LoopSetting(saturation=Saturation(-0.02, 0.03)), Saturation(-0.03, 0.02)
+    up, down = (
+        LoopSetting(measurement_delay_s=0.005, saturation=Saturation(-0.02, 0.03)),
+        Saturation(-0.03, 0.02),
+    )
     longer = design_pid(plant, DesignSpec(), up, rng=RNG(0))
-    shorter = design_pid(plant, DesignSpec(), LoopSetting(saturation=down), rng=RNG(0))
+    shorter = design_pid(plant, DesignSpec(), LoopSetting(100.0, 0.005, down), rng=RNG(0))
     # Half of what the larger limit reaches: 0.04 is out of reach.
     assert longer.spec.step == pytest.approx(0.012)
     assert shorter.spec.step == pytest.approx(-0.012)

@@ -118,7 +118,7 @@ def test_a_plant_that_pushes_back_is_refused():
 
 
 def test_a_step_beyond_the_limits_is_refused_as_a_demand_with_what_is_reachable():
-    setting = LoopSetting(saturation=Saturation(-0.02, 0.06))
+    setting = LoopSetting(measurement_delay_s=0.005, saturation=Saturation(-0.02, 0.06))
     said = r"step of 0\.04 needs .* of 0\.08, .* State a step of -0\.01 to 0\.03 in the demands"
     with pytest.raises(ResultError, match=said):
         design_pi(

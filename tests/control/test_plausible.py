@@ -13,8 +13,8 @@ from haselab.control import (
     PidGains,
     Saturation,
     binomial_proportion,
+    design_controller,
     design_pi,
-    design_plausible,
     margins,
     plausible_margins,
 )
@@ -195,7 +195,7 @@ def test_a_tiny_covariance_gives_the_gains_of_the_best_plant():
     spec = DesignSpec()  # its spread of frequency leaves the best plant room
     tiny = posterior(std=(1e-6, 1e-6, 1e-6, 1e-9))
     alone = design_pi(tiny.nominal, spec, SETTING, rng=np.random.default_rng(4))
-    found = design_plausible(
+    found = design_controller(
         tiny, spec, SETTING, structure="pi", probability=0.99, rng=np.random.default_rng(4)
     )
     assert found.gains == alone.gains and found.shortfalls == ()
@@ -208,7 +208,7 @@ def test_a_wider_covariance_gives_more_careful_gains():
     gains = []
     for scale in (0.1, 1.0, 3.0):
         wide = posterior(std=scale * np.array([0.05, 0.05, 0.2, 0.001]))
-        found = design_plausible(
+        found = design_controller(
             wide, spec, SETTING, structure="pi", probability=0.95, rng=np.random.default_rng(4),
             draws=200,
         )  # fmt: skip
@@ -224,7 +224,7 @@ def test_a_wider_covariance_gives_more_careful_gains():
 def test_a_share_out_of_reach_is_a_shortfall_with_the_best_one():
     """With a gain of either sign no integral controller stands more than its positive part."""
     either = posterior(std=(1.0, 0.05, 0.2, 0.001))  # positive with a probability of 84 %
-    found = design_plausible(
+    found = design_controller(
         either, SPEC, SETTING, structure="pi", probability=0.95, rng=np.random.default_rng(4),
         draws=200,
     )  # fmt: skip
@@ -234,7 +234,7 @@ def test_a_share_out_of_reach_is_a_shortfall_with_the_best_one():
 
 def test_a_negative_static_gain_is_refused_as_without_a_posterior():
     with pytest.raises(InputError, match="Negate the input column and identify again"):
-        design_plausible(
+        design_controller(
             posterior((-1.0, 32.1, 0.12, 0.012)), SPEC, SETTING, rng=np.random.default_rng(1)
         )
 
@@ -242,7 +242,7 @@ def test_a_negative_static_gain_is_refused_as_without_a_posterior():
 @pytest.mark.parametrize(("probability", "draws"), [(0.0, 400), (1.0, 400), (0.999, 400), (0.9, 9)])
 def test_what_the_draws_cannot_show_is_refused(probability, draws):
     with pytest.raises(InputError, match=r"can show a share|must be 50 to"):
-        design_plausible(
+        design_controller(
             posterior(), SPEC, SETTING, rng=np.random.default_rng(1), probability=probability,
             draws=draws,
         )  # fmt: skip
@@ -253,7 +253,7 @@ def test_a_general_plant_in_volts_and_millimetres_gets_careful_gains():
     drawn = general([-2e-3, 0.09], [18.0, 900.0], spread=0.15)  # 0.1 um a volt, zero at 45 rad/s
     setting = LoopSetting(100.0, 0.01, Saturation(0.0, 8000.0))
     spec = DesignSpec(frequency_spread=0.0, step=0.2, noise_gain=1e6)
-    found = design_plausible(
+    found = design_controller(
         drawn, spec, setting, structure="pi", probability=0.9, rng=np.random.default_rng(4),
         draws=100,
     )  # fmt: skip

@@ -80,7 +80,7 @@ def test_saturated_loop_equals_a_brute_force_integration(delay_s):
 
 def test_open_loop_of_the_paper_settles_when_the_analytic_envelope_says():
     plant = Plant(0.5, math.sqrt(26.14), 0.93 / (2.0 * math.sqrt(26.14)))
-    trace = simulate_drive(plant, np.full(1500, 0.04), LoopSetting())
+    trace = simulate_drive(plant, np.full(1500, 0.04), LoopSetting(100.0, 0.005))
     zeta = plant.damping_ratio
     peak = 0.02 * (1.0 + math.exp(-math.pi * zeta / math.sqrt(1.0 - zeta**2)))
     assert trace.y.max() == pytest.approx(peak, rel=1e-4)
@@ -90,7 +90,7 @@ def test_open_loop_of_the_paper_settles_when_the_analytic_envelope_says():
 
 def test_integrator_stands_still_while_the_output_is_clamped():
     gains = PidGains(0.0, 2.0)
-    setting = LoopSetting(saturation=Saturation(-0.01, 0.01))
+    setting = LoopSetting(measurement_delay_s=0.005, saturation=Saturation(-0.01, 0.01))
     reference = np.r_[np.full(3000, 0.05), np.full(200, 0.0)]
     trace = simulate_loop(CREEPING, gains, reference, setting)
     assert np.all(trace.u[100:3000] == 0.01)
@@ -115,12 +115,12 @@ def test_delay_is_split_into_whole_samples_and_a_lead(delay_s):
 
 def test_a_drive_beyond_the_limits_is_refused_not_clipped():
     with pytest.raises(InputError, match=r"drive spans \[0\.2, 0\.2\]"):
-        simulate_drive(CREEPING, [0.2], LoopSetting())
+        simulate_drive(CREEPING, [0.2], LoopSetting(100.0, 0.005))
 
 
 def test_a_reference_with_a_gap_is_refused():
     with pytest.raises(InputError, match="reference has shape"):
-        simulate_loop(CREEPING, PidGains(1.0, 1.0), [0.0, np.nan], LoopSetting())
+        simulate_loop(CREEPING, PidGains(1.0, 1.0), [0.0, np.nan], LoopSetting(100.0, 0.005))
 
 
 @pytest.mark.parametrize("gains", [PidGains(0.85, 1.5), PidGains(2.0, 3.0, 0.3, 0.03)])

@@ -54,7 +54,9 @@ def test_the_raw_rise_of_a_ringing_step_is_that_of_its_first_swing():
 @pytest.mark.parametrize("zeta", [0.03, 0.09, 0.15])
 def test_overshoot_of_a_second_order_step_is_the_closed_form(zeta):
     plant = Plant(1.0, 20.0, zeta)
-    trace = simulate_drive(plant, np.r_[np.zeros(100), np.full(3000, STEP)], LoopSetting())
+    trace = simulate_drive(
+        plant, np.r_[np.zeros(100), np.full(3000, STEP)], LoopSetting(100.0, 0.005)
+    )
     found = step_metrics(trace.time_s, trace.y, np.where(trace.time_s < 1.0, 0.0, STEP))
     closed_form = math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2))
     # The parabola over a fifth of a period lowers a peak by (pi / 5)^4 / 280, part of 1.
@@ -125,7 +127,9 @@ def test_the_interval_covers_the_noise_free_rise_time():
 
 
 def test_open_loop_error_is_the_missing_static_gain():
-    trace = simulate_drive(CREEPING, np.r_[np.zeros(100), np.full(4000, STEP)], LoopSetting())
+    trace = simulate_drive(
+        CREEPING, np.r_[np.zeros(100), np.full(4000, STEP)], LoopSetting(100.0, 0.005)
+    )
     found = step_metrics(trace.time_s, trace.y, np.where(trace.time_s < 1.0, 0.0, STEP))
     late = 0.4 * math.exp(-38.0 / 4.7)
     assert found.steady_state_error.value == pytest.approx(0.1 + late, abs=1e-4)

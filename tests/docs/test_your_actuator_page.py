@@ -183,7 +183,7 @@ def test_what_the_page_types_is_enough_for_a_design(
 ) -> None:
     _, study, typed = TABLES
     (tmp_path / "steps.toml").write_text(study, encoding="utf-8")
-    assert load_study(tmp_path / "steps.toml").steps.own_trials == 3
+    assert load_study(tmp_path / "steps.toml").steps.custom_trials == 3
     path = tmp_path / "typed.toml"
     path.write_text(typed, encoding="utf-8")
     run(capsys, f"haselab design {path}")

@@ -26,6 +26,7 @@ from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Ack, Result, Run, SetReference, Trace
 from haselab.models.maps import VoltageMap
 from haselab.rig import Rig
+from haselab.rig.checks import LivePlan, live_checks
 from haselab.rig.chip import ChipBench, CoSim, Firmware, SerialChip
 from haselab.rig.chip.chip_bench import describe_chip
 from haselab.rig.chip.link import ChipLink
@@ -160,6 +161,54 @@ def test_a_drive_or_a_strain_that_the_chip_does_not_take_is_refused_before_it_is
     with pytest.raises(LimitError, match=r"carrier of the microcontroller = 2000 Hz is outside"):
         rig.generator.sine(2000.0, 0.02)
     assert not any(out.enable for out in chip.outputs)
+
+
+def test_a_known_capacitor_is_measured_with_the_loop_open(
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
+) -> None:
+    """10 bits and four readings of each channel: 0.1 % of rounding; the stage's tolerances, 5 %."""
+    known_f = 500e-12
+    chip.command(f"connect {known_f} 5e3")
+    rig = armed(bench, settings)
+    first = len(chip.outputs)
+    (found,) = [each for each in live_checks(rig, LivePlan(known_f)) if "capacitor" in each.what]
+    assert found.passed and "multiply both numbers of front_end.correction by" in found.found
+    factor = float(found.found.rpartition(" ")[2])
+    assert factor == pytest.approx(known_f / chip_measured_f(found.found), rel=1e-3)
+    assert any(out.enable for out in chip.outputs[first:])  # it was armed
+    assert not any(out.on and out.code for out in chip.outputs[first:])  # and put out 0 V
+    assert not chip.outputs[-1].enable and rig.read_back().at_zero
+
+
+def chip_measured_f(text: str) -> float:
+    return 1e-12 * float(text.split()[1])
+
+
+def test_a_capacitor_outside_the_strain_map_trips_and_names_the_range(
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
+) -> None:
+    chip.command(f"connect {3.0 * settings.capacitance_range_f[1]} 5e3")
+    rig = armed(bench, settings)
+    assert rig.controller is not None
+    with pytest.raises(SafetyError, match=r"tripped: .* Only capacitances of .* pF, those of its"):
+        rig.controller.measure_capacitance_f()
+    rig.safe()
+    assert not chip.outputs[-1].enable
+
+
+def test_a_capacitance_is_only_measured_while_the_bench_is_armed(
+    chip: CoSim, bench: ChipBench, settings: ChipSettings
+) -> None:
+    rig = guard(rig_of(bench, settings))
+    assert rig.controller is not None
+    with pytest.raises(SafetyError, match="The bench is off"):
+        rig.controller.measure_capacitance_f()
+    assert not any(out.enable for out in chip.outputs)
+    rig = armed(bench, settings)
+    assert rig.controller is not None
+    follow(rig, 0.02, 20)
+    with pytest.raises(DeviceError, match="has closed its loop"):
+        rig.controller.measure_capacitance_f()
 
 
 def test_nothing_moves_before_the_bench_is_armed(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from haselab.identify import Record, TransferStructure, fit_transfer
-from haselab.identify.training_output import TrainingOutput, hash_output, share_used
+from haselab.identify.training_output import TrainingOutput, hash_output, is_comparable, share_used
 from haselab.models import Plant
 
 
@@ -160,8 +160,20 @@ def test_constant_and_short_outputs_have_no_training_output():
     steps = np.repeat([0.0, 1.0, 2.0], 100)  # the same in every record
     assert hash_output([steps]).hashes.size == hash_output([output(15)]).hashes.size == 0
     assert hash_output([]).hashes.size == hash_output([np.ones(400)]).hashes.size == 0
-    assert share_used([output(400)], TrainingOutput(0.0, np.zeros(0, np.uint64))) == 0.0
-    assert share_used([], hash_output([output(400)])) == 0.0
+    assert np.isnan(share_used([output(400)], TrainingOutput(0.0, np.zeros(0, np.uint64))))
+    assert np.isnan(share_used([], hash_output([output(400)])))
+
+
+@pytest.mark.parametrize("other", [np.zeros(500), np.linspace(0.0, 1.0, 12)])
+def test_a_record_without_comparable_windows_is_neither_new_nor_known(other):
+    known = hash_output([output(400)])
+    assert np.isnan(share_used([other], known)) and not is_comparable([other], known)
+    assert is_comparable([output(400, 3)], known)
+
+
+def test_a_scaled_copy_counts_as_new():
+    y = output(400)
+    assert share_used([1.7 * y], hash_output([y])) == 0.0
 
 
 def test_compare_in_python_knows_half_of_the_record():

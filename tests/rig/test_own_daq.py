@@ -124,7 +124,7 @@ def test_a_driver_that_fails_under_voltage_is_named_after_0_v(
     study = tmp_path / "study.toml"
     study.write_text(
         'name = "a"\n[triangle]\nlow_v = 0.0\nhigh_v = 1.0\nfrequency_hz = 1.0\ncycles = 3\n'
-        "left_out_cycles = 1\nframe_rate_hz = 400.0\n"
+        "skipped_cycles = 1\nframe_rate_hz = 400.0\n"
     )
     with pytest.raises(SystemExit) as stop:
         main(["run", str(study), "--rig", str(rig_file), "--yes", "--acknowledge",

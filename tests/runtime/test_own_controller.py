@@ -199,7 +199,7 @@ class Leaves(Spy):
         (lambda: Raises(0.0), "Controller 'spy' failed: ZeroDivisionError: float division"),
         (lambda: Spy(math.nan), "Controller 'spy' returned nan for a strain of"),
         (lambda: Spy(math.inf), "Controller 'spy' returned inf for a strain of"),
-        (lambda: Spy("much"), "Controller 'spy' failed: ValueError"),
+        (lambda: Spy("much"), "Controller 'spy' returned 'much' for a strain of"),
     ],
 )
 def test_a_controller_that_fails_ends_at_0_v_with_its_name(scene, make, said):
@@ -232,3 +232,58 @@ def test_a_wild_controller_is_stopped_by_the_watchdog_as_a_pid_is(scene):
     with pytest.raises(SafetyError, match="Output charges the actuator too often"):
         scene.play(lambda: Wild(0.1), [0.0] * 300)
     assert scene.twin.output_v == 0.0
+
+
+class MuteError(Exception):
+    """An exception of which no text can be made."""
+
+    def __str__(self) -> str:
+        raise KeyError("text")
+
+    __repr__ = __str__
+
+
+class Unprintable:
+    """An object that is no number and cannot be printed."""
+
+    def __repr__(self) -> str:
+        raise KeyError("text")
+
+
+class Fails(Spy):
+    """Raises an exception without a text."""
+
+    def step(self, reference: float, measurement: Measurement) -> float:
+        raise MuteError
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Fails(0.0), "'spy' failed: MuteError: no text: its __str__ raised KeyError"),
+        (lambda: Spy("0.1"), "returned '0.1' for a strain of"),
+        (lambda: Spy(True), "returned True for"),
+        (lambda: Spy(np.bool_(True)), "returned (np.)?True"),
+        (lambda: Spy(None), "returned None"),
+        (lambda: Spy(np.zeros(1)), "returned an array of shape .1,. and type float64"),
+        (lambda: Spy([0.1]), r"returned \[0\.1\]"),
+        (lambda: Spy(0.1 + 0j), r"returned \(0\.1\+0j\)"),
+        (lambda: Spy(Unprintable()), "returned an object of type Unprintable"),
+        (lambda: Spy(10**400), "returned 1000"),
+    ],
+)  # fmt: skip
+def test_a_step_that_is_no_finite_number_ends_at_0_v_in_one_line(scene, make, said):
+    with pytest.raises(SafetyError, match=said) as raised:
+        scene.play(make, [0.0] * 20)
+    assert "\n" not in str(raised.value)
+    assert scene.twin.output_v == 0.0
+
+
+@pytest.mark.parametrize("drive", [np.float32(0.015), np.int64(0), 0])
+def test_any_real_number_is_a_drive(drive):
+    loop = LoopSettings(
+        ControllerKind("spy", lambda: Spy(drive)).choose(), Saturation(), EQ4, TO_STRAIN
+    )
+    running = RunningController(loop.controller, loop.setting(0.01, None, (0.0, 2.0)))
+    found = running.step(0.0, Measurement(0.0, 6e-10, 1.0, 0.0))
+    assert type(found) is float and found == pytest.approx(float(drive))

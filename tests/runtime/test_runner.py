@@ -28,6 +28,7 @@ from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
 from haselab.signals import linear_chirp, triangle
+from haselab.store.session.reader import SessionReader
 from haselab.store.session.writer import ExperimentPlan, ExperimentRecord, SessionWriter
 from haselab.store.video.opening import open_video
 
@@ -282,6 +283,16 @@ def test_the_session_says_what_the_output_was_in_each_block(scene):
     monitor_v = record.codes[:, -100:, 0].mean(axis=1) * d.volt_per_code
     # The mean of 100 samples is one carrier period: 3 sigma of its noise, the amplifier settled.
     np.testing.assert_allclose(monitor_v, drive_v, atol=3 * 0.3e-3 / 10 + 1e-4)
+
+
+def test_a_run_begins_without_the_carrier_before_which_the_mass_hung_for_long(scene):
+    start_s = scene.twin.time_s
+    with scene.runner:
+        pass
+    with SessionReader(scene.folder) as reader:
+        rows = reader.conditions()
+    np.testing.assert_array_equal(rows["time_s"][:2], start_s)
+    np.testing.assert_array_equal(rows["carrier_v"][:2], [0.0, CARRIER_V])
 
 
 def test_a_release_lifts_waits_lets_go_and_notes_when(scene):

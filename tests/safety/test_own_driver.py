@@ -104,6 +104,30 @@ def test_a_driver_that_exits_during_the_shutdown_does_not_stop_it() -> None:
     assert (bench.amplifier.drive_v, bench.amplifier.supply_v) == (0.0, 0.0)
 
 
+class MuteError(Exception):
+    """An exception of which no text can be made."""
+
+    def __str__(self) -> str:
+        raise KeyError("text")
+
+
+def test_a_fault_without_a_text_during_the_shutdown_does_not_stop_it() -> None:
+    """The text was made inside the shutdown: its exception skipped the steps that were left."""
+
+    def fail() -> None:
+        raise MuteError
+
+    bench = OwnBench(supply=True)
+    left = pytest.raises(SafetyError, match=r"Output not at 0 V: 100\.1 V remain .* by hand")
+    with left, armed(bench.rig) as guarded:
+        assert guarded.supply is not None
+        guarded.generator.sine(2000.0, 0.02)
+        guarded.supply.set_voltage(500.0)
+        guarded.source.write(0.5)
+        bench.generator.off = fail  # type: ignore[method-assign]
+    assert (bench.amplifier.drive_v, bench.amplifier.supply_v) == (0.0, 0.0)
+
+
 def test_an_output_that_cannot_be_read_is_not_taken_for_zero() -> None:
     bench = OwnBench()
     with pytest.raises(SafetyError, match="not confirmed at 0 V"), armed(bench.rig) as guarded:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from haselab.base import InputError, LimitError, ResultError
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.sensing.strain import drift_check, fit_strain_map
 
 KINDS = ["line", "quadratic", "cubic", "auto"]
@@ -59,17 +60,67 @@ def test_auto_takes_the_highest_degree_that_rises():
     assert fit_strain_map(c, curved(c)) == fit_strain_map(c, curved(c), "cubic")
 
 
-def test_a_parabola_that_would_fall_inside_the_record_is_replaced_by_a_line():
+def test_a_map_ends_where_the_strain_turns():
+    """The strain turns at 0.71 of the record: no loop may use the map beyond, on either side."""
     c, _ = cycles(3)
+    turn_f = c.min() + np.ptp(c) / 1.4
     x = (c - c.min()) / np.ptp(c)
-    bend = x - 0.7 * x**2  # falls beyond 0.71
+    bend = x - 0.7 * x**2
     for sign, way in ((1.0, "rise"), (-1.0, "fall")):
         for kind in ("quadratic", "cubic"):
             words = rf"does not {way} with the capacitance everywhere.*Fit a lower degree"
             with pytest.raises(ResultError, match=words):
                 fit_strain_map(c, sign * bend, kind)
-        line = fit_strain_map(c, sign * bend)
-        assert line.curvature_per_f2 == 0.0 and sign * line.slope_per_f > 0.0
+        fitted = fit_strain_map(c, sign * bend)
+        assert fitted.range_f[0] == c.min()
+        # within a cell of 1/24 of the record, beyond which the strain is almost constant
+        assert fitted.range_f[1] == pytest.approx(turn_f, abs=np.ptp(c) / 24)
+        assert fitted.usable_f[1] <= turn_f + np.ptp(c) / 24
+        grid = np.linspace(fitted.range_f[0], fitted.usable_f[1], 200)
+        assert (sign * np.diff(fitted.strain(grid)) > -1e-12).all()
+
+
+@pytest.mark.parametrize("onset", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("side", ["low", "high"])
+def test_a_map_is_limited_to_the_part_that_it_follows(onset, side):
+    """A slack pouch zips without motion up to an onset. The oracle is the kinked line itself."""
+    c, way = cycles(4)
+    x = (c - c.min()) / np.ptp(c)
+    x = x if side == "low" else 1.0 - x
+    still = -0.05 * np.maximum(0.0, (x - onset) / (1.0 - onset))
+    noise = 2e-5 * np.random.default_rng(1).standard_normal(c.size)
+    fitted = fit_strain_map(c, still + 2e-4 * way + noise)
+    inside = fitted.inside(c)
+    low, high = fitted.interval(c[inside])
+    share = np.mean((still[inside] >= low) & (still[inside] <= high))
+    assert share >= 0.93  # 95 %, and the error of a share of some 1000 samples with hysteresis
+    assert max(np.abs(fitted.band)) < 0.1 * 0.05  # a line over everything: up to 0.4
+    assert np.ptp(still[inside]) > 0.9 * 0.05
+    if onset >= 0.5:  # a cubic follows a short flat part
+        limit_f = fitted.usable_f[0] if side == "low" else fitted.usable_f[1]
+        flat_f = c.min() if side == "low" else c.max()
+        assert abs(limit_f - flat_f) > 0.5 * onset * np.ptp(c)
+
+
+def test_a_record_that_no_curve_follows_gives_no_map():
+    c, _ = cycles(3)
+    x = (c - c.min()) / np.ptp(c)
+    stairs = 0.05 * (np.floor(5.0 * x) / 5.0 + 0.02 * x)
+    with pytest.raises(ResultError, match="No line, parabola or cubic follows the strain"):
+        fit_strain_map(c, stairs)
+
+
+def test_a_map_that_turns_is_refused_or_ends_there():
+    """strain = (c - 1 nF)^2 / nF^2 turns at 1 nF."""
+    turning = {"slope_per_f": -2e9, "offset": 1.0, "curvature_per_f2": 1e18}
+    with pytest.raises(InputError, match=r"turns at 1e-09 F, within its range .* narrow range_f"):
+        StrainMap(**turning, range_f=(0.9e-9, 1.2e-9))
+    assert StrainMap(**turning, range_f=(1.1e-9, 1.4e-9)).usable_f == pytest.approx((1e-9, 1.7e-9))
+    assert StrainMap(**turning, range_f=(0.6e-9, 0.9e-9)).usable_f == pytest.approx((3e-10, 1e-9))
+    cubic = StrainMap(2e9, 0.0, 0.0, -0.5e27 / 3.0, range_f=(0.5e-9, 1.8e-9))  # turns at 2 nF
+    assert cubic.turns_f == pytest.approx((-2e-9, 2e-9)) and cubic.usable_f[1] == 2e-9
+    limited = StrainMap(4e8, 0.0, range_f=(5e-10, 6e-10), limits_f=(5e-10, 7e-10))
+    assert limited.usable_f == (5e-10, 7e-10)
 
 
 def test_the_covariance_is_that_of_maps_of_other_cycles():

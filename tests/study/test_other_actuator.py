@@ -12,7 +12,7 @@ from haselab.study.feasibility import judge_study, rating_of_twin
 from haselab.study.simulated.truth import parameters, set_in_twin, twin_of
 
 TRIANGLE = {
-    "low_v": 0.0, "high_v": 2.0, "frequency_hz": 0.25, "cycles": 2, "left_out_cycles": 1,
+    "low_v": 0.0, "high_v": 2.0, "frequency_hz": 0.25, "cycles": 2, "skipped_cycles": 1,
     "frame_rate_hz": 100.0,
 }  # fmt: skip
 

@@ -42,7 +42,7 @@ def study_with(folder: Path, control: str, trials: int = 2) -> Study:
     start, end = text.index("[control]"), text.index("[quick.triangle]")
     text = f"{text[:start]}[control]\n{control}\n{text[end:]}"
     path = folder / "study.toml"
-    path.write_text(text.replace("[control]", f"own_trials = {trials}\n[control]", 1))
+    path.write_text(text.replace("[control]", f"custom_trials = {trials}\n[control]", 1))
     return load_study(path)
 
 
@@ -145,7 +145,7 @@ def test_a_study_without_pi_and_pid_trials_has_all_the_rest(tmp_path, capsys):
     for old, new in (
         ('"mycontroller"\ngain_per_s = 1.0\nsmoothing_s = 0.1', '"pi"\nkp = 0.3\nki = 1.0'),
         ("pi_trials = 1\npid_trials = 1", "pi_trials = 0\npid_trials = 0\nsaturating_trials = 1\n"
-         "extra_delay_trials = 1\nprinted_chain_trials = 1"),
+         "extra_delay_trials = 1\npaper_chain_trials = 1"),
     ):  # fmt: skip
         assert old in text
         text = text.replace(old, new)

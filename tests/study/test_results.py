@@ -105,7 +105,7 @@ def test_what_a_study_fixes_is_marked_as_set_in_it() -> None:
     study = reference.model_copy(
         update={
             "operating_point": reference.operating_point.model_copy(update={"baseline_v": 1.2}),
-            "static_load": reference.static_load.model_copy(update={"pieces": 2}),
+            "static_load": reference.static_load.model_copy(update={"segments": 2}),
         }
     )
     found = {key: Estimate.normal(1.0, 0.1, "") for key in ("S18.baseline", "S17.region_low")}

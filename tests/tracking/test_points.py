@@ -120,6 +120,39 @@ def test_noise_free_dots_show_no_bias_beyond_the_spline_and_rounding(sheet):
     assert rms(worst) <= 1.15 * cramer_rao_px(made, 1, noise=0.0)
 
 
+def test_a_brightness_slope_does_not_move_a_dot_where_the_light_may_slope():
+    """A slope b across a dark dot of depth D and width s shifts least squares by -4 b s^2 / D.
+
+    Without the part of the gradient that resembles a slope, the deviation is larger: that part is
+    (2 pi D s^2)^2 / I, with the second moment I of the subset, of all, pi D^2 / 2.
+    """
+    side, depth, sigma, slope = 21, 110.0, 3.0, 0.1  # px, grey, px, grey/px
+    y, x = np.mgrid[:61, :61].astype(float)
+
+    def frame(shift_px: float, rise: float) -> np.ndarray:
+        dot = np.exp(-((x - 30.0) ** 2 + (y - 30.0 - shift_px) ** 2) / (2 * sigma**2))
+        image = 200.0 - depth * dot + rise * (y - 30.0 - shift_px)
+        return np.rint(16.0 * image).astype(np.uint16)  # the tracker takes 10 bits of 12
+
+    error, std = {}, {}
+    for sloped in (False, True):
+        options = TrackOptions(subset_px=side, sloped_light=sloped)
+        tracker = PointTracker(np.array([[30.0, 30.0]]), options)
+        state = tracker.init([frame(0.0, 0.0)] * 2)
+        off = []
+        for shift_px in (0.2, 0.45, 0.6, 0.9):
+            state, found = tracker.step(state, frame(shift_px, slope))
+            off.append(found.y_px[0] - 30.0 - shift_px)
+        error[sloped] = np.array(off)
+        std[sloped] = np.sqrt(state.reference.subsets.even[0, 1, 1])  # by even noise
+    np.testing.assert_allclose(error[False], -4.0 * slope * sigma**2 / depth, rtol=0.1)
+    rounding_px = 0.25 / np.sqrt(12.0) * np.sqrt(2.0 / np.pi) / depth  # Cramer-Rao, of a dot
+    assert np.abs(error[True]).max() < 5.0 * rounding_px
+    moment = side**2 * (side**2 - 1) / 12.0
+    taken = (2.0 * np.pi * sigma**2) ** 2 / (moment * np.pi / 2.0)
+    assert std[True] / std[False] == pytest.approx((1.0 - taken) ** -0.5, rel=0.02)
+
+
 @pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(

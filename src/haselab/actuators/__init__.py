@@ -2,7 +2,7 @@
 
 from haselab.actuators.curling_hasel import CurlingHasel
 from haselab.actuators.dea_stack import DeaStack
-from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, Parameter, parameter
+from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, LawValues, Parameter, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
@@ -34,6 +34,7 @@ __all__ = [
     "DeaStack",
     "Drive",
     "LawTable",
+    "LawValues",
     "Losses",
     "OperatingPoint",
     "Parameter",

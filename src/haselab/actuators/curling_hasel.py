@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
-from haselab.actuators.law import ActuatorLaw, parameter
+from haselab.actuators.law import ActuatorLaw, LawValues, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.peano_hasel import PeanoHasel
 from haselab.base import LimitError, Limits
@@ -213,6 +213,20 @@ class CurlingHasel(ActuatorLaw):
             if (np.abs(step) <= 1e-15 * angle).all():
                 break
         return np.asarray(angle)
+
+    def on_grid(
+        self, lengths_m: Floats, voltages_v: Floats, near: LawValues | None = None
+    ) -> LawValues:
+        """Strip, and all cells at once."""
+        curl = self.curl_rad_at(lengths_m)
+        known = near.solution if near else None
+        known = known if isinstance(known, LawValues) else None
+        cells = self.cell_law.on_grid(self._cells_m(curl), voltages_v, known)
+        lever = -self.lever_m / (self.strip_m * _slope(curl))
+        strip_n_m = self.bending_n_m2 / self.strip_m * (curl - self.curl_rad)
+        elastic_n = strip_n_m / (self.strip_m * _slope(curl)) + lever * cells.elastic_n
+        pull_n_v2 = lever * cells.pull_n_v2
+        return LawValues(self, lengths_m, elastic_n, cells.capacitance_f, pull_n_v2, cells)
 
     def elastic_energy_j(self, length_m: ArrayLike) -> Floats:
         """Of strip and cells at 0 V."""

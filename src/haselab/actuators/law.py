@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.actuators.losses import Circuit, Losses
 from haselab.base import LimitError, Limits
 
-__all__ = ["VACUUM_F_PER_M", "ActuatorLaw", "Parameter", "parameter"]
+__all__ = ["VACUUM_F_PER_M", "ActuatorLaw", "LawValues", "Parameter", "parameter"]
 
 Floats = NDArray[np.float64]
 Value = float | tuple[float, ...]
@@ -32,6 +32,8 @@ VACUUM_F_PER_M = 8.8541878128e-12
 _STEP = 5e-4  # of the derivatives, in free lengths
 _STENCIL = ((-2.0, 1.0 / 12.0), (-1.0, -8.0 / 12.0), (1.0, 8.0 / 12.0), (2.0, -1.0 / 12.0))
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_LEAST_V = 1.0  # at which the force over the voltage squared is that at 0 V
+_LOSSES = {field.name for field in dataclasses.fields(Losses)}
 _KEY = "haselab"
 
 
@@ -98,6 +100,27 @@ def parameter(
     }
     field: AnyValue = dataclasses.field(default=default, metadata={_KEY: about})
     return field
+
+
+@dataclass(frozen=True)
+class LawValues:
+    """Forces and capacitances of a law on a grid.
+
+    Args:
+        law: to which they belong.
+        lengths_m: of the grid. Shape `(L,)`.
+        elastic_n: elastic force. Shape `(L,)`.
+        capacitance_f: differential. Shape `(V, L)`.
+        pull_n_v2: electric force over the voltage squared; at 0 V its limit. Shape `(V, L)`.
+        solution: what the law solved, from which a similar law may start; None: nothing.
+    """
+
+    law: ActuatorLaw
+    lengths_m: Floats
+    elastic_n: Floats
+    capacitance_f: Floats
+    pull_n_v2: Floats
+    solution: Floats | LawValues | None = None
 
 
 @dataclass(frozen=True)
@@ -180,6 +203,38 @@ class ActuatorLaw(abc.ABC):
         return 1.0
 
     # ---- what follows ----------------------------------------------------------------------------
+
+    def on_grid(
+        self, lengths_m: Floats, voltages_v: Floats, near: LawValues | None = None
+    ) -> LawValues:
+        """Evaluate the law at all pairs of some lengths and voltages.
+
+        Args:
+            lengths_m: Shape `(L,)`.
+            voltages_v: Shape `(V,)`.
+            near: those of a law with slightly different parameters, on the same grid. A law that
+                solves equations may start from them; the result must not depend on it by more than
+                the square of the difference.
+        Returns:
+            Forces and capacitances.
+        """
+        capacitance = [self.differential_capacitance_f(lengths_m, v) for v in voltages_v]
+        acting_v = np.maximum(voltages_v, _LEAST_V)
+        pull = [self.electric_force_n(lengths_m, v) / v**2 for v in acting_v]
+        elastic_n = self.elastic_force_n(lengths_m)
+        return LawValues(self, lengths_m, elastic_n, np.stack(capacitance), np.stack(pull))
+
+    def same_statics(self, other: ActuatorLaw) -> bool:
+        """Whether another law of this kind differs at most in fields that `Losses` has too.
+
+        Args:
+            other: any law.
+        """
+        return type(other) is type(self) and all(
+            getattr(self, field.name) == getattr(other, field.name)
+            for field in dataclasses.fields(self)
+            if field.name not in _LOSSES
+        )
 
     def coenergy_j(self, length_m: ArrayLike, voltage_v: ArrayLike) -> Floats:
         """Electric co-energy: the integral of the charge over the voltage.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigvals
+from scipy.optimize import brentq
 
 from haselab.actuators.law import ActuatorLaw
 from haselab.base import LimitError
@@ -16,6 +17,7 @@ __all__ = ["OperatingPoint", "equilibrium_m", "linearise"]
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _GRID = 4001
+_CLOSE_M = 1e-17
 _STEP = 1e-4  # of the derivatives, in free lengths
 _FAR = 1e9  # a zero farther than that many times the fastest pole is one at infinity
 
@@ -71,6 +73,8 @@ def _net_force_n(
 ) -> Floats:
     reached = np.maximum(length_m, longest_m) / law.free_length_m
     elastic = law.elastic_force_n(length_m) * law.losses.softening(reached)
+    if voltage_v == 0.0:
+        return np.asarray(load_n - elastic)
     return np.asarray(load_n + law.electric_force_n(length_m, voltage_v) - elastic)
 
 
@@ -89,11 +93,16 @@ def _next_rest_m(
         return None
     k = max(1, int(np.argmax(turned)))  # at the start the sign may be one of rounding
     near, far = float(grid[k - 1]), float(grid[k])
-    for _ in range(80):
-        middle = 0.5 * (near + far)
-        ahead = float(_net_force_n(law, np.array(middle), voltage_v, load_n, longest_m)) * pushed
-        near, far = (middle, far) if ahead > 0.0 else (near, middle)
-    return 0.5 * (near + far)
+
+    def ahead(length_m: float) -> float:
+        return float(_net_force_n(law, np.array(length_m), voltage_v, load_n, longest_m)) * pushed
+
+    # many lengths at once and a single one may differ by rounding
+    if near == far or ahead(near) <= 0.0:
+        return near
+    if ahead(far) >= 0.0:
+        return far
+    return float(brentq(ahead, near, far, xtol=_CLOSE_M, rtol=4.0 * np.finfo(np.float64).eps))
 
 
 def equilibrium_m(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import expit, spence
 
-from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, parameter
+from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, LawValues, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.pouch import Pouch
 from haselab.base import LimitError, Limits
@@ -32,6 +32,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 class _State(NamedTuple):
     """Where one pouch rests at a given length and voltage."""
 
+    y: Floats  # ln(ds/dz)
     zipped_m: Floats
     stretch_m: Floats  # of the film; negative: slack
     tension_n: Floats
@@ -239,6 +240,36 @@ class PeanoHasel(ActuatorLaw):
         """As set."""
         return self.own_mass_kg
 
+    def on_grid(
+        self, lengths_m: Floats, voltages_v: Floats, near: LawValues | None = None
+    ) -> LawValues:
+        """All pouches at once, each state for the force and the capacitance."""
+        if near and self.same_statics(near.law) and np.array_equal(near.lengths_m, lengths_m):
+            return near
+        length, count = lengths_m / self.pouches, voltages_v.size
+        acting_v = np.maximum(voltages_v, 1.0)
+        small = acting_v < _SMALL * self.half_zipped_v
+        within_v = acting_v[small, None] * np.sqrt(0.5 * (_NODES + 1.0))
+        every_v = np.concatenate([[0.0], acting_v, within_v.ravel()])
+        known = near.solution if near else None
+        if not isinstance(known, np.ndarray) or known.shape != (every_v.size, length.size):
+            known = None
+        found = self._state(length, every_v[:, None], known)
+        at_rest_n = found.tension_n[0]
+        pull_n_v2 = (at_rest_n - found.tension_n[1 : 1 + count]) / acting_v[:, None] ** 2
+        if small.any():  # see `electric_force_n`
+            slopes = found.tension_per_pull[1 + count :].reshape(-1, _NODES.size, length.size)
+            mean = 0.5 * np.einsum("vnl,n->vl", slopes, _WEIGHTS)
+            pull_n_v2[small] = -0.5 * self.zipped_f_per_m * mean
+        zipped_m = np.where(
+            voltages_v[:, None] < 1.0, found.zipped_m[:1], found.zipped_m[1 : 1 + count]
+        )
+        return LawValues(
+            self, lengths_m, at_rest_n + self.restoring_n_per_m * (length - self.pouch.rest_m),
+            self.pouches * (self._unzipped_f + self.zipped_f_per_m * zipped_m),
+            pull_n_v2, found.y,
+        )  # fmt: skip
+
     def elastic_energy_j(self, length_m: ArrayLike) -> Floats:
         """Of the films at 0 V."""
         length = np.asarray(length_m, dtype=np.float64) / self.pouches
@@ -331,43 +362,64 @@ class PeanoHasel(ActuatorLaw):
         zipping_j = self._pull_n(voltage) * state.zipped_m
         return np.asarray(film_j + resisted_j - rounded_j - zipping_j)
 
-    def _state(self, length: Floats, voltage_v: ArrayLike) -> _State:
+    def _state(self, length: Floats, voltage_v: ArrayLike, near: Floats | None = None) -> _State:
         r"""Solve the balance of zipping, $T\,ds/dz = \tfrac12\kappa V^2 + \theta/z - U'$.
 
         In $y = \ln(ds/dz)$ the tension is explicit, and so is the length, which falls with y.
-        Newton's steps, halving the bracket where one leaves it.
+        The solution of a similar law is near enough for two steps of Newton.
         """
         length, pull_n = np.broadcast_arrays(length, self._pull_n(voltage_v))
         wanted_m, pulls_n = length.ravel(), pull_n.ravel()
-        left = np.arange(wanted_m.size)
         with np.errstate(all="ignore"):  # outside the bracket some terms are infinite
-            y, low, high = self._start(wanted_m, pulls_n)
-            for _ in range(_ITERATIONS):
-                at, wanted = y[left], wanted_m[left]
-                balance = self._balance(at, pulls_n[left])
-                over_m = balance.pouch_m + balance.stretch_m - wanted
-                longer = np.where(balance.possible, over_m > 0.0, balance.zipped_m <= 0.0)
-                low[left] = np.where(longer, at, low[left])
-                high[left] = np.where(longer, high[left], at)
-                stretch_m = wanted - balance.pouch_m
-                # the logarithm of a slack film's tension misleads Newton
-                slack = ~(np.minimum(stretch_m, balance.stretch_m) > -2.0 * self.rounding_m)
-                tension_n, _, slope_n = self._tension(balance, stretch_m)
-                missing_n = tension_n * balance.steep - balance.needed_n
-                new = at - np.where(slack, missing_n / slope_n, over_m / balance.length_by)
-                inside = (low[left] < new) & (new < high[left]) & (balance.possible | slack)
-                close = np.abs(new - at) <= _CLOSE * np.abs(at)
-                y[left] = np.where(inside, new, 0.5 * (low[left] + high[left]))
-                halved = high[left] - low[left] <= _CLOSEST * np.abs(at)
-                y[left[close]] = new[close]
-                left = left[~(close | halved)]
-                if left.size == 0:
-                    break
+            y = self._solved(wanted_m, pulls_n) if near is None else near.ravel()
+            if near is not None:
+                y = y + self._left(y, self._balance(y, pulls_n), wanted_m)
             found = self._balance(y, pulls_n)
+            left = 0.0 if near is None else self._left(y, found, wanted_m)
         stretch_m = wanted_m - found.pouch_m
         tension_n, rise_n, slope_n = self._tension(found, stretch_m)
-        parts = (found.zipped_m, stretch_m, tension_n, rise_n / slope_n)
+        # what is left of a similar law's solution counts linearly
+        zipped_m, tension_n = found.zipped_m + found.zipped_by * left, tension_n + rise_n * left
+        parts = (y + left, zipped_m, stretch_m, tension_n, rise_n / slope_n)
         return _State(*(np.reshape(part, length.shape) for part in parts))
+
+    def _solved(self, wanted_m: Floats, pulls_n: Floats) -> Floats:
+        """Values of y in a bracket, which is halved where a step of Newton leaves it."""
+        left = np.arange(wanted_m.size)
+        y, low, high = self._start(wanted_m, pulls_n)
+        for _ in range(_ITERATIONS):
+            at, wanted = y[left], wanted_m[left]
+            balance = self._balance(at, pulls_n[left])
+            new, over_m, slack = self._newton(at, balance, wanted)
+            longer = np.where(balance.possible, over_m > 0.0, balance.zipped_m <= 0.0)
+            low[left] = np.where(longer, at, low[left])
+            high[left] = np.where(longer, high[left], at)
+            inside = (low[left] < new) & (new < high[left]) & (balance.possible | slack)
+            close = np.abs(new - at) <= _CLOSE * np.abs(at)
+            y[left] = np.where(inside, new, 0.5 * (low[left] + high[left]))
+            halved = high[left] - low[left] <= _CLOSEST * np.abs(at)
+            y[left[close]] = new[close]
+            left = left[~(close | halved)]
+            if left.size == 0:
+                break
+        return y
+
+    def _left(self, y: Floats, balance: _Balance, wanted_m: Floats) -> Floats:
+        """Newton's step, where there is one."""
+        step = self._newton(y, balance, wanted_m)[0] - y
+        return np.where(np.isfinite(step), step, 0.0)
+
+    def _newton(
+        self, y: Floats, balance: _Balance, wanted_m: Floats
+    ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Newton's next y, the length beyond the wanted one, and whether the film is slack."""
+        over_m = balance.pouch_m + balance.stretch_m - wanted_m
+        stretch_m = wanted_m - balance.pouch_m
+        # the logarithm of a slack film's tension misleads Newton
+        slack = ~(np.minimum(stretch_m, balance.stretch_m) > -2.0 * self.rounding_m)
+        tension_n, _, slope_n = self._tension(balance, stretch_m)
+        missing_n = tension_n * balance.steep - balance.needed_n
+        return y - np.where(slack, missing_n / slope_n, over_m / balance.length_by), over_m, slack
 
     def _tension(self, balance: _Balance, stretch_m: Floats) -> tuple[Floats, Floats, Floats]:
         """Tension at a stretch, its derivative by y, and that of what it lacks for balance."""

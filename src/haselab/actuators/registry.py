@@ -10,7 +10,7 @@ import numpy as np
 
 from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.losses import Circuit, Losses
-from haselab.base import HaselabError, InputError, LimitError, Limits, shown
+from haselab.base import HaselabError, InputError, LimitError, Limits, described, shown
 from haselab.base.exits import no_exit
 from haselab.base.registry import Registry
 
@@ -117,7 +117,7 @@ def _got(law: ActuatorLaw, name: str, *lengths: object) -> object:
     except HaselabError:
         raise
     except Exception as error:
-        why = f"{type(error).__name__}: {error}"
+        why = described(error)
         raise InputError(f"{_place(law, name)} failed: {why}. Repair it.") from error
 
 

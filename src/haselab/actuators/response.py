@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab import _motion
 from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.operating_point import equilibrium_m
-from haselab.actuators.table import law_table, law_values
+from haselab.actuators.table import law_table
 from haselab.base import InputError, LimitError
 
 __all__ = [
@@ -58,6 +58,13 @@ def motion_parameters(law: ActuatorLaw) -> NDArray[np.void]:
     Raises:
         InputError: The law has more branches than the compiled motion.
     """
+    found = _parameters(law)
+    found["free_length_m"] = law.free_length_m
+    return found
+
+
+def _parameters(law: ActuatorLaw) -> NDArray[np.void]:
+    """The same without the free length, which some laws must solve for."""
     losses, count = law.losses, len(law.losses.branch_share)
     if count > _motion.BRANCHES:
         raise InputError(
@@ -65,7 +72,6 @@ def motion_parameters(law: ActuatorLaw) -> NDArray[np.void]:
             "can be simulated. Remove some."
         )
     found = np.zeros(1, _motion.PARAMETERS)
-    found["free_length_m"] = law.free_length_m
     found["softening_share"] = losses.softening_share
     found["softening_stretch"] = losses.softening_stretch
     found["softening_width"] = losses.softening_transition
@@ -233,8 +239,9 @@ def _difference(
     """Change of the electric minus the elastic force between two laws or lengths."""
     net = []
     for law, length_m in zip(laws, lengths_m, strict=True):
-        reached = max(length_m, longest_m) / law.free_length_m
-        elastic = law.elastic_force_n(length_m) * law.losses.softening(reached)
+        elastic = law.elastic_force_n(length_m)
+        if law.losses.softening_share > 0.0:
+            elastic = elastic * law.losses.softening(max(length_m, longest_m) / law.free_length_m)
         net.append(float(law.electric_force_n(length_m, voltage_v) - elastic))
     return net[1] - net[0]
 
@@ -273,16 +280,16 @@ class SampledLaw:
         lengths_m = np.asarray(self.table.low_m + self.table.step_m * knots)
         rows = self.table.capacitance_f.shape[0]
         voltages_v = np.asarray(self.table.step_v * np.arange(rows, dtype=np.float64))
+        near = self.table.values if rows > 1 else None  # otherwise of more voltages
         elastic, pull, capacitance, free, losses = [], [], [], [], []
         for name in self.by:
             low, high, width = _beside(law, name)
-            from_n, from_f, from_v2 = law_values(low, lengths_m, voltages_v)
-            to_n, to_f, to_v2 = law_values(high, lengths_m, voltages_v)
-            elastic.append((to_n - from_n) / width)
-            capacitance.append((to_f - from_f) / width)
-            pull.append((to_v2 - from_v2) / width)
-            free.append((high.free_length_m - low.free_length_m) / width)
-            changed = _losses_of(motion_parameters(high)) - _losses_of(motion_parameters(low))
+            first, last = (part.on_grid(lengths_m, voltages_v, near) for part in (low, high))
+            elastic.append((last.elastic_n - first.elastic_n) / width)
+            capacitance.append((last.capacitance_f - first.capacitance_f) / width)
+            pull.append((last.pull_n_v2 - first.pull_n_v2) / width)
+            free.append(self._free_moved_m(low, high) / width)
+            changed = _losses_of(_parameters(high)) - _losses_of(_parameters(low))
             changed[_INERTIA] += width if name == ADDED_INERTIA else 0.0
             losses.append(changed / width)
         count = len(self.by)
@@ -304,6 +311,14 @@ class SampledLaw:
         self._kinds = np.array([*range(own.size), *(_LOSSES[k][2] for k in used)], dtype=np.int32)
         # derivatives by the columns of the motion, to those by the parameters
         self._joined = np.vstack([np.eye(count)[own], losses_by[:, used].T])
+
+    def _free_moved_m(self, low: ActuatorLaw, high: ActuatorLaw) -> float:
+        """Difference of the free lengths of two laws beside this one, where the forces are 0."""
+        free_m = self.law.free_length_m
+        step_m = _STEP * free_m
+        ends = self.law.elastic_force_n(np.array([free_m - step_m, free_m + step_m]))
+        moved_n = float(high.elastic_force_n(free_m)) - float(low.elastic_force_n(free_m))
+        return -moved_n * 2.0 * step_m / float(ends[1] - ends[0])
 
     def at_rest(
         self, voltage_v: float, ripple_v2: float, load_n: float, *, longest_m: float = 0.0

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators.law import ActuatorLaw
+from haselab.actuators.law import ActuatorLaw, LawValues
 from haselab.base import InputError
 
-__all__ = ["LawTable", "law_table", "law_values"]
+__all__ = ["LawTable", "law_table"]
 
 Floats = NDArray[np.float64]
 LENGTHS = 1024  # MOTION_LENGTHS of native/motion/motion.h
@@ -35,6 +35,7 @@ class LawTable:
         gap_m: thickness of the dielectric. Shape `(L,)`.
         capacitance_f: differential. Shape `(V, L)`; V is 1 where the voltage has no effect.
         pull_n_v2: electric force over the voltage squared. Shape `(V, L)`.
+        values: of which it was made, at all voltages.
     """
 
     low_m: float
@@ -44,6 +45,7 @@ class LawTable:
     gap_m: Floats
     capacitance_f: Floats
     pull_n_v2: Floats
+    values: LawValues = field(repr=False)
 
     @property
     def high_m(self) -> float:
@@ -61,29 +63,6 @@ class LawTable:
             self.capacitance_f,
             self.pull_n_v2,
         )
-
-
-def _rows(law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats) -> tuple[Floats, Floats]:
-    """Differential capacitance, and force over voltage squared, whose limit at 0 V is finite."""
-    capacitance = np.stack([law.differential_capacitance_f(lengths_m, v) for v in voltages_v])
-    acting_v = np.maximum(voltages_v, 1.0)
-    pull = np.stack([law.electric_force_n(lengths_m, v) / v**2 for v in acting_v])
-    return capacitance, pull
-
-
-def law_values(
-    law: ActuatorLaw, lengths_m: Floats, voltages_v: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Elastic force, differential capacitance, and electric force over the voltage squared.
-
-    Args:
-        law: to evaluate.
-        lengths_m: Shape `(L,)`.
-        voltages_v: Shape `(V,)`.
-    Returns:
-        Shapes `(L,)`, `(V, L)` and `(V, L)`.
-    """
-    return law.elastic_force_n(lengths_m), *_rows(law, lengths_m, voltages_v)
 
 
 def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
@@ -106,20 +85,22 @@ def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
     lengths_m, step_m = np.linspace(limits.low, limits.high, LENGTHS, retstep=True)
     voltages_v = np.linspace(0.0, highest_v, VOLTAGES)
     with np.errstate(all="ignore"):  # the values are checked below
-        capacitance, pull = _rows(law, lengths_m, voltages_v)
-        elastic_n, gap_m = law.elastic_force_n(lengths_m), law.gap_m(lengths_m)
+        values = law.on_grid(lengths_m, voltages_v)
+        gap_m = law.gap_m(lengths_m)
         constant = all(
-            np.abs(v - v[0]).max() <= _SAME * np.abs(v[0]).max() for v in (capacitance, pull)
+            np.abs(v - v[0]).max() <= _SAME * np.abs(v[0]).max()
+            for v in (values.capacitance_f, values.pull_n_v2)
         )
     used = 1 if constant else VOLTAGES
     table = LawTable(
         low_m=float(lengths_m[0]),
         step_m=float(step_m),
         step_v=highest_v / (VOLTAGES - 1),
-        elastic_n=np.ascontiguousarray(elastic_n),
+        elastic_n=np.ascontiguousarray(values.elastic_n),
         gap_m=np.ascontiguousarray(gap_m),
-        capacitance_f=np.ascontiguousarray(capacitance[:used]),
-        pull_n_v2=np.ascontiguousarray(pull[:used]),
+        capacitance_f=np.ascontiguousarray(values.capacitance_f[:used]),
+        pull_n_v2=np.ascontiguousarray(values.pull_n_v2[:used]),
+        values=values,
     )
     _check_values(law, table)
     _check_lengths(law, table, lengths_m)
@@ -148,32 +129,32 @@ def _check_lengths(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None
     middles_m = 0.5 * (lengths_m[1:-2] + lengths_m[2:-1])
     rows = np.arange(table.capacitance_f.shape[0], dtype=np.float64)
     voltages_v = table.step_v * rows[::-_EVERY]
-    capacitance, pull = _rows(law, middles_m, voltages_v)
+    exact = law.on_grid(middles_m, voltages_v)
     single = voltages_v.size == 1
     squares, limit = (1.0, _INTERPOLATED) if single else (voltages_v[:, None] ** 2, _WITH_VOLTAGE)
-    for name, knots, exact, most in (
-        ("elastic force", table.elastic_n, law.elastic_force_n(middles_m), _INTERPOLATED),
+    for name, knots, wanted, most in (
+        ("elastic force", table.elastic_n, exact.elastic_n, _INTERPOLATED),
         ("gap", table.gap_m, law.gap_m(middles_m), _INTERPOLATED),
-        ("capacitance", table.capacitance_f[::-_EVERY], capacitance, limit),
-        ("electric force", squares * table.pull_n_v2[::-_EVERY], squares * pull, limit),
+        ("capacitance", table.capacitance_f[::-_EVERY], exact.capacitance_f, limit),
+        ("electric force", squares * table.pull_n_v2[::-_EVERY], squares * exact.pull_n_v2, limit),
     ):
         found = np.lib.stride_tricks.sliding_window_view(knots, 4, axis=-1) @ _MIDDLE
-        _require(law, name, f"{LENGTHS} lengths", found, exact, knots, most)
+        _require(law, name, f"{LENGTHS} lengths", found, wanted, knots, most)
 
 
 def _check_voltages(law: ActuatorLaw, table: LawTable, lengths_m: Floats) -> None:
     """Compare the cubic interpolation with the law, midway between the voltages."""
     voltages_v = table.step_v * np.arange(VOLTAGES, dtype=np.float64)
     middles_v = 0.5 * (voltages_v[1:-2] + voltages_v[2:-1])
-    capacitance, pull = _rows(law, lengths_m[::_EVERY], middles_v)
+    exact = law.on_grid(lengths_m[::_EVERY], middles_v)
     between, squares = middles_v[:, None] ** 2, voltages_v[:, None] ** 2
-    for name, knots, exact, largest in (
-        ("capacitance", table.capacitance_f, capacitance, table.capacitance_f),
-        ("electric force", table.pull_n_v2, between * pull, squares * table.pull_n_v2),
+    for name, knots, wanted, largest in (
+        ("capacitance", table.capacitance_f, exact.capacitance_f, table.capacitance_f),
+        ("electric force", table.pull_n_v2, between * exact.pull_n_v2, squares * table.pull_n_v2),
     ):
         found = np.lib.stride_tricks.sliding_window_view(knots[:, ::_EVERY], 4, axis=0) @ _MIDDLE
         found = found * between if name == "electric force" else found
-        _require(law, name, f"{VOLTAGES} voltages", found, exact, largest, _BETWEEN_VOLTAGES)
+        _require(law, name, f"{VOLTAGES} voltages", found, wanted, largest, _BETWEEN_VOLTAGES)
 
 
 def _require(

@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from haselab.base import InputError, check_fields, checked, generator
+from haselab.base import check_fields, checked, generator
 from haselab.control import (
     Design,
     DesignSpec,
     LoopSetting,
     Saturation,
-    design_pi,
-    design_pid,
-    design_plausible,
+    design_controller,
 )
-from haselab.control.plausible_design import Structure
+from haselab.control.plausible_design import USUAL_STRUCTURE, Structure
 from haselab.controllers import ChosenController
 from haselab.controllers.registry import chosen_controller
 from haselab.identify import TransferFit
@@ -30,20 +28,25 @@ from haselab.store.toml import validated
 
 __all__ = ["Actuator", "design"]
 
+_USUAL = LoopSetting()
+
 
 @checked
 def design(
     model: TransferFit | PlantPosterior | Plant | RationalModel,
     spec: DesignSpec | Mapping[str, float | bool] | None = None,
     *,
-    controller: Structure = "pi",
-    limits: tuple[float, float] = (-0.05, 0.1),
-    rate_hz: float = 100.0,
-    delay_s: float = 0.005,
+    controller: Structure = USUAL_STRUCTURE,
+    limits: tuple[float, float] = (_USUAL.saturation.low, _USUAL.saturation.high),
+    rate_hz: float = _USUAL.rate_hz,
+    delay_s: float = _USUAL.measurement_delay_s,
     probability: float | None = None,
     seed: int = 0,
 ) -> Design:
     """Design a PI or PID controller for a model, with margins that include the loop's delay.
+
+    `haselab design` makes the same design from a file. It takes rate and delay from the file if
+    they are in it.
 
     Args:
         model: a fit, which also gives the share of plausible plants that keep the margins; or a
@@ -67,17 +70,10 @@ def design(
     """
     demands = spec if isinstance(spec, DesignSpec) else DesignSpec.from_mapping(spec or {})
     loop, rng = LoopSetting(rate_hz, delay_s, Saturation(*limits)), generator(seed)
-    posterior = model.posterior if isinstance(model, TransferFit) else model
-    if isinstance(posterior, PlantPosterior):
-        return design_plausible(
-            posterior, demands, loop, rng=rng, structure=controller, probability=probability
-        )
-    if probability is not None:
-        raise InputError(
-            "probability needs the covariance of the model. Give a fit instead of a plant."
-        )
-    search = design_pi if controller == "pi" else design_pid
-    return search(posterior, demands, loop, rng=rng)
+    known = model.posterior if isinstance(model, TransferFit) else model
+    return design_controller(
+        known, demands, loop, rng=rng, structure=controller, probability=probability
+    )
 
 
 @dataclass(frozen=True)

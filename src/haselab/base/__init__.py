@@ -1,6 +1,13 @@
 """Foundations that every package uses: estimates, limits, errors, progress."""
 
-from haselab.base.arguments import check_fields, checked, generator, real_array, shown
+from haselab.base.arguments import (
+    check_fields,
+    checked,
+    generator,
+    is_real,
+    real_array,
+    shown,
+)
 from haselab.base.closing import Closing
 from haselab.base.errors import (
     DeviceError,
@@ -9,6 +16,8 @@ from haselab.base.errors import (
     LimitError,
     ResultError,
     SafetyError,
+    described,
+    text_of,
 )
 from haselab.base.estimate import Estimate
 from haselab.base.json import Json, JsonObject, table_at
@@ -32,9 +41,12 @@ __all__ = [
     "SilentProgress",
     "check_fields",
     "checked",
+    "described",
     "generator",
+    "is_real",
     "real_array",
     "shown",
     "table_at",
+    "text_of",
     "to_plain",
 ]

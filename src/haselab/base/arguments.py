@@ -8,14 +8,14 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from types import NoneType, UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, ParamSpec, TypeGuard, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.base.errors import InputError
 
-__all__ = ["check_fields", "checked", "generator", "real_array", "shown"]
+__all__ = ["check_fields", "checked", "generator", "is_real", "real_array", "shown"]
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
@@ -96,7 +96,7 @@ def real_array(name: str, values: object) -> NDArray[np.float64]:
     """
     try:
         array = np.asarray(values)
-        if array.dtype.kind == "O" and array.ndim and all(map(_is_real, array.flat)):
+        if array.dtype.kind == "O" and array.ndim and all(map(is_real, array.flat)):
             array = array.astype(np.float64)
     except (ValueError, TypeError) as error:
         raise InputError(
@@ -106,7 +106,7 @@ def real_array(name: str, values: object) -> NDArray[np.float64]:
         return np.asarray(array, dtype=np.float64)
     if array.ndim == 0:
         raise InputError(f"{name} is {shown(values)}; it must be an array of real numbers.")
-    strange = next((each for each in array.flat if not _is_real(each)), array.dtype)
+    strange = next((each for each in array.flat if not is_real(each)), array.dtype)
     raise InputError(f"{name} holds {shown(strange)}; it must hold real numbers.")
 
 
@@ -170,9 +170,9 @@ def _suits(value: object, kind: Any) -> bool:
             return False
         return True
     if kind is float:
-        return _is_real(value) and value == value
+        return is_real(value) and value == value
     if kind is int:
-        return isinstance(value, Integral) and _is_real(value)
+        return isinstance(value, Integral) and is_real(value)
     if kind is bool:
         return isinstance(value, (bool, np.bool_))
     if kind is str:
@@ -207,7 +207,17 @@ def _is_one_of(value: object, kind: Any) -> bool:
     return any(_suits(value, option) for option in _options(kind))
 
 
-def _is_real(value: object) -> bool:
+def is_real(value: object) -> TypeGuard[float]:
+    """Whether a value is one real number that a double can hold; booleans and texts are not.
+
+    Args:
+        value: anything.
+    Returns:
+        True for numbers of Python and of numpy.
+    Example:
+        >>> is_real(np.float32(0.1)), is_real(True), is_real("0.1"), is_real(np.ones(1))
+        (True, False, False, False)
+    """
     if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
         return False
     return not isinstance(value, int) or abs(value) <= sys.float_info.max

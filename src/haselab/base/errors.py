@@ -1,6 +1,17 @@
 """The error classes. A message says what is wrong, the value found and what to do."""
 
-__all__ = ["DeviceError", "HaselabError", "InputError", "LimitError", "ResultError", "SafetyError"]
+from haselab.base.exits import no_exit
+
+__all__ = [
+    "DeviceError",
+    "HaselabError",
+    "InputError",
+    "LimitError",
+    "ResultError",
+    "SafetyError",
+    "described",
+    "text_of",
+]
 
 
 class HaselabError(Exception):
@@ -33,3 +44,39 @@ class DeviceError(HaselabError, OSError):
 
 class SafetyError(DeviceError):
     """A protection tripped; the output was commanded to 0 V."""
+
+
+def text_of(error: BaseException) -> str:
+    """Return the text of an exception in one line.
+
+    Args:
+        error: of any package; its own `__str__` may fail.
+    Returns:
+        The text, or a remark that there is none.
+    Example:
+        >>> class Broken(Exception):
+        ...     def __str__(self):
+        ...         raise KeyError("text")
+        >>> text_of(ValueError("too large")), text_of(Broken())
+        ('too large', 'no text: its __str__ raised KeyError')
+    """
+    try:
+        with no_exit():
+            return " ".join(str(error).split())
+    except Exception as second:
+        return f"no text: its __str__ raised {type(second).__name__}"
+
+
+def described(error: BaseException) -> str:
+    """Return the class and the text of an exception in one line.
+
+    Args:
+        error: of any package; its own `__str__` may fail.
+    Returns:
+        The description.
+    Example:
+        >>> described(ValueError("too large")), described(TimeoutError())
+        ('ValueError: too large', 'TimeoutError')
+    """
+    name, text = type(error).__name__, text_of(error)
+    return f"{name}: {text}" if text else name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["SignalExit", "no_exit"]
+__all__ = ["SignalExit", "exit_code_text", "no_exit"]
 
 
 class SignalExit(SystemExit):
@@ -31,4 +31,10 @@ def no_exit() -> Iterator[None]:
     except SignalExit:
         raise
     except SystemExit as stop:
-        raise RuntimeError(f"it called sys.exit({stop.code!r})") from stop
+        raise RuntimeError(f"it called sys.exit({exit_code_text(stop)})") from stop
+
+
+def exit_code_text(stop: SystemExit) -> str:
+    """Return the argument of `sys.exit()` as it was written, or its type if it is an object."""
+    plain = stop.code is None or type(stop.code) in (int, str)
+    return repr(stop.code) if plain else type(stop.code).__name__

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import EntryPoint
 from typing import Generic, TypeVar, cast
 
-from haselab.base.errors import HaselabError, InputError
+from haselab.base.errors import HaselabError, InputError, described
 from haselab.base.exits import no_exit
 
 __all__ = ["Registry"]
@@ -84,7 +84,7 @@ class Registry(Generic[T]):
                 loaded = found[0].load()
                 fault = self._fault(loaded, name)
         except Exception as error:  # another package may raise anything
-            fault = f"it does not load ({type(error).__name__}: {error})"
+            fault = f"it does not load ({described(error)})"
         if fault:
             raise self._error(
                 f"The {self.what} {name!r} of package {packages} ({found[0].value}) cannot be "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import importlib
 import os
 import select
 import sys
@@ -14,11 +13,12 @@ from typing import Any, TextIO
 import click
 
 from haselab import __version__
-from haselab.base.errors import HaselabError
-from haselab.base.exits import SignalExit
+from haselab.base.errors import HaselabError, described, text_of
+from haselab.base.exits import SignalExit, exit_code_text
 from haselab.base.foreign_code import foreign_failure
 from haselab.cli.bench.revoke_first import revoke_first
 from haselab.cli.invocation import Invocation
+from haselab.cli.lazy_group import LazyGroup
 
 __all__ = ["cli", "main"]
 
@@ -73,17 +73,8 @@ class _BrokenPipe(Exception):  # noqa: N818 -- never seen outside of this file
         self.error = error
 
 
-class _LazyGroup(click.Group):
-    """A group that imports its commands on demand, so that --help is fast."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in _COMMANDS:
-            return None
-        command: click.Command = importlib.import_module(_COMMANDS[cmd_name][0]).command
-        return command
+class _Root(LazyGroup):
+    """All commands, with their lines of help, so that --help imports none."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         """Parse the options; wrap a broken pipe, for which click would exit with 1."""
@@ -99,21 +90,16 @@ class _LazyGroup(click.Group):
         except BrokenPipeError as error:
             raise _BrokenPipe(error) from error
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Import the command, then call `on_command`."""
-        found = super().resolve_command(ctx, args)
-        if isinstance(ctx.obj, Invocation):
-            ctx.obj.on_command()
-        return found
-
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
 
-@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=_Root,
+    places={name: f"{module}:command" for name, (module, _) in _COMMANDS.items()},
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.version_option(__version__, prog_name="haselab")
 def cli() -> None:
     """Measure, model and control soft electrostatic actuators (HASEL, DEA).
@@ -170,7 +156,7 @@ def _exit_if_foreign(error: Exception) -> None:
     found = foreign_failure(error)
     if found is None:
         return
-    what = f"{found.place} of the package {found.package!r} failed: {type(error).__name__}: {error}"
+    what = f"{found.place} of the package {found.package!r} failed: {described(error)}"
     advice = "Repair it; run again with --debug for the traceback"
     sys.exit(_fail(f"{what}. {advice}.", 4 if "haselab.instruments" in found.groups else 2))
 
@@ -210,12 +196,12 @@ def main(
     except SystemExit as stop:  # of another package, where no one expects it
         if debug:
             raise RuntimeError("code of another package called sys.exit()") from stop
-        what = f"Code of another package called sys.exit({stop.code!r})."
+        what = f"Code of another package called sys.exit({exit_code_text(stop)})."
         sys.exit(_fail(f"{what} Run again with --debug to see which; uninstall or repair it.", 2))
     except HaselabError as error:
         if debug:
             raise
-        sys.exit(_fail(str(error), error.exit_code))
+        sys.exit(_fail(text_of(error), error.exit_code))
     except OSError as error:
         if debug:
             raise
@@ -228,6 +214,6 @@ def main(
         if debug:
             raise
         _exit_if_foreign(error)
-        what = f"A bug in haselab ({type(error).__name__}: {error})."
+        what = f"A bug in haselab ({described(error)})."
         sys.exit(_fail(f"{what} Run again with --debug and report the traceback.", 1))
     sys.exit(0)

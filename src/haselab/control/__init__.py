@@ -10,7 +10,7 @@ from haselab.control.gains import PidGains, Saturation
 from haselab.control.linear import LinearController
 from haselab.control.loop_shaping import Design, Prediction, design_pi, design_pid, predict
 from haselab.control.plants.loop_table import WhiteNoise
-from haselab.control.plausible_design import design_plausible
+from haselab.control.plausible_design import design_controller
 from haselab.control.simulate import LoopSetting, LoopTrace, simulate_drive, simulate_loop
 from haselab.control.spec import DesignSpec
 from haselab.control.stability.margins import Crossover, Margins, loop_response, margins
@@ -39,9 +39,9 @@ __all__ = [
     "StepNumbers",
     "WhiteNoise",
     "binomial_proportion",
+    "design_controller",
     "design_pi",
     "design_pid",
-    "design_plausible",
     "loop_response",
     "margins",
     "over_trials",

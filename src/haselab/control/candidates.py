@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ class Task:
         """The nominal plant, and with its natural frequency varied to both sides."""
         return varied(self.plant, self.spec.frequency_spread)
 
-    @property
+    @cached_property
     def step(self) -> float:
         """Reference step of the simulated experiments."""
         if self.spec.step is None:

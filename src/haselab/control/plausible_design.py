@@ -1,4 +1,4 @@
-"""Robust controller design: margins for a required share of plausible plants."""
+"""Controller design, on request with margins for a required share of plausible plants."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from haselab.control.spec import DesignSpec
 from haselab.control.stability.plausible import Chance, plausible_margins
 from haselab.models.posterior import PlantPosterior
 
-__all__ = ["Structure", "design_plausible"]
+__all__ = ["USUAL_STRUCTURE", "Structure", "design_controller"]
 
 Structure = Literal["pi", "pid"]
+USUAL_STRUCTURE: Structure = "pid"
 _FEWEST, _MOST = 50, 20_000  # draws
 _SEARCHED = 200  # plants used by a search
 _ROUNDS = 3
 
 
-def design_plausible(
-    posterior: PlantPosterior,
+def design_controller(
+    model: PlantPosterior | AnyPlant,
     spec: DesignSpec,
     setting: LoopSetting,
     *,
     rng: np.random.Generator,
-    structure: Structure = "pid",
+    structure: Structure = USUAL_STRUCTURE,
     probability: float | None = None,
     draws: int = 400,
     nominal: AnyPlant | None = None,
 ) -> Design:
-    """Design a PI or PID controller with margins evaluated on plants drawn from a posterior.
+    """Design a PI or PID controller, with margins of plausible plants if their spread is known.
 
     The design for the best plant comes first. If the required share of plausible plants keeps its
     margins, it is the result: no loop with more integral gain meets the demands for the best plant
@@ -45,7 +46,8 @@ def design_plausible(
     those that evaluate its result, so that the reported share is unbiased.
 
     Args:
-        posterior: the model's parameters with their covariance.
+        model: the parameters with their covariance, from which plausible plants are drawn; or a
+            plant alone.
         spec: specification; phase and gain margin are those of the share.
         setting: rate, measurement delay and saturation.
         rng: random generator of the draws and of the search.
@@ -54,8 +56,9 @@ def design_plausible(
         draws: number of plausible plants for the evaluation.
         nominal: best plant, if it is not the posterior's nominal one.
     Returns:
-        The design with `plausible`; a share that was not reached is a shortfall, and the gains are
-        then those with the largest share found among loops that meet all other demands.
+        The design, with `plausible` if the model has a covariance; a share that was not reached is
+        a shortfall, and the gains are then those with the largest share found among loops that
+        meet all other demands.
     Raises:
         InputError: as for `design_pi`; a probability or a number of draws outside its range.
         ResultError: as for `design_pi`.
@@ -66,11 +69,19 @@ def design_plausible(
         >>> posterior = PlantPosterior(
         ...     names, (False, True, True, False), np.array([1.0, 32.0, 0.3, 0.01]),
         ...     np.diag([0.01, 0.01, 0.05, 0.0]) ** 2)
-        >>> design = design_plausible(posterior, DesignSpec(), LoopSetting(), structure="pi",
+        >>> design = design_controller(posterior, DesignSpec(), LoopSetting(), structure="pi",
         ...                           rng=np.random.default_rng(1), draws=100)
         >>> design.plausible.share.value
         1.0
     """
+    search = design_pi if structure == "pi" else design_pid
+    if not isinstance(model, PlantPosterior):
+        if probability is not None:
+            raise InputError(
+                f"probability = {probability:g} needs the covariance of the model, which a plant "
+                "alone does not have. Give a fit, or leave the probability out."
+            )
+        return search(model, spec, setting, rng=rng)
     if not _FEWEST <= draws <= _MOST:
         raise InputError(f"draws = {draws}; must be {_FEWEST} to {_MOST}.")
     most = 1.0 - 1.0 / min(draws, _SEARCHED)
@@ -80,15 +91,14 @@ def design_plausible(
             f"{most:g}."
         )
     streams = rng.spawn(2)
-    plants = posterior.draw(draws, streams[0])
-    best_plant = posterior.nominal if nominal is None else nominal
-    search = design_pi if structure == "pi" else design_pid
+    plants = model.draw(draws, streams[0])
+    best_plant = model.nominal if nominal is None else nominal
     found = _judged(search(best_plant, spec, setting, rng=rng), plants)
     if probability is None or _share(found) >= probability:
         return found
     if found.shortfalls:  # further demands do not help
         return _short(found, probability, reachable=False)
-    others = posterior.draw(min(draws, _SEARCHED), streams[1])
+    others = model.draw(min(draws, _SEARCHED), streams[1])
     chance = Chance.of(others, setting, probability)
     error = math.sqrt(probability * (1.0 - probability) / len(others))
     share = probability + 0.5 * error

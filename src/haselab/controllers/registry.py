@@ -27,10 +27,10 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
     "controller",
     "haselab.controllers",
     {
-        "force": "haselab.controllers.force:FORCE",
         "open-loop": "haselab.controllers.builtin:OPEN_LOOP",
         "pi": "haselab.controllers.builtin:PI",
         "pid": "haselab.controllers.builtin:PID",
+        "force": "haselab.controllers.force:FORCE",
     },
     _fault,
 )

@@ -37,8 +37,8 @@ class Prediction:
     Args:
         status: "ok", or why this is no validation of the model.
         used_for_fit: share of the samples that the fit has used, recognised by their values; NaN
-            where it is not known what the model was fitted to, and where the steps of the converter
-            hide it.
+            where it is not known what the model was fitted to, where the steps of the converter
+            hide it, and where no samples can be compared.
         fit_percent: NRMSE fit: 100 is perfect, 0 no better than the mean.
         rms_error: root mean square of measured minus predicted, in the unit of the output.
         inside_band: share of the samples inside the 95 % band; NaN where there is no band.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["TrainingOutput", "hash_output", "share_used"]
+__all__ = ["TrainingOutput", "hash_output", "is_comparable", "share_used"]
 
 Floats = NDArray[np.float64]
 Hashes = NDArray[np.uint64]
@@ -100,23 +100,43 @@ def share_used(outputs: Sequence[ArrayLike], known: TrainingOutput) -> float:
     Returns:
         Between 0 and 1; of long records an estimate, from the windows with the smallest hashes.
         NaN where the steps of the converter hide whether the records are a repetition or in part a
-        copy.
+        copy, and where no window can be compared.
     Example:
         >>> y = np.random.default_rng(1).normal(size=1000)
         >>> known = hash_output([y])
         >>> share_used([np.round(y[137:600], 4)], known), share_used([-y], known)
         (1.0, 0.0)
     """
+    hashes = _compared(outputs, known)
+    if not hashes.size:
+        return math.nan
+    share = float(np.isin(hashes, known.hashes).mean())
+    copied = share >= _LEAST_ALIKE and hashes.size >= _LEAST_WINDOWS
+    return math.nan if known.quantised and share > _MOST_BY_CHANCE and not copied else share
+
+
+def is_comparable(outputs: Sequence[ArrayLike], known: TrainingOutput) -> bool:
+    """Whether some records have windows that can be compared with the outputs of a fit.
+
+    Args:
+        outputs: of the records. Shape `(M_r,)` each.
+        known: outputs of the fit.
+    Returns:
+        False for constant records, and for many short ones.
+    """
+    return bool(_compared(outputs, known).size)
+
+
+def _compared(outputs: Sequence[ArrayLike], known: TrainingOutput) -> Hashes:
+    """Hashes of windows that the outputs of the fit would have kept, too."""
     if not (known.hashes.size and len(outputs)):
-        return 0.0
+        return np.zeros(0, np.uint64)
     # Twice the margin: rounding up to one margin leaves these windows among those of the fit.
     arrays = [np.asarray(y, dtype=np.float64) for y in outputs]
     hashes = _all_hashes(arrays, known, 2.0 * _MARGIN)
     if known.hashes.size >= _MOST:  # larger hashes of the fit were not kept
         hashes = hashes[hashes <= known.hashes.max()]
-    share = float(np.isin(hashes, known.hashes).mean()) if hashes.size else 0.0
-    copied = share >= _LEAST_ALIKE and hashes.size >= _LEAST_WINDOWS
-    return math.nan if known.quantised and share > _MOST_BY_CHANCE and not copied else share
+    return hashes
 
 
 def _level_step(y: Floats) -> float:

@@ -14,11 +14,11 @@ def lfilter(b: Any, a: Any, x: Any, **options: Any) -> Any:
     return signal.lfilter(b, a, x, **options)
 
 
-def fftconvolve(first: Any, second: Any) -> Any:
+def fftconvolve(first: Any, second: Any, **options: Any) -> Any:
     """`scipy.signal.fftconvolve`."""
     from scipy import signal
 
-    return signal.fftconvolve(first, second)
+    return signal.fftconvolve(first, second, **options)
 
 
 def resample_poly(x: Any, up: int, down: int, **options: Any) -> Any:

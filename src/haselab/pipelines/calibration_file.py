@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from haselab.base import InputError, ResultError, table_at
+from haselab.base.numbers_only import numbers_only
 from haselab.sensing.calibration import Calibration, Reference, ReferenceReading, fit_calibration
 from haselab.store.folder import write_text
 from haselab.store.toml import read_toml, validated
@@ -26,6 +27,8 @@ _ROUNDING = 1e-9  # relative difference of the same fit on another machine
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    _numbers = field_validator("*", mode="before")(classmethod(numbers_only))
 
 
 _Number = Annotated[float, Field(ge=-1e18, le=1e18)]  # squares do not overflow

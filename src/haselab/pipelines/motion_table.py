@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +25,8 @@ def motion_of_table(
     mass_kg: float,
     length_m: Floats | None = None,
     capacitance_f: Floats | None = None,
-    std: float,
+    length_std_m: float | None = None,
+    capacitance_std_f: float | None = None,
 ) -> MotionRecord:
     """Make a motion of the samples of a table.
 
@@ -37,7 +40,8 @@ def motion_of_table(
         mass_kg: that hangs.
         length_m: measured; None: it was not. Shape `(N,)`.
         capacitance_f: likewise. Shape `(N,)`.
-        std: standard deviation of the measured values, in m or F.
+        length_std_m: standard deviation of the lengths; None: estimated from neighbouring rows.
+        capacitance_std_f: likewise.
     Returns:
         The motion.
     Raises:
@@ -45,26 +49,40 @@ def motion_of_table(
     """
     if time_s.size < 2 or not (np.diff(time_s) > 0.0).all():
         raise InputError(
-            f"{name} has {time_s.size} rows. A prediction needs at least 2 rows whose times rise. "
+            f"{name} has {time_s.size} rows. It needs at least 2 rows whose times rise. "
             "Sort the rows by time, and remove repeated times."
         )
-    count = time_s.size
     step_s = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])
-    # a capacitance is the mean over an interval, so each row begins with a short one
-    glimpse_s = _GLIMPSE * step_s
-    starts_s = np.stack([time_s, time_s + glimpse_s], axis=1).ravel()
-    pairs = 2 * count
-    drive = Drive(
-        np.append(starts_s, time_s[-1] + step_s[-1]), np.repeat(voltage_v, 2),
-        np.full(pairs, mass_kg * GRAVITY_M_S2), np.full(pairs, mass_kg), np.zeros(pairs),
-    )  # fmt: skip
     no, none = np.zeros(0), np.zeros(0, dtype=np.int64)
-    rows, stds = np.arange(count), np.full(count, std)
-    frames, length_m = (no, no) if length_m is None else (time_s, length_m)
-    sensed, capacitance_f = (none, no) if capacitance_f is None else (rows, capacitance_f)
-    sizes = frames.size, sensed.size
-    return MotionRecord(
-        name, drive, frames, length_m, stds[: sizes[0]], 2 * sensed, sensed, capacitance_f,
-        stds[: sizes[1]], (name,), np.zeros(sizes[0], np.int64), np.zeros(sizes[1], np.int64),
-        capacitance_later_s=-0.5 * glimpse_s[: sizes[1]],
+    starts_s, volt, sensed, later_s = time_s, voltage_v, none, no
+    if capacitance_f is not None:
+        # a capacitance is the mean over an interval, so each row begins with a short one
+        glimpse_s = _GLIMPSE * step_s
+        starts_s = np.stack([time_s, time_s + glimpse_s], axis=1).ravel()
+        volt, sensed, later_s = np.repeat(voltage_v, 2), np.arange(time_s.size), -0.5 * glimpse_s
+    count = starts_s.size
+    drive = Drive(
+        np.append(starts_s, time_s[-1] + step_s[-1]), volt,
+        np.full(count, mass_kg * GRAVITY_M_S2), np.full(count, mass_kg), np.zeros(count),
     )  # fmt: skip
+    seen = [
+        (no, no) if values is None else (values, np.full(values.size, std or _noise(name, values)))
+        for values, std in ((length_m, length_std_m), (capacitance_f, capacitance_std_f))
+    ]
+    (length_m, length_std), (capacitance_f, capacitance_std) = seen
+    return MotionRecord(
+        name, drive, time_s[: length_m.size], length_m, length_std, 2 * sensed, sensed,
+        capacitance_f, capacitance_std, (name,), np.zeros(length_m.size, np.int64),
+        np.zeros(sensed.size, np.int64), capacitance_later_s=later_s,
+    )  # fmt: skip
+
+
+def _noise(name: str, values: Floats) -> float:
+    """Standard deviation of the noise, by second differences, most of which hold no motion."""
+    second = np.abs(np.diff(values, 2))
+    steps = np.diff(np.unique(values))
+    if steps.size == 0:
+        raise InputError(f"{name}: all measured values are {values[0]:g}. Check the column.")
+    # the median of a normal variable's size is 0.674 of its deviation; a second difference has 6
+    noise = float(np.median(second)) / (0.674 * math.sqrt(6.0)) if second.size else 0.0
+    return max(noise, float(steps.min()) / math.sqrt(12.0))

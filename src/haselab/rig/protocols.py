@@ -270,6 +270,17 @@ class BuiltInController(Protocol):
             DeviceError: The controller refuses.
         """
 
+    def measure_capacitance_f(self) -> float:
+        """Arm, and measure the capacitance with the sensing signal alone.
+
+        The loop stays open and the drive at 0 V.
+
+        Returns:
+            The capacitance, in F.
+        Raises:
+            DeviceError: The controller refuses, or has closed its loop.
+        """
+
     @property
     def output_v(self) -> float:
         """Drive at the end of the last block, in V."""

@@ -30,7 +30,7 @@ _SAMPLE_S = 1.0
 _SURE = 0.9  # correlation above which a fiducial found near its last position needs no search
 _PARTICLE_RATE_HZ = 20.0
 _CLAMP_PX = 28.0  # half height of the clamp's bar around its row of fiducials
-_OPTIONS = TrackOptions(subset_px=21, search_px=40)
+_OPTIONS = TrackOptions(subset_px=21, search_px=40, sloped_light=True)
 
 
 def _fiducials_of(images: NDArray[np.uint8]) -> NDArray[np.float64]:

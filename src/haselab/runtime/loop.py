@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from haselab.base import InputError, SafetyError
+from haselab.base import InputError, SafetyError, described, is_real, shown
 from haselab.base.exits import no_exit
 from haselab.control import Saturation
 from haselab.controllers import (
@@ -92,7 +92,7 @@ class RunningController:
                 self._controller.start(setting)
         except Exception as error:  # code of another package may raise anything
             raise InputError(
-                f"Controller {self._name!r} does not start: {type(error).__name__}: {error}. "
+                f"Controller {self._name!r} does not start: {described(error)}. "
                 "Fix the controller, or change its parameters."
             ) from error
 
@@ -111,27 +111,29 @@ class RunningController:
             The drive, in strain within the saturation or in V within the limits; None: keep the
             output, because the measurement is not valid.
         Raises:
-            SafetyError: The controller failed, returned something that is not a number, or a
-                voltage outside the limits.
+            SafetyError: The controller failed, or returned something other than a finite number or
+                a voltage outside the limits.
         """
         try:
             with no_exit():
-                drive = float(self._controller.step(reference, measurement))
+                drive: object = self._controller.step(reference, measurement)
         except Exception as error:
             raise SafetyError(
-                f"Controller {self._name!r} failed: {type(error).__name__}: {error}. Fix it and "
-                "test it on the twin."
+                f"Controller {self._name!r} failed: {described(error)}. Fix it and test it on the "
+                "twin."
             ) from error
         if not measurement.valid:
             return None
-        if not math.isfinite(drive):
+        if not is_real(drive) or not math.isfinite(drive):
             raise SafetyError(
-                f"Controller {self._name!r} returned {drive} for a strain of "
-                f"{measurement.strain:.6g}. Fix it and test it on the twin."
+                f"Controller {self._name!r} returned {shown(drive)} for a strain of "
+                f"{measurement.strain:.6g}, but a step must return one finite number. Fix it and "
+                "test it on the twin."
             )
-        if self._voltage and not self._low <= drive <= self._high:
+        value = float(drive)
+        if self._voltage and not self._low <= value <= self._high:
             raise SafetyError(
-                f"Controller {self._name!r} returned {drive:.6g} V, outside its limits of "
+                f"Controller {self._name!r} returned {value:.6g} V, outside its limits of "
                 f"{self._low:g} to {self._high:g} V. Limit the voltage in the controller."
             )
-        return min(max(drive, self._low), self._high)
+        return min(max(value, self._low), self._high)

@@ -10,7 +10,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, HaselabError, InputError, Progress, SafetyError
+from haselab.base import DeviceError, HaselabError, InputError, Progress, SafetyError, text_of
 from haselab.rig import Rig
 from haselab.runtime.closed_loop import ClosedLoop
 from haselab.runtime.conditions import Conditions
@@ -52,7 +52,7 @@ class Recorder(Protocol):
 
 def _left(found: str, error: BaseException | None) -> str:
     """Describe an output that is not at 0 V, and what had ended the run."""
-    why = "" if error is None else str(error)
+    why = "" if error is None else text_of(error)
     if error is None or (why and why in found):
         return found
     return f"{found} The run had ended by {type(error).__name__}{': ' * bool(why)}{why}"
@@ -121,6 +121,7 @@ class Runner:
             if not self._arms:
                 self._rig.check_idle()
                 self._safety.heartbeat(_SETUP_S)  # instruments are set up, still at 0 V
+            self._conditions.carrier(0.0)  # it hung for long without one
             self._rig.generator.sine(*self._carrier)
             self._conditions.carrier(self._carrier[1])
             self._entered = True
@@ -128,7 +129,7 @@ class Runner:
         except BaseException as error:
             self._signals.__exit__(None, error, None)
             if isinstance(error, DeviceError):
-                self._safety.trip(str(error))
+                self._safety.trip(text_of(error))
             if self._left:
                 raise SafetyError(_left(self._left, error)) from error
             raise
@@ -203,10 +204,10 @@ class Runner:
         if isinstance(error, KeyboardInterrupt):
             error.add_note(self._output)
         if isinstance(error, DeviceError):
-            self._safety.trip(str(error))
-        elif str(error):
+            self._safety.trip(text_of(error))
+        elif why := text_of(error):
             with contextlib.suppress(HaselabError):
-                self._note(f"reason: {error}")
+                self._note(f"reason: {why}")
         with contextlib.suppress(HaselabError):
             at = "output not at 0 V" if found else "0 V commanded, not read back"
             at = "output at 0 V" if self._at_zero else at

@@ -83,11 +83,12 @@ class CapacitanceSensor:
         """See `StrainSensor`."""
         if self._reason or self.capacitance_f is None or self._map.range_f is None:
             return _no_capacitance(self._reason)
-        low_f, high_f = self._map.range_f
+        (low_f, high_f), (least_f, most_f) = self._map.range_f, self._usable_f
         return (
-            f"Capacitance = {self.capacitance_f:.4g} F is too far from {low_f:.4g} to {high_f:.4g} "
-            "F, where the strain map was fitted. Fit a record that reaches there, or limit the "
-            "controller's output."
+            f"Capacitance = {self.capacitance_f:.4g} F is outside {least_f:.4g} to {most_f:.4g} F, "
+            f"too far from {low_f:.4g} to {high_f:.4g} F, where the strain map was fitted. Fit a "
+            "record in which the length follows the capacitance there, or limit the controller's "
+            "output."
         )
 
 

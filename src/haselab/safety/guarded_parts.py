@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import HaselabError, InputError, Limits
+from haselab.base import HaselabError, InputError, Limits, text_of
 from haselab.rig import (
     Acquisition,
     BuiltInController,
@@ -98,7 +98,7 @@ class GuardedBench:
             if why := self.safety.revoked_by_others:
                 raise self.safety.trip(why) from error
             if self.safety.live:
-                self.safety.trip(str(error) or type(error).__name__)
+                self.safety.trip(text_of(error) or type(error).__name__)
             raise
 
     def answered(self) -> None:
@@ -296,6 +296,15 @@ class GuardedController(_Part):
         b.safety.heartbeat(0.0)
         with b.calling():
             self._plain.follow(strain)
+
+    def measure_capacitance_f(self) -> float:
+        """Switch the sensing signal on, which energises the actuator; only while armed."""
+        b = self._bench
+        if not b.safety.live:
+            raise b.safety.refusal()
+        b.safety.heartbeat(0.0)
+        with b.calling():
+            return self._plain.measure_capacitance_f()
 
     @property
     def output_v(self) -> float:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from haselab.base import described
 from haselab.rig import HighVoltageSupply, ReportsOutput, ReportsOutputState, Rig
 from haselab.rig.drivers import quietly
 
@@ -72,7 +73,7 @@ def output_state(rig: Rig, residual_v: float) -> OutputState | None:
         try:
             left_v = source.read_back() * rig.description.amplifier_gain
         except Exception as error:  # whatever the driver does: the bench is not known to be safe
-            silent = f"{type(error).__name__}: {error}"
+            silent = described(error)
             continue
         if abs(left_v) < residual_v:
             return OutputState(voltage_v=left_v)
@@ -132,7 +133,7 @@ def discharged(rig: Rig, residual_v: float) -> str:
         try:
             left_v = rig.supply.read_voltage()
         except Exception as error:
-            return f"The supply's voltage cannot be read ({type(error).__name__}: {error})."
+            return f"The supply's voltage cannot be read ({described(error)})."
         if abs(left_v) <= limit_v:
             return ""
         if time.monotonic() >= end_s:
@@ -147,7 +148,7 @@ def _asked(name: str, is_off: Callable[[], bool]) -> OutputState:
     try:
         return OutputState() if is_off() else OutputState(energised=f"{name} is on")
     except Exception as error:
-        return OutputState(unreachable=f"{name} does not respond ({type(error).__name__}: {error})")
+        return OutputState(unreachable=f"{name} does not respond ({described(error)})")
 
 
 class BackgroundCall:

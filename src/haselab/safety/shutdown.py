@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from haselab.base import SafetyError
+from haselab.base import SafetyError, described
 from haselab.rig import FunctionGenerator, HighVoltageSupply, ReportsOutput
 from haselab.safety.instrument_state import (
     BackgroundCall,
@@ -71,13 +71,12 @@ class Shutdown:
                     act()
                     break
                 except Exception as error:
-                    failed = f"{type(error).__name__}: {error}"
+                    failed = described(error)
                 except BaseException as error:
                     stopped = error
             else:
-                self._ask_guardian(
-                    f"a driver failed during shutdown: {failed if stopped is None else stopped}"
-                )
+                failed = failed if stopped is None else described(stopped)
+                self._ask_guardian(f"a driver failed during shutdown: {failed}")
         if stopped is not None:
             raise stopped
 
@@ -226,5 +225,5 @@ class Shutdown:
                 if left_v < self._limit_v:
                     return OutputState(voltage_v=left_v)
         except Exception as error:  # any failure: 0 V is not confirmed
-            return OutputState(unreachable=f"{type(error).__name__}: {error}")
+            return OutputState(unreachable=described(error))
         return OutputState(energised=f"{left_v:.4g} V remain at the output", voltage_v=left_v)

@@ -16,6 +16,7 @@ from scipy.special import stdtrit
 
 from haselab.base import Estimate, InputError, ResultError, checked
 from haselab.models.actuator.strain_map import StrainMap
+from haselab.sensing.map_range import followed_range
 
 __all__ = ["DriftCheck", "MapKind", "drift_check", "fit_strain_map"]
 
@@ -25,6 +26,7 @@ MapKind = Literal["auto", "line", "quadratic", "cubic"]
 _FEWEST = 32
 _CELLS = 24  # of equal capacitance; each counts once per branch, however long it took
 _TURN = 0.15  # of the range: smaller reversals do not start a new branch
+_FOLLOWED = 1.0 / 3.0  # of the change of the strain, that the map must cover
 _LEFT = 0.5  # of the variance of the strain, that a line may leave
 _FOLDS = 10  # groups of cycles, each left out once
 _SEGMENTS = 16  # of a record that is checked for drift
@@ -64,16 +66,17 @@ def fit_strain_map(
         capacitance_f: in order of time, in F. Shape `(N,)`.
         strain: of the camera at the same times. Shape `(N,)`.
         kind: "line", the study's form; "quadratic"; "cubic"; "auto" is the highest degree for
-            which the map rises, or falls, over the whole record. It falls for an actuator that
-            contracts.
+            which the map rises, or falls, over its whole range. It falls for an actuator that
+            contracts. If none of them follows the strain over the whole record, "auto" limits the
+            map to the part that it follows, see `followed_range`.
         coverage: share of the strains that the band should contain.
     Returns:
         The map with its band and the range of the record. With one cycle it has no covariance.
     Raises:
         InputError: fewer than 32 samples, unequal lengths, NaN, a constant capacitance, values
             that cannot be F or strain, an unknown kind, a coverage outside (0, 1).
-        ResultError: the map turns within the record, or explains less than half of the variance
-            of the strain.
+        ResultError: the map turns within the record, follows only a small part of it, or explains
+            less than half of the variance of the strain.
     Source: reference study, row S15, for the line; Efron, The Jackknife (1982), for the covariance.
     Example:
         >>> phase = 2 * np.pi * np.arange(4000) / 1000
@@ -84,6 +87,10 @@ def fit_strain_map(
         (True, True)
     """
     c, e = _checked(capacitance_f, strain, coverage)
+    limits_f = _limits_f(c, e) if kind == "auto" else None
+    if limits_f is not None:
+        inside = (c >= limits_f[0]) & (c <= limits_f[1])
+        c, e = c[inside], e[inside]
     ends_f = (float(c.min()), float(c.max()))
     turns = _turns(c)
     record = _Record(c, e, _branches(c.size, turns), ends_f)
@@ -99,6 +106,7 @@ def fit_strain_map(
         *_in_farads(factors, ends_f),
         covariance=_jackknife([_in_farads(other, ends_f) for _, other in parts]),
         range_f=ends_f,
+        limits_f=limits_f,
         band=band,
         coverage=coverage,
         held_out_coverage=held,
@@ -317,6 +325,44 @@ def _chosen(record: _Record, kind: MapKind) -> tuple[int, Floats]:
         f"everywhere: {low:.3g} at {ends_f[0]:.3g} F and {high:.3g} at {ends_f[1]:.3g} F, with a "
         "turn in between. Fit a lower degree."
     )
+
+
+def _limits_f(c: Floats, e: Floats) -> tuple[float, float] | None:
+    """Capacitances that limit the map, because no curve follows the strain beyond them.
+
+    Raises:
+        ResultError: the curve follows less than a third of the change of the strain.
+    """
+    ends_f, width_f = (float(c.min()), float(c.max())), float(np.ptp(c))
+    branch = _branches(c.size, _turns(c))
+    found = followed_range(c, e, branch, _monotonic)
+    inside = np.zeros(c.size, np.bool_) if found is None else (c >= found[0]) & (c <= found[1])
+    if found is None or inside.sum() < _FEWEST or np.ptp(e[inside]) < _FOLLOWED * np.ptp(e):
+        whole = _Record(c, e, branch, ends_f)
+        if _left(whole, _fit(whole, 1)) > _LEFT:
+            return None  # which is refused for this reason
+        raise ResultError(
+            "No line, parabola or cubic follows the strain over a third of its change: it hardly "
+            "changes with the capacitance, or turns. Record a range in which the length follows "
+            "the capacitance; a slack actuator needs a larger load or a higher lowest voltage."
+        )
+    low_f, high_f = found
+    cut_low, cut_high = low_f > ends_f[0] + 1e-9 * width_f, high_f < ends_f[1] - 1e-9 * width_f
+    if not (cut_low or cut_high):
+        return None
+    beyond_f = high_f - low_f  # on a side without a limit, as in StrainMap.usable_f
+    return low_f if cut_low else low_f - beyond_f, high_f if cut_high else high_f + beyond_f
+
+
+def _monotonic(c: Floats, e: Floats) -> Floats | None:
+    """The polynomial of the highest degree that rises or falls everywhere, at its points."""
+    x = (2.0 * c - c[0] - c[-1]) / (c[-1] - c[0])
+    for degree in (3, 2, 1):
+        factors = np.polynomial.polynomial.polyfit(x, e, degree)
+        padded = np.concatenate([factors, np.zeros(3 - degree)])
+        if _rises(float(np.sign(e[-1] - e[0])) * padded):
+            return np.asarray(np.polynomial.polynomial.polyval(x, factors))
+    return None
 
 
 def _fit(record: _Record, degree: int) -> Floats:

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from haselab.base import InputError, JsonObject, table_at
+from haselab.base import InputError, JsonObject, described, table_at
 from haselab.store.claim import create_exclusively
 from haselab.store.folder import read_json, write_json
 
@@ -185,7 +185,7 @@ class Manifest:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        ended = "complete" if kind is None else f"{kind.__name__}: {' '.join(str(error).split())}"
+        ended = "complete" if error is None else described(error)
         try:
             seal(self._folder, "SEALED", {"ended": ended}, clock=self._clock)
         except OSError:  # a full disk must not hide the original error

@@ -9,12 +9,13 @@ import typing
 import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError, JsonObject
+from haselab.base.numbers_only import numbers_only
 from haselab.store.keys import describe_key
 from haselab.store.text_file import parse_toml, read_text
 
@@ -34,11 +35,16 @@ _UNPRINTABLE = {"Cc", "Zl", "Zp"}  # control characters and line breaks
 class Section(BaseModel):
     """A table of a settings file: no unknown keys, and no extreme numbers.
 
-    A field states its own range. Every number must also be finite, and 0 or between 1e-18 and 1e18
-    in size, so that squares and quotients neither overflow nor underflow.
+    A field states its own range. A number is neither `true` nor a text. It must also be finite, and
+    0 or between 1e-18 and 1e18 in size, so that squares and quotients neither overflow nor
+    underflow.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    former_names: ClassVar[Mapping[str, str]] = {}  # of keys that were renamed
+
+    _numbers = field_validator("*", mode="before")(classmethod(numbers_only))
 
     @field_validator("*", mode="after")
     @classmethod
@@ -136,8 +142,7 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
     faults = "; ".join(
         _missing(model, fault, data, section)
         if fault["type"] == "missing"
-        else f"{_path(section, fault['loc']) or 'file'}: "
-        f"{_said(model, fault, data)}{_got(fault['input'])}"
+        else f"{_place(section, fault['loc'])}{_said(model, fault, data)}{_got(fault['input'])}"
         for fault in shown
     )
     more = f"; and {count - len(shown)} more" if count > len(shown) else ""
@@ -147,6 +152,12 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
 
 def _path(section: str, parts: Sequence[Any]) -> str:
     return ".".join([*([section] if section else []), *(str(part)[:60] for part in parts)])
+
+
+def _place(section: str, parts: Sequence[Any]) -> str:
+    """Path of a key in front of what is wrong with it; nothing for the whole file."""
+    path = _path(section, parts)
+    return f"{path}: " if path else ""
 
 
 def _missing(model: type[BaseModel], fault: Any, data: Any, section: str) -> str:
@@ -174,8 +185,11 @@ def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
     if fault["type"] == "model_type":
         return f"Input should be a table, headed [{_path('', fault['loc'])}]"
     if fault["type"] != "extra_forbidden":
-        return str(fault["msg"])
+        return str(fault["msg"]).removeprefix("Value error, ")
     table = _table_of(model, fault["loc"][:-1], data)
+    former = getattr(table, "former_names", {}).get(fault["loc"][-1])
+    if former is not None:
+        return f"no such key; it is now called {former}"
     keys = [] if table is None else sorted(table.model_fields)
     if 0 < len(keys) <= _MOST_KEYS:
         return f"no such key; the keys are {', '.join(keys)}"

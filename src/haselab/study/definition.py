@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from pydantic import ConfigDict, Field, create_model, model_validator
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.controllers import CONTROLLERS
 from haselab.store.toml import Section, read_toml, validated
 from haselab.study.registry import EXPERIMENTS, table_types
@@ -34,6 +34,7 @@ __all__ = [
     "file_model",
     "load_step_study",
     "load_study",
+    "recorded_study",
     "step_study_of",
 ]
 
@@ -61,7 +62,7 @@ class Study(_Head):
     experiment without a table is not played. The file may have the tables in any order.
 
     Example:
-        >>> triangle = dict(low_v=0, high_v=2, frequency_hz=0.25, cycles=5, left_out_cycles=1,
+        >>> triangle = dict(low_v=0, high_v=2, frequency_hz=0.25, cycles=5, skipped_cycles=1,
         ...                 frame_rate_hz=100)
         >>> study = Study.model_validate({"name": "one triangle", "triangle": triangle})
         >>> study.triangle.high_v, study.has("chirp"), study.nominal_baseline_v
@@ -249,6 +250,22 @@ def checked_study(data: Mapping[str, Any], source: object) -> Study:
         )
     validated(file_model(data), data, source)  # whose messages know the keys of each table
     return Study.model_validate(data)
+
+
+def recorded_study(tables: JsonObject) -> JsonObject:
+    """The tables of a study in a recording, with the present names of keys that were renamed.
+
+    Args:
+        tables: in the recording's header.
+    Returns:
+        The tables.
+    """
+    found = dict(tables)
+    for name, kind in table_types(tables).items():
+        table = found[name]
+        if isinstance(table, dict):
+            found[name] = {kind.former_names.get(key, key): value for key, value in table.items()}
+    return found
 
 
 def load_step_study(path: Path, *, quick: bool = False) -> StepStudy:

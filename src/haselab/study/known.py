@@ -42,7 +42,7 @@ def with_known(study: Study, tables: ActuatorTables) -> Study:
         study: as in its file; its own settings are kept.
         tables: of the actuator file.
     Returns:
-        The study; with `[steps]` and without `[control]`, its `own_trials` use the controller
+        The study; with `[steps]` and without `[control]`, its `custom_trials` use the controller
         of the actuator file, within its limits.
     Raises:
         InputError: the controller's kind is not registered, does not accept its parameters, or has

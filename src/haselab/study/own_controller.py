@@ -31,7 +31,7 @@ def own_controller(study: Study) -> ChosenController | None:
 def own_names(study: Study) -> list[str]:
     """Names of the step trials with the study's own controller."""
     has_own = study.has("control") and study.control.kind is not None
-    trials = study.steps.own_trials if has_own else 0
+    trials = study.steps.custom_trials if has_own else 0
     return [f"{OWN}-{k + 1}" for k in range(trials)]
 
 

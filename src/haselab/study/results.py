@@ -11,7 +11,7 @@ from haselab.base import Estimate, Json, JsonObject
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
 from haselab.study.experiments.foreign import rows_of_experiment
-from haselab.study.paper.quantity_table import quantities
+from haselab.study.paper.quantity_table import paper_rows, quantities
 from haselab.study.quantity import Quantity
 from haselab.study.simulated.truth import (
     follows_from_twin,
@@ -37,6 +37,7 @@ VERDICT_RULE = (
     "Inconclusive: the interval is partly inside."
 )
 _PRINTED_ZETA = 0.09  # eq. 10
+_ON_CHIP = ("S26.", "S28.")  # played by `reproduce` beside the experiments
 
 
 def verdict(quantity: Quantity, measured: Estimate) -> str:
@@ -134,11 +135,12 @@ def rows_of(study: Study) -> dict[str, Quantity]:
     Args:
         study: the reference study also has the rows of the chip's experiments.
     """
-    found: dict[str, Quantity] = dict(quantities()) if study.is_reference else {}
+    found: dict[str, Quantity] = {}
     for experiment in experiments_of(study):
         found |= rows_of_experiment(experiment)
     if study.is_reference:
-        return found
+        found = paper_rows(*_ON_CHIP) | found
+        return {key: found[key] for key in (*quantities(), *found) if key in found}
     return {key: row for key, row in found.items() if not row.reference_only}
 
 
@@ -152,10 +154,10 @@ def _fixed_by(study: Study) -> dict[str, str]:
     if study.operating_point.baseline_v is not None:
         fixed["S18.baseline"] = "operating_point.baseline_v"
         fixed["S18.centre_offset"] = "at operating_point.baseline_v"
-    if study.has("static_load") and study.static_load.pieces is not None:
-        fixed["S17.region_low"] = "number of segments: static_load.pieces"
+    if study.has("static_load") and study.static_load.segments is not None:
+        fixed["S17.region_low"] = "number of segments: static_load.segments"
         fixed["S17.region_high"] = fixed["S17.region_low"]
-        fixed.setdefault("S18.baseline", "centre of a region by static_load.pieces")
+        fixed.setdefault("S18.baseline", "centre of a region by static_load.segments")
         fixed.setdefault("S18.centre_offset", fixed["S18.baseline"])
     return fixed
 

@@ -35,7 +35,7 @@ from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReade
 from haselab.store.source_commit import source_commit
 from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
-from haselab.study.definition import StepStudy, Study, checked_study
+from haselab.study.definition import StepStudy, Study, checked_study, recorded_study
 from haselab.study.experiment import ExperimentResult
 from haselab.study.experiments.foreign import declared, foreign, refuse_repeated
 from haselab.study.fits.observe import Observation, observe
@@ -242,6 +242,7 @@ def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, 
                 f"it with 'haselab sense' or 'haselab session export'. {path}"
             )
         try:
+            session.header["study"] = recorded_study(session.header["study"])
             study = checked_study(session.header["study"], path)
             rig = described(session.header["rig"])
             tables = validated(ActuatorTables, session.header.get("actuator", {}), path)

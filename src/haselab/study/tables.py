@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -59,11 +60,13 @@ class OperatingPoint(Section):
 class Triangle(Section):
     """Slow triangles of voltage (rows S13 to S15)."""
 
+    former_names: ClassVar[Mapping[str, str]] = {"left_out_cycles": "skipped_cycles"}
+
     low_v: float = Field(ge=-100, le=100, description="lowest drive", examples=[0.0])
     high_v: float = Field(ge=-100, le=100, description="highest drive", examples=[2.0])
     frequency_hz: float = Field(ge=1e-4, le=25, description="triangles per second", examples=[0.25])
     cycles: int = Field(ge=2, le=1000, description="number of triangles", examples=[5])
-    left_out_cycles: int = Field(
+    skipped_cycles: int = Field(
         ge=0,
         le=1000,
         description="triangles at the start that the fits of the maps leave out",
@@ -77,15 +80,17 @@ class Triangle(Section):
             raise ValueError("cycles / frequency_hz must not exceed a day")
         if not self.low_v < self.high_v:
             raise ValueError(f"low_v = {self.low_v:g} must be below high_v = {self.high_v:g}")
-        if self.left_out_cycles >= self.cycles:
+        if self.skipped_cycles >= self.cycles:
             raise ValueError(
-                f"left_out_cycles = {self.left_out_cycles} must be below cycles = {self.cycles}"
+                f"skipped_cycles = {self.skipped_cycles} must be below cycles = {self.cycles}"
             )
         return self
 
 
 class StaticLoad(Section):
     """Masses hung at 0 V (rows S16 and S17)."""
+
+    former_names: ClassVar[Mapping[str, str]] = {"pieces": "segments"}
 
     masses_kg: tuple[float, ...] = Field(
         max_length=1000,
@@ -96,7 +101,7 @@ class StaticLoad(Section):
         gt=0, le=_DAY_S, description="wait after each mass, before its frames", examples=[60.0]
     )
     frame_rate_hz: float = _frames(100.0)
-    pieces: int | None = Field(
+    segments: int | None = Field(
         None,
         ge=1,
         le=6,
@@ -144,6 +149,12 @@ class Chirp(Section):
 class Steps(Section):
     """Steps of strain in open loop and, with controllers, in closed loop (rows S21 to S25)."""
 
+    former_names: ClassVar[Mapping[str, str]] = {
+        "own_trials": "custom_trials",
+        "printed_chain_trials": "paper_chain_trials",
+        "printed_chain_carrier_v": "paper_chain_carrier_v",
+    }
+
     step: float = Field(description="desired strain after the step", examples=[0.04])
     zero_s: float = Field(
         gt=1, le=_DAY_S, description="time at zero strain before the step", examples=[15.0]
@@ -156,10 +167,10 @@ class Steps(Section):
     open_trials: int = Field(ge=1, le=1000, description="trials in open loop", examples=[2])
     pi_trials: int = Field(ge=0, le=1000, description="trials with the PI", examples=[2])
     pid_trials: int = Field(ge=0, le=1000, description="trials with the PID", examples=[2])
-    printed_chain_trials: int = Field(
+    paper_chain_trials: int = Field(
         0, ge=0, le=100, description="trials with the PI and the paper's sensing chain"
     )
-    printed_chain_carrier_v: float = Field(
+    paper_chain_carrier_v: float = Field(
         0.1,
         gt=0,
         le=1,
@@ -177,7 +188,7 @@ class Steps(Section):
         0, ge=0, le=100, description="trials with the PI, to saturating_step first, then to step"
     )
     saturating_step: float = Field(0.2, ge=-1, le=1, description="desired strain in these trials")
-    own_trials: int = Field(
+    custom_trials: int = Field(
         2,
         ge=1,
         le=1000,
@@ -203,7 +214,7 @@ class Control(Section):
         None,
         min_length=1,
         max_length=64,
-        description="registered kind of a controller for own_trials",
+        description="registered kind of a controller for custom_trials",
     )
     parameters: dict[str, float] = Field({}, description="parameters of that controller, by name")
     kp: float = Field(0.85, ge=0, description="proportional gain for a plant of gain plant_gain")

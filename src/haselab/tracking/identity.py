@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter, uniform_filter
-from scipy.signal import fftconvolve
 
+from haselab.models.filters import fftconvolve
 from haselab.tracking.options import Floats, Frame, Poses
 from haselab.tracking.subsets import Subsets
 
@@ -177,7 +177,7 @@ def lookalikes(picture: Frame | Floats, subsets: Subsets, reach_px: int, least: 
         window = around[y : y + 2 * edge + 1, x : x + 2 * edge + 1]
         window = window - window.mean()
         template = subsets.shape[index, : side**2].reshape(side, side)
-        score = fftconvolve(window, template[::-1, ::-1], "valid")
+        score = fftconvolve(window, template[::-1, ::-1], mode="valid")
         cut = slice(half, -half)
         mean = uniform_filter(window, side)[cut, cut]
         power = side**2 * (uniform_filter(window**2, side)[cut, cut] - mean**2)

@@ -129,6 +129,14 @@ def project_out(rows: Floats, shape: Floats) -> Floats:
     return np.asarray(rows - along[:, :, None] * shape[:, None, :])
 
 
+def _without_tilt(rows: Floats, place: Floats, shape: Floats) -> Floats:
+    """Make rows orthogonal to a brightness slope, as far as that differs from 1 and the shape."""
+    tilts = project_out(np.broadcast_to(place, (len(rows), *place.shape)), shape)
+    inner = tilts @ tilts.transpose(0, 2, 1)
+    share = np.linalg.solve(inner, tilts @ rows.transpose(0, 2, 1))
+    return np.asarray(rows - share.transpose(0, 2, 1) @ tilts)
+
+
 def _check_inside(points: Floats, centres: Floats, side: int, shape: tuple[int, ...]) -> None:
     last = np.array([shape[1] - 1, shape[0] - 1]) - side // 2
     outside = ((centres < side // 2) | (centres > last)).any(axis=1)
@@ -227,21 +235,25 @@ def build_subsets(reference: Floats, points_px: Floats, options: TrackOptions) -
         [part / scale for part in parts]
         for parts in _derivatives(reference, centres, side, options.smoothing_px)
     )
-    gradient = project_out(descent_rows(smooth[0], smooth[1], side, unknowns), shape)
+    half = side // 2
+    place = np.mgrid[-half : half + 1, -half : half + 1][::-1].reshape(2, -1).astype(float)
+    slopes = np.stack(smooth, axis=1)
+    if options.sloped_light:
+        slopes = _without_tilt(slopes, place, shape)
+    gx, gy = slopes[:, 0], slopes[:, 1]
+    gradient = project_out(descent_rows(gx, gy, side, unknowns), shape)
     descent = descent_rows(exact[0], exact[1], side, unknowns)
     hessian = gradient @ descent.transpose(0, 2, 1)
     _refuse_blank(points_px, _translation_condition(hessian, norm))
     inverse = _observable_inverse(gradient, hessian, side)
-    weight = smooth[0] ** 2 + smooth[1] ** 2
+    weight = gx**2 + gy**2
     weight /= weight.sum(axis=1, keepdims=True)
     leverage = np.einsum("pmn,pmk,pkn->pn", gradient, inverse, gradient) + shape**2
     offsets = points_px - centres
     solve = _point_rows(offsets, unknowns) @ inverse
-    half = side // 2
-    place = np.mgrid[-half : half + 1, -half : half + 1][::-1].reshape(2, -1).astype(float)
     return Subsets(
         shape=_pad(shape),
-        gradient=_pad(np.stack(smooth, axis=1)),
+        gradient=_pad(slopes),
         inverse=np.ascontiguousarray(inverse, dtype=np.float32),
         place=_pad(place),
         centres_px=centres,

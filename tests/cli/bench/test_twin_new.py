@@ -7,6 +7,7 @@ import pytest
 
 from haselab.actuators import DeaStack
 from haselab.cli.main import main
+from haselab.rig.twin.camera import TwinCamera
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_file import load_twin
 
@@ -35,6 +36,27 @@ def test_values_are_set_and_every_parameter_is_in_the_file(tmp_path) -> None:
     assert list(written) == [about.name for about in DeaStack.described()]
     assert written["branch_share"] == [0.1, 0.2]
     assert "layer_thickness_m = 0.0007  # m, 1e-06 to 0.01: undeformed" in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [("peano-hasel", ("pouches=8", "pouch_length_m=0.012", "electrode_length_m=0.006")),
+     ("curling-hasel", ("strip_width_m=0.03",)), ("dea-stack", ("side_m=0.02", "layers=80"))],
+)  # fmt: skip
+def test_the_camera_sees_the_whole_of_an_actuator_of_any_size(kind, changes, tmp_path) -> None:
+    path = tmp_path / "twin.toml"
+    words = [word for change in changes for word in ("--set", f"actuator.{change}")]
+    assert run("--kind", kind, *words, "--out", path) == 0
+    twin = load_twin(path)
+    law, scale = twin.law, twin.camera.scale_m_per_px
+    seen = TwinCamera(twin.camera, 0.5 * law.width_m, law.free_length_m, seed=1).lengths_m
+    assert seen.low < 0.8 * law.free_length_m and 1.1 * law.free_length_m < seen.high
+    assert 250.0 < law.free_length_m / scale < 350.0
+    assert twin.camera.neck_coefficient == 0.0
+    assert run("--kind", kind, "--set", "camera.scale_m_per_px=1e-4", "--out", path) == 2
+    other = tmp_path / "other.toml"
+    assert run("--kind", kind, "--set", "camera.scale_m_per_px=1e-4", "--out", other) == 0
+    assert load_twin(other).camera.scale_m_per_px == 1e-4
 
 
 def test_it_prints_toml_or_json(capsys) -> None:

@@ -133,3 +133,100 @@ def test_the_drive_is_imported_block_by_block_and_times_without_a_unit_are_named
     with SessionReader(tmp_path / "o" / "session.h5") as session:
         record = session.experiment("imported")
     assert record.drive_v.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+def foreign_record(path: Path, columns: dict[str, str] | None = None) -> tuple[np.ndarray, ...]:
+    """A record as a foreign logger writes it, with its true capacitance and strain.
+
+    The strain falls with the capacitance: an actuator that contracts. Two cycles of 2 s.
+    """
+    rate_hz, carrier_hz, samples = 20e3, 1e3, 80_000
+    rng = np.random.default_rng(1)
+    time_s = np.arange(samples) / rate_hz
+    share = 0.5 - 0.5 * np.cos(2 * np.pi * 0.5 * time_s)
+    farad = 180e-12 * (1.0 + 0.6 * share)
+    strain = -0.012 * (farad / 180e-12 - 1.0)
+    v = 0.1 * np.sin(2 * np.pi * carrier_hz * time_s)  # at the monitor; 1000 V/V: 100 V
+    i = 2 * np.pi * carrier_hz * farad * 100.0 * np.cos(2 * np.pi * carrier_hz * time_s) / 1e-3
+    v, i = (each + 1e-3 * rng.standard_normal(samples) for each in (v, i))
+    every = strain.copy()
+    every[np.arange(samples) % 5 != 0] = np.nan  # a camera of a fifth of the rate
+    table = {"t [ms]": 1e3 * time_s, "U [mV]": 1e3 * v, "I [mV]": 1e3 * i,
+             "Dehnung [%]": 100.0 * strain, "Weg [mm]": 50.0 * strain, "eps": strain,
+             "lang [mm]": 50.0 * (1.0 + strain), "selten": every,
+             "Prozent": 100.0 * strain}  # fmt: skip
+    table = {name: table[name] for name in ("t [ms]", "U [mV]", "I [mV]", *(columns or table))}
+    rows = "\n".join(";".join(f"{x:.9g}".replace(".", ",") for x in row)
+                     for row in zip(*table.values(), strict=True))  # fmt: skip
+    path.write_text(f"Logger 7\nPrüfling;A\n\n{';'.join(table)}\n{rows}\n", encoding="utf-8")
+    return time_s, farad, strain
+
+
+@pytest.mark.parametrize(
+    ("column", "options"),
+    [
+        ("Dehnung [%]", ("--strain", "Dehnung")),
+        ("selten", ("--strain", "selten")),
+        ("Weg [mm]", ("--displacement", "Weg", "--zero-length-m", 0.05)),
+        ("lang [mm]", ("--length", "lang", "--zero-length-m", 0.05)),
+        ("eps", ("--strain", "eps", "--zero-length-m", 0.05)),
+    ],
+)
+def test_an_imported_record_of_monitors_and_length_is_sensed_and_gives_a_map(
+    column, options, tmp_path, capsys
+) -> None:
+    record, out, sensed = tmp_path / "log.csv", tmp_path / "session", tmp_path / "c.csv"
+    time_s, _, strain = foreign_record(record, {column: ""})
+    code, printed, _ = typed(
+        capsys, "session", "import", record, "--v", "U", "--i", "I", *options, "--carrier-hz", 1e3,
+        "--block-samples", 200, "--volt-per-monitor-volt", 1000, "--ampere-per-monitor-volt", 1e-3,
+        "--out", out, "--json",
+    )  # fmt: skip
+    assert (code, json.loads(printed)["blocks"]) == (0, 400)
+    assert typed(capsys, "sense", out / "session.h5", "--out", sensed)[0] == 0
+    actuator = tmp_path / "a.toml"
+    assert typed(capsys, "init", "mine", "--out", actuator)[0] == 0
+    code, printed, _ = typed(
+        capsys, "identify", "capacitance-map", sensed, "--strain-file", out, "--actuator", actuator,
+        "--json",
+    )  # fmt: skip
+    found = json.loads(printed)
+    assert (code, found["status"]) == (0, "ok")
+    # strain = -0.012 (C / 180 pF - 1)
+    for name, value in (("slope", -0.012 / 180e-12), ("offset", 0.012)):
+        assert abs(found[name]["value"] - value) < 4.0 * found[name]["std"]
+    assert typed(capsys, "session", "export", out, "--to", "csv", "--out", tmp_path / "x")[0] == 0
+    with (tmp_path / "x" / "imported-strain.csv").open() as file:
+        names = file.readline().strip().split(",")
+        rows = np.loadtxt(file, delimiter=",")
+    middle = np.interp(rows[:, names.index("time_s")], time_s, strain)
+    np.testing.assert_allclose(rows[:, names.index("strain")], middle, atol=2e-5)
+    if "--zero-length-m" in options:
+        length_m = rows[:, names.index("length_m")]
+        np.testing.assert_allclose(length_m, 0.05 * (1.0 + middle), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--displacement", "Weg"), "needs the length at zero strain. State it with --zero-le"),
+        (("--zero-length-m", 0.05), "--zero-length-m has no effect without --strain"),
+        (("--strain", "eps", "--length", "lang"), "--strain and --length name the same"),
+        (("--strain", "lang"), "The column of the strain is in mm, but must be a ratio or in %"),
+        (("--length", "Dehnung"), "The column of the length is in %, but must be in m"),
+        (("--strain", "Prozent"), "Column Prozent reaches 0.72 and states no unit"),
+        (("--strain", "none"), "Name the columns with --strain"),
+    ],
+)
+def test_a_wrong_column_of_the_length_is_refused(options, words, tmp_path, capsys) -> None:
+    record = tmp_path / "log.csv"
+    foreign_record(record)
+    code, _, line = typed(
+        capsys, "session", "import", record, "--v", "U", "--i", "I", *options, "--out",
+        tmp_path / "out",
+    )  # fmt: skip
+    expected = 0 if "Prozent" in options else 2  # 0.72 may be a strain
+    assert code == expected
+    if expected:
+        assert words in line and len(line.splitlines()) == 1
+        assert not (tmp_path / "out").exists()

@@ -2,12 +2,17 @@
 
 import json
 import re
+import shutil
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from haselab.cli.main import main
+from haselab.actuators import ACTUATORS
+from haselab.cli.actuator_file import load_actuator
+from haselab.cli.identify.actuator import law_of_section
+from haselab.cli.main import cli, main
 from haselab.control import PidGains, margins
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
@@ -34,20 +39,31 @@ def record(path, seed, plant=TRUTH, offset=0.01):
     return path
 
 
-@pytest.fixture
-def files(tmp_path, capsys):
-    actuator = tmp_path / "leg.toml"
-    assert run(capsys, "init", "my leg", "--out", actuator)[0] == 0
+def new_files(folder):
+    actuator = folder / "leg.toml"
+    cli.main(["init", "my leg", "--out", str(actuator)], standalone_mode=False)
     actuator.write_text(actuator.read_text() + '\n[mine]\ncolour = "red"  # of the shell\n')
-    return actuator, record(tmp_path / "one.csv", 1), record(tmp_path / "two.csv", 2)
+    return actuator, record(folder / "one.csv", 1), record(folder / "two.csv", 2)
 
 
 @pytest.fixture
-def known(files, capsys):
-    actuator, first, _ = files
-    code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
-    assert (code, error) == (0, "")
-    return files
+def files(tmp_path):
+    return new_files(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory):
+    """Files whose actuator has a model, identified once for all tests."""
+    found = new_files(tmp_path_factory.mktemp("identified"))
+    arguments = ["identify", "transfer", str(found[1]), "--actuator", str(found[0])]
+    cli.main(arguments, standalone_mode=False)
+    return found
+
+
+@pytest.fixture
+def known(identified, tmp_path):
+    """A test's own copy of them."""
+    return tuple(Path(shutil.copy(path, tmp_path)) for path in identified)
 
 
 def test_a_new_file_names_the_actuator_and_is_not_overwritten(files, capsys):
@@ -69,8 +85,10 @@ def test_any_printable_name_is_kept(name, tmp_path, capsys):
     assert code == 2 and "lower-case letters" in error
 
 
-def test_the_model_is_written_with_its_full_covariance_and_origin(known):
-    actuator, first, _ = known
+def test_the_model_is_written_with_its_full_covariance_and_origin(files, capsys):
+    actuator, first, _ = files
+    code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
+    assert (code, error) == (0, "")
     data = tomllib.loads(actuator.read_text())
     model = data["model"]
     assert model["natural_frequency_rad_s"] == pytest.approx(28.0, rel=0.01)
@@ -408,16 +426,16 @@ _CURVE = "[drive.voltage_map]\na1_v = 1.3\nb1 = 3.1\na2_v = -0.3\nb2 = -27.0\n"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (f"{_MAP}range_f = [8e-10, 5e-10]", "range_f: Value error, [8e-10, 5e-10] must have the"),
+        (f"{_MAP}range_f = [8e-10, 5e-10]", "range_f: [8e-10, 5e-10] must have the"),
         (f"{_MAP}range_f = [nan, 5e-10]", "range_f.0: Input should be a finite number (got nan)"),
-        (f"{_MAP}band = [0.01, -0.01]", "band: Value error, [0.01, -0.01] must have the lower end"),
+        (f"{_MAP}band = [0.01, -0.01]", "band: [0.01, -0.01] must have the lower end"),
         (f"{_MAP}hysteresis_strain = -0.1", "hysteresis_strain: Input should be greater than or"),
         (f"{_CURVE}strain_low = 0.2\nstrain_high = 0.1", "strain_low = 0.2 must be below strain_"),
-        ("[drive]\nlow_v = 3\nhigh_v = 1", "drive: Value error, low_v = 3 must be below high_v"),
+        ("[drive]\nlow_v = 3\nhigh_v = 1", "drive: low_v = 3 must be below high_v"),
         ("[drive]\nhighest_field_v_per_m = -1.0", "Input should be greater than 0 (got -1.0)"),
         ("[controller]\nlimits = {low = 0.1, high = -0.05}", "low = 0.1 must be below high = -0"),
         ('[[controller.alternatives]]\nkind = "x"\nlimits = {low = 0.1, high = 0.1}',
-         "alternatives.0.limits: Value error, low = 0.1 must be below high = 0.1"),
+         "alternatives.0.limits: low = 0.1 must be below high = 0.1"),
         ("[controller.demands]\nphase_margin_deg = -5.0", "phase_margin_deg = -5; must be within"),
     ],
 )  # fmt: skip
@@ -487,3 +505,16 @@ def test_a_model_of_a_length_is_not_designed_for_a_loop_of_strain(tmp_path, caps
     assert code == 2 and "The output of [model] is in m, but the maps of this file are for" in error
     path.write_text(path.read_text().replace('output_unit = "m"', 'output_unit = "1"'))
     assert run(capsys, "design", path)[0] == 0
+
+
+@pytest.mark.parametrize("kind", ["planar-hasel", "peano-hasel", "curling-hasel", "dea-stack"])
+def test_the_parameters_of_a_new_file_are_the_defaults_of_its_kind(kind, tmp_path, capsys):
+    path = tmp_path / "A.toml"
+    assert run(capsys, "init", "x", "--kind", kind, "--out", path)[0] == 0
+    head, mark, rest = path.read_text().partition("[actuator.parameters]\n")
+    lines, gap, tail = rest.partition("\n\n")
+    stated = [line.removeprefix("# ") if " = " in line else line for line in lines.splitlines()]
+    path.write_text(head + mark + "\n".join(stated) + gap + tail)
+    law = law_of_section(load_actuator(path).actuator, path)
+    assert law == ACTUATORS.find(kind)()
+    assert sum(" = " in line for line in stated) == len(law.described())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from haselab.cli.main import main
+from haselab.cli.main import cli, main
 from haselab.models.plant import Plant
 
 WHOLE = """\
@@ -43,12 +44,19 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     return int(str(stop.value.code)), printed.out, printed.err
 
 
-@pytest.fixture
-def leg(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
-    path = tmp_path / "leg.toml"
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole file with a controller, designed once for all tests."""
+    path = tmp_path_factory.mktemp("designed") / "leg.toml"
     path.write_text(WHOLE)
-    assert run(capsys, "design", path)[0] == 0
+    cli.main(["design", str(path)], standalone_mode=False)
     return path
+
+
+@pytest.fixture
+def leg(designed: Path, tmp_path: Path) -> Path:
+    """A test's own copy of it."""
+    return Path(shutil.copy(designed, tmp_path))
 
 
 def changed(path: Path, *pairs: tuple[str, str]) -> None:
@@ -236,7 +244,7 @@ def test_a_run_with_such_a_file_warns_before_it_plays(
     rig.write_text('kind = "twin"\n')
     study.write_text(
         'name = "beyond the limit of the file"\n[triangle]\nlow_v = 0.0\nhigh_v = 2.0\n'
-        "frequency_hz = 0.25\ncycles = 3\nleft_out_cycles = 1\nframe_rate_hz = 100.0\n"
+        "frequency_hz = 0.25\ncycles = 3\nskipped_cycles = 1\nframe_rate_hz = 100.0\n"
     )
     arguments = ("--rig", rig, "--actuator", leg, "--out", tmp_path / "out")
     code, _, error = run(capsys, "run", study, *arguments)

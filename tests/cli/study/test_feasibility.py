@@ -162,7 +162,7 @@ low_v = 0.0
 high_v = 2.0
 frequency_hz = 0.5
 cycles = 3
-left_out_cycles = 1
+skipped_cycles = 1
 frame_rate_hz = 100.0
 """
 
@@ -180,8 +180,8 @@ frame_rate_hz = 100.0
          "only 6 frames on each edge within 0.3 V of the baseline of 5 V"),
         ("[triangle]", "hold_s = 3\n[triangle]", "has the key hold_s outside its tables"),
         ("[triangle]", "chirp = 3\n[triangle]", "chirp: Input should be a table, headed [chirp]"),
-        ("left_out_cycles = 1", "left_out_cycles = 3",
-         "left_out_cycles = 3 must be below cycles = 3"),
+        ("skipped_cycles = 1", "skipped_cycles = 3",
+         "skipped_cycles = 3 must be below cycles = 3"),
         ("high_v = 2.0", "high_v = 0.0", "low_v = 0 must be below high_v = 0"),
     ],
 )  # fmt: skip
@@ -291,7 +291,7 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
     rating = rating_of_twin(config, study)
     assert judge_study(study, describe(config), rating).ok
     for trials in (1, 0):
-        changed = {"printed_chain_carrier_v": 0.2, "printed_chain_trials": trials}
+        changed = {"paper_chain_carrier_v": 0.2, "paper_chain_trials": trials}
         loud = study.model_copy(update={"steps": study.steps.model_copy(update=changed)})
         found = judge_study(loud, describe(config), rating)
         bad = {check.name: check.where for check in found.checks if not check.ok}

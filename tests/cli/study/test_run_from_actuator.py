@@ -20,7 +20,7 @@ low_v = 0.0
 high_v = 2.0
 frequency_hz = 0.25
 cycles = 3
-left_out_cycles = 1
+skipped_cycles = 1
 frame_rate_hz = 50.0
 """
 STEPS = """\
@@ -34,7 +34,7 @@ frame_rate_hz = 20.0
 open_trials = 1
 pi_trials = 1
 pid_trials = 0
-own_trials = 1
+custom_trials = 1
 """
 CONTROLLER = """
 [controller]

@@ -58,7 +58,7 @@ low_v = 0.0
 high_v = 2.0
 frequency_hz = 0.25
 cycles = 3
-left_out_cycles = 1
+skipped_cycles = 1
 frame_rate_hz = 50.0
 """
 

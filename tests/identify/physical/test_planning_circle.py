@@ -29,7 +29,7 @@ BENCH = PhysicalRecords(
     gain_v_per_v=GAIN, carrier_v=100.0, length_std_m=4e-6, capacitance_std_f=3e-13
 )
 TRIANGLE = {
-    "low_v": 0.0, "high_v": 1.6, "frequency_hz": 0.5, "cycles": 4, "left_out_cycles": 0,
+    "low_v": 0.0, "high_v": 1.6, "frequency_hz": 0.5, "cycles": 4, "skipped_cycles": 0,
     "frame_rate_hz": 100.0,
 }  # fmt: skip
 DROP = {"trials": 1, "settle_s": 2.0, "record_s": 2.0, "frame_rate_hz": 100.0}

@@ -32,7 +32,7 @@ def test_the_ecoflex_record_breaks_where_a_second_implementation_breaks_it(share
     table = np.genfromtxt(path, delimiter=";", skip_header=18, encoding="latin-1")
     stretch, stress_kpa = 1.0 + table[:, 3], 1e3 * table[:, 4]
     kept = np.isfinite(stretch) & np.isfinite(stress_kpa) & (stretch <= 8.0)
-    fit = find_regions(stretch[kept], stress_kpa[kept], pieces=4)
+    fit = find_regions(stretch[kept], stress_kpa[kept], segments=4)
     # pwlf 2.7.0, to its two decimals; the cost differs by 0.05 % between the two sets.
     known = [3.80, 5.29, 6.71]
     spreads = sorted((r.low for r in fit.regions), key=lambda low: low.value)[1:]
@@ -47,7 +47,7 @@ def test_the_ecoflex_record_breaks_where_a_second_implementation_breaks_it(share
 def test_seventeen_loads_are_fitted_no_worse_than_by_brute_force(seed):
     x = np.sort(np.random.default_rng([17, seed]).uniform(1.0, 3.0, 17))
     y = np.sqrt(x - 0.9) + 0.1 * np.random.default_rng([18, seed]).normal(size=17)
-    fit = find_regions(x, y, pieces=3)
+    fit = find_regions(x, y, segments=3)
     grid = np.linspace(x[0], x[-1], 120)[1:-1]
     sets = [
         pair for pair in combinations(grid, 2)
@@ -121,7 +121,7 @@ def test_coloured_loads_do_not_make_pieces_and_the_intervals_know_the_colour():
 
 def test_regions_are_sorted_by_length_and_join():
     x = np.linspace(1.0, 3.0, 81)
-    fit = find_regions(x, np.interp(x, KNOTS, LOADS), pieces=4)
+    fit = find_regions(x, np.interp(x, KNOTS, LOADS), segments=4)
     lengths = [r.high.value - r.low.value for r in fit.regions]
     assert lengths == sorted(lengths, reverse=True) and sum(lengths) == pytest.approx(2.0)
     # No noise: the search stops where the cost is rounding, a millionth of the range.
@@ -139,8 +139,8 @@ def test_units_and_order_of_the_samples_do_not_matter(factor, shift, shuffler):
     y = np.interp(x, KNOTS, LOADS) + 0.02 * np.random.default_rng(20).normal(size=40)
     order = list(range(40))
     shuffler.shuffle(order)
-    plain = find_regions(x, y, pieces=3)
-    other = find_regions(x[order], (factor * (y + shift))[order], pieces=3)
+    plain = find_regions(x, y, segments=3)
+    other = find_regions(x[order], (factor * (y + shift))[order], segments=3)
     # The search rests at 1e-9 of the cost: the square root of it, in spreads.
     for a, b in zip(plain.regions, other.regions, strict=True):
         assert abs(a.low.value - b.low.value) <= 1e-3 * max(a.low.std, 1e-6)
@@ -150,10 +150,10 @@ def test_units_and_order_of_the_samples_do_not_matter(factor, shift, shuffler):
 def test_too_few_samples_and_bad_columns_are_refused():
     x = np.linspace(1.0, 2.0, 10)
     with pytest.raises(InputError, match="must be 1 to 3"):
-        find_regions(x, x**2, pieces=4)
+        find_regions(x, x**2, segments=4)
     with pytest.raises(InputError, match="must be equally long"):
         find_regions(x, np.arange(9.0))
     with pytest.raises(InputError, match="stretch is 1 throughout"):
         find_regions(np.ones(10), x)
-    repeated = find_regions(np.repeat([1.0, 2.0], 5), np.arange(10.0), pieces=3)
+    repeated = find_regions(np.repeat([1.0, 2.0], 5), np.arange(10.0), segments=3)
     assert repeated.status.startswith("no result") and repeated.answer()["chosen"] is None

@@ -299,7 +299,7 @@ def test_bad_requests_are_refused() -> None:
         seen.render([[0.09]], first_index=-1)
     with pytest.raises(LimitError, match=r"neck_coefficient = 0.5 .* would fold"):
         camera(neck_coefficient=0.5)
-    with pytest.raises(LimitError, match="sheet half-width"):
+    with pytest.raises(LimitError, match=r"is 10 mm wide, but .* Lower that scale"):
         TwinCamera(TwinCameraConfig(), 0.005, FREE_LENGTH_M, seed=0)
     with pytest.raises(LimitError, match=r"needs at least \d+ rows"):
         camera(height_px=100)

@@ -40,3 +40,22 @@ def test_its_camera_sees_all_lengths_of_the_study(kind):
     highest_m = (camera.height_px - camera.top_px) * camera.scale_m_per_px
     assert equilibrium_m(law, 0.0, 5.0) < 0.9 * highest_m
     assert law.width_m < 0.9 * camera.width_px * camera.scale_m_per_px
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("carrier_hz", [2000.0, 1700.0])
+def test_zipping_does_not_follow_the_carrier(kind, carrier_hz):
+    """The current of a capacitance that does not change has the frequency of its voltage alone."""
+    config = TwinConfig(kind=kind)
+    bench = native_bench(config, 0, noise=False)
+    bench.carrier_v, bench.carrier_rad_s = 0.02, 2.0 * np.pi * carrier_hz
+    codes, lengths = np.empty((10, 2000, 2), dtype=np.int16), np.empty(100)
+    for block in codes:
+        bench.acquire(0.8, 0.8, 0, config.load.mass_kg * GRAVITY_M_S2, block, lengths)
+    at_s = np.arange(2000) / config.acquisition.rate_hz
+    turns = [np.exp(-2j * np.pi * k * carrier_hz * at_s) for k in (1, 2)]
+    window = np.hanning(2000)
+    first, second = (abs((codes[-1, :, 1] * window) @ turn) for turn in turns)
+    # by a code, evenly distributed, each sample is wrong by 0.29 at most
+    noise = 5.0 * 0.29 * np.sqrt((window**2).sum())
+    assert second < noise + 1e-4 * first, second / first

@@ -6,15 +6,34 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from haselab.pipelines.model_results import _axes
 from haselab.store.actuator_file import read_actuator
 
 # Of the reference study's rows, those that the model replaces but for S21, which follow from S20.
 MODELLED = ("S14.", "S15.slope", "S16.", "S17.", "S18.rest", "S19.", "S20.")
-# The noise-free study rounds its codes as well: 0.27 pF rms a block, the same in both cycles, over
-# a spread of 90 pF and about 1,000 blocks a cycle. So it knows the slope to 1e-4 (model: 3e-5).
-ROUNDED = {"S15.slope": 1e-4, "S15.offset": 1e-4}
+# The noise-free study rounds its codes as well, with a dither: 0.15 pF rms a block, over a spread
+# of 90 pF and about 4,000 blocks. So it knows the slope to 3e-5, as well as the model.
+ROUNDED = {"S15.slope": 3e-5, "S15.offset": 3e-5}
+
+
+def test_the_axes_carry_the_whole_covariance_whatever_the_units():
+    """So the variance of a row that is linear in the parameters is that of its gradient."""
+    rng = np.random.default_rng(4)
+    root, units = rng.standard_normal((5, 5)), np.array([1e4, 1.0, 1e-6, 3.0, 1e-3])
+    covariance, slopes = (
+        root @ root.T * np.outer(units, units),
+        np.array([2.0, 1.0, 1e-6, 5.0, 0.1]),
+    )
+    covariance[3, 3] = np.inf  # not known at all: kept where it is
+    gradient = rng.standard_normal(5) / units * np.array([1.0, 1.0, 1.0, 0.0, 1.0])
+    moved = (_axes(covariance, slopes) * slopes) @ gradient
+    assert moved.size == 4
+    kept = np.isfinite(np.diag(covariance))
+    expected = gradient[kept] @ covariance[np.ix_(kept, kept)] @ gradient[kept]
+    assert moved @ moved == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -281,7 +281,7 @@ class Maps:
 def fit_maps(trace: Trace, study: Study, sheet: Sheet) -> Maps:
     t = study.triangle
     end = 0.2 + t.cycles / t.frequency_hz
-    first = end - (t.cycles - t.left_out_cycles) / t.frequency_hz
+    first = end - (t.cycles - t.skipped_cycles) / t.frequency_hz
     frames = trace.frames(t.frame_rate_hz)
     frames = frames[(frames >= first) & (frames <= end)]
     zero = zero_length(trace, frames, study)
@@ -344,7 +344,7 @@ def edges_in_time(trace: Trace, zero: float, study: Study, sheet: Sheet) -> Floa
     farads = sheet.capacitance(trace.at(middles)) * relative_of(study)
     after = (np.arange(round(half / 0.01)) + 0.5) * 0.01
     rows = []
-    for cycle in range(t.left_out_cycles, t.cycles):
+    for cycle in range(t.skipped_cycles, t.cycles):
         start = end - (t.cycles - cycle) / t.frequency_hz + SWITCH_S
         times = start + after, start + 2.0 * half - after
         e, c = (
@@ -557,7 +557,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
     config, study = twin_of_reading(request.param), builtin_study(quick=True)
     few = study.steps.model_copy(
         update={
-            "open_trials": 1, "pi_trials": 1, "pid_trials": 0, "printed_chain_trials": 0,
+            "open_trials": 1, "pi_trials": 1, "pid_trials": 0, "paper_chain_trials": 0,
             "extra_delay_trials": 0, "saturating_trials": 0,
         }
     )  # fmt: skip

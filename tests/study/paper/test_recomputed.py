@@ -32,7 +32,7 @@ class Triangle:
         seen, t = session.experiment("triangle"), session.study["triangle"]
         self.rig, self.codes, self.start, self.drive = seen.rig, seen.codes, seen.start, seen.drive
         self.time, self.length = seen.time, seen.length
-        self.session, self.left_out = session, t["left_out_cycles"]
+        self.session, self.left_out = session, t["skipped_cycles"]
         period = 1.0 / t["frequency_hz"]
         self.half = 0.5 * period
         self.bounds = self.start[-1] + session.block_s - period * np.arange(t["cycles"], -1, -1)

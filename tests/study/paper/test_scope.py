@@ -25,6 +25,15 @@ def test_a_whole_run_lacks_nothing() -> None:
     assert not_played(set(quantities()), {}, REFERENCE) == []
 
 
+def test_results_of_an_own_controller_are_missing_only_where_the_study_names_one() -> None:
+    own = {"S25.rise_own", "S25.overshoot_own", "S25.error_own"}
+    assert not_played(set(quantities()) - own, {}, REFERENCE) == []
+    control = REFERENCE.control.model_copy(update={"kind": "open-loop"})
+    with_own = REFERENCE.model_copy(update={"control": control})
+    (found,) = not_played(set(quantities()) - own, {}, with_own)
+    assert set(found["ids"]) == own
+
+
 def test_an_experiment_of_the_chip_that_is_missing_is_named_with_its_reason() -> None:
     figures = {"chip": {"left_out": "no compiler."}, "miniature": {"left_out": "no compiler."}}
     (found,) = not_played(set(quantities()) - ON_CHIP, figures, REFERENCE)
@@ -35,7 +44,7 @@ def test_an_experiment_of_the_chip_that_is_missing_is_named_with_its_reason() ->
 @pytest.mark.parametrize(
     ("setting", "key"),
     [
-        ("printed_chain_trials", "S10.rise_printed_chain"),
+        ("paper_chain_trials", "S10.rise_printed_chain"),
         ("extra_delay_trials", "S24.rise_delayed"),
         ("saturating_trials", "S22.recovery_time"),
         ("pi_trials", "S24.rise_closed"),

@@ -49,6 +49,7 @@ from haselab.store.folder import write_new, write_text
 __all__ = ["check", "command", "safe", "status"]
 
 _RANGE_SHARE = 0.98  # share of an input's range that a signal may use
+_LEAST_F = 3e-10  # smallest known capacitor of a bench
 _SUPPLY_SHARE = 0.1  # share of the supply's limit that the live checks use
 _LIVE_S = 10.0  # limit for one live check; the loop-back and the supply check take longest
 _ROUTES_S = 5.0  # limit for one call of the board
@@ -135,7 +136,7 @@ def _checks(
             daq = file.daq
         yield from dry_checks(rig, DryPlan(_by_hand(file), daq, frames_hz))
         if operator is not None:
-            click.echo(_live_warning(rig, plan), err=True)
+            click.echo(_live_warning(rig, plan, file), err=True)
             with _armed(rig, file, path, operator) as alive:
                 yield from live_checks(rig, replace(plan, alive=alive))
                 alive()
@@ -188,10 +189,15 @@ def _armed(
                 safety.end_run()
 
 
-def _live_warning(rig: Rig, plan: LivePlan) -> str:
+def _live_warning(rig: Rig, plan: LivePlan, file: RigFile) -> str:
     """The voltages that the live checks will apply."""
     d = rig.description
-    if rig.controller is not None:
+    if isinstance(file, ChipFile) and plan.capacitor_f is not None:
+        volts = (
+            f"the microcontroller's sensing signal of {file.front_end.carrier_high_v:g} V peak, at "
+            "a drive of 0 V, into the capacitor"
+        )
+    elif rig.controller is not None:
         what = "the microcontroller closes its loop at zero strain for 0.5 s, up to "
         volts = f"{what}{1e-3 * d.drive_limits.high * d.amplifier_gain:g} kV"
     else:
@@ -235,16 +241,18 @@ def _first_block(rig: Rig) -> bytes:
     is_flag=True,
     help="Apply HIGH VOLTAGE too: the sensing signal, a step to 10 % of the drive range (1 kV at "
     "2 V x 5000) and 10 % of the supply's highest voltage, but at least 100 V; on a "
-    "microcontroller, closed loop at zero strain for 0.5 s. Keep clear. Requires --yes.",
+    "microcontroller, closed loop at zero strain for 0.5 s, or with --capacitor only the sensing "
+    "signal. Keep clear. Requires --yes.",
 )
 @shared_option(
     "--yes", is_flag=True,
     detail="High voltage WILL be applied; keep clear. Required with --live.",
 )  # fmt: skip
 @shared_option(
-    "--capacitor", type=Real(3e-10, 1e-6), metavar="FARAD",
-    detail="It must withstand high voltage. Also checks the scale of the current monitor. With "
-    "--live. Default: none.",
+    "--capacitor", type=Real(1e-12, 1e-6), metavar="FARAD",
+    detail="It must withstand high voltage. Also checks the scale of the current monitor; on a "
+    "microcontroller, measures the capacitor instead of closing the loop. With --live. Default: "
+    "none.",
 )  # fmt: skip
 @click.option(
     "--loop-back",
@@ -310,6 +318,11 @@ def check(
     daq = file.daq if isinstance(file, BenchConfig) else None
     if loop_back and daq is None:
         raise InputError(f"--loop-back needs a rig of kind = 'bench', found {file.kind!r}. {rig}")
+    if capacitor is not None and capacitor < _LEAST_F and not isinstance(file, ChipFile):
+        raise InputError(
+            f"--capacitor is {capacitor:g} F, but must be at least {_LEAST_F:g} F: the check "
+            f"tolerates the stray capacitance of cable and fixture. {rig}"
+        )
     plan = LivePlan(capacitor, _supply_v(file), loop_back, daq)
     try:
         # Closed at once if a check fails: 0 V must not wait for the garbage collector.

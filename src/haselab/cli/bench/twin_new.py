@@ -10,7 +10,7 @@ from typing import Any
 import click
 from pydantic import BaseModel
 
-from haselab.actuators import ACTUATORS, PlanarHasel
+from haselab.actuators import ACTUATORS, ActuatorLaw, CurlingHasel, PlanarHasel
 from haselab.base import InputError
 from haselab.cli.common import answer_options
 from haselab.cli.options import shared_option
@@ -22,6 +22,8 @@ from haselab.store.text_file import parse_toml
 from haselab.store.toml import validated
 
 __all__ = ["new"]
+
+_ALONG_PX, _ACROSS_PX = 320.0, 400.0  # of the actuator at rest, of 512 rows and columns
 
 
 @click.command("new")
@@ -43,9 +45,14 @@ def new(kind: str, name: str, values: tuple[str, ...], as_json: bool, out: Path 
     """Write a TWIN.toml, which describes a simulated bench.
 
     The file holds every parameter of the actuator with its unit and limits. The sections amplifier,
-    acquisition and camera are left out where they have their default values.
+    acquisition and camera are left out where they have the values of the reference study. For
+    another kind than planar-hasel, the camera is scaled to the actuator.
     """
-    config = validated(TwinConfig, _data(kind, name, values), "--set")
+    data = _data(kind, name, values)
+    config = validated(TwinConfig, data, "--set")
+    if kind != PLANAR_HASEL:
+        data["camera"] = _camera(config.law) | data.get("camera", {})
+        config = validated(TwinConfig, data, "--set")
     text = "\n".join(_lines(config)) + "\n"
     if out is not None:
         write_new(out, text)
@@ -78,6 +85,15 @@ def _data(kind: str, name: str, values: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"--set {given}: {section} is not a section. Use --{section}.")
         table[entry] = parsed
     return data
+
+
+def _camera(law: ActuatorLaw) -> dict[str, Any]:
+    """A camera that sees the whole actuator, which does not neck as a stretched shell does."""
+    scale = max(law.free_length_m / _ALONG_PX, law.width_m / _ACROSS_PX)
+    look = {"particle_stretch": 1.0, "neck_coefficient": 0.0}
+    if isinstance(law, CurlingHasel):  # the camera sees the heights of clamp and tip
+        look["particles"] = 0
+    return {"scale_m_per_px": float(f"{scale:.2g}"), **look}
 
 
 def _lines(config: TwinConfig) -> Iterator[str]:

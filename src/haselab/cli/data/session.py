@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
 import click
+import numpy as np
 
 from haselab.base import InputError
-from haselab.cli.columns import advice_on_columns, column_options, note_seconds
+from haselab.cli.columns import advice_on_columns, check_strain, column_options, note_seconds
 from haselab.cli.common import Real, answer_options, emit, unverified_option, warn_unverified
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.pipelines.sensing.series import derived_series
+from haselab.runtime.observer import FIDUCIALS
+from haselab.store.columns.reader import open_columns
 from haselab.store.columns.selection import ColumnOptions
-from haselab.store.export.import_session import ImportPlan, import_session
+from haselab.store.export.import_session import ImportPlan, LengthColumn, import_session
 from haselab.store.export.session import FOLDERS, FORMS, export_session, nothing_derived
 
 __all__ = ["command"]
+
+
+_LENGTHS = {"--strain": "strain", "--displacement": "displacement", "--length": "length"}
+_ROWS = 100_000
 
 
 @click.group("session")
@@ -107,6 +115,25 @@ def _export(
     help="Name the column of the drive voltage before the amplifier, in V; the median of each "
     "block is kept. Default: none.",
 )  # fmt: skip
+@click.option(
+    "--strain", "strain_column", metavar="COLUMN",
+    help="Name the column of the strain; the mean of each block is kept as the track of a camera. "
+    "Default: none.",
+)  # fmt: skip
+@click.option(
+    "--displacement", "displacement_column", metavar="COLUMN",
+    help="Name the column of the displacement from the length at zero strain, in m, in place of "
+    "--strain. Default: none.",
+)  # fmt: skip
+@click.option(
+    "--length", "length_column", metavar="COLUMN",
+    help="Name the column of the length, in m, in place of --strain. Default: none.",
+)  # fmt: skip
+@shared_option(
+    "--zero-length-m", type=Real(1e-6, 10.0),
+    detail="Gives strains from lengths, and lengths from strains. Required with --displacement. "
+    "Default: none.",
+)  # fmt: skip
 @shared_option("--experiment", default="imported", show_default=True)
 @shared_option("--rate-hz", type=Real(1e-3, 1e8), detail="Default: the rate in the file.")
 @click.option(
@@ -145,22 +172,62 @@ def _import(
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
-    **scales: float | None,
+    zero_length_m: float | None,
+    **more: Any,
 ) -> None:
-    """Import voltage and current columns as a session.
+    """Import columns of voltage, current and perhaps strain as a session.
 
     FILE is CSV, MAT, NPZ, HDF5 or TDMS. The session can be sensed, exported and read like a
-    recorded one.
+    recorded one. With a strain, displacement or length, it has the tracks of a camera.
     """
     if out is None:
         raise InputError("Missing option '--out': the new folder of the session.")
     plan = ImportPlan(
         experiment, (v_column, i_column), block_samples, rate_hz, volt_per_code, columns,
-        scales["volt_per_monitor_volt"], scales["ampere_per_monitor_volt"], scales["carrier_hz"],
-        scales["skew_s"] or 0.0, drive,
+        more["volt_per_monitor_volt"], more["ampere_per_monitor_volt"], more["carrier_hz"],
+        more["skew_s"] or 0.0, drive, _length(more, zero_length_m, file, columns),
     )  # fmt: skip
-    with advice_on_columns(["--v", "--i", "--drive"] if drive else ["--v", "--i"]):
+    named = [option for option in ("--drive", *_LENGTHS) if more.get(f"{option[2:]}_column")]
+    with advice_on_columns(["--v", "--i", *(["--drive"] if drive else []), *named]):
         answer = asdict(import_session(file, out, plan))
     if assumed := answer.pop("assumed_seconds"):
         note_seconds(assumed, file)
     emit(answer, as_json=as_json, out=None)
+
+
+def _length(
+    given: Mapping[str, Any], zero_length_m: float | None, file: Path, columns: ColumnOptions
+) -> LengthColumn | None:
+    """The column that shows the length, from the options."""
+    named = {option: given[f"{kind}_column"] for option, kind in _LENGTHS.items()}
+    found = [option for option, column in named.items() if column is not None]
+    if len(found) > 1:
+        raise InputError(f"{' and '.join(found)} name the same quantity. Give one of them. {file}")
+    if not found:
+        if zero_length_m is not None:
+            raise InputError(
+                f"--zero-length-m has no effect without {', '.join(_LENGTHS)}. Name a column of "
+                f"the length, or leave it out. {file}"
+            )
+        return None
+    kind = cast(Literal["strain", "displacement", "length"], _LENGTHS[found[0]])
+    if kind == "displacement" and zero_length_m is None:
+        raise InputError(
+            f"A displacement needs the length at zero strain. State it with --zero-length-m. {file}"
+        )
+    column = named[found[0]]
+    if kind == "strain":
+        _check_ratio(column, file, columns)
+    return LengthColumn(column, kind, FIDUCIALS, zero_length_m)
+
+
+def _check_ratio(column: str, file: Path, columns: ColumnOptions) -> None:
+    """Refuse a strain without a unit that is probably in per cent."""
+    with (
+        advice_on_columns(["--strain"]),
+        open_columns(file, [column], use_times=False, options=columns) as stream,
+    ):
+        if stream.units[0] is None:
+            parts = (np.abs(part) for (part,) in stream.chunks(_ROWS))
+            largest = [float(np.nanmax(part, initial=0.0)) for part in parts]
+            check_strain(column, np.array(largest), None, file)

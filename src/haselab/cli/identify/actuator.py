@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -12,29 +13,52 @@ import numpy as np
 from haselab.actuators import ACTUATORS, ActuatorLaw, with_parameters
 from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
-from haselab.cli.common import actuator_option, answer_options, unverified_option, warn_unverified
-from haselab.cli.identify.common import give
+from haselab.cli.columns import column_options
+from haselab.cli.common import POSITIVE, REAL, actuator_option, answer_options, unverified_option
+from haselab.cli.identify.common import FILES, RATE, give
+from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
+from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.physical import ActuatorFit, MotionRecord, fit_actuator
 from haselab.models.actuator.sections import ActuatorSection, ActuatorTables, PhysicalTable
-from haselab.pipelines.motion import motion_of_session
 from haselab.pipelines.planning.actuator_file import planner_of
 from haselab.pipelines.planning.proposal import DETERMINED, Proposal
 from haselab.pipelines.planning.records import summary_of
-from haselab.store.session.reader import SessionReader, session_file
+from haselab.store.columns.selection import ColumnOptions
+from haselab.store.session.opening import is_session
+from haselab.store.session.reader import session_file
 from haselab.store.toml import validated
 
 __all__ = ["actuator", "law_of_section", "section_of_fit"]
 
 
 @click.command("actuator")
-@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@FILES
 @actuator_option("Read [actuator], write [model.physical].")
+@shared_option("--input", "source", detail="For tables. Default: u, voltage_v or voltage.")
+@shared_option("--output", "outputs", multiple=True,
+               detail="For tables. Give it twice for a length and a capacitance. Default: y, "
+               "length_m, strain or capacitance_f.")  # fmt: skip
+@RATE
+@shared_option("--mass-kg", "masses_kg", type=REAL, multiple=True,
+               detail="For tables: once for all, or once for each in their order. Default: that "
+               "of A.toml.")  # fmt: skip
+@shared_option("--gain-v-per-v", type=POSITIVE, detail="For tables. Default: that of A.toml.")
+@shared_option("--zero-length-m", type=POSITIVE,
+               detail="For tables with strains. Default: that of A.toml.")  # fmt: skip
 @unverified_option
+@column_options
 @answer_options(plot=True)
 def actuator(
-    sessions: tuple[Path, ...],
+    files: tuple[Path, ...],
     actuator: Path | None,
+    source: str | None,
+    outputs: tuple[str, ...],
+    rate_hz: float | None,
+    masses_kg: tuple[float, ...],
+    gain_v_per_v: float | None,
+    zero_length_m: float | None,
+    columns: ColumnOptions,
     *,
     unverified: bool,
     as_json: bool,
@@ -43,9 +67,12 @@ def actuator(
 ) -> None:
     """Identify a physical model from everything recorded.
 
-    SESSIONS are folders of runs or their session.h5, all of one actuator. Lengths and
-    capacitances of all experiments are compared with one simulated motion. [actuator] gives
-    the kind, the parameters that were measured otherwise, such as a width, and the starting values.
+    FILES are folders of runs, their session.h5, or tables with a voltage and a length, strain or
+    capacitance, all of one actuator. Lengths and capacitances of all experiments are compared with
+    one simulated motion. [actuator] gives the kind, the parameters that were measured otherwise,
+    such as a width, and the starting values.
+
+    Each table is a motion of its own, which begins at rest under its first voltage.
     """
     if actuator is None:
         raise InputError(
@@ -54,23 +81,47 @@ def actuator(
         )
     tables = load_actuator(actuator, to_write=True)
     law = law_of_section(tables.actuator, actuator)
+    options = TableOptions(source, outputs, rate_hz, None, gain_v_per_v, zero_length_m, columns)
     records, gains_v_per_v = [], []
-    for session in sessions:
-        with SessionReader(session, unverified=unverified) as reader:
-            warn_unverified(reader.doubt, session)
-            records.append(motion_of_session(reader, session))
-            gains_v_per_v.append(float(reader.header["rig"]["amplifier_gain"]))
+    std: dict[str, float] = {}  # tables of one instrument have one noise, which the fit scales
+    for file, mass_kg in zip(files, _each_mass(masses_kg, len(files)), strict=True):
+        record, gain = motion_of_file(
+            file, replace(options, mass_kg=mass_kg), tables, unverified=unverified, std=std
+        )
+        if not (file.is_dir() or is_session(file)):
+            for unit, stds in (("m", record.length_std_m), ("F", record.capacitance_std_f)):
+                std |= {unit: float(stds[0])} if stds.size else {}
+        records.append(record)
+        gains_v_per_v.append(gain)
     mass_kg = max(float(record.drive.mass_kg[0]) for record in records)
+    if not mass_kg > 0.0:
+        raise InputError(
+            "No mass hangs on the actuator in these records. Record at least one with a mass, or "
+            "state it with --mass-kg or as mass_kg in [actuator]."
+        )
     fit = fit_actuator(law, records, mass_kg=mass_kg)
-    files = [session_file(session) for session in sessions]
+    inputs = [session_file(file) for file in files]
     if not fit.succeeded:
-        give(fit, files, as_json, out)
+        give(fit, inputs, as_json, out)
     section = section_of_fit(fit, records, gains_v_per_v[0])
     proposals = _proposals(tables, section, fit, actuator)
     listed = {"experiments": [proposal.answer() for proposal in proposals]}
-    give(fit, files, as_json, out, listed)
+    give(fit, inputs, as_json, out, listed)
     save_plot(plot, fit.chart)
-    save_section(actuator, "model.physical", section, files, status=fit.status)
+    save_section(actuator, "model.physical", section, inputs, status=fit.status)
+
+
+def _each_mass(masses_kg: Sequence[float], count: int) -> Sequence[float | None]:
+    if any(not 0.0 < mass_kg < math.inf for mass_kg in masses_kg):
+        raise InputError(f"--mass-kg is {min(masses_kg):g} kg. Use a mass above 0 kg.")
+    if len(masses_kg) <= 1:
+        return [masses_kg[0] if masses_kg else None] * count
+    if len(masses_kg) != count:
+        raise InputError(
+            f"--mass-kg is given {len(masses_kg)} times, but there are {count} files. State it "
+            "once for all, or once for each."
+        )
+    return masses_kg
 
 
 def _proposals(

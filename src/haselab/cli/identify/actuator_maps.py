@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,9 +18,12 @@ from haselab.identify.statics.voltage_map import VoltageMapFit
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
+from haselab.pipelines.sensing.series import derived_series
 from haselab.sensing.strain import fit_strain_map
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table
+from haselab.store.session.opening import is_session
+from haselab.store.session.reader import SessionReader, session_file
 
 __all__ = ["Pairs", "read_pairs", "save_strain_map", "save_voltage_map"]
 
@@ -51,6 +55,7 @@ def read_pairs(
     strain_column: str | None,
     columns: ColumnOptions,
     known: ActuatorTables | None = None,
+    experiment: str | None = None,
 ) -> Pairs:
     """Read capacitances and strains from one file, or from two with the same clock.
 
@@ -60,6 +65,7 @@ def read_pairs(
         strain_column: that the user named, or None.
         columns: what the user states about the columns.
         known: the actuator's file, with which strains are compared.
+        experiment: of a session that has the strain; None: its only one.
     Returns:
         Both; rows outside the other file's times are left out.
     Raises:
@@ -68,6 +74,18 @@ def read_pairs(
     """
     file, strain_file = files[0], files[-1]
     name = CAPACITANCE.column(file, capacitance_column)
+    if len(files) == 2 and (strain_file.is_dir() or is_session(strain_file)):
+        table = read_valid(file, [name], columns, [CAPACITANCE.option])
+        time_s = _times(table, file, columns)
+        known_s, strains = _strain_of_session(strain_file, experiment, known)
+        inside = _common(time_s, known_s, file, strain_file)
+        strain = np.interp(time_s[inside], known_s, strains)
+        return Pairs(table[name][inside], strain, name, _in_farads(table, name))
+    if experiment is not None:
+        raise InputError(
+            f"--experiment is for a session as --strain-file, but this is a table. Leave it out. "
+            f"{strain_file}"
+        )
     strain_name = STRAIN.column(strain_file, strain_column)
     options = [CAPACITANCE.option, STRAIN.option]
     if len(files) == 1:
@@ -81,12 +99,43 @@ def read_pairs(
         inside = _common(time_s, known_s, file, strain_file)
         capacitance = table[name][inside]
         strain = np.interp(time_s[inside], known_s, other[strain_name])
-    unit = table.units[name]
     strain_unit = other.units[strain_name]
     check_unit(strain_name, strain_unit, STRAIN, strain_file)
     check_strain(strain_name, other[strain_name], strain_unit, strain_file, known)
-    in_farads = name == "capacitance_f" if unit is None else unit.si == "F"
-    return Pairs(capacitance, strain, name, in_farads)
+    return Pairs(capacitance, strain, name, _in_farads(table, name))
+
+
+def _in_farads(table: Table, name: str) -> bool:
+    unit = table.units[name]
+    return name == "capacitance_f" if unit is None else unit.si == "F"
+
+
+def _strain_of_session(
+    path: Path, experiment: str | None, known: ActuatorTables | None
+) -> tuple[Floats, Floats]:
+    """Times and strains of the frames of an experiment."""
+    zero_m = None if known is None else known.actuator.geometry.zero_length_m
+    with SessionReader(session_file(path)) as reader:
+        if experiment is None and len(reader.names) != 1:
+            raise InputError(
+                f"The session has the experiments {', '.join(reader.names)}. Name the one that "
+                f"shows the strain with --experiment. {path}"
+            )
+        name = experiment or reader.names[0]
+        if name not in reader.names:
+            raise InputError(
+                f"The session has no experiment {name!r}, only {', '.join(reader.names)}. {path}"
+            )
+        stated = reader.states("rig", "zero_length_px")
+        seen = derived_series(reader, name, zero_length_m=None if stated else zero_m).get("strain")
+    if seen is None or "strain" not in seen:
+        raise InputError(
+            f"The experiment {name!r} has {'no tracks' if seen is None else 'no zero strain'}. "
+            "Import it with --strain, or with --length and --zero-length-m; for a run, add "
+            f"zero_length_m to [actuator.geometry] of the actuator file. {path}"
+        )
+    good = np.isfinite(seen["strain"])
+    return seen["time_s"][good], seen["strain"][good]
 
 
 def _times(table: Table, file: Path, columns: ColumnOptions) -> Floats:
@@ -130,7 +179,17 @@ def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapp
             f"sense, but {pairs.column} states no such unit. Name another column with "
             f"--capacitance, or state its unit with --unit: {files[0]}"
         )
-    section = strain_map_section(fit_strain_map(pairs.capacitance, pairs.strain))
+    found = fit_strain_map(pairs.capacitance, pairs.strain)
+    if found.limits_f is not None and found.range_f is not None:
+        low_f, high_f = found.range_f
+        click.echo(
+            f"haselab: the map is limited to {1e12 * low_f:.4g} to {1e12 * high_f:.4g} pF of "
+            f"{1e12 * pairs.capacitance.min():.4g} to {1e12 * pairs.capacitance.max():.4g} pF: no "
+            "line, parabola or cubic follows the strain over the whole record, which hardly "
+            f"changes with the capacitance there, or turns. {files[0]}",
+            err=True,
+        )
+    section = strain_map_section(found)
     fields = StrainMap.__dataclass_fields__
     save_section(actuator, "sensing.strain_map", section, files, list(fields))
     return section

@@ -22,7 +22,7 @@ from haselab.identify.statics.columns import plausible_strain, plausible_voltage
 from haselab.models.actuator import ActuatorTables
 from haselab.pipelines.time_axis import check_rising, records_of, time_axis
 from haselab.store.columns.reader import check_rate
-from haselab.store.columns.selection import ColumnOptions
+from haselab.store.columns.selection import ColumnOptions, check_assumed_seconds
 from haselab.store.columns.table import Table, read_table
 
 __all__ = [
@@ -186,8 +186,7 @@ def recorded(
     time_s = table.time_s if table.rate_hz is None else None
     if time_s is not None and held_at_hz is None:
         axis = time_axis(time_s, file, table.time_name or "time_s")
-        if rate_hz is not None:
-            check_rate(rate_hz, axis.rate_hz, time_s.size, f"column {table.time_name}", file)
+        _check_rate(table, rate_hz, axis.rate_hz, file)
         records, notes = records_of(table, names, axis, hold)
         if not records:
             raise InputError(
@@ -309,7 +308,7 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
         rows = next(iter(table.columns.values())).size
         if table.time_s is not None and table.time_name is not None:
             found_hz = table.rate_hz or time_axis(table.time_s, file, table.time_name).rate_hz
-            check_rate(given, found_hz, rows, where, file)
+            _check_rate(table, given, found_hz, file)
         elif table.rate_hz is not None:
             check_rate(given, table.rate_hz, rows, "the file's own rate", file)
     rate_hz = table.rate_hz if given is None else given
@@ -327,4 +326,17 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
         )
     if not 0.0 < rate_hz < float("inf"):
         raise InputError(f"--rate-hz is {rate_hz:g} Hz. Use a rate above 0 Hz.")
+    if given is None and table.time_s is not None:
+        _check_rate(table, None, rate_hz, file)
     return rate_hz
+
+
+def _check_rate(table: Table, given: float | None, found_hz: float, file: Path) -> None:
+    """Compare the rate of the times with the stated one; without one, times need a clear unit."""
+    name = table.time_name or "time_s"
+    rows = next(iter(table.columns.values())).size
+    assumed = name if table.assumed_seconds else ""
+    if given is not None:
+        check_rate(given, found_hz, rows, f"column {name}", file, assumed=assumed)
+    elif assumed:
+        check_assumed_seconds(assumed, found_hz, file)

@@ -4,43 +4,33 @@ from __future__ import annotations
 
 import click
 
-from haselab.cli.identify.actuator import actuator
-from haselab.cli.identify.arx import arx, subspace
-from haselab.cli.identify.hysteresis import creep, hysteresis
-from haselab.cli.identify.model_comparison import verdict
-from haselab.cli.identify.plan_experiment import command as plan_experiment
-from haselab.cli.identify.response import free_response, frequency_response
-from haselab.cli.identify.static_map import spline_map
-from haselab.cli.identify.statics import capacitance_map, hyperelastic, regions, voltage_map
-from haselab.cli.identify.transfer import transfer
+from haselab.cli.lazy_group import LazyGroup
 
 __all__ = ["command"]
 
+_PLACES = {
+    "actuator": "haselab.cli.identify.actuator:actuator",
+    "arx": "haselab.cli.identify.arx:arx",
+    "capacitance-map": "haselab.cli.identify.statics:capacitance_map",
+    "creep": "haselab.cli.identify.hysteresis:creep",
+    "free-response": "haselab.cli.identify.response:free_response",
+    "frequency-response": "haselab.cli.identify.response:frequency_response",
+    "hyperelastic": "haselab.cli.identify.statics:hyperelastic",
+    "hysteresis": "haselab.cli.identify.hysteresis:hysteresis",
+    "map": "haselab.cli.identify.static_map:spline_map",
+    "plan-experiment": "haselab.cli.identify.plan_experiment:command",
+    "regions": "haselab.cli.identify.statics:regions",
+    "subspace": "haselab.cli.identify.arx:subspace",
+    "transfer": "haselab.cli.identify.transfer:transfer",
+    "verdict": "haselab.cli.identify.model_comparison:verdict",
+    "voltage-map": "haselab.cli.identify.statics:voltage_map",
+}
 
-@click.group("identify")
+
+@click.group("identify", cls=LazyGroup, places=_PLACES)
 def command() -> None:
     """Identify models, with confidence intervals, from records.
 
     FILE is CSV or another text table, .mat, .npz, .h5 or .tdms, as other programs write them. Units
     are read from the headers. Options name the columns; --time and --unit describe them.
     """
-
-
-for _method in (
-    actuator,
-    transfer,
-    arx,
-    subspace,
-    frequency_response,
-    free_response,
-    hyperelastic,
-    regions,
-    voltage_map,
-    capacitance_map,
-    spline_map,
-    hysteresis,
-    creep,
-    verdict,
-    plan_experiment,
-):
-    command.add_command(_method)

@@ -272,8 +272,9 @@ def voltage_map(
 @column_option(STRAIN)
 @click.option(
     "--strain-file", type=click.Path(path_type=Path),
-    help="Read the strain from this file, recorded with the same clock. Default: FILE.",
+    help="Read the strain from this file or session, recorded with the same clock. Default: FILE.",
 )  # fmt: skip
+@shared_option("--experiment", detail="For a session as --strain-file. Default: its only one.")
 @column_options
 @actuator_option("Writes [sensing.strain_map], the map from F with its band.")
 @answer_options(plot=True)
@@ -284,6 +285,7 @@ def capacitance_map(
     strain_file: Path | None,
     actuator: Path | None,
     *,
+    experiment: str | None,
     columns: ColumnOptions,
     as_json: bool,
     out: Path | None,
@@ -296,7 +298,7 @@ def capacitance_map(
     """
     known = None if actuator is None else load_actuator(actuator, to_write=True)
     files = [file] if strain_file is None else [file, strain_file]
-    pairs = read_pairs(files, capacitance_column, strain_column, columns, known)
+    pairs = read_pairs(files, capacitance_column, strain_column, columns, known, experiment)
     fit = fit_capacitance_map(pairs.capacitance, pairs.strain)
     more: dict[str, object] = {}
     if actuator is not None and fit.succeeded:

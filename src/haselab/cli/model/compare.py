@@ -24,6 +24,7 @@ from haselab.cli.identify.common import (
     unit_of_name,
     unit_text,
 )
+from haselab.cli.identify.recorded_motion import TableOptions
 from haselab.cli.model.charts import prediction_chart
 from haselab.cli.model.model_file import read_any_plant, read_origin, read_posterior
 from haselab.cli.model.physical_comparison import (
@@ -37,7 +38,7 @@ from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import predict
 from haselab.identify.record import Record
-from haselab.identify.training_output import TrainingOutput
+from haselab.identify.training_output import TrainingOutput, is_comparable
 from haselab.models.actuator.model_tables import OriginTable
 from haselab.store.columns.selection import ColumnOptions
 
@@ -119,11 +120,12 @@ def command(
     worse than the mean of the record.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
-    options = PhysicalOptions(
-        experiments, free_offset, longest_m, unverified,
-        _given(context, "source", source), _given(context, "output", output), rate_hz,
+    measured = _given(context, "output", output)
+    table = TableOptions(
+        _given(context, "source", source), () if measured is None else (measured,), rate_hz,
         mass_kg, gain_v_per_v, zero_length_m, columns,
     )  # fmt: skip
+    options = PhysicalOptions(experiments, free_offset, longest_m, unverified, table)
     if which == "physical" and linear:
         raise InputError(
             "--at-rest, --through-voltage-map and --held-at-hz are for linear models. Leave them "
@@ -152,14 +154,7 @@ def command(
             rng=np.random.default_rng(seed),
         )
     if math.isnan(prediction.used_for_fit):
-        why = (
-            "the model does not state the samples that it was fitted to. Whether this record is "
-            "new was not checked"
-            if origin.training_output is None
-            else "part of this record has the same values as the record of the fit. The steps of "
-            "the converter are larger than the noise, so it can be a copy or a repetition. "
-            "Use a record with another input"
-        )
+        why = _why_unknown(_training_output(origin), records)
         click.echo(f"haselab: warning: {why}. {model}", err=True)
     emit(_answer(prediction, posterior is not None), as_json=as_json, out=out)
     names = ", ".join(file.name for file in files)
@@ -167,6 +162,25 @@ def command(
     save_plot(plot, lambda: prediction_chart(prediction, _times(records), title))
     if prediction.status != "ok":
         raise ResultError(f"{prediction.status}. {' '.join(map(str, files))}")
+
+
+def _why_unknown(known: TrainingOutput | None, records: Sequence[Record]) -> str:
+    """Why it is not known whether some records were used for the fit."""
+    if known is None:
+        return (
+            "the model does not state the samples that it was fitted to. Whether this record is "
+            "new was not checked"
+        )
+    if not is_comparable([record.y for record in records], known):
+        return (
+            "this record is too short, or its output changes too little, to be compared with the "
+            "record of the fit. Whether it is new was not checked"
+        )
+    return (
+        "part of this record has the same values as the record of the fit. The steps of the "
+        "converter are larger than the noise, so it can be a copy or a repetition. Use a record "
+        "with another input"
+    )
 
 
 def _given(context: click.Context, parameter: str, value: str) -> str | None:

@@ -36,12 +36,11 @@ from haselab.control import (
     Design,
     DesignSpec,
     LoopSetting,
-    design_pi,
-    design_pid,
-    design_plausible,
+    design_controller,
     margins,
 )
 from haselab.control.plants.general import AnyPlant
+from haselab.control.plausible_design import USUAL_STRUCTURE
 from haselab.control.stability.plausible import PlausibleMargins, binomial_proportion
 from haselab.models.posterior import PlantPosterior
 from haselab.store.actuator_file import read_actuator
@@ -61,7 +60,7 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
     help="Read the demands from this file. Default: those of the actuator file, or built-in ones.",
 )  # fmt: skip
 @shared_option(
-    "--controller", "--structure", "structure", default="pid", show_default=True,
+    "--controller", "--structure", "structure", default=USUAL_STRUCTURE, show_default=True,
     detail="pi: as in the paper; pid: with the derivative of the filtered measurement. For any "
     "other registered kind, only the margins are computed, with the parameters of the file.",
 )  # fmt: skip
@@ -242,15 +241,11 @@ def _designed(
     setting: LoopSetting,
     loop: dict[str, Any],
 ) -> Design:
-    rng = np.random.default_rng(loop["seed"])
-    if posterior is None:
-        search = design_pi if loop["structure"] == "pi" else design_pid
-        return search(plant, demands, setting, rng=rng)
-    return design_plausible(
-        posterior,
+    return design_controller(
+        posterior or plant,
         demands,
         setting,
-        rng=rng,
+        rng=np.random.default_rng(loop["seed"]),
         structure=loop["structure"],
         probability=loop["probability"],
         draws=loop["draws"],

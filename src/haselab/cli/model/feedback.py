@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, fields
 from pathlib import Path
 
-from haselab.base import HaselabError, InputError
+from haselab.base import HaselabError, InputError, described
 from haselab.base.exits import no_exit
 from haselab.cli.actuator_file import load_actuator
 from haselab.control import LinearController, PidGains
@@ -88,6 +88,6 @@ def _named_failures(kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise InputError(
-            f"Controller {kind!r} failed: {type(error).__name__}: {error}. Fix the controller, or "
+            f"Controller {kind!r} failed: {described(error)}. Fix the controller, or "
             "change its parameters."
         ) from error

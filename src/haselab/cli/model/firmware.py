@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import click
-from matplotlib.figure import Figure
 
 from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
 from haselab.cli.common import REAL, SEED, answer_options, emit
@@ -20,11 +19,6 @@ from haselab.control import PidGains, Saturation
 from haselab.control.reach import default_step
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
-from haselab.report import write_report
-from haselab.report.analysis import Section
-from haselab.report.chart_file import write_figure
-from haselab.report.figures.chip import draw_loops
-from haselab.report.style import figure_style
 from haselab.rig.chip import (
     ChipDesign,
     ChipFile,
@@ -246,9 +240,10 @@ def simulate(
     }
     section = to_plain(section_of(runs, rows))
     if plot is not None:
-        with figure_style():
-            write_figure(_draw(section), "Step by the chip and by the computer", plot)
+        _draw(section, plot)
     if (run / "results.json").is_file():
+        from haselab.report import write_report  # matplotlib takes half a second to import
+
         write_json(run / "firmware" / "simulation.json", section)
         write_report(run)
     emit(answer, as_json=as_json, out=out)
@@ -309,11 +304,19 @@ def _compared(found: Agreement | None) -> dict[str, Any]:
     }
 
 
-def _draw(section: Mapping[str, Any]) -> Figure:
+def _draw(section: Mapping[str, Any], path: Path) -> None:
     """Draw the responses of `section_of` in one figure."""
-    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
-    draw_loops(figure, Section("chip", section))
-    return figure
+    from matplotlib.figure import Figure  # it takes half a second to import
+
+    from haselab.report.analysis import Section
+    from haselab.report.chart_file import write_figure
+    from haselab.report.figures.chip import draw_loops
+    from haselab.report.style import figure_style
+
+    with figure_style():
+        figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+        draw_loops(figure, Section("chip", section))
+        write_figure(figure, "Step by the chip and by the computer", path)
 
 
 def _check_image(path: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
 import click
 
+from haselab.actuators import ACTUATORS
 from haselab.base import InputError
 from haselab.cli.actuator_file import unknown_kind
 from haselab.cli.common import POSITIVE, REAL, answer_options, emit
@@ -16,6 +18,10 @@ from haselab.store.folder import write_text
 __all__ = ["command"]
 
 _KIND = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_MEASURED = (
+    "# For haselab identify actuator: starting values, and what you measured otherwise. Type those",
+    "# that it does not fit, if they differ from these defaults.",
+)
 _PAGE = """\
 # One physical actuator and everything known about it. SI units.
 # Commands with --actuator write their results into their own section; you may type values, too.
@@ -30,7 +36,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
 {zero}  # m, between the fiducials at zero strain
 # width_m = 0.05
 # gap_m = 1e-3  # m, thickness of the dielectric
-
+{parameters}
 [sensing]
 # haselab calibrate writes the calibration of the monitors, haselab identify capacitance-map the
 # map from capacitance to strain. To type a map:
@@ -103,6 +109,7 @@ def command(
         kind=kind,
         mass=_line("mass_kg", mass_kg, 0.25),
         zero=_line("zero_length_m", zero_length_m, 0.05),
+        parameters=_parameters(kind),
         low=_line("low_v", low_v, 0.0),
         high=_line("high_v", high_v, 2.0),
         gain=_line("gain_v_per_v", gain_v_per_v, 5000.0),
@@ -111,6 +118,21 @@ def command(
         click.echo(f"haselab: warning: {doubt}", err=True)
     write_text(out, page)
     emit({"actuator": str(out), "kind": kind}, as_json=as_json, out=None)
+
+
+def _parameters(kind: str) -> str:
+    """Lines of the parameters of a known kind, as comments."""
+    if kind not in ACTUATORS.packages():
+        return ""
+    law = ACTUATORS.find(kind)
+    lines = ["", "[actuator.parameters]", *_MEASURED]
+    for about in law.described():
+        default = getattr(law, about.name)
+        value = list(default) if isinstance(default, tuple) else default
+        unit = f"{about.unit}, " if about.unit else ""
+        measured = "" if about.fitted else "; not fitted"
+        lines.append(f"# {about.key} = {json.dumps(value)}  # {unit}{about.description}{measured}")
+    return "\n".join(lines) + "\n"
 
 
 def _line(key: str, value: float | None, example: float) -> str:

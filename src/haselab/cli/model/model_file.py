@@ -12,6 +12,7 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import warn_misspelled
 from haselab.cli.common import REAL
 from haselab.cli.options import shared_option
+from haselab.control import LoopSetting
 from haselab.models.actuator.model_tables import (
     CovarianceTable,
     LoopTable,
@@ -44,7 +45,7 @@ __all__ = [
 MAT_NAME = "model"
 
 _Checked = TypeVar("_Checked", bound=PolesTable)
-_RATE_HZ, _DELAY_S = 100.0, 0.01  # defaults for the loop
+_USUAL = LoopSetting()
 _SAME = 1e-3  # relative difference of responses: a file rounded by hand has fewer digits
 
 
@@ -204,11 +205,13 @@ def loop_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add `--delay-s` and `--rate-hz`, which describe the control loop."""
     for option in (
         shared_option(
-            "--delay-s", type=REAL, show_default="the model file's, else 0.01",
+            "--delay-s", type=REAL,
+            show_default=f"the model file's, else {_USUAL.measurement_delay_s:g}",
             detail="Half the sampling period is added for the hold.",
         ),
         shared_option(
-            "--rate-hz", type=REAL, show_default="the model file's, else 100",
+            "--rate-hz", type=REAL,
+            show_default=f"the model file's, else {_USUAL.rate_hz:g}",
             detail="It is the rate of the control loop.",
         ),
     ):  # fmt: skip
@@ -235,8 +238,8 @@ def loop_of(
         InputError: a value in the file is not a number above 0.
     """
     stated = {
-        "rate_hz": _RATE_HZ if usual[0] is None else usual[0],
-        "loop_delay_s": _DELAY_S if usual[1] is None else usual[1],
+        "rate_hz": _USUAL.rate_hz if usual[0] is None else usual[0],
+        "loop_delay_s": _USUAL.measurement_delay_s if usual[1] is None else usual[1],
     }
     if path.suffix.lower() != ".mat":
         stated |= read_loop(path)

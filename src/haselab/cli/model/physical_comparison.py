@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, JsonObject, ResultError
-from haselab.cli.columns import Quantity, check_strain
-from haselab.cli.common import emit, warn_unverified
-from haselab.cli.identify.common import rate_hz_of, read_valid, unit_text
+from haselab.cli.common import emit
+from haselab.cli.identify.common import unit_text
+from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.model.physical_model import read_physical_model, sources_of_physical_model
 from haselab.cli.plot import save_plot
 from haselab.identify.physical import (
@@ -23,23 +23,14 @@ from haselab.identify.physical import (
     PredictedPart,
     predict_motion,
 )
-from haselab.models.actuator import ActuatorTables
-from haselab.pipelines.motion import motion_of_session
-from haselab.pipelines.motion_table import motion_of_table
 from haselab.store.actuator_file import hashed
-from haselab.store.columns.selection import ColumnOptions
 from haselab.store.session.opening import is_session
-from haselab.store.session.reader import SessionReader, session_file
+from haselab.store.session.reader import session_file
 
 __all__ = ["PhysicalOptions", "compare_physical", "refuse_for_linear"]
 
 Floats = NDArray[np.float64]
 _UNITS = {"length": "m", "capacitance": "F"}
-_VOLTAGE = Quantity("--input", ("u", "voltage_v", "voltage"), "V", "the voltage")
-_MEASURED = Quantity(
-    "--output", ("y", "length_m", "strain", "capacitance_f"), None, "what was measured"
-)
-_ENDINGS = {"strain": "1", "_m": "m", "_f": "F"}
 
 
 @dataclass(frozen=True)
@@ -51,26 +42,14 @@ class PhysicalOptions:
         free_offset: estimate a constant offset of the lengths.
         longest_m: length to which the actuator had been stretched before.
         unverified: read sessions whose checksums do not match.
-        source: column of the voltage in tables; None: by its name.
-        output: column of what was measured in tables; None: by its name.
-        rate_hz: of tables; None: that of the file.
-        mass_kg: hung mass of tables; None: that of the actuator file.
-        gain_v_per_v: of the amplifier, for tables; None: that of the actuator file.
-        zero_length_m: length at zero strain of tables; None: that of the actuator file.
-        columns: what the user states about the columns.
+        table: about tables.
     """
 
     experiments: tuple[str, ...]
     free_offset: bool
     longest_m: float | None
     unverified: bool
-    source: str | None
-    output: str | None
-    rate_hz: float | None
-    mass_kg: float | None
-    gain_v_per_v: float | None
-    zero_length_m: float | None
-    columns: ColumnOptions
+    table: TableOptions
 
 
 def compare_physical(
@@ -97,10 +76,18 @@ def compare_physical(
     """
     model, tables = read_physical_model(path)
     sources = sources_of_physical_model(path)
-    found, used = [], []
+    found, used, noise = [], [], _noise(model)
     for file in files:
         session = file.is_dir() or is_session(file)
-        record = _session(file, options) if session else _table(file, options, model, tables)
+        if options.experiments and not session:
+            raise InputError(
+                f"--experiment is for sessions, but this file is a table. Leave it out. {file}"
+            )
+        record, _ = motion_of_file(
+            file, options.table, tables, unverified=options.unverified, std=noise
+        )
+        if not session:
+            _check_noise(record, noise, file)
         prediction = predict_motion(
             model, record, experiments=options.experiments if session else (),
             free_offset=options.free_offset, longest_m=options.longest_m or 0.0,
@@ -138,94 +125,22 @@ def _joined(found: Sequence[MotionPrediction], names: Sequence[str]) -> MotionPr
     return MotionPrediction(tuple(parts), undetermined=tuple(undetermined))
 
 
-def _session(file: Path, options: PhysicalOptions) -> MotionRecord:
-    given = {
-        "--mass-kg": options.mass_kg,
-        "--gain-v-per-v": options.gain_v_per_v,
-        "--zero-length-m": options.zero_length_m,
-        "--input": options.source,
-        "--output": options.output,
-        "--rate-hz": options.rate_hz,
-    }
-    wrong = [name for name, value in given.items() if value is not None]
-    if wrong:
-        raise InputError(
-            f"{', '.join(wrong)} is for tables, but a session states this itself. Leave it out. "
-            f"{file}"
-        )
-    with SessionReader(file, unverified=options.unverified) as reader:
-        warn_unverified(reader.doubt, file)
-        return motion_of_session(reader, session_file(file))
-
-
-def _table(
-    file: Path, options: PhysicalOptions, model: IdentifiedModel, known: ActuatorTables
-) -> MotionRecord:
-    if options.experiments:
-        raise InputError(
-            f"--experiment is for sessions, but this file is a table. Leave it out. {file}"
-        )
-    source = _VOLTAGE.column(file, options.source)
-    output = _MEASURED.column(file, options.output)
-    table = read_valid(file, (source, output), options.columns)
-    stated = table.units[source]
-    if stated is not None and stated.si != "V":
-        raise InputError(
-            f"Column {source} is {unit_text(stated.si)}, but the physical model needs a voltage. "
-            f"Name its column with --input. {file}"
-        )
-    time_s = table.time_s
-    if time_s is None or options.rate_hz is not None:
-        time_s = np.arange(table[source].size) / rate_hz_of(table, options.rate_hz, file)
-    mass_kg = options.mass_kg if options.mass_kg is not None else known.actuator.mass_kg
-    if mass_kg is None:
-        raise InputError(
-            "The hung mass of this table is not known. State it with --mass-kg, or add mass_kg to "
-            f"[actuator]. {file}"
-        )
-    gain = options.gain_v_per_v or known.drive.gain_v_per_v
-    if gain is None:
-        raise InputError(
-            f"The gain from column {source} to the actuator's voltage is not known. State it with "
-            "--gain-v-per-v (1 if the column is the voltage of the actuator), or add gain_v_per_v "
-            f"to [drive]. {file}"
-        )
-    volt = gain * table[source]
-    values = table[output]
-    unit = table.units[output]
-    si = unit.si if unit is not None else _unit_of_name(output)
-    if si == "1":
-        check_strain(output, values, unit, file, known)
-        zero_m = options.zero_length_m or known.actuator.geometry.zero_length_m
-        if zero_m is None:
-            raise InputError(
-                f"Column {output} is a strain, but the length at zero strain is not known. State "
-                f"it with --zero-length-m, or add zero_length_m to [actuator.geometry]. {file}"
-            )
-        values, si = zero_m * (1.0 + values), "m"
-    if si not in ("m", "F"):
-        raise InputError(
-            f"Column {output} is {unit_text(si) if si else 'without a unit'}, but the physical "
-            "model predicts lengths, strains and capacitances. Name one with --output, or state "
-            f"the unit with --unit. {file}"
-        )
-    noise = model.length if si == "m" else model.capacitance
-    if not math.isfinite(noise.noise):
-        raise InputError(
-            f"[model.physical.residuals] does not state the noise of values {unit_text(si)}. "
-            f"Identify the actuator again. {file}"
-        )
+def _noise(model: IdentifiedModel) -> dict[str, float]:
+    """Standard deviation of the values of a table, by their unit, as far as it is known."""
+    known = {"m": model.length, "F": model.capacitance}
     # the factor multiplies it again
-    std = noise.noise / noise.factor
-    return motion_of_table(
-        file.name, time_s, volt, mass_kg=mass_kg,
-        length_m=values if si == "m" else None,
-        capacitance_f=values if si == "F" else None, std=std,
-    )  # fmt: skip
+    return {
+        unit: part.noise / part.factor for unit, part in known.items() if math.isfinite(part.noise)
+    }
 
 
-def _unit_of_name(name: str) -> str:
-    return next((si for ending, si in _ENDINGS.items() if name.endswith(ending)), "")
+def _check_noise(record: MotionRecord, known: Mapping[str, float], file: Path) -> None:
+    for unit, values in (("m", record.length_m), ("F", record.capacitance_f)):
+        if values.size and unit not in known:
+            raise InputError(
+                f"[model.physical.residuals] does not state the noise of values {unit_text(unit)}. "
+                f"Identify the actuator again. {file}"
+            )
 
 
 def _answer(joined: MotionPrediction, found: Sequence[MotionPrediction], status: str) -> JsonObject:
@@ -276,9 +191,9 @@ def refuse_for_linear(options: PhysicalOptions) -> None:
         "--free-offset": options.free_offset,
         "--longest-m": options.longest_m,
         "--unverified": options.unverified,
-        "--mass-kg": options.mass_kg,
-        "--gain-v-per-v": options.gain_v_per_v,
-        "--zero-length-m": options.zero_length_m,
+        "--mass-kg": options.table.mass_kg,
+        "--gain-v-per-v": options.table.gain_v_per_v,
+        "--zero-length-m": options.table.zero_length_m,
     }
     wrong = [name for name, value in given.items() if value]
     if wrong:

@@ -28,7 +28,7 @@ CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
     "uncertainty", "alternatives",
 )  # fmt: skip
-_DEFAULT = (-0.05, 0.1)  # strain, the study's saturation
+_DEFAULT = (Saturation().low, Saturation().high)  # strain, the study's
 _NO_UNCERTAINTY = "no uncertainty: [model] has no covariance"
 
 

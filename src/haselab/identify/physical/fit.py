@@ -31,8 +31,9 @@ from haselab.identify.physical.information import (
     largest_std,
     vague_information,
 )
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment, least_explained
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
+from haselab.identify.physical.plausible import implausible
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.rivals import Rival, other_elastic, richer, simpler
 from haselab.identify.physical.search import Found, refine, search
@@ -52,8 +53,10 @@ _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
+_APART = 2.0  # rms over noise from which records are compared alone
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
-_GOOD_SCALE = 0.01  # and a careful one
+_GOOD_SCALE = 0.005  # and a careful one
+_LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
 _WHITE = 1e-3  # probability of the residuals under white noise
 _ENOUGH = 20  # values of an experiment, for an rms of its own
 _POINTS = 5  # voltages of the linear models
@@ -215,7 +218,7 @@ def fit_actuator(
         camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
             is usual.
         camera_scale_std: relative standard deviation of the camera's scale, with the slow
-            errors of tracking over the picture, such as that of uneven light.
+            errors of tracking over the picture.
     Returns:
         The model, with the covariance of its parameters.
     Raises:
@@ -223,6 +226,8 @@ def fit_actuator(
     """
     if not records:
         raise InputError("There is no record of the actuator's motion. Give at least one.")
+    if fault := implausible(law, records):
+        return ActuatorFit(status=fault, kind=law.kind)
     if added_inertia_kg is None:
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
@@ -254,11 +259,22 @@ def fit_actuator(
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
+    if len(records) > 1 and _seen(misfit, found).excess[0] > _APART and _each_alone(misfit, start):
+        status = "the records contradict each other: the law explains each alone, but not all"
+        status += " together. Check that all are of one actuator, and mass, units and gain of each"
+        return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
     others = other_elastic(misfit, found) if _seen(misfit, found).explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
     return _result(misfit, _ordered(found), rejected, preferred)
+
+
+def _each_alone(misfit: Misfit, start: Unknowns) -> bool:
+    """Whether the law explains each record alone, with parameters of its own."""
+    parts = [replace(misfit, records=[record]) for record in misfit.records]
+    alone = [(own, search(own, start)) for own in parts]
+    return all(part is not None and _seen(own, part).explained for own, part in alone)
 
 
 def _ordered(found: Found) -> Found:
@@ -478,6 +494,7 @@ class _Seen:
 
     lengths: list[Floats]
     capacitances: list[Floats]
+    share: float  # of the variance of the channel that is explained least
 
     @property
     def whiteness_p(self) -> float:
@@ -505,6 +522,7 @@ def _seen(misfit: Misfit, found: Found) -> _Seen:
     return _Seen(
         _channel(misfit.segments, LENGTH, found.residuals),
         _channel(misfit.segments, CAPACITANCE, found.residuals),
+        least_explained(misfit, found.residuals),
     )
 
 
@@ -529,6 +547,12 @@ def _status(
             f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
             "noise. Check the mass, the units and that all records are of one actuator, or start "
             "nearer, by [actuator.parameters]"
+        ), False
+    if not seen.explained and seen.share < _LEAST_SHARE:
+        return (
+            f"the records contradict the model: it explains only {100.0 * max(seen.share, 0.0):.0f}"
+            " % of the variance of a signal. Check the mass, the amplifier's gain, the units and "
+            "that all records are of one actuator, or start nearer, by [actuator.parameters]"
         ), False
     if not converged:
         return "the search did not converge; start nearer, by [actuator.parameters]", False

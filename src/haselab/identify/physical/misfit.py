@@ -34,12 +34,13 @@ __all__ = [
     "Modelled",
     "Segment",
     "SharedErrors",
+    "least_explained",
     "modelled",
 ]
 
 Floats = NDArray[np.float64]
 LENGTH, CAPACITANCE = "length", "capacitance"
-SHARED_PX = 1.5e-3  # error of tracking that all frames with the same pixels share
+SHARED_PX = 3e-4  # error of tracking that all frames with the same pixels share
 _LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
@@ -344,3 +345,28 @@ class Misfit:
             parts.append((record.capacitance_f - part.capacitance_f) / std_f)
         known = [(usual(name) - unknowns.value(name)) / std for name, std in self.known.items()]
         return np.concatenate([*parts, known])
+
+
+def least_explained(misfit: Misfit, residuals: Floats) -> float:
+    """Share of the variance of a channel that a model explains, of the less explained one.
+
+    Args:
+        misfit: with the records.
+        residuals: of it. Shape `(N,)`.
+    Returns:
+        1 for a perfect model, 0 or less for one that is no better than a constant.
+    """
+    records, shares = misfit.records, []
+    for channel, factor, values, stds in (
+        (LENGTH, misfit.length_factor, [r.length_m for r in records],
+         [r.length_std_m for r in records]),
+        (CAPACITANCE, misfit.capacitance_factor, [r.capacitance_f for r in records],
+         [r.capacitance_std_f for r in records]),
+    ):  # fmt: skip
+        rows = [residuals[part.rows] for part in misfit.segments if part.channel == channel]
+        variance = float(np.var(np.concatenate(values))) if rows else 0.0
+        if variance > 0.0:
+            left = float(np.mean(np.concatenate(rows) ** 2))
+            typical = factor * float(np.median(np.concatenate(stds)))
+            shares.append(1.0 - left * typical**2 / variance)
+    return min(shares, default=1.0)

@@ -22,7 +22,7 @@ from haselab.identify.statics.columns import paired, plausible_stretch
 __all__ = ["Region", "RegionsFit", "find_regions"]
 
 Floats = NDArray[np.float64]
-_MOST_PIECES = 6
+_MOST_SEGMENTS = 6
 _LEAST_SAMPLES = 3
 _FINAL_STEPS = 100  # first steps of the last search, in the range of stretch
 _PROFILE_STEPS = 8
@@ -88,9 +88,9 @@ class RegionsFit(CurveFit):
     def simulate(self, x: ArrayLike) -> Floats:
         """Load at stretches, in N; the first and the last piece go on. See `CurveFit`."""
         self._require()
-        pieces = sorted(self.regions, key=lambda region: region.low.value)
-        slopes_n = [region.slope_n.value for region in pieces]
-        breaks = np.array([region.low.value for region in pieces[1:]])
+        segments = sorted(self.regions, key=lambda region: region.low.value)
+        slopes_n = [region.slope_n.value for region in segments]
+        breaks = np.array([region.low.value for region in segments[1:]])
         stretch = np.atleast_1d(np.asarray(x, dtype=np.float64))
         bends = np.maximum(stretch[:, None] - breaks, 0.0) @ np.diff(slopes_n)
         start_n = float(self.load_n[0] - self.residuals[0][0])
@@ -111,14 +111,14 @@ class RegionsFit(CurveFit):
             "regions": [region.to_dict() for region in self.regions],
             "chosen": self.chosen if self.regions else None,
             "r_squared": self.r_squared,
-            "bic": {str(pieces): value for pieces, value in self.bic.items()},
+            "bic": {str(segments): value for segments, value in self.bic.items()},
             "status": self.status,
             "notes": list(self.notes),
         }
 
 
 @checked
-def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = None) -> RegionsFit:
+def find_regions(stretch: ArrayLike, load_n: ArrayLike, segments: int | None = None) -> RegionsFit:
     r"""Fit a continuous broken line; its straight segments are the linear regions.
 
     $\min \sum_i \bigl(F_i - c - \sum_k s_k\,(\lambda_i - \lambda_k)_+\bigr)^2$ over the break
@@ -128,11 +128,11 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = Non
     Args:
         stretch: stretches, in any order. Shape `(N,)`.
         load_n: loads, in N. Shape `(N,)`.
-        pieces: number of straight segments. None: the number of up to six that BIC prefers.
+        segments: number of straight segments. None: the number of up to six that BIC prefers.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
-        InputError: too few samples for the pieces, unequal lengths, NaN, no change.
+        InputError: too few samples for the segments, unequal lengths, NaN, no change.
     Source: reference study, row S17; Hudson, J. Am. Stat. Assoc. 61 (1966), 1097; intervals from
         the covariance for the noise model of the residuals.
     Example:
@@ -144,13 +144,13 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = Non
         >>> len(fit.regions), longest.low.ci95[0] < 1.6 < longest.low.ci95[1]
         (2, True)
     """
-    x, y = _checked(stretch, load_n, pieces)
-    most = min(_MOST_PIECES, x.size // _LEAST_SAMPLES) if pieces is None else pieces
+    x, y = _checked(stretch, load_n, segments)
+    most = min(_MOST_SEGMENTS, x.size // _LEAST_SAMPLES) if segments is None else segments
     starts = best_breaks(BreakGrid.of(x, y), most, _LEAST_SAMPLES)
     tried = {
         count: _best(x, y, found)
         for count, found in starts.items()
-        if pieces is None or count == pieces
+        if segments is None or count == segments
     }
     if not tried:
         reason = "no result: too few distinct stretches for these segments; fit fewer segments"
@@ -163,15 +163,15 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None = Non
     return _describe(x, y, _settled(x, y, tried[chosen]), bic)
 
 
-def _checked(stretch: ArrayLike, load_n: ArrayLike, pieces: int | None) -> tuple[Floats, Floats]:
+def _checked(stretch: ArrayLike, load_n: ArrayLike, segments: int | None) -> tuple[Floats, Floats]:
     x, y = paired(
         "stretch", stretch, "load_n", load_n, least=2 * _LEAST_SAMPLES, record="record more loads"
     )
     plausible_stretch(x, "load_n", y)
     most = x.size // _LEAST_SAMPLES
-    if pieces is not None and not 1 <= pieces <= most:
+    if segments is not None and not 1 <= segments <= most:
         raise InputError(
-            f"pieces = {pieces}; must be 1 to {most}, a third of the {x.size} samples. "
+            f"segments = {segments}; must be 1 to {most}, a third of the {x.size} samples. "
             "Fit fewer segments, or record more loads."
         )
     order = np.argsort(x, kind="stable")
@@ -235,11 +235,11 @@ def _filled(x: Floats, breaks: Floats) -> bool:
     return bool((counts >= _LEAST_SAMPLES).all())
 
 
-def _bic(solution: Solution, pieces: int, y: Floats, share: float) -> float:
+def _bic(solution: Solution, segments: int, y: Floats, share: float) -> float:
     """Schwarz's criterion with the effective number of samples of coloured residuals."""
     floor = y.size * (_ROUNDING * float(np.ptp(y))) ** 2
     samples = share * y.size
-    return samples * math.log((solution.cost + floor) / y.size) + 2 * pieces * math.log(samples)
+    return samples * math.log((solution.cost + floor) / y.size) + 2 * segments * math.log(samples)
 
 
 @dataclass(frozen=True)

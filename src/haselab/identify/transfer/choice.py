@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -137,23 +137,68 @@ def choose_transfer(
     if unknown:
         raise InputError(f"varied names {', '.join(unknown)}; must be one of {', '.join(allowed)}.")
     records = several(records)
-    fits = [fit_transfer(records, start)]
-    tried = {_key(fits[0].structure)}
-    ranked = _ranked(fits)
+    first = start or TransferStructure()
+    search = _Search(records, first)
+    at = first
     for _ in range(_MOST_ROUNDS):
-        best = ranked[0].fit
-        for structure in _neighbours(best.structure, varied):
-            if _key(structure) not in tried:
-                tried.add(_key(structure))
-                fits.append(_fit_or_not(records, structure))
-        ranked = _ranked(fits)
-        if ranked[0].fit is best:
+        search.try_all(_neighbours(at, varied))
+        ranked = search.ranked()
+        if _key(ranked[0].fit.structure) == _key(at):
             break
+        at = ranked[0].fit.structure
     notes = _hidden_creep(ranked) if "slow_modes" in varied else ()
     if _NONLINEAR in varied:
-        ranked, said = _with_nonlinear(records, ranked, start or TransferStructure())
+        ranked, said = _with_nonlinear(records, ranked, first)
         notes += said
     return TransferChoice(tuple(ranked), notes)
+
+
+class _Search:
+    """Fits of structures to the same records.
+
+    Whether a fault of the records, such as a drifting clock, explains the residuals takes most of
+    the time of a fit. It is asked only while no structure leaves white residuals, and of the best
+    fit.
+
+    Args:
+        records: experiments.
+        first: the first structure, which has to be possible.
+    """
+
+    def __init__(self, records: Sequence[Record], first: TransferStructure) -> None:
+        self._records = records
+        fit = fit_transfer(records, first, applied=True)
+        self._plain = {_key(fit.structure): fit}
+        self._diagnosed: dict[tuple[object, ...], TransferFit] = {}
+
+    def try_all(self, structures: Iterable[TransferStructure]) -> None:
+        """Fit those that have not been tried."""
+        for structure in structures:
+            if _key(structure) not in self._plain:
+                fit = _fit_or_not(self._records, structure, applied=True)
+                self._plain[_key(structure)] = fit
+
+    def ranked(self) -> list[Candidate]:
+        """All candidates, the best one with its diagnosis."""
+        if not any(map(_explains, self._plain.values())):
+            for key in self._plain:
+                self._diagnose(key)
+        while True:
+            found = _ranked([self._diagnosed.get(key, fit) for key, fit in self._plain.items()])
+            key = _key(found[0].fit.structure)
+            if key in self._diagnosed or _explains(found[0].fit):
+                return found
+            self._diagnose(key)
+
+    def _diagnose(self, key: tuple[object, ...]) -> None:
+        if key not in self._diagnosed:
+            structure = self._plain[key].structure
+            self._diagnosed[key] = _fit_or_not(self._records, structure, applied=False)
+
+
+def _explains(fit: TransferFit) -> bool:
+    """Whether nothing is left in the residuals that a fault of the records could explain."""
+    return fit.succeeded and fit.residual_whiteness_p >= _WHITE
 
 
 def _with_nonlinear(
@@ -197,10 +242,12 @@ def _words(structure: TransferStructure) -> str:
     return ", ".join([*parts, f"{structure.slow_modes} slow branches"])
 
 
-def _fit_or_not(records: Sequence[Record], structure: TransferStructure) -> TransferFit:
+def _fit_or_not(
+    records: Sequence[Record], structure: TransferStructure, *, applied: bool
+) -> TransferFit:
     """The fit; with too few samples for the structure, a fit without a result."""
     try:
-        return fit_transfer(records, structure)
+        return fit_transfer(records, structure, applied=applied)
     except InputError as error:
         return TransferFit(status=f"no result: {error}", structure=structure)
 

@@ -183,7 +183,7 @@ class TransferFit(RecordFit[Record]):
 
     @property
     def posterior(self) -> PlantPosterior:
-        """The parameters with their covariance, from which `design_plausible` draws plants.
+        """The parameters with their covariance, from which `design_controller` draws plants.
 
         Raises:
             InputError: a parameter is not identifiable.

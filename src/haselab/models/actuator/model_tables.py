@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
+
+from haselab.base.numbers_only import numbers_only
 
 __all__ = [
     "CovarianceTable",
@@ -50,6 +52,8 @@ def _delay(item: Any) -> Any:
 
 class _Table(BaseModel):
     model_config = ConfigDict(frozen=True)
+
+    _numbers = field_validator("*", mode="before")(classmethod(numbers_only))
 
 
 class _SlowModeTable(_Table):

@@ -9,10 +9,19 @@ from __future__ import annotations
 import operator
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from haselab.base import InputError
+from haselab.base.numbers_only import numbers_only, switches_only
 from haselab.models.actuator.model_tables import CovarianceTable, Number
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
@@ -40,7 +49,7 @@ __all__ = [
 _Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
 _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
 _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
-_Margin = Annotated[float, Field(strict=True)] | bool  # infinite without a crossover
+_Margin = Annotated[float, Field(strict=True)]  # infinite without a crossover
 # products of two numbers: 1/F^2 squared is large
 _Variance = Annotated[float, Field(strict=True, ge=-1e120, le=1e120, allow_inf_nan=False)]
 
@@ -79,6 +88,8 @@ _Covariance = Annotated[tuple[tuple[_Variance, ...], ...], AfterValidator(_four_
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True)
+
+    _numbers = field_validator("*", mode="before")(classmethod(numbers_only))
 
     _ends: ClassVar[tuple[str, ...]] = ()  # keys of a lower and an upper limit
 
@@ -136,6 +147,7 @@ class StrainMapTable(_Section):
     cubic_per_f3: Number = 0.0
     covariance: _Covariance | None = None
     range_f: _Range | None = None
+    limits_f: _Range | None = None
     band: _Range | None = None
     coverage: _Share = 0.95
     held_out_coverage: Annotated[Number, Field(ge=0, le=1)] | None = None
@@ -333,8 +345,10 @@ class ControllerSection(_Section):
     parameters: dict[str, Number] = {}
     limits: Limits | None = None
     loop: LoopTable | None = None
-    margins: dict[str, _Margin] = {}
-    demands: dict[str, Number | bool] = {}
+    margins: Annotated[dict[str, _Margin | bool], AfterValidator(switches_only("stable"))] = {}
+    demands: Annotated[
+        dict[str, Number | bool], AfterValidator(switches_only("keep_crossover"))
+    ] = {}
     alternatives: tuple[ControllerSection, ...] = ()
 
     @property

@@ -32,13 +32,16 @@ class StrainMap:
         covariance: of slope, offset, curvature and cubic factor; rows and columns of 0 for a known
             coefficient. Shape `(4, 4)`.
         range_f: lowest and highest capacitance of the record that was fitted, in F.
+        limits_f: capacitances outside which the map must not be used, in F, because the record
+            showed that the strain does not follow it there; None: see `usable_f`.
         band: lowest and highest deviation of the strain from the map.
         coverage: share of the deviations that the band should contain.
         held_out_coverage: share inside the band, for cycles left out of fit and band.
         hysteresis_strain: largest distance between the rising and the falling branch, in strain.
         residual_std: root mean square of the deviations, in strain.
     Raises:
-        InputError: coefficients that are not finite, a range or a band that is empty.
+        InputError: coefficients that are not finite, a range or a band that is empty, a map that
+            turns within its range.
     Example:
         >>> line = StrainMap(4.923e8, -0.276, range_f=(5e-10, 8e-10), band=(-0.002, 0.002))
         >>> [round(float(end), 4) for end in line.interval(7.6e-10)]
@@ -51,6 +54,7 @@ class StrainMap:
     cubic_per_f3: float = 0.0
     covariance: tuple[tuple[float, ...], ...] | None = None
     range_f: tuple[float, float] | None = None
+    limits_f: tuple[float, float] | None = None
     band: tuple[float, float] | None = None
     coverage: float = 0.95
     held_out_coverage: float = math.nan
@@ -63,12 +67,24 @@ class StrainMap:
                 f"The strain map has the coefficients {self.coefficients}, but they must be "
                 "finite. Fit the map again."
             )
-        for name, ends in (("range_f", self.range_f), ("band", self.band)):
+        for name, ends in (
+            ("range_f", self.range_f), ("limits_f", self.limits_f), ("band", self.band)
+        ):  # fmt: skip
             if ends is not None and not ends[0] <= ends[1]:
                 raise InputError(
                     f"{name} of the strain map is [{ends[0]:g}, {ends[1]:g}]. Give the lower end "
                     "first."
                 )
+        low_f, high_f = self.range_f or (-math.inf, math.inf)
+        inside_f = 1e-6 * (high_f - low_f)  # a map may end where it turns
+        if self.range_f is not None and any(
+            low_f + inside_f < turn_f < high_f - inside_f for turn_f in self.turns_f
+        ):
+            raise InputError(
+                f"The strain map turns at {self.turns_f[0]:.4g} F, within its range of {low_f:.4g} "
+                f"to {high_f:.4g} F: a loop would get the wrong direction there. Fit the map again "
+                "with haselab identify capacitance-map, or narrow range_f."
+            )
         columns = [len(row) for row in self.covariance or ()]
         if self.covariance is not None and columns != [4] * 4:
             raise InputError(
@@ -120,13 +136,31 @@ class StrainMap:
 
         Creep, overshoot and another load take an actuator a little beyond the record that was
         fitted: there the strain is extrapolated, beyond its band but still a strain to control.
-        Further out than the width of the fitted range, the map is not used.
+        The map is not used further out than the width of the fitted range, than `limits_f`, and
+        than where the polynomial turns.
         """
         if self.range_f is None:
-            return -math.inf, math.inf
+            return self.limits_f or (-math.inf, math.inf)
         low_f, high_f = self.range_f
         beyond_f = _BEYOND * (high_f - low_f)
-        return low_f - beyond_f, high_f + beyond_f
+        least_f, most_f = self.limits_f or (low_f - beyond_f, high_f + beyond_f)
+        middle_f = 0.5 * (low_f + high_f)
+        return (
+            max([least_f, *(turn_f for turn_f in self.turns_f if turn_f < middle_f)]),
+            min([most_f, *(turn_f for turn_f in self.turns_f if turn_f > middle_f)]),
+        )
+
+    @property
+    def turns_f(self) -> tuple[float, ...]:
+        """Capacitances at which the polynomial turns, in F, in order."""
+        a, b, c = 3.0 * self.cubic_per_f3, 2.0 * self.curvature_per_f2, self.slope_per_f
+        if a == 0.0:
+            return () if b == 0.0 else (-c / b,)
+        root = b * b - 4.0 * a * c
+        if not root > 0.0:
+            return ()
+        sum_ = -0.5 * (b + math.copysign(math.sqrt(root), b))  # without cancellation
+        return tuple(sorted({sum_ / a, c / sum_ if sum_ else 0.0}))
 
     def interval(self, capacitance_f: ArrayLike) -> tuple[Floats, Floats]:
         """Ends of the strain's interval: the map plus its band.

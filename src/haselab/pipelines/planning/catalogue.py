@@ -106,7 +106,7 @@ def _triangles(highest_v: float) -> Iterator[Candidate]:
             "high_v": high_v,
             "frequency_hz": frequency_hz,
             "cycles": _CYCLES,
-            "left_out_cycles": 0,
+            "skipped_cycles": 0,
             "frame_rate_hz": _frame_rate_hz(_CYCLES / frequency_hz),
         }
         text = f"{_CYCLES} triangles of {1.0 / frequency_hz:g} s, to a drive of {high_v:g} V"

@@ -20,7 +20,7 @@ from haselab.study.fits.observe import gauge_length
 __all__ = ["DEFAULT_REQUEST", "derived_series"]
 
 Columns = dict[str, NDArray[Any]]
-_SWITCH, _SCALE = ("rig", "switch_sample"), "scale_m_per_px"
+_SWITCH, _SCALE, _ZERO = ("rig", "switch_sample"), "scale_m_per_px", ("rig", "zero_length_px")
 _CARRIERS = (("study", "sensing", "carrier_hz"), ("sensing", "carrier_hz"))
 _NAMES = (
     "time_s", "capacitance_f", "capacitance_std_f", "resistance_ohm", "relative_capacitance",
@@ -41,7 +41,8 @@ def derived_series(
     Args:
         reader: of the session, open.
         experiment: its name.
-        zero_length_m: length at zero strain; adds the column `strain`.
+        zero_length_m: length at zero strain; adds the column `strain`. None: that of an imported
+            session, if it states one.
     Returns:
         `capacitance` (time_s, capacitance_f, capacitance_std_f, resistance_ohm,
         relative_capacitance, valid; one row per block) if the session states its carrier, and
@@ -93,6 +94,8 @@ def _strain(
     columns["strain_from_start"] = length_px / start_px - 1.0
     if zero_length_m is not None:
         columns["strain"] = columns["length_m"] / zero_length_m - 1.0
+    elif reader.states(*_ZERO):  # of an imported strain
+        columns["strain"] = length_px / reader.stated(*_ZERO) - 1.0
     return columns
 
 

@@ -13,8 +13,19 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.sensing import ChargeConfig, LockinConfig
-from haselab.store.columns.reader import ColumnStream, check_rate, head_of_times, open_columns
-from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions
+from haselab.store.columns.reader import (
+    ColumnStream,
+    check_rate,
+    head_of_times,
+    open_archive,
+    open_columns,
+)
+from haselab.store.columns.selection import (
+    AS_THE_FILE_STATES,
+    ColumnOptions,
+    assumed_seconds,
+    time_column,
+)
 from haselab.store.columns.units import Unit
 from haselab.store.session.reader import SessionReader, session_file
 
@@ -118,16 +129,17 @@ def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
         path = session_file(path)
     if request.method == "charge":
         _refuse_with_charge(request, path)
-    if request.experiment is not None:
+    experiment = request.experiment
+    if experiment is None and path.suffix.lower() in (".h5", ".hdf5"):
+        experiment = _only_experiment(path, request)
+    if experiment is not None:
         from haselab.store.columns.session import SessionColumns
 
         session = opened.enter_context(
-            SessionColumns(path, request.experiment, unverified=request.unverified)
+            SessionColumns(path, experiment, unverified=request.unverified)
         )
         source = _of_session(session, request, path)
     else:
-        if path.suffix.lower() in (".h5", ".hdf5"):
-            _refuse_session(path, unverified=request.unverified)
         source = _of_file(path, request, opened)
     if request.calibration is None:
         return source
@@ -150,15 +162,19 @@ def _refuse_with_charge(request: Request, path: Path) -> None:
             )
 
 
-def _refuse_session(path: Path, *, unverified: bool) -> None:
+def _only_experiment(path: Path, request: Request) -> str | None:
+    """The only experiment of a session; None for a file that is no session."""
     from haselab.store.columns.session import session_experiments
 
-    experiments = session_experiments(path, unverified=unverified)
+    experiments = session_experiments(path, unverified=request.unverified)
+    if experiments is not None and len(experiments) == 1 and request.method != "charge":
+        return experiments[0]
     if experiments is not None:
         raise InputError(
             f"The file is a session with the experiments {', '.join(experiments) or 'none'}. Name "
             f"one with --experiment. {path}"
         )
+    return None
 
 
 def _calibrated(path: Path, request: Request, source: Source) -> LockinConfig:
@@ -278,7 +294,10 @@ def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None
     if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
         found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
         nearest = min(found, key=lambda rate: abs(rate / given - 1.0))
-        check_rate(given, nearest, steps.size, f"column {name}", path)
+        with open_archive(path) as archive:
+            full = time_column(archive, request.columns) or name
+            assumed = name if assumed_seconds(archive, full, request.columns) else ""
+        check_rate(given, nearest, steps.size, f"column {name}", path, assumed=assumed)
     return given
 
 

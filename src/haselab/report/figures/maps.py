@@ -70,7 +70,7 @@ def _voltage_map(host: FigureBase, run: RunFolder) -> None:
     axes.set_xlabel("Strain about the operating point (%)")
     axes.set_ylabel("DAQ output (V)")
     _add_kv(axes)
-    axes.legend(loc="lower right")
+    axes.legend(loc="best")
 
 
 def _capacitance_map(host: FigureBase, run: RunFolder) -> None:
@@ -110,7 +110,7 @@ def _capacitance_map(host: FigureBase, run: RunFolder) -> None:
     axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
     axes.set_xlabel("Relative capacitance (a.u.)")
     axes.set_ylabel("Strain (%)")
-    axes.legend(loc="upper left")
+    axes.legend(loc="best")
 
 
 def _reconstruction(host: FigureBase, run: RunFolder) -> None:

@@ -77,7 +77,7 @@ def _each_group(host: FigureBase, run: RunFolder) -> None:
                 time_s[step], 100.0 * sensed[step], color=GREY, linewidth=0.8, label="self-sensed"
             )
         axes.set_ylabel("Strain (%)")
-        axes.legend(loc="lower right", ncols=3)
+        axes.legend(loc="best", ncols=3)
     rows[-1].set_xlabel("Time (s)")
 
 

@@ -88,7 +88,7 @@ def _along(host: FigureBase, run: RunFolder) -> None:
     axes.set_ylim(*_ylim_from_zero(strain))
     axes.set_xlabel("Position along the length (1)")
     axes.set_ylabel("Strain (%)")
-    axes.legend(loc="lower right")
+    axes.legend(loc="best")
 
 
 def _ylim_from_zero(values: Array) -> tuple[float, float]:

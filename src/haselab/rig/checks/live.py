@@ -97,7 +97,9 @@ def live_checks(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
             d = rig.description
             yield from start_checks(rig, plan.daq, live_step_v(d), _probe_v(d))
             return
-        if rig.controller is not None:
+        if rig.controller is not None and plan.capacitor_f is not None:
+            yield _see_capacitor(rig.controller, plan.capacitor_f)
+        elif rig.controller is not None:
             yield _see_loop(rig, rig.controller)
         else:
             yield from _see_wires(rig, plan)
@@ -158,6 +160,20 @@ def _see_loop(rig: Rig, controller: BuiltInController) -> CheckResult:
         f"{drive_v:.3g} V of drive at a strain of {wanted:g}",
         0.0 < drive_v < rig.description.drive_limits.high,
         "Calibrate the microcontroller again, and check its wiring",
+    )
+
+
+def _see_capacitor(controller: BuiltInController, known_f: float) -> CheckResult:
+    """Measure a known capacitor with the sensing signal alone; the loop stays open."""
+    farad = controller.measure_capacitance_f()
+    factor = f"multiply both numbers of front_end.correction by {known_f / farad:.4g}"
+    return CheckResult(
+        "live",
+        "known capacitor",
+        f"measured {1e12 * farad:.4g} pF, nominal {1e12 * known_f:.4g} pF: {factor}",
+        abs(farad / known_f - 1.0) <= _KNOWN_SHARE,
+        f"If the capacitor is right, {factor}, build the firmware again with 'haselab firmware "
+        "build RUN --rig' and this rig file, and flash it",
     )
 
 

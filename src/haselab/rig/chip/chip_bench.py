@@ -40,6 +40,7 @@ _SILENT_S = 0.25  # longest time without an update
 _ARMED_S = 0.5  # longest time until a strain is valid
 _RUN_S = 0.02  # from the command until its update is reported
 _DOWN_S = 1.0  # for the ramp to 0 V
+_STATUSES, _STATUS_UPDATES = 10, 5  # for a capacitance: how many, and updates between two
 _SETTLED = 4  # updates until the level follows an output: two were measured in simulation
 _LIVE = (State.ARMED, State.RUNNING, State.STOPPING)
 
@@ -333,6 +334,50 @@ class ChipBench:
             self._link.send(SetReference(strain))
             self._alive = 0
         self._desired = strain
+
+    def measure_capacitance_f(self) -> float:
+        """See `haselab.rig.BuiltInController`; the mean of some status messages."""
+        if self._follows:
+            raise DeviceError(
+                "The microcontroller has closed its loop, but a capacitance is measured at a drive "
+                "of 0 V. Go to 0 V first."
+            )
+        if self._state != State.ARMED:
+            self._arm()
+        found = [status.capacitance_f for status in self._armed_status()]
+        if min(found) <= 0.0:
+            raise DeviceError(
+                f"The microcontroller measured no capacitance in {found.count(0.0)} of "
+                f"{len(found)} readings. Check the monitors' wires and [front_end]."
+            )
+        return float(np.mean(found))
+
+    def _armed_status(self) -> list[Status]:
+        """Collect status messages while the microcontroller is armed; keep it alive meanwhile."""
+        found: list[Status] = []
+        self._wants_status = True
+        try:
+            self._link.execute(SetTelemetry(_STATUS_UPDATES, 0))
+            while len(found) < _STATUSES:
+                self._status = None
+                self._link.send(KeepAlive())
+                if not self._wait(lambda: self._status is not None, self._patience_s):
+                    raise DeviceError(
+                        "No status received from the microcontroller. Check its cable and its "
+                        "power."
+                    )
+                assert self._status is not None
+                if self._status.state != State.ARMED:
+                    low_f, high_f = self._settings.capacitance_range_f
+                    raise SafetyError(
+                        f"{self._tripped()} Only capacitances of {1e12 * low_f:.3g} to "
+                        f"{1e12 * high_f:.3g} pF, those of its strain map, are valid."
+                    )
+                found.append(self._status)
+            self._link.execute(SetTelemetry(0, 1))
+        finally:
+            self._wants_status = False
+        return found
 
     def _run(self, strain: float) -> None:
         """Close the loop as soon as there is a valid strain."""

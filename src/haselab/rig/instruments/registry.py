@@ -22,7 +22,7 @@ from typing import Any, cast
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
-from haselab.base import DeviceError, HaselabError
+from haselab.base import DeviceError, HaselabError, described
 from haselab.base.exits import no_exit
 from haselab.base.registry import Registry
 from haselab.rig.instruments.instrument import (
@@ -123,7 +123,7 @@ def reported_faults(config: InstrumentConfig) -> Iterator[None]:
         raise
     except Exception as error:
         raise DeviceError(
-            f"The driver of instrument {config.kind!r} failed ({type(error).__name__}: {error}). "
+            f"The driver of instrument {config.kind!r} failed ({described(error)}). "
             "Check the instrument; if it works, report the fault to the authors of the driver."
         ) from error
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from haselab import _camera
 from haselab.base import InputError, LimitError, Limits
+from haselab.store.toml import Section
 
 __all__ = ["TwinCamera", "TwinCameraConfig"]
 
@@ -22,10 +23,8 @@ _SIDE_MARGIN = 0.96  # no particle sits closer to a free side, in half-widths
 _CLAMP_OVERHANG_PX = 14.0  # by which a clamp is wider than the sheet
 
 
-class TwinCameraConfig(BaseModel):
+class TwinCameraConfig(Section):
     """All settings of the twin's images except the sheet's dimensions."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     width_px: int = Field(512, ge=64, le=4096, description="Columns of a frame")
     height_px: int = Field(512, ge=64, le=4096, description="Rows of a frame")
@@ -145,7 +144,12 @@ class TwinCamera:
         Limits("camera seed", 0, 2**63 - 1, "").check(seed)
         Limits("sheet free length", scale, 10.0, "m").check(free_length_m)
         narrowest = 2 * (_EDGE_REACH * config.edge_px + 2) * scale
-        Limits("sheet half-width", narrowest, 10.0, "m").check(half_width_m)
+        if not half_width_m >= narrowest:
+            raise LimitError(
+                f"The actuator is {1e3 * 2 * half_width_m:.3g} mm wide, but the camera needs at "
+                f"least {1e3 * 2 * narrowest:.3g} mm at camera.scale_m_per_px = {scale:g}. Lower "
+                "that scale."
+            )
         self.config = config
         self.lengths_m = _visible_lengths(config)
         self._half_width_px = half_width_m / scale

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, signal, special
+from scipy import fft, special
 
 from haselab.sensing.sensed import LockinConfig
 
@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 
 _MOST_BLOCKS = 16
 _MOST_LINES = 8
+_BLACKMAN_HARRIS = (0.35875, 0.48829, 0.14128, 0.01168)  # its four cosine terms
 _LOBE = 5  # bins to each side covered by a line of the window
 _NEIGHBOURS = 60  # bins to each side that give the noise floor
 _EACH = 4  # thinned bins per median
@@ -119,7 +120,9 @@ def _without_staircase(shown: Floats, spacing: float, lobe: int) -> None:
 
 @lru_cache(maxsize=8)
 def _window(samples: int) -> Floats:
-    return np.asarray(signal.windows.blackmanharris(samples, sym=False))
+    angle = np.linspace(-np.pi, np.pi, samples + 1)[:-1]
+    terms = (share * np.cos(k * angle) for k, share in enumerate(_BLACKMAN_HARRIS))
+    return np.asarray(sum(terms))
 
 
 def _floor(power: Floats) -> Floats:

@@ -18,6 +18,7 @@ from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
     ColumnOptions,
     assumed_seconds,
+    check_assumed_seconds,
     stated_unit,
     time_column,
 )
@@ -37,6 +38,7 @@ __all__ = [
 
 _HEAD_ROWS = 4096
 _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
+_UNITS_OF_TIME = {"ms": 1e3, "us": 1e6}  # per second
 _EVEN = 0.01  # of a step: how far times may be from even ones
 
 _TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".lvm", ".prn")
@@ -155,7 +157,9 @@ def rates_agree(one_hz: float, other_hz: float, rows: int) -> bool:
     return abs(one_hz / other_hz - 1.0) <= max(1.5 / rows, 1e-3)
 
 
-def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Path) -> None:
+def check_rate(
+    given_hz: float, found_hz: float, rows: int, where: str, file: Path, *, assumed: str = ""
+) -> None:
     """Refuse a rate that differs from the file's by more than 0.1 % and 1.5 rows in total.
 
     Args:
@@ -164,16 +168,25 @@ def check_rate(given_hz: float, found_hz: float, rows: int, where: str, file: Pa
         rows: of the record.
         where: in the file it was found, for the error.
         file: path of it.
+        assumed: column of times whose unit nobody states and that was taken as seconds; "": none.
     Raises:
         InputError: they contradict each other.
     Example:
         >>> check_rate(1000.0, 1000.5, 4096, "column time_s", Path("a.csv"))
     """
-    if not rates_agree(found_hz, given_hz, rows):
-        raise InputError(
-            f"--rate-hz is {given_hz:g}, but {where} has {found_hz:.6g} rows per second. Leave out "
-            f"--rate-hz, or change the file: {file}"
-        )
+    if rates_agree(found_hz, given_hz, rows):
+        return
+    for unit, factor in _UNITS_OF_TIME.items() if assumed else ():
+        if rates_agree(found_hz * factor, given_hz, rows):
+            raise InputError(
+                f"--rate-hz is {given_hz:g}, but column {assumed}, which states no unit, has "
+                f"{found_hz:.6g} rows per second if its times are in s. They agree if it is in "
+                f"{unit}: add --unit {assumed}={unit}: {file}"
+            )
+    raise InputError(
+        f"--rate-hz is {given_hz:g}, but {where} has {found_hz:.6g} rows per second. Leave out "
+        f"--rate-hz, or change the file: {file}"
+    )
 
 
 def pairs_of(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any] | None:
@@ -278,7 +291,8 @@ class ColumnStream(Closing):
             )
         self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
-        if self._times and assumed_seconds(self._archive, full, self._options):
+        if self.rate_hz and assumed_seconds(self._archive, full, self._options):
+            check_assumed_seconds(full, self.rate_hz, self._archive.file)
             self.assumed_seconds = full
 
     def _check_stated_rate(self, stated_hz: float) -> None:

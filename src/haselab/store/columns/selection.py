@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Archive
@@ -14,11 +15,13 @@ __all__ = [
     "TIME_NAMES",
     "ColumnOptions",
     "assumed_seconds",
+    "check_assumed_seconds",
     "stated_unit",
     "time_column",
     "why_no_times",
 ]
 
+_AMBIGUOUS_HZ = 10.0 * 1.001  # with the rounding of times of few digits
 TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiempo", "tempo")
 
 
@@ -128,6 +131,26 @@ def assumed_seconds(archive: Archive, full: str, options: ColumnOptions) -> bool
     """
     name = archive.plain_name(full).casefold()
     return not name.endswith("_s") and stated_unit(archive, full, options) is None
+
+
+def check_assumed_seconds(name: str, rate_hz: float, file: Path) -> None:
+    """Refuse times without a unit whose rate is so low in seconds that ms are as likely.
+
+    Records of moving actuators have 50 Hz to 10 kHz: in milliseconds these are 0.05 to 10.
+
+    Args:
+        name: of the column.
+        rate_hz: rows per second, if the times are in s.
+        file: where they are from.
+    Raises:
+        InputError: at most 10 rows per second.
+    """
+    if rate_hz <= _AMBIGUOUS_HZ:
+        raise InputError(
+            f"Column {name} states no unit: in seconds it has {rate_hz:.4g} rows per second, in "
+            f"milliseconds {1e3 * rate_hz:.4g}. State which: --unit {name}=s or --unit {name}=ms: "
+            f"{file}"
+        )
 
 
 def _is_time(archive: Archive, full: str, options: ColumnOptions) -> bool:

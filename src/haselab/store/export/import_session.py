@@ -4,23 +4,79 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, JsonObject
 from haselab.store.columns.reader import ColumnStream, open_columns
 from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions
 from haselab.store.manifest import Manifest, sha256_of
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
 
-__all__ = ["ImportPlan", "Imported", "import_session"]
+__all__ = ["ImportPlan", "Imported", "LengthColumn", "import_session"]
 
 _LARGEST = 32767
 _CHUNK_BLOCKS = 200
 _FULL_SCALE_V = 10.0  # of a monitor that stands for values at the actuator
+_ZERO_PX, _M_PER_PX = 1000.0, 1e-4  # of lengths that no camera saw
+_LENGTH_UNITS = {"strain": "1", "displacement": "m", "length": "m"}
 _VOLT_PER_MONITOR_VOLT, _AMPERE_PER_MONITOR_VOLT = 5000.0, 2e-3
+
+
+@dataclass(frozen=True)
+class LengthColumn:
+    """A column that shows the length of the actuator.
+
+    The session gets it as the tracks of a camera: one frame a block, whose two rows of fiducials
+    are as far apart as the mean length in that block.
+
+    Args:
+        column: name of it.
+        kind: what it contains.
+        points: fiducials of a frame, half of them in each row.
+        zero_length_m: length at zero strain, in m; None: unknown.
+    """
+
+    column: str
+    kind: Literal["strain", "displacement", "length"]
+    points: int
+    zero_length_m: float | None = None
+
+    def rig_keys(self) -> dict[str, float]:
+        """Scale and zero of the tracks, as far as they are known."""
+        zero_m = self.zero_length_m
+        if self.kind == "strain":
+            known = {} if zero_m is None else {"scale_m_per_px": zero_m / _ZERO_PX}
+            return known | {"zero_length_px": _ZERO_PX}
+        zero = {} if zero_m is None else {"zero_length_px": zero_m / _M_PER_PX}
+        return {"scale_m_per_px": _M_PER_PX} | zero
+
+    def length_px(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance of the rows of fiducials for values of the column."""
+        if self.kind == "strain":
+            return _ZERO_PX * (1.0 + values)
+        start_m = (self.zero_length_m or 0.0) if self.kind == "displacement" else 0.0
+        return (start_m + values) / _M_PER_PX
+
+    def tracks(self, blocks: NDArray[np.float64]) -> NDArray[np.void]:
+        """Tracks of the means of some blocks; rows without a number are left out of a mean.
+
+        Args:
+            blocks: values of the column. Shape `(B, N)`.
+        Returns:
+            Shape `(B, points)`; not valid where a block has no number.
+        """
+        seen = np.isfinite(blocks)
+        count = seen.sum(axis=1)
+        sums = np.where(seen, blocks, 0.0).sum(axis=1)
+        mean = np.divide(sums, count, out=np.full(len(blocks), np.nan), where=count > 0)
+        tracks = np.zeros((len(blocks), self.points), SessionWriter.track_dtype())
+        tracks["y_px"][:, self.points // 2 :] = self.length_px(mean)[:, None]
+        tracks["std_x_px"] = tracks["std_y_px"] = np.nan  # unknown
+        tracks["valid"] = (count > 0)[:, None]
+        return tracks
 
 
 @dataclass(frozen=True)
@@ -39,6 +95,7 @@ class ImportPlan:
         carrier_hz: of the sensing signal, if known.
         skew_s: from a voltage sample to its current sample.
         drive: column of the drive voltage ahead of the amplifier, in V; None: there is none.
+        length: column that shows the length; None: there is none.
     """
 
     experiment: str = "imported"
@@ -52,11 +109,13 @@ class ImportPlan:
     carrier_hz: float | None = None
     skew_s: float = 0.0
     drive: str | None = None
+    length: LengthColumn | None = None
 
     @property
     def all_columns(self) -> tuple[str, ...]:
-        """The monitors, and the drive where there is one."""
-        return self.columns if self.drive is None else (*self.columns, self.drive)
+        """The monitors, and the drive and the length where there is one."""
+        drive = () if self.drive is None else (self.drive,)
+        return (*self.columns, *drive, *(() if self.length is None else (self.length.column,)))
 
 
 @dataclass(frozen=True)
@@ -127,9 +186,13 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
                 "i_monitor_v_per_a": 1.0 / ampere_per_unit, "skew_s": plan.skew_s},
         "source": {"file": file.name, "sha256": sha256_of(file)},
     }  # fmt: skip
+    if plan.length is not None:
+        header["rig"] |= plan.length.rig_keys()
     if plan.carrier_hz is not None:
         header["sensing"] = {"carrier_hz": plan.carrier_hz}
-    plans = [ExperimentPlan(plan.experiment, "imported", 1, {"columns": list(plan.all_columns)})]
+    points = 1 if plan.length is None else plan.length.points
+    settings: JsonObject = {"columns": list(plan.all_columns)}
+    plans = [ExperimentPlan(plan.experiment, "imported", points, settings)]
     path = folder / "session.h5"
     with (
         Manifest(folder, header),
@@ -158,11 +221,16 @@ def _scale(file: Path, plan: ImportPlan) -> _Scale:
     with _open(file, plan) as stream:
         v, i, *rest = stream.units
     wanted = [(v, ("V",), "voltage"), (i, ("V", "A"), "current")]
-    for unit, good, what in (*wanted, *((unit, ("V",), "drive") for unit in rest)):
+    if plan.drive is not None:
+        wanted.append((rest[0], ("V",), "drive"))
+    if plan.length is not None:
+        wanted.append((rest[-1], (_LENGTH_UNITS[plan.length.kind],), plan.length.kind))
+    for unit, good, what in wanted:
         if unit is not None and unit.si not in good:
+            needed = "a ratio or in %" if good == ("1",) else f"in {' or '.join(good)}"
             raise InputError(
-                f"The column of the {what} is in {unit.symbol}, but must be in "
-                f"{' or '.join(good)}. Name another column, or state its unit with --unit. {file}"
+                f"The column of the {what} is in {unit.symbol}, but must be {needed}. Name another "
+                f"column, or state its unit with --unit. {file}"
             )
     peaks = (1.0, 1.0) if plan.volt_per_code else _peaks(file, plan)
     per_volt = [
@@ -227,7 +295,7 @@ def _copy(
     file: Path,
 ) -> tuple[int, int, float]:
     samples, count, worst_v = plan.block_samples, 0, 0.0
-    rest, rest_v = np.empty((0, 2), np.int16), np.empty(0)
+    rest, rest_v, rest_length = np.empty((0, 2), np.int16), np.empty(0), np.empty(0)
     for chunk in stream.chunks(_CHUNK_BLOCKS * samples):
         codes, lost_v = _codes(chunk[:2], scale, stream.rows_read - len(chunk[0]), file)
         worst_v = max(worst_v, lost_v)
@@ -237,6 +305,13 @@ def _copy(
         whole = len(codes) // samples
         shape = (whole, samples)
         levels_v = np.median(drive_v[: whole * samples].reshape(shape), axis=1)  # one a block
+        if plan.length is not None:
+            values = np.concatenate([rest_length, chunk[-1].astype(np.float64)])
+            rest_length = values[whole * samples :]
+            first = samples * np.arange(count, count + whole, dtype=np.float64)
+            middle_s = (first + 0.5 * (samples - 1)) / rate_hz
+            tracks = plan.length.tracks(values[: whole * samples].reshape(shape))
+            session.append_frames(plan.experiment, middle_s, tracks, float("nan"))
         for block, level_v in zip(
             codes[: whole * samples].reshape(*shape, 2), levels_v, strict=True
         ):

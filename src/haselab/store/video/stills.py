@@ -16,7 +16,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, described
 from haselab.store.video.container import ContainerReader, read_times
 from haselab.store.video.reader import (
     COLOUR_RULE,
@@ -129,7 +129,7 @@ class TiffReader(VideoReader):
             raise
         except Exception as error:
             self._handle.close()
-            why = f"{type(error).__name__}: {error}"
+            why = described(error)
             raise broken(f"The TIFF file cannot be read ({why})", _COPY_AGAIN, path) from None
         self._complaints = complaints.lines if self._run is None else []
         bits = page.bitspersample
@@ -171,7 +171,7 @@ class TiffReader(VideoReader):
             except InputError:
                 raise
             except Exception as error:  # as in __init__
-                why = f"{type(error).__name__}: {error}"
+                why = described(error)
                 raise self._short(index, why) from None
             yield _grey(image, self.path)
         if self._complaints:

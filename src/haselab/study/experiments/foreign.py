@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from haselab.base import Estimate, HaselabError, InputError, ResultError, to_plain
+from haselab.base import Estimate, HaselabError, InputError, ResultError, described, to_plain
 from haselab.base.exits import no_exit
 from haselab.safety.feasibility import Drive
 from haselab.study.experiment import Chart, Curve, Experiment, ExperimentResult
@@ -67,7 +67,7 @@ def foreign(
         kept = " The recorded data are kept." if issubclass(failed, ResultError) else ""
         raise failed(
             f"The method {doing!r} of the experiment [{experiment.table}], package "
-            f"{_package(experiment)!r}, failed: {type(error).__name__}: {error}.{kept} Run again "
+            f"{_package(experiment)!r}, failed: {described(error)}.{kept} Run again "
             "with --debug for the traceback."
         ) from error
 

@@ -56,8 +56,8 @@ class StaticLoadTest(Experiment[StaticLoad]):
         """See `Experiment`."""
         found = fit_static(analysis.observe(_NAME), self.study, analysis.rig)
         reason = (
-            "is of the shell of a planar-hasel; this actuator is a "
-            f"{analysis.rig.actuator_kind}, whose law haselab identify actuator fits"
+            "only a planar-hasel has such a shell; this actuator is a "
+            f"{analysis.rig.actuator_kind}. 'haselab identify actuator' fits its law"
         )
         missing = {key: reason for key in self.rows() if key not in found.quantities}
         return ExperimentResult(

@@ -56,7 +56,7 @@ def closed_names(study: Study, group: str) -> list[str]:
     trials = {
         "pi": steps.pi_trials,
         "pid": steps.pid_trials,
-        "printed": steps.printed_chain_trials,
+        "printed": steps.paper_chain_trials,
         "late": steps.extra_delay_trials,
         "saturating": steps.saturating_trials,
     }[group]
@@ -98,9 +98,9 @@ class StepTest(Experiment[Steps]):
         highest_v = high_v if high_v >= -low_v else low_v
         values_v = np.array([0.0, self.study.nominal_baseline_v, highest_v])
         drives = [Drive("step trials", values_v)]
-        if self.settings.printed_chain_trials:
+        if self.settings.paper_chain_trials:
             name = "step trials with the paper's sensing chain"
-            carrier_v = self.settings.printed_chain_carrier_v
+            carrier_v = self.settings.paper_chain_carrier_v
             drives.append(Drive(name, values_v, carrier_v=carrier_v))
         return drives
 
@@ -155,11 +155,11 @@ class StepTest(Experiment[Steps]):
             ),
             "saturating": pi,
         }
-        if steps.printed_chain_trials:
+        if steps.paper_chain_trials:
             found["printed"] = replace(
                 pi,
                 printed_chain=True,
-                carrier_v=steps.printed_chain_carrier_v,
+                carrier_v=steps.paper_chain_carrier_v,
                 strain_map=analysis.to_play(PrintedChain).strain_map,
                 video_zero_px=None,
             )

@@ -64,7 +64,7 @@ class TriangleTest(Experiment[Triangle]):
         near = near_v(t)
         width_v = min(baseline_v + near, t.high_v) - max(baseline_v - near, t.low_v)
         edge_s = 0.5 * max(width_v, 0.0) / ((t.high_v - t.low_v) * t.frequency_hz)
-        kept = t.cycles - t.left_out_cycles
+        kept = t.cycles - t.skipped_cycles
         frames = kept * edge_s * t.frame_rate_hz
         if frames < LEAST_FRAMES:
             raise InputError(

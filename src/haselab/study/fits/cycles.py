@@ -65,7 +65,7 @@ class Cycles:
         t = study.triangle
         end_s = float(seen.block_start_s[-1]) + rig.block_s
         before = np.arange(t.cycles, -1, -1) / t.frequency_hz
-        return cls(seen, end_s - before, t.left_out_cycles, near_v(t), rig)
+        return cls(seen, end_s - before, t.skipped_cycles, near_v(t), rig)
 
     @property
     def from_s(self) -> float:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import find_peaks
 
 from haselab.base import Estimate, JsonObject, ResultError
 from haselab.control import over_trials
@@ -141,6 +140,8 @@ def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float)
 
     The amplitude of eq. 6 is not used: with the decay of the peaks it misses them.
     """
+    from scipy.signal import find_peaks  # the import takes half a second
+
     apart = max(1, round(0.7 * 2.0 * math.pi / omega / float(np.median(np.diff(time_s)))))
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)
     if peaks.size < _LEAST_PEAKS:

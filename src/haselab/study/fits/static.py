@@ -85,7 +85,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
             shell = _fit_shell(stretch, load_n, rig)
         except ResultError as error:
             left_out = str(error)
-    regions = find_regions(stretch, load_n, pieces=study.static_load.pieces)
+    regions = find_regions(stretch, load_n, segments=study.static_load.segments)
     chosen = regions.regions[regions.chosen]
     finest = POSITION_PX * rig.scale_m_per_px / free_length_m
     return Static(
@@ -156,7 +156,7 @@ def _fit_shell(stretch: Floats, load_n: Floats, rig: RigDescription) -> _Shell:
 
 def _segments_note(regions: RegionsFit, study: Study) -> str:
     count = len(regions.regions)
-    if study.static_load.pieces is not None:
+    if study.static_load.segments is not None:
         return f"{count} straight segments, as set in the study"
     return " ".join([f"{count} straight segments, chosen by BIC.", *regions.notes]).rstrip(".")
 

@@ -26,7 +26,7 @@ _ROWS = {
 }
 # Results of step trials that a study may leave out, and the setting for their number.
 _COUNTED = {
-    "printed_chain_trials": ("S10.rise_printed_chain", "S10.error_printed_chain"),
+    "paper_chain_trials": ("S10.rise_printed_chain", "S10.error_printed_chain"),
     "extra_delay_trials": ("S24.rise_delayed", "S24.error_delayed"),
     "saturating_trials": ("S22.saturated_fraction", "S22.recovery_time"),
     "pi_trials": ("S24.rise_closed", "S24.rise_closed_raw", "S24.error_closed",

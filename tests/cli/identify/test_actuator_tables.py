@@ -1,0 +1,120 @@
+"""`haselab identify actuator` from tables, as a lab without sessions of haselab has them."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from haselab.actuators import GRAVITY_M_S2, DeaStack, Drive, SampledLaw
+from haselab.cli.main import main
+
+LAW = DeaStack(shear_modulus_pa=18e3, permittivity=3.3, damping_n_s_per_m=1.6)
+GAIN, LENGTH_STD_M, CAPACITANCE_STD_F = 4000.0, 4e-6, 3e-13
+HEADER = "# a stack\n[actuator]\nkind = 'dea-stack'  # mine\nmass_kg = 0.3\nowner = 'ada'\n"
+
+
+def run(capsys, *arguments):
+    with pytest.raises(SystemExit) as stop:
+        main(["identify", "actuator", *map(str, arguments)])
+    printed = capsys.readouterr()
+    return stop.value.code, printed.out, printed.err
+
+
+def table(path, mass_kg, *, seed=1, law=LAW, gain=GAIN, rows=1200):
+    """Held random voltages of 0 to 9 kV, what the law does, and noise."""
+    rng = np.random.default_rng(seed)
+    time_s = 0.01 * np.arange(rows)
+    u = np.repeat(rng.uniform(0.0, 9e3 / gain, rows // 25), 25)
+    u[:50] = 0.0
+    same = np.ones(rows)
+    drive = Drive(
+        np.append(time_s, 0.01 * rows), gain * u, mass_kg * GRAVITY_M_S2 * same, mass_kg * same,
+        0.0 * same,
+    )  # fmt: skip
+    sampled = SampledLaw(law, 11e3)
+    start, _ = sampled.at_rest(0.0, 0.0, mass_kg * GRAVITY_M_S2)
+    seen_m = sampled.respond(drive, time_s, start).length_m
+    length_m = seen_m + LENGTH_STD_M * rng.standard_normal(rows)
+    capacitance_f = law.capacitance_f(seen_m) + CAPACITANCE_STD_F * rng.standard_normal(rows)
+    columns = np.column_stack([time_s, 1e3 * u, length_m, 1e12 * capacitance_f])
+    np.savetxt(path, columns, "%.12g", ";", header="Zeit (s);U (mV);length_m;C (pF)", comments="")
+    return path
+
+
+@pytest.fixture
+def actuator(tmp_path):
+    path = tmp_path / "A.toml"
+    path.write_text(HEADER + f"[drive]\ngain_v_per_v = {GAIN}\n")
+    return path
+
+
+COLUMNS = ("--time", "Zeit", "--input", "U", "--output", "length_m", "--output", "C")
+
+
+@pytest.mark.long
+def test_two_tables_of_two_masses_give_the_law(actuator, tmp_path, capsys):
+    files = [table(tmp_path / f"{m}.csv", m, seed=k) for k, m in enumerate((0.1, 0.3))]
+    masses = "--mass-kg", "0.1", "--mass-kg", "0.3"
+    code, text, _ = run(capsys, *files, "--actuator", actuator, *COLUMNS, *masses, "--json")
+    answer = json.loads(text)
+    assert code == 0 and answer["status"] == "ok", answer["status"]
+    for name, true in (("shear_modulus_pa", 18e3), ("permittivity", 3.3),
+                       ("damping_n_s_per_m", 1.6), ("layer_thickness_m", 7e-4)):  # fmt: skip
+        found = answer["parameters"][f"actuator.{name}"]
+        assert found["value"] == pytest.approx(true, abs=4.0 * found["std"]), name
+    # 4 standard deviations of the rms of 2,400 values
+    within = 4.0 / np.sqrt(2.0 * 2400)
+    assert answer["residual_rms"]["length_m"] == pytest.approx(LENGTH_STD_M, rel=within)
+    assert answer["residual_rms"]["capacitance_f"] == pytest.approx(CAPACITANCE_STD_F, rel=within)
+    written = actuator.read_text()
+    assert written.startswith(HEADER)
+    physical = tomllib.loads(written)["model"]["physical"]
+    assert physical["records"]["gain_v_per_v"] == GAIN and physical["mass_kg"] == 0.3
+    # the model predicts a third table, and says that the first is no validation
+    new = table(tmp_path / "new.csv", 0.2, seed=9)
+    options = ("--time", "Zeit", "--input", "U", "--output", "length_m", "--mass-kg")
+    for file, mass_kg, expected in ((new, 0.2, 0), (files[0], 0.1, 3)):
+        with pytest.raises(SystemExit) as stop:
+            main(["compare", str(actuator), str(file), *options, str(mass_kg)])
+        assert stop.value.code == expected
+    assert "not a validation" in capsys.readouterr().err
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--mass-kg", "0.15"), "contradict"),
+        (("--mass-kg", "0.3", "--gain-v-per-v", "1"), "contradict"),
+    ],
+)  # fmt: skip
+def test_a_wrong_mass_gain_or_unit_gives_no_numbers(actuator, tmp_path, capsys, options, words):
+    before = actuator.read_text()
+    file = table(tmp_path / "a.csv", 0.3, rows=600)
+    code, text, error = run(capsys, file, "--actuator", actuator, *COLUMNS, *options, "--json")
+    assert code == 3 and words in error, error
+    assert json.loads(text)["parameters"] == {}
+    assert actuator.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--mass-kg", "0.1", "--mass-kg", "0.2"), "--mass-kg is given 2 times, but there are 1 f"),
+        (("--output", "length_m", "--output", "length_m"), "names two columns in m"),
+        (("--output", "U"), "Column U is in V, but the physical model has lengths, strains and"),
+        (("--mass-kg", "0"), "Use a mass above 0 kg"),
+        (("--rate-hz", "50"), "50"),
+    ],
+)
+def test_what_cannot_be_read_is_refused(actuator, tmp_path, capsys, options, words):
+    file = table(tmp_path / "a.csv", 0.3, rows=100)
+    names = ("--time", "Zeit", "--input", "U")
+    if "--output" not in options:
+        names += ("--output", "length_m")
+    code, _, error = run(capsys, file, "--actuator", actuator, *names, *options)
+    assert code == 2 and words in error, error
+    assert error.splitlines()[0].endswith("was converted from mV to V. " + str(file)) or (
+        error.count("\n") == 1
+    )

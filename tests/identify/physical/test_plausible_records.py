@@ -1,0 +1,90 @@
+"""Swapped units and wrong volts are named before a fit, for each kind of actuator."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from haselab.actuators import (
+    GRAVITY_M_S2,
+    CurlingHasel,
+    DeaStack,
+    Drive,
+    PeanoHasel,
+    PlanarHasel,
+    SampledLaw,
+)
+from haselab.identify.physical import MotionRecord, fit_actuator
+from haselab.identify.physical.plausible import implausible
+
+KINDS = {
+    "planar-hasel": (PlanarHasel(), 0.25, 8e3),
+    "peano-hasel": (PeanoHasel(), 0.1, 7e3),
+    "curling-hasel": (CurlingHasel(curl_rad=0.5), 0.05, 8e3),
+    "dea-stack": (DeaStack(), 0.2, 9e3),
+}
+GAIN = 5e3
+STD_M, STD_F = 4e-6, 3e-13
+
+
+@pytest.fixture(scope="module", params=list(KINDS))
+def seen(request):
+    """Law and record of a kind: two seconds, a step to the highest voltage after one."""
+    law, mass_kg, highest_v = KINDS[request.param]
+    edge_s = np.linspace(0.0, 2.0, 201)
+    volt = np.where(edge_s[:-1] < 1.0, 0.0, highest_v)
+    load_n, masses_kg = np.full(200, mass_kg * GRAVITY_M_S2), np.full(200, mass_kg)
+    drive = Drive(edge_s, volt, load_n, masses_kg, np.full(200, 5e3))
+    sampled = SampledLaw(law, 11e3)
+    start, _ = sampled.at_rest(0.0, 5e3, float(load_n[0]))
+    found = sampled.respond(drive, edge_s[:-1], start)
+    every, none = np.arange(200), np.zeros(200, np.int64)
+    return law, MotionRecord(
+        "a", drive, edge_s[:-1], found.length_m, np.full(200, STD_M), every, every,
+        found.capacitance_f, np.full(200, STD_F), ("all",), none, none,
+    )  # fmt: skip
+
+
+def scaled(record, **factors):
+    return replace(record, **{name: f * getattr(record, name) for name, f in factors.items()})
+
+
+def driven(record, factor):
+    drive = record.drive
+    ripple_v2 = factor**2 * drive.ripple_v2
+    return replace(
+        record, drive=replace(drive, voltage_v=factor * drive.voltage_v, ripple_v2=ripple_v2)
+    )
+
+
+def test_a_plausible_record_has_no_fault(seen):
+    law, record = seen
+    assert implausible(law, [record]) == ""
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (lambda r: scaled(r, length_m=1e3, length_std_m=1e3), "Check the unit of the lengths"),
+        (lambda r: scaled(r, length_m=1e-3, length_std_m=1e-3), "Check the unit of the lengths"),
+        (
+            lambda r: scaled(r, capacitance_f=1e12, capacitance_std_f=1e12),
+            "Check the unit of the capacitances",
+        ),
+        (lambda r: driven(r, 1.0 / GAIN), "not those at the amplifier's input"),
+        (lambda r: driven(r, GAIN), "the amplifier's gain is not counted twice"),
+    ],
+    ids=["mm", "km", "pF", "input volts", "gain twice"],
+)
+def test_swapped_units_and_volts_are_named_without_numbers(seen, bad, words):
+    law, record = seen
+    fit = fit_actuator(law, [record, bad(record)], mass_kg=float(record.drive.mass_kg[0]))
+    assert words in fit.status and not fit.parameters
+
+
+def test_a_record_without_motion_may_have_a_small_drive(seen):
+    law, record = seen
+    small = driven(record, 1.0 / GAIN)
+    rng = np.random.default_rng(1)
+    still = replace(small, length_m=record.length_m[0] + STD_M * rng.standard_normal(200))
+    assert implausible(law, [still]) == ""

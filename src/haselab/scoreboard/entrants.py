@@ -6,7 +6,6 @@ import contextlib
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import ss2tf
 
 from haselab.actuators import GRAVITY_M_S2, linearise
 from haselab.base import InputError, ResultError
@@ -115,6 +114,8 @@ def plant_at_zero(known: KnownActuator) -> RationalModel:
     Returns:
         A rational model of static gain 1.
     """
+    from scipy.signal import ss2tf  # slow to import
+
     volt = known.gain_v_per_v * known.static_drive_v(0.0)
     load_n, inertia_kg = GRAVITY_M_S2 * known.mass_kg, known.mass_kg + known.added_inertia_kg
     point = linearise(known.law, float(np.hypot(volt, np.sqrt(known.carrier_v2))), load_n,

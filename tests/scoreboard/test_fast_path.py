@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from haselab.controllers import ControllerKind, OpenLoop
+from haselab.controllers import (
+    CONTROLLERS,
+    ChosenController,
+    ControllerKind,
+    Measurement,
+    OpenLoop,
+)
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.lockin import counted_s, lockin_of
+from haselab.runtime.loop import RunningController
 from haselab.scoreboard.devices import find_device
 from haselab.scoreboard.knowledge import true_actuator
 from haselab.scoreboard.loop_class import (
@@ -22,7 +30,7 @@ from haselab.scoreboard.loop_class import (
     noise_of,
 )
 from haselab.scoreboard.plant import FastPlant
-from haselab.scoreboard.play import Scenario, play
+from haselab.scoreboard.play import Scenario, play, setting_for
 
 HOST = CLASSES["host-100hz"]
 HZ = find_device("hz")
@@ -124,8 +132,6 @@ def test_a_controller_gets_the_reference_the_preview_and_the_drive_in_force():
 def test_a_late_device_gets_each_drive_later():
     shifted = {}
     for late_s in (0.0, 0.004, 0.012):
-        from dataclasses import replace
-
         device = replace(HZ, late_s=late_s)
         silent = replace(HOST, relative_noise=0.0)
         plant = FastPlant(device, silent, np.random.default_rng(0), 12)
@@ -160,3 +166,39 @@ def test_the_slew_of_the_chip_limits_the_drive():
 
 def test_the_reading_of_the_frequency_axis_is_a_device():
     assert find_device("rad").config == twin_of_reading("rad")
+
+
+def test_a_closed_loop_on_the_full_twin_has_the_trace_of_the_fast_path():
+    """The same controller and step on raw samples, the lock-in and the amplifier.
+
+    Both have noise of their own. It moves the length by at most 1.2 times the noise of one update
+    (a demand of the design), so two traces differ by sqrt(2) * 1.2 * 2e-4; 5 standard deviations.
+    """
+    known = replace(true_actuator(HZ), capacitance_noise_f=noise_of(HOST, HZ.config, 5.6e-10))
+    kind = CONTROLLERS.find("force")
+    chosen = kind.choose(kind.design(setting_for(ChosenController(kind, ()), HOST, known, 1.04)))
+    step = Scenario(HZ, known.zero_length_m, 0.6, lambda t: 0.04 * (t >= 0.0), lead_s=0.6)
+    fast = play(step, chosen, HOST, known, np.random.default_rng(1))
+    assert fast.failure == ""
+    bench = TwinBench(HZ.config, 3)
+    bench.sine(CARRIER_HZ, CARRIER_V)
+    bench.hang(2.4 * 0.25)
+    bench.wait(20.0)
+    bench.hang(0.25)
+    bench.wait(60.0)
+    drive_v = known.static_drive_v(0.0)
+    bench.write(drive_v)
+    bench.wait(20.0)
+    lockin = lockin_of(describe(HZ.config), CARRIER_HZ)
+    running = RunningController(chosen, setting_for(chosen, HOST, known, drive_v))
+    strains = []
+    for k in range(120):
+        bench.write(drive_v)
+        farad = lockin.step(bench.read())[0]
+        strains.append(known.strain(bench.length_m))
+        seen = known.strain(known.sensed_length_m(farad, drive_v))
+        measured = Measurement(seen, farad, drive_v, 0.01 * (k + 1))
+        drive_v = running.step(0.04 if k >= 60 else 0.0, measured)
+        drive_v = round(drive_v / HOST.drive_step_v) * HOST.drive_step_v
+    np.testing.assert_allclose(fast.strain[9::10], strains, rtol=0.0, atol=5.0 * 1.2 * 2.83e-4)
+    assert strains[-1] == pytest.approx(0.04, abs=2e-3)

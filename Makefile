@@ -9,8 +9,8 @@ VENV    := .venv
 BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip --disable-pip-version-check --quiet
 OUT     ?= out/reference
-# One more than there are cores: some tests wait.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print(1 + min(os.cpu_count() or 1, 7))')
+# Two more than there are cores: many tests wait for a time limit or another process.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print(2 + min(os.cpu_count() or 1, 6))')
 # Neighbouring tests stay on one worker, which then builds what they share once.
 PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 FUZZ_S  ?= 1800

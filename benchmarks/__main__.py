@@ -43,6 +43,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
             quick={"twins": 0, "starts": 2, "planted": 1, "short": 3},
         ),
         Measurement("identification.prediction", quick={"twins": (), "short": 1}),
+        Measurement("identification.hard_twins", quick={"seeds": 1}),
     ),
     "random-plants": (
         Measurement("identification.random_plants", quick={"plants": 200}),

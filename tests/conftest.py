@@ -42,10 +42,10 @@ hypothesis.settings.load_profile("haselab")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the unit tests, which are those of `make check`, and put lint and whole studies first.
+    """Mark the unit tests, which are those of `make check`, and put what takes longest first.
 
-    They take longest, so they should not be left for the end. The tests that use a study stay side
-    by side, hence on one worker, which plays it once.
+    Left for the end, it would run alone. The tests that use a study stay side by side, hence on
+    one worker, which plays it once.
     """
     for item in items:
         folder = item.path.relative_to(_TESTS).parts[0]
@@ -55,10 +55,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=_place)
 
 
+# Files beside whole studies with a test or a fixture of more than 7 s of CPU, the longest first.
+_LONGEST = (
+    "test_kinds.py", "test_own_controller.py", "test_your_actuator_page.py", "test_fuzz.py",
+    "test_add_an_experiment_page.py", "test_one_experiment_page.py", "test_transfer_choice.py",
+    "test_add_an_instrument_page.py", "test_add_a_controller_page.py",
+    "test_add_an_actuator_page.py", "test_twin_of_your_actuator.py",
+    "test_identification_page.py", "test_run_from_actuator.py", "test_chip_rig.py",
+    "test_study_run.py", "test_which_model_page.py", "test_session_kill.py",
+)  # fmt: skip
+
+
 def _place(item: pytest.Item) -> int:
     if item.path.name == "test_lint.py":
         return 0
-    return 1 if "studies" in getattr(item, "fixturenames", ()) else 2
+    if "studies" in getattr(item, "fixturenames", ()):
+        return 1
+    return 2 + (_LONGEST.index(item.path.name) if item.path.name in _LONGEST else len(_LONGEST))
 
 
 _SIGNALS = [

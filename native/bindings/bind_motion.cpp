@@ -149,6 +149,8 @@ NB_MODULE(_motion, m)
         FIELD(motion_parameters, hysteresis_n),
         FIELD(motion_parameters, hysteresis_width),
         FIELD(motion_parameters, elastic_scale),
+        FIELD(motion_parameters, elastic_drift),
+        FIELD(motion_parameters, electric_drift),
         FIELD(motion_parameters, step_s),
         FIELD(motion_parameters, phase),
     });
@@ -178,6 +180,8 @@ NB_MODULE(_motion, m)
     m.attr("HYSTERESIS_N") = static_cast<int>(MOTION_HYSTERESIS_N);
     m.attr("HYSTERESIS_WIDTH") = static_cast<int>(MOTION_HYSTERESIS_WIDTH);
     m.attr("VOLTAGE_SCALE") = static_cast<int>(MOTION_VOLTAGE_SCALE);
+    m.attr("ELASTIC_DRIFT") = static_cast<int>(MOTION_ELASTIC_DRIFT);
+    m.attr("ELECTRIC_DRIFT") = static_cast<int>(MOTION_ELECTRIC_DRIFT);
     m.attr("BRANCH_SHARE") = static_cast<int>(MOTION_BRANCH_SHARE);
     m.attr("BRANCH_S") = static_cast<int>(MOTION_BRANCH_S);
     nb::class_<Law>(m, "Law").def(

@@ -52,6 +52,7 @@ const Value kValues[] = {
     {"warming_s", &twin_parameters::warming_s},
     {"stiffness_loss", &twin_parameters::stiffness_loss},
     {"ageing_s", &twin_parameters::ageing_s},
+    {"begins_s", &twin_parameters::begins_s},
     {"second_kg", &twin_parameters::second_kg},
     {"second_rad_s", &twin_parameters::second_rad_s},
     {"second_damping", &twin_parameters::second_damping},

@@ -165,6 +165,7 @@ static int32_t rows_of(const motion_parameters *p)
 typedef struct {
     double elastic, softening;  /* of the elastic force by length and by longest length */
     double pull, acting;        /* of the electric force by length and by the acting voltage */
+    double square;              /* of the electric force by the square of that voltage */
     double share, stretch, width, reached; /* of the factor of softening */
     double turning, slipping;   /* of the rate of hysteresis by speed; less that by its force */
     double longest_m;
@@ -188,7 +189,8 @@ static slopes slopes_of(const motion_law *law, const motion_parameters *p, const
     d.elastic *= p->elastic_scale * r->softening;
     d.softening = r->elastic * d.reached / p->free_length_m;
     d.pull = r->square * pull.per_m;
-    d.acting = 2.0 * r->acting_v * (r->pull + 0.5 * root * pull.per_v);
+    d.square = r->pull + 0.5 * root * pull.per_v;
+    d.acting = 2.0 * r->acting_v * d.square;
     if (p->hysteresis_n > 0.0) {
         d.turning = (p->hysteresis_n - sign * s->hysteresis_n) / slip_m(p);
         d.slipping = sign * s->speed_m_s / slip_m(p);
@@ -240,6 +242,14 @@ static void direct_rates(const motion_law *law, const motion_parameters *p, cons
         } else if (kind == MOTION_VOLTAGE_SCALE) {
             to->force[j] = d->acting * (1.0 - p->charge_share) * in->volt;
             to->charge[j] = in->volt * c->per_charge_s;
+        } else if (kind == MOTION_ELASTIC_DRIFT || kind == MOTION_ELASTIC_DRIFT_S) {
+            to->elastic[j] =
+                tangent->drift[kind - MOTION_ELASTIC_DRIFT] * r->elastic * r->softening;
+        } else if (kind == MOTION_ELECTRIC_DRIFT || kind == MOTION_ELECTRIC_DRIFT_S) {
+            const double share = tangent->drift[kind - MOTION_ELASTIC_DRIFT];
+            to->force[j] = share * (0.5 * d->acting * (1.0 - p->charge_share) * in->volt +
+                                    d->square * in->ripple_v2);
+            to->charge[j] = 0.5 * share * in->volt * c->per_charge_s;
         }
     }
     memset(by_elastic, 0, (size_t)laws * sizeof(double));

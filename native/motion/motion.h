@@ -39,6 +39,9 @@ typedef struct {
     double charge_share, charge_s; /* of the voltage that acts late; share 0: none */
     double hysteresis_n, hysteresis_width; /* largest force; stretch that it needs; 0 N: none */
     double elastic_scale;          /* of the law's elastic force: 1 unless it ages */
+    /* Slow changes in a record, of the elastic force and of the permittivity, each of a rate and a
+     * time constant: the factor is 1 + rate s (1 - exp(-t / s)) a time t after its first edge. */
+    double elastic_drift[2], electric_drift[2]; /* 1/s, s; 0 s: none */
     double step_s;                 /* longest step */
     double phase;                  /* of the fastest motion in a step, at most; rad */
 } motion_parameters;
@@ -72,6 +75,10 @@ enum motion_column {
     MOTION_HYSTERESIS_N,
     MOTION_HYSTERESIS_WIDTH,
     MOTION_VOLTAGE_SCALE, /* of volt; the present scale is 1 */
+    MOTION_ELASTIC_DRIFT, /* rate of the drift, then its time constant */
+    MOTION_ELASTIC_DRIFT_S,
+    MOTION_ELECTRIC_DRIFT,
+    MOTION_ELECTRIC_DRIFT_S,
     MOTION_BRANCH_SHARE = 1100, /* + branch */
     MOTION_BRANCH_S = 1200      /* + branch */
 };
@@ -84,6 +91,7 @@ typedef struct {
     const double *elastic;            /* [lengths][laws] */
     const double *pull, *capacitance; /* [voltages][lengths][laws] */
     const double *free_length;        /* [laws]: derivative of the free length */
+    double drift[4]; /* relative derivatives of the present factors, from MOTION_ELASTIC_DRIFT on */
     double *rows;
     double *work;
 } motion_tangent;

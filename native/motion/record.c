@@ -73,22 +73,35 @@ static int32_t sample(const step *now, const motion_tangent *t, const motion_rec
     return next;
 }
 
+/* Factor of a drift; `by`: its relative derivatives by rate and time constant. */
+static double drifted(const double d[2], double time_s, double by[2])
+{
+    const double share = d[1] > 0.0 ? time_s / d[1] : 0.0;
+    const double gone = d[1] > 0.0 ? -expm1(-share) : 0.0;
+    const double factor = 1.0 + d[0] * d[1] * gone;
+    by[0] = d[1] * gone / factor;
+    by[1] = d[0] * (gone - share * (1.0 - gone)) / factor;
+    return factor;
+}
+
 /* Voltage on which the capacitance depends. */
 static double root_v(const motion_input *in)
 {
     return sqrt(in->volt * in->volt + in->ripple_v2);
 }
 
-/* Adds the integral of the capacitance over the step by Simpson's rule. */
+/* Adds the integral of the capacitance over the step by Simpson's rule; `scale` multiplies it. */
 static void integrate(const motion_law *law, const step *now, const motion_tangent *t,
-                      const motion_input *in, const motion_output *output, int32_t interval)
+                      double scale, const motion_input *in, const motion_output *output,
+                      int32_t interval)
 {
     const double volt = root_v(in);
     static const double at[3] = {0.0, 0.5, 1.0}, weight[3] = {1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0};
     int i;
     for (i = 0; i < 3; ++i) {
         const ends e = hermite(at[i], now->dt);
-        const double length_m = blend(&e, now->a, now->b), share = now->dt * weight[i];
+        const double length_m = blend(&e, now->a, now->b);
+        const double share = scale * now->dt * weight[i];
         if (t == NULL) {
             output->mean_f[interval] += share * motion_capacitance(law, length_m, volt);
         } else {
@@ -108,6 +121,12 @@ static void integrate(const motion_law *law, const step *now, const motion_tange
             for (j = 0; volt > 0.0 && c.per_v != 0.0 && j < t->columns; ++j) {
                 by[j] += t->kind[j] == MOTION_VOLTAGE_SCALE ? share * c.per_v * in->volt * in->volt / volt : 0.0;
             }
+            for (j = 0; j < t->columns; ++j) {
+                const int32_t k = t->kind[j] - MOTION_ELECTRIC_DRIFT;
+                if (k == 0 || k == 1) {
+                    by[j] += share * t->drift[2 + k] * (c.value + 0.5 * c.per_v * volt);
+                }
+            }
         }
     }
 }
@@ -120,12 +139,13 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
     for (k = 0; k < record->intervals; ++k) {
         const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
         const double volt = root_v(&record->input[k]);
-        double before_f = 0.0, at_s = from_s;
+        double before_f = 0.0, at_s = from_s, drift[4];
         int32_t j;
         moving.inertia_kg = p->inertia_kg + record->mass_kg[k];
         output->mean_f[k] = output->drift_f_s[k] = 0.0;
         if (record->sensed[k]) {
-            before_f = motion_capacitance(law, s->length_m, volt);
+            const double scale = drifted(p->electric_drift, from_s - record->edge_s[0], drift + 2);
+            before_f = scale * motion_capacitance(law, s->length_m, volt * sqrt(scale));
         }
         if (tangent != NULL) {
             memset(output->mean_by + (int64_t)k * tangent->columns, 0,
@@ -138,24 +158,32 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
             const double end_s = unseen ? next_s : to_s;
             const motion_state start = *s;
             step now = {&start, s, at_s, 0.0};
-            double until_s;
+            motion_input in = record->input[k];
+            double until_s, middle_s, scale;
             moving.phase = unseen ? LONG_PHASE : p->phase;
             moving.step_s = unseen ? LONG_STEP_S : p->step_s;
             now.dt = (end_s - at_s) / (double)motion_steps(law, &moving, s, end_s - at_s);
             until_s = end_s - at_s - now.dt > 1e-9 * now.dt ? at_s + now.dt : end_s;
+            middle_s = at_s + 0.5 * now.dt - record->edge_s[0];
+            moving.elastic_scale = p->elastic_scale * drifted(p->elastic_drift, middle_s, drift);
+            scale = drifted(p->electric_drift, middle_s, drift + 2);
+            in.volt *= sqrt(scale);
+            in.ripple_v2 *= scale;
             if (tangent != NULL) {
                 const size_t n = (size_t)tangent->columns;
+                memcpy(tangent->drift, drift, sizeof drift);
                 memcpy(output->kept, tangent->rows, 2 * n * sizeof(double));
             }
-            motion_step(law, &moving, s, tangent, &record->input[k], now.dt);
+            motion_step(law, &moving, s, tangent, &in, now.dt);
             next = sample(&now, tangent, record, output, next, until_s);
             if (record->sensed[k]) {
-                integrate(law, &now, tangent, &record->input[k], output, k);
+                integrate(law, &now, tangent, scale, &in, output, k);
             }
             at_s = until_s;
         }
         if (record->sensed[k]) {
-            const double after_f = motion_capacitance(law, s->length_m, volt);
+            const double scale = drifted(p->electric_drift, to_s - record->edge_s[0], drift + 2);
+            const double after_f = scale * motion_capacitance(law, s->length_m, volt * sqrt(scale));
             output->drift_f_s[k] = (after_f - before_f) / (to_s - from_s);
             output->mean_f[k] /= to_s - from_s;
             for (j = 0; tangent != NULL && j < tangent->columns; ++j) {

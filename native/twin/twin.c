@@ -53,7 +53,7 @@ static double changed(double share, double time_s, double constant_s)
 
 static double permittivity(const twin_parameters *p, double time_s)
 {
-    return changed(p->capacitance_rise, time_s, p->warming_s);
+    return changed(p->capacitance_rise, fmax(time_s - p->begins_s, 0.0), p->warming_s);
 }
 
 /* Motion of the actuator with ageing, warming and the second mass, of which the force on the moving
@@ -67,7 +67,8 @@ static void move_further(const twin_parameters *p, twin_state *s, const motion_i
     const double force = spring * s->second_m + damper * s->second_m_s;
     motion_parameters moving = p->motion;
     motion_input pull = *in;
-    moving.elastic_scale = changed(-p->stiffness_loss, time_s, p->ageing_s);
+    moving.elastic_scale =
+        changed(-p->stiffness_loss, fmax(time_s - p->begins_s, 0.0), p->ageing_s);
     pull.volt *= sqrt(share);
     pull.ripple_v2 *= share;
     pull.load_n += force;
@@ -83,7 +84,7 @@ static void move_on(const twin_parameters *p, twin_state *s, const motion_input 
                     double dt)
 {
     const motion_law *law = &p->law;
-    if (p->capacitance_rise != 0.0 || p->stiffness_loss > 0.0 || p->second_kg > 0.0) {
+    if (p->capacitance_rise != 0.0 || p->stiffness_loss != 0.0 || p->second_kg > 0.0) {
         move_further(p, s, in, time_s, dt);
     } else {
         motion_advance(law, &p->motion, &s->motion, NULL, in, dt);

@@ -32,8 +32,9 @@ typedef struct {
     /* converters */
     double sample_s, skew_s, lsb_v, v_noise_v, i_noise_v;
     /* What no law has, all off at 0: the permittivity rises by capacitance_rise as the bench warms
-     * up, ageing takes stiffness_loss of the elastic force, and a second mass hangs on a spring. */
-    double capacitance_rise, warming_s, stiffness_loss, ageing_s;
+     * up, ageing takes stiffness_loss of the elastic force, both from begins_s on, and a second
+     * mass hangs on a spring. */
+    double capacitance_rise, warming_s, stiffness_loss, ageing_s, begins_s;
     double second_kg, second_rad_s, second_damping;
     /* of the amplifier for sample_s, filled by twin_prepare; amp_r: response to an input that rises
      * to 1 in a straight line */

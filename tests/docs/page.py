@@ -40,7 +40,9 @@ class Page:
             assert Path(arguments[arguments.index("--out") + 1]).stat().st_size > 0, command
 
     def execute(self, code: str, names: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Run a block of Python; its names afterwards."""
+        """Run a block of Python, whose fits must have a result; its names afterwards."""
         found = {} if names is None else names
         exec(compile(code, self.name, "exec"), found)
+        for name, value in found.items():
+            assert getattr(value, "status", "ok") == "ok", f"{name} of {self.name}"
         return found

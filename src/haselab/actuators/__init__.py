@@ -2,6 +2,7 @@
 
 from haselab.actuators.curling_hasel import CurlingHasel
 from haselab.actuators.dea_stack import DeaStack
+from haselab.actuators.drift import DRIFT_LIMITS, DRIFT_TIMES, DRIFT_UNITS, DRIFTS
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, LawValues, Parameter, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.motion import ActuatorState, rates
@@ -25,6 +26,10 @@ from haselab.actuators.uncertain import Scales, draw_parameters
 __all__ = [
     "ACTUATORS",
     "ADDED_INERTIA",
+    "DRIFTS",
+    "DRIFT_LIMITS",
+    "DRIFT_TIMES",
+    "DRIFT_UNITS",
     "GRAVITY_M_S2",
     "VACUUM_F_PER_M",
     "ActuatorLaw",

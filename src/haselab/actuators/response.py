@@ -17,11 +17,13 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab import _motion
+from haselab.actuators.drift import DRIFTS, drift_pairs
 from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.operating_point import equilibrium_m
 from haselab.actuators.table import law_table
@@ -154,7 +156,7 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
         values: by the names of `ActuatorLaw.parameters`; one of several values by its index, such
             as `viscosity.share[0]`; the index after the last one adds a value.
     Returns:
-        The changed law; `ADDED_INERTIA` is none of its parameters and changes nothing.
+        The changed law; `ADDED_INERTIA` and `DRIFTS` are none of its parameters and change nothing.
     Raises:
         InputError: A name is unknown.
         LimitError: A value is outside its limits.
@@ -167,7 +169,7 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
     changed: dict[str, float | tuple[float, ...]] = {}
     for key, value in values.items():
         name, _, index = key.partition("[")
-        if key == ADDED_INERTIA:
+        if key == ADDED_INERTIA or key in DRIFTS:
             continue
         if name not in names:
             raise InputError(
@@ -198,10 +200,13 @@ _LOSSES = (
     ("charge_s", 0, _motion.CHARGE_S),
     ("hysteresis_n", 0, _motion.HYSTERESIS_N),
     ("hysteresis_width", 0, _motion.HYSTERESIS_WIDTH),
+    *(("elastic_drift", k, _motion.ELASTIC_DRIFT + k) for k in range(2)),
+    *(("electric_drift", k, _motion.ELECTRIC_DRIFT + k) for k in range(2)),
     *(("branch_share", k, _motion.BRANCH_SHARE + k) for k in range(_motion.BRANCHES)),
     *(("branch_s", k, _motion.BRANCH_S + k) for k in range(_motion.BRANCHES)),
 )
-_INERTIA = 1  # of _LOSSES
+# places in _LOSSES of what is no parameter of a law
+_BESIDE_THE_LAW = {ADDED_INERTIA: 1} | {name: 9 + k for k, name in enumerate(DRIFTS)}
 _LENGTH_ROW, _CHARGE_ROW, _LONGEST_ROW, _RELAXED_ROW = (
     0,
     2,
@@ -256,8 +261,9 @@ class SampledLaw:
     Args:
         law: to sample.
         highest_v: largest voltage that will act.
-        by: names of the parameters, see `with_parameters`; `ADDED_INERTIA` is one too.
+        by: names of the parameters, see `with_parameters`; `ADDED_INERTIA` and `DRIFTS` too.
         added_inertia_kg: inertia without weight: clamp, oil, linkage.
+        drifts: values of some of `DRIFTS` by their names.
     Raises:
         InputError: A name is unknown, or the law is not smooth.
         LimitError: A parameter is at its limit.
@@ -270,11 +276,14 @@ class SampledLaw:
         by: Sequence[str] = (),
         *,
         added_inertia_kg: float = 0.0,
+        drifts: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.law, self.by = law, tuple(by)
         self.table = law_table(law, highest_v)
         self.parameters = motion_parameters(law)
         self.parameters["inertia_kg"] += added_inertia_kg
+        for field, pair in drift_pairs(drifts).items():
+            self.parameters[field] = pair
         self._native = _motion.Law(*self.table.arrays())
         knots = np.arange(self.table.elastic_n.size, dtype=np.float64)
         lengths_m = np.asarray(self.table.low_m + self.table.step_m * knots)
@@ -288,9 +297,10 @@ class SampledLaw:
             elastic.append((last.elastic_n - first.elastic_n) / width)
             capacitance.append((last.capacitance_f - first.capacitance_f) / width)
             pull.append((last.pull_n_v2 - first.pull_n_v2) / width)
-            free.append(self._free_moved_m(low, high) / width)
+            free.append(self._free_change(low, high) / width)
             changed = _losses_of(_parameters(high)) - _losses_of(_parameters(low))
-            changed[_INERTIA] += width if name == ADDED_INERTIA else 0.0
+            if name in _BESIDE_THE_LAW:
+                changed[_BESIDE_THE_LAW[name]] += width
             losses.append(changed / width)
         count = len(self.by)
         losses_by = np.reshape(losses, (count, len(_LOSSES)))
@@ -312,7 +322,7 @@ class SampledLaw:
         # derivatives by the columns of the motion, to those by the parameters
         self._joined = np.vstack([np.eye(count)[own], losses_by[:, used].T])
 
-    def _free_moved_m(self, low: ActuatorLaw, high: ActuatorLaw) -> float:
+    def _free_change(self, low: ActuatorLaw, high: ActuatorLaw) -> float:
         """Difference of the free lengths of two laws beside this one, where the forces are 0."""
         free_m = self.law.free_length_m
         step_m = _STEP * free_m

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.actuators.drift import DRIFT_TIMES
 from haselab.actuators.law import ActuatorLaw
 
 __all__ = ["Scales", "draw_parameters"]
@@ -35,6 +36,7 @@ class Scales:
     def of(cls, law: ActuatorLaw, names: Sequence[str]) -> Scales:
         """Those of parameters of a law; other names, such as an added inertia, vary by value."""
         marked = {about.key: about.inverse_square for about in law.described()}
+        marked |= dict.fromkeys(DRIFT_TIMES, False)
         inverse = [marked.get(name.partition("[")[0]) for name in names]
         return cls(
             np.array([mark is False for mark in inverse], dtype=bool),

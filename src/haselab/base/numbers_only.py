@@ -26,11 +26,13 @@ def numbers_only(model: Any, value: Any, info: Any) -> Any:
     kinds, is_table = set(_leaves(annotation)), "dict[" in str(annotation)
     if not kinds & {int, float}:
         return value
-    if bool not in kinds and any(isinstance(part, bool) for part in _parts(value)):
-        raise ValueError("input should be a number, not true or false")
-    texts = any(isinstance(part, str) for part in _parts(value, tables=is_table))
-    if texts and kinds <= {int, float, NoneType}:
-        raise ValueError("input should be a number, not a text")
+    for name, part in _parts(value, str(info.field_name) if is_table else "input"):
+        estimate = not is_table and isinstance(value, Mapping)  # with the text of its unit
+        wrong = "true or false" if isinstance(part, bool) and bool not in kinds else ""
+        if isinstance(part, str) and kinds <= {int, float, NoneType} and not estimate:
+            wrong = "a text"
+        if wrong:
+            raise ValueError(f"{name} should be a number, not {wrong}")
     return value
 
 
@@ -68,13 +70,13 @@ def _leaves(annotation: Any) -> Iterator[Any]:
         yield from _leaves(part)
 
 
-def _parts(value: Any, *, tables: bool = True) -> Iterator[Any]:
-    """The values in nested lists and tables; an estimate is a table with the text of its unit."""
+def _parts(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """The values in nested lists and tables, with the names of their keys."""
     if isinstance(value, Mapping):
-        for part in value.values() if tables else ():
-            yield from _parts(part)
+        for key, part in value.items():
+            yield from _parts(part, f"{name}.{key}")
     elif isinstance(value, (list, tuple)):
         for part in value:
-            yield from _parts(part, tables=tables)
+            yield from _parts(part, name)
     else:
-        yield value
+        yield name, value

@@ -116,9 +116,9 @@ def test_the_drive_is_imported_block_by_block_and_times_without_a_unit_are_named
     tmp_path, capsys
 ) -> None:
     """Blocks of 20 samples, whose drive changes with each of them."""
-    time_s = np.arange(100) / 1000.0
+    time_s = np.arange(100) / 2000.0
     drive_v = np.repeat([0.0, 0.5, 1.0, 1.5, 2.0], 20)
-    wave = np.sin(2.0 * np.pi * 200.0 * time_s)
+    wave = np.sin(2.0 * np.pi * 400.0 * time_s)
     rows = np.column_stack([time_s, wave, 0.5 * wave, drive_v])
     np.savetxt(tmp_path / "m.csv", rows, "%.6g", ",", header="t,u,i,out", comments="")
     with pytest.raises(SystemExit) as stop:
@@ -230,3 +230,24 @@ def test_a_wrong_column_of_the_length_is_refused(options, words, tmp_path, capsy
     if expected:
         assert words in line and len(line.splitlines()) == 1
         assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), "in seconds it has 100 rows per second, in milliseconds 1e+05"),
+        (("--rate-hz", 1e5), "They agree if it is in ms: add --unit t=ms"),
+        (("--rate-hz", 5e4), "--rate-hz is 50000, but column t has 100 rows per second"),
+        (("--rate-hz", 100), ""),
+        (("--unit", "t=ms"), ""),
+    ],
+)
+def test_an_import_does_not_believe_a_rate_that_contradicts_the_times(
+    options, words, tmp_path, capsys
+) -> None:
+    time_ms = np.arange(4000) / 100.0
+    rows = np.column_stack([time_ms, np.sin(time_ms), np.cos(time_ms)])
+    np.savetxt(tmp_path / "m.csv", rows, "%.6g", ",", header="t,u,i", comments="")
+    code, _, err = typed(capsys, "session", "import", tmp_path / "m.csv", "--v", "u", "--i", "i",
+                         *options, "--out", tmp_path / "o")  # fmt: skip
+    assert code == (2 if words else 0) and words in err

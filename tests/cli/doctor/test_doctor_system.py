@@ -285,9 +285,13 @@ def test_on_macos_a_local_board_needs_a_server(tmp_path):
 
 
 @pytest.mark.parametrize("junk", ["", "x", "\x00\xff", "CapEff:", "a b c\nd e"])
-def test_files_with_junk_are_no_crash(plant, junk):
+def test_what_files_with_junk_do_not_show_is_missing_with_advice(plant, junk):
     changed = {path: junk for path in HEALTHY if not path.startswith("dev/")}
-    examine_system(plant(changed), NEEDS)
+    missing = bad(plant(changed))
+    # An empty file of limits or modules is that of a kernel that does not say.
+    names = ["NI driver", "network", "real time"] if junk else ["network"]
+    assert [each.name for each in missing] == names
+    assert all(each.advice.startswith("Type: ") for each in missing)
 
 
 def test_a_port_with_a_null_character_is_not_there_and_no_fault_of_the_program(plant):

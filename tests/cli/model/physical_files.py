@@ -41,7 +41,8 @@ def written(path, *, status="ok", kind="planar-hasel", residuals=True, left_out=
         f"matrix = {rows}\n",
         "residuals": f"[model.physical.residuals]\nlength_noise_m = {LENGTH_STD_M}\n"
         f"length_worst_m = {LENGTH_STD_M}\nlength_factor = 0.95\n"
-        f"capacitance_noise_f = {CAPACITANCE_STD_F}\ncapacitance_worst_f = {CAPACITANCE_STD_F}\n",
+        f"capacitance_noise_f = {CAPACITANCE_STD_F}\ncapacitance_worst_f = {CAPACITANCE_STD_F}\n"
+        "hidden_variance = 1.0\n",
     }
     without = {left_out} | (set() if residuals else {"residuals"})
     without |= {"covariance", "residuals"} if left_out == "physical" else set()

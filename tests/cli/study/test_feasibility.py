@@ -35,7 +35,9 @@ STUDY = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 @pytest.mark.parametrize("reading", ["hz", "rad"])
 def test_the_reference_study_is_feasible_on_the_twin(reading: str) -> None:
     config, study = twin_of_reading(reading), builtin_study()
-    judge_study(study, describe(config), rating_of_twin(config, study)).require()
+    printed = judge_study(study, describe(config), rating_of_twin(config, study))
+    printed.require()
+    assert len(printed.checks) >= 5 and all(check.ok for check in printed.checks)
 
 
 def test_the_predicted_field_is_the_field_that_breaks_the_twin() -> None:
@@ -133,8 +135,10 @@ def test_a_recording_needs_no_confirmation(tmp_path: Path, monkeypatch) -> None:
     path.write_text('kind = "replay"\nsession = "s.h5"\n')
     plain = rig_of(TwinBench(twin_of_reading("hz"), 1), twin_of_reading("hz"))
     monkeypatch.setattr(click, "confirm", lambda words, err: 1 / 0)
-    with armed_rig(plain, load_rig(path), path, builtin_study(quick=True), tmp_path, Operator()):
-        pass
+    with armed_rig(
+        plain, load_rig(path), path, builtin_study(quick=True), tmp_path, Operator()
+    ) as rig:
+        assert rig.acquisition.read().size > 0  # it plays
 
 
 def test_an_end_of_input_is_no_answer_and_ctrl_c_is_an_interrupt(monkeypatch) -> None:

@@ -91,4 +91,5 @@ def test_a_value_that_cannot_be_sent_is_named(study: Study) -> None:
 def test_the_process_ends_with_the_study(study: Study) -> None:
     with NoiseFreeRun(CONFIG, study) as run:
         process = run._process
+        assert process.poll() is None
     assert process.returncode is not None

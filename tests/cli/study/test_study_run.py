@@ -283,4 +283,5 @@ def test_an_interrupt_that_was_swallowed_comes_again_at_the_next_step(
 
 def test_what_nohup_ignores_stays_ignored(listener: Interruptible) -> None:
     signal.raise_signal(signal.SIGHUP)
-    listener.advance(0.5, "x")
+    listener.advance(0.5, "x")  # nothing is raised
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN

@@ -1,5 +1,6 @@
 """Every command on the page about identification runs as it stands, on files made for it."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -58,8 +59,13 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_command_of_the_page_runs(records: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_command_of_the_page_has_a_result(
+    records: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(records)
     assert len(PAGE.commands) >= 10
     for line in PAGE.commands:
         PAGE.run(line)
+        if " regions " not in line:  # it has no status
+            told = capsys.readouterr().out
+            assert re.search(r"^status +ok$", told, flags=re.MULTILINE), line

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from haselab.actuators import (
     ADDED_INERTIA,
+    DRIFTS,
     GRAVITY_M_S2,
     Drive,
     PlanarHasel,
@@ -41,11 +42,11 @@ def drive(duration_s: float, seed: int) -> Drive:
     return Drive(edges, volt, pull, np.full(count, MASS_KG), np.full(count, 5e3))
 
 
-def record(law, seed=1, *, duration_s=60.0, scale=1.0, mass_scale=1.0):
+def record(law, seed=1, *, duration_s=60.0, scale=1.0, mass_scale=1.0, drifts=None):
     """What camera and monitors see of a law, with noise."""
     rng = np.random.default_rng(100 + seed)
     acts = drive(duration_s, seed)
-    sampled = SampledLaw(law, 11e3)
+    sampled = SampledLaw(law, 11e3, drifts=drifts or {})
     start, _ = sampled.at_rest(acts.voltage_v[0], acts.ripple_v2[0], acts.load_n[0])
     times = np.arange(0.0, duration_s, 0.02)
     seen = sampled.respond(acts, times, start)
@@ -203,6 +204,26 @@ def test_hysteresis_that_the_law_lacks_is_found():
     assert "hysteresis.force_n" in far and max(map(abs, far.values())) < 4.0, far
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "law", "drifts"),
+    [
+        ("drift of the stiffness", TRUE, {DRIFTS[0]: -1e-4, DRIFTS[1]: 200.0}),
+        ("drift of the permittivity", TRUE, {DRIFTS[2]: 2e-5, DRIFTS[3]: 200.0}),
+        ("charge creep", replace(TRUE, charge_share=0.08, charge_relaxation_s=5.7), {}),
+    ],
+)
+def test_an_effect_without_which_the_search_may_fail_is_found(words, law, drifts):
+    fit = fit_actuator(START, [record(law, 3, drifts=drifts)], mass_kg=MASS_KG)
+    assert fit.status == "ok"
+    assert f"without {words}" in [rival.law for rival in fit.rejected_laws]
+    truth = {name: value for name, value in drifts.items() if name in (DRIFTS[0], DRIFTS[2])}
+    far = deviations(fit, law)
+    far |= {n: (fit.parameters[n].value - v) / fit.parameters[n].std for n, v in truth.items()}
+    judged = {n: z for n, z in far.items() if n not in set(DRIFTS) - set(truth)}
+    assert max(map(abs, judged.values())) < 4.0, judged
+
+
 def test_a_model_error_that_is_hidden_by_as_much_as_it_shows_is_one_deviation():
     """A line fitted to a line and a parabola that has equal parts along and across the line."""
     x = np.linspace(0.0, 1.0, 400)
@@ -216,6 +237,21 @@ def test_a_model_error_that_is_hidden_by_as_much_as_it_shows_is_one_deviation():
     assert std[1] == np.inf
     noisy = excess_energy([([np.full(50, 2.0)], 1.0), ([np.full(10, 1.0)], 2.0)])
     assert noisy == pytest.approx(50.0 * 3.0 - 10.0 * 3.0)
+
+
+def test_a_hidden_error_of_any_direction_has_the_energy_of_the_visible_one():
+    """Errors in the space of the parameters, of random directions and one energy."""
+    rng = np.random.default_rng(1)
+    jacobian = rng.standard_normal((300, 5)) * np.array([1.0, 10.0, 0.1, 3.0, 1.0])
+    basis = np.linalg.qr(jacobian)[0]
+    draws, energy = 4000, 7.0
+    ways = rng.standard_normal((draws, 5))
+    ways *= np.sqrt(energy) / np.linalg.norm(ways, axis=1, keepdims=True)
+    moved = np.linalg.lstsq(jacobian, (ways @ basis.T).T, rcond=None)[0]
+    stated = energy / 5.0 * np.diag(np.linalg.inv(jacobian.T @ jacobian))
+    # the square of a direction's part has the relative spread sqrt(2 * 4 / 7)
+    chance = 4.0 * np.sqrt(8.0 / 7.0 / draws)
+    np.testing.assert_allclose(np.mean(moved**2, axis=1), stated, rtol=chance)
 
 
 def test_covariances_only_grow():

@@ -12,7 +12,7 @@ import pytest
 from haselab.actuators import DeaStack, PlanarHasel
 from haselab.base import InputError
 from haselab.rig.rig_file import load_rig
-from haselab.rig.twin.config import Amplifier, TwinConfig, twin_of_reading
+from haselab.rig.twin.config import SETTLE_S, Amplifier, TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_file import identified_twin, is_actuator_file, load_twin
 from haselab.store.toml import toml_text
 
@@ -105,6 +105,14 @@ def test_the_estimates_replace_the_actuator_and_the_bench_stays(parts: Parts, pa
     assert twin.name == "twin of the identified actuator 'leg'"
     assert TwinConfig.model_validate(twin.model_dump(mode="json")) == twin
     assert load_twin(path) == identified_twin(path, TwinConfig())
+
+
+def test_a_drift_begins_with_the_study(parts: Parts, path: Path) -> None:
+    drift = {"drift.stiffness_per_s": -5e-5, "drift.stiffness_s": 600.0}
+    parts.physical["parameters"] |= drift
+    effects = load_twin(parts.written(path)).unmodelled
+    assert effects.stiffness_loss == pytest.approx(0.03) and effects.ageing_s == 600.0
+    assert effects.capacitance_rise == 0.0 and effects.begins_s == SETTLE_S
 
 
 def test_another_kind_takes_its_own_parameters(parts: Parts, path: Path) -> None:

@@ -162,6 +162,7 @@ def section_of_fit(
         "capacitance_rms_f": fit.capacitance_rms_f,
         "capacitance_worst_f": fit.capacitance_worst_f,
         "capacitance_factor": fit.capacitance_factor,
+        "hidden_variance": fit.hidden_variance,
     }
     covariance = {"names": names, "matrix": fit.covariance[np.ix_(finite, finite)].tolist()}
     if (fit.widening[finite] > 1.0).any():

@@ -73,14 +73,15 @@ def read_physical_model(path: Path) -> tuple[IdentifiedModel, ActuatorTables]:
         raise InputError(f"[model.physical] has no mass_kg, the hung mass of its records. {path}")
     names, left = model.covariance.names, model.residuals
     if model.status != "ok":
-        if left.length_worst_m is None and left.capacitance_worst_f is None:
+        worst = (left.length_worst_m, left.capacitance_worst_f)
+        if left.hidden_variance is None or worst == (None, None):
             raise InputError(
                 f"[model.physical] has the status {model.status!r}, but no residuals that say how "
                 f"large its error is. Identify the actuator again with: {again}"
             )
         click.echo(
             f"haselab: warning: [model.physical] has the status {model.status!r}. The band allows "
-            f"for an error as large as in the worst experiment of the fit. {path}",
+            f"for an error like those in the records of the fit. {path}",
             err=True,
         )
     matrix = np.array(model.covariance.matrix, dtype=np.float64).reshape(len(names), len(names))
@@ -92,7 +93,7 @@ def read_physical_model(path: Path) -> tuple[IdentifiedModel, ActuatorTables]:
             law,
             model.parameters,
             names,
-            matrix / np.outer(widening, widening),
+            matrix / np.outer(widening, widening) * (1.0 + (left.hidden_variance or 0.0)),
             mass_kg=mass_kg,
             length=_noise(left.length_factor, left.length_noise_m, left.length_worst_m, explained),
             capacitance=_noise(

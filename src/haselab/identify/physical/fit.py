@@ -19,11 +19,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import ADDED_INERTIA, GRAVITY_M_S2, ActuatorLaw, OperatingPoint, linearise
+from haselab.actuators import (
+    ADDED_INERTIA,
+    DRIFT_UNITS,
+    DRIFTS,
+    GRAVITY_M_S2,
+    ActuatorLaw,
+    OperatingPoint,
+    linearise,
+)
 from haselab.base import Estimate, InputError, JsonObject, LimitError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import Fit
-from haselab.identify.noise import coloured_covariance, whiteness_p
+from haselab.identify.noise import coloured_covariance
 from haselab.identify.physical.information import (
     Source,
     covariance_of,
@@ -31,11 +39,27 @@ from haselab.identify.physical.information import (
     largest_std,
     vague_information,
 )
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment, least_explained
-from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
+from haselab.identify.physical.model_error import hidden_std, widened
 from haselab.identify.physical.plausible import implausible
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.rivals import Rival, other_elastic, richer, simpler
+from haselab.identify.physical.residuals import (
+    channel_of,
+    noise_of,
+    notes_of,
+    rms_of,
+    seen_of,
+    status_of,
+    typical_of,
+    worst_of,
+)
+from haselab.identify.physical.rivals import (
+    Rival,
+    other_elastic,
+    richer,
+    simpler,
+    with_every_effect,
+)
 from haselab.identify.physical.search import Found, refine, search
 from haselab.identify.physical.unknowns import (
     CAMERA_OFFSET,
@@ -49,16 +73,11 @@ __all__ = ["ActuatorFit", "fit_actuator"]
 
 Floats = NDArray[np.float64]
 _MOST_ADDED = 2  # effects that the given law lacks
+_EXPLAINS = 0.1  # of a model error, which an effect must explain to be added
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
-_SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
 _APART = 2.0  # rms over noise from which records are compared alone
-_SCALE = 0.2  # largest error of the capacitance that a calibration can have
-_GOOD_SCALE = 0.005  # and a careful one
-_LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
-_WHITE = 1e-3  # probability of the residuals under white noise
-_ENOUGH = 20  # values of an experiment, for an rms of its own
 _POINTS = 5  # voltages of the linear models
 _UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
 
@@ -88,6 +107,8 @@ class ActuatorFit(Fit):
         length_worst_m: rms of the residuals in the experiment that the model explains least.
         capacitance_worst_f: the same of the capacitances.
         widening: of the standard deviations, by which a model error raised those of `covariance`.
+        hidden_variance: of the parameters by a model error of no particular direction, over that
+            by the noise; see `model_error`.
         evaluations: of the model, until it was found.
         chi_squared_ratio: mean square of the residuals over their standard deviations.
         residual_whiteness_p: probability of the less probable channel under white noise.
@@ -112,6 +133,7 @@ class ActuatorFit(Fit):
     length_worst_m: float = float("nan")
     capacitance_worst_f: float = float("nan")
     widening: Floats = field(default_factory=lambda: np.ones(0), repr=False)
+    hidden_variance: float = 0.0
     evaluations: int = 0
     chi_squared_ratio: float = float("nan")
     residual_whiteness_p: float = float("nan")
@@ -135,7 +157,10 @@ class ActuatorFit(Fit):
         """
         self._require()
         assert self.law is not None
-        start = Unknowns.of(self.law, added_inertia_kg=self.added_inertia_kg, mass_kg=self.mass_kg)
+        drifts = {name: found.value for name, found in self.parameters.items() if name in DRIFTS}
+        start = Unknowns.of(
+            self.law, added_inertia_kg=self.added_inertia_kg, mass_kg=self.mass_kg, drifts=drifts
+        )
         values = np.array([self.parameters[name].value for name in start.names])
         return replace(start, values=values)
 
@@ -191,7 +216,7 @@ class ActuatorFit(Fit):
         experiments = list(dict.fromkeys(name for name, _ in self.channels))
         curves = []
         for channel in (LENGTH, CAPACITANCE):
-            found = {name: _rms([part]) for (name, of), part in zip(
+            found = {name: rms_of([part]) for (name, of), part in zip(
                 self.channels, self.residuals, strict=True) if of == channel}  # fmt: skip
             x = np.array([experiments.index(name) for name in found], dtype=np.float64)
             curves.append(Curve(x, np.array(list(found.values())), channel, "bars"))
@@ -242,39 +267,71 @@ def fit_actuator(
             "first load and voltage",
             kind=law.kind,
         )
+    rejected: list[Rival] = []
+    if not found.converged:
+        found, rejected = with_every_effect(plain, start.without((CAMERA_SCALE,)), found)
+    if rejected:
+        start = start.with_law(found.unknowns.present_law(), found.unknowns.drifts)
     misfit, found = _weighed(
         Misfit(records, known=known, strict=True), start.at(found.unknowns), found
     )
     anew = _from_start(misfit, start, found)
     if anew is not None and anew is not found:
         misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
-    rejected = []
+    misfit, found, more = _with_effects(misfit, start, found)
+    rejected += more
+    seen = seen_of(misfit, found)
+    if len(records) > 1 and seen.excess[0] > _APART and _each_alone(misfit, start):
+        status = "the records contradict each other: the law explains each alone, but not all"
+        status += " together. Check that all are of one actuator, and mass, units and gain of each"
+        return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
+    # beside a model error, the evidence for another elastic law would mean nothing
+    others = other_elastic(misfit, found) if seen.explained else []
+    rejected += [rival for rival in others if rival.log_evidence < 0.0]
+    preferred = [rival for rival in others if rival.log_evidence > 0.0]
+    return _result(misfit, _ordered(found), rejected, preferred)
+
+
+def _with_effects(
+    misfit: Misfit, start: Unknowns, found: Found
+) -> tuple[Misfit, Found, list[Rival]]:
+    """Add effects that the law lacks, as long as the records prefer one decisively.
+
+    Args:
+        misfit: to minimise.
+        start: where the user began.
+        found: before.
+    Returns:
+        Misfit with its noise, minimum, and the laws without these effects.
+    """
+    rejected: list[Rival] = []
     for _ in range(_MOST_ADDED):
         better = richer(misfit, found)
         if better is None:
             break
         again = refine(misfit, better.start, found.evaluations)
+        if again is None or not _explains(misfit, found, again):
+            break
         again = _from_start(misfit, better.start.at(start), again, explained=True)
-        if again is None or _rms([again.residuals]) > _rms([found.residuals]):
+        if again is None or rms_of([again.residuals]) > rms_of([found.residuals]):
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
-    if len(records) > 1 and _seen(misfit, found).excess[0] > _APART and _each_alone(misfit, start):
-        status = "the records contradict each other: the law explains each alone, but not all"
-        status += " together. Check that all are of one actuator, and mass, units and gain of each"
-        return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
-    # beside a model error, the evidence for another elastic law would mean nothing
-    others = other_elastic(misfit, found) if _seen(misfit, found).explained else []
-    rejected += [rival for rival in others if rival.log_evidence < 0.0]
-    preferred = [rival for rival in others if rival.log_evidence > 0.0]
-    return _result(misfit, _ordered(found), rejected, preferred)
+    return misfit, found, rejected
+
+
+def _explains(misfit: Misfit, before: Found, after: Found) -> bool:
+    """Whether an effect explains a part of a model error, and not only imitates a little of it."""
+    seen = seen_of(misfit, before)
+    left = seen_of(misfit, after).excess_energy
+    return seen.explained or left < (1.0 - _EXPLAINS) * seen.excess_energy
 
 
 def _each_alone(misfit: Misfit, start: Unknowns) -> bool:
     """Whether the law explains each record alone, with parameters of its own."""
     parts = [replace(misfit, records=[record]) for record in misfit.records]
     alone = [(own, search(own, start)) for own in parts]
-    return all(part is not None and _seen(own, part).explained for own, part in alone)
+    return all(part is not None and seen_of(own, part).explained for own, part in alone)
 
 
 def _ordered(found: Found) -> Found:
@@ -312,11 +369,11 @@ def _from_start(
         found: before; None: nothing.
         explained: search again also if the result leaves more than noise.
     """
-    left = found is not None and explained and not _seen(misfit, found).explained
+    left = found is not None and explained and not seen_of(misfit, found).explained
     if found is not None and found.converged and not left:
         return found
     anew = search(misfit, start, 0 if found is None else found.evaluations)
-    if found is None or (anew is not None and _rms([anew.residuals]) < _rms([found.residuals])):
+    if found is None or (anew is not None and rms_of([anew.residuals]) < rms_of([found.residuals])):
         return anew
     return found
 
@@ -332,44 +389,18 @@ def _weighed(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Misfit, Fou
         if again is None:
             break
         start, found = again.unknowns, again
-        if same:
+        if same or not found.converged:
             break
     return misfit, found
-
-
-def _channel(segments: Sequence[Segment], channel: str, residuals: Floats) -> list[Floats]:
-    """Residuals of one channel, experiment by experiment."""
-    return [residuals[part.rows] for part in segments if part.channel == channel]
 
 
 def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
     """True over stated standard deviation of both channels, by the residuals."""
     segments = misfit.segments
     share = 1.0 - found.unknowns.values.size / found.residuals.size
-    rms = [_rms(_channel(segments, name, found.residuals)) / math.sqrt(share)
+    rms = [rms_of(channel_of(segments, name, found.residuals)) / math.sqrt(share)
            for name in (LENGTH, CAPACITANCE)]  # fmt: skip
     return misfit.length_factor * rms[0], misfit.capacitance_factor * rms[1]
-
-
-def _rms(parts: Sequence[Floats]) -> float:
-    return math.sqrt(float(np.mean(np.concatenate(parts) ** 2))) if parts else 1.0
-
-
-def _worst(parts: Sequence[Floats]) -> float:
-    """Largest rms of an experiment with enough values."""
-    return max((_rms([part]) for part in parts if part.size >= _ENOUGH), default=math.nan)
-
-
-def _neighbours(parts: Sequence[Floats]) -> float:
-    """Noise by the differences of neighbours, which a slow misfit does not change."""
-    steps = [np.diff(part) for part in parts if part.size > 1]
-    return _rms(steps) / math.sqrt(2.0) if steps else math.nan
-
-
-def _typical(parts: Sequence[Floats]) -> float:
-    """Typical standard deviation of a channel; NaN where it has no values."""
-    joined = np.concatenate(list(parts))
-    return float(np.median(joined)) if joined.size else math.nan
 
 
 def _result(
@@ -377,10 +408,10 @@ def _result(
 ) -> ActuatorFit:
     unknowns = found.unknowns
     segments = misfit.segments
-    seen = _seen(misfit, found)
+    seen = seen_of(misfit, found)
     lengths, capacitances = seen.lengths, seen.capacitances
-    length_noise, capacitance_noise = _neighbours(lengths), _neighbours(capacitances)
-    status, usable = _status(
+    length_noise, capacitance_noise = noise_of(lengths), noise_of(capacitances)
+    status, usable = status_of(
         seen, unknowns.value(SENSING_SCALE), preferred, converged=found.converged
     )
     if not usable:
@@ -389,11 +420,8 @@ def _result(
     covariance = _covariance(found, segments, prior)
     own_std = np.sqrt(np.diag(covariance))
     white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
+    energy = seen.excess_energy if status != "ok" else 0.0
     if status != "ok":
-        energy = excess_energy(
-            [(part, noise) for part, noise in (
-                (lengths, length_noise), (capacitances, capacitance_noise)) if part]
-        )  # fmt: skip
         covariance = widened(covariance, hidden_std(found.jacobian, energy, prior))
     std = np.sqrt(np.diag(covariance))
     widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
@@ -401,7 +429,7 @@ def _result(
     units = {key: about.unit for key, about in described.items()}
     units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
               "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": "",
-              START_HYSTERESIS: "N"}  # fmt: skip
+              START_HYSTERESIS: "N", **DRIFT_UNITS}  # fmt: skip
     slopes = unknowns.slopes
     weak = (std > largest_std(unknowns)) | (np.abs(found.left) > _UNSETTLED * std)
     parameters = {}
@@ -419,26 +447,27 @@ def _result(
             parameters[name] = Estimate.normal(unknowns.values[k], known_std, unit)
     sources = determined_by(unknowns, _by_segment(segments, found.jacobian))
     names = np.array(unknowns.names)
-    std_m = misfit.length_factor * _typical([r.length_std_m for r in misfit.records])
-    std_f = misfit.capacitance_factor * _typical([r.capacitance_std_f for r in misfit.records])
+    std_m = misfit.length_factor * typical_of([r.length_std_m for r in misfit.records])
+    std_f = misfit.capacitance_factor * typical_of([r.capacitance_std_f for r in misfit.records])
     law = unknowns.present_law()
     values = covariance * np.outer(slopes, slopes)
     return ActuatorFit(
         status=status,
-        notes=_notes(unknowns.value(SENSING_SCALE)),
+        notes=notes_of(unknowns.value(SENSING_SCALE)),
         parameters=parameters,
         covariance=values,
         residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),
         channels=tuple((part.experiment, part.channel) for part in segments if part.experiment),
-        length_rms_m=std_m * _rms(lengths),
+        length_rms_m=std_m * rms_of(lengths),
         length_noise_m=std_m * length_noise,
-        capacitance_rms_f=std_f * _rms(capacitances),
+        capacitance_rms_f=std_f * rms_of(capacitances),
         capacitance_noise_f=std_f * capacitance_noise,
         length_factor=misfit.length_factor * length_noise,
         capacitance_factor=misfit.capacitance_factor * capacitance_noise,
-        length_worst_m=std_m * _worst(lengths),
-        capacitance_worst_f=std_f * _worst(capacitances),
+        length_worst_m=std_m * worst_of(lengths),
+        capacitance_worst_f=std_f * worst_of(capacitances),
         widening=widening,
+        hidden_variance=energy / std.size,
         residual_whiteness_p=seen.whiteness_p,
         law=law,
         kind=law.kind,
@@ -486,102 +515,6 @@ def _by_segment(segments: Sequence[Segment], values: Floats) -> dict[tuple[str, 
     for part in segments:
         found.setdefault((part.experiment, part.channel), []).append(values[part.rows])
     return {name: np.vstack(parts) for name, parts in found.items()}
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """Residuals of both channels, experiment by experiment."""
-
-    lengths: list[Floats]
-    capacitances: list[Floats]
-    share: float  # of the variance of the channel that is explained least
-
-    @property
-    def whiteness_p(self) -> float:
-        """Of the less probable channel."""
-        return min(whiteness_p(self.lengths), whiteness_p(self.capacitances))
-
-    @property
-    def excess(self) -> tuple[float, str]:
-        """Largest rms of a channel over its noise, and its name."""
-        both = {"lengths": self.lengths, "capacitances": self.capacitances}
-        found = {
-            name: float(np.nan_to_num(_rms(part) / _neighbours(part)))
-            for name, part in both.items()
-        }
-        largest = max(found, key=lambda name: found[name])
-        return found[largest], largest
-
-    @property
-    def explained(self) -> bool:
-        """Whether the law leaves nothing but noise."""
-        return not (self.excess[0] > _SLIGHT and self.whiteness_p < _WHITE)
-
-
-def _seen(misfit: Misfit, found: Found) -> _Seen:
-    return _Seen(
-        _channel(misfit.segments, LENGTH, found.residuals),
-        _channel(misfit.segments, CAPACITANCE, found.residuals),
-        least_explained(misfit, found.residuals),
-    )
-
-
-def _status(
-    seen: _Seen,
-    scale: float,
-    preferred: Sequence[Rival],
-    *,
-    converged: bool,
-) -> tuple[str, bool]:
-    """ "ok", a model error, or why there is no result; and whether there is one.
-
-    Args:
-        seen: residuals.
-        scale: measured over true capacitance.
-        preferred: laws that the records prefer to the chosen one.
-        converged: whether the search did.
-    """
-    ratio, largest = seen.excess
-    if ratio > _GROSS:
-        return (
-            f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
-            "noise. Check the mass, the units and that all records are of one actuator, or start "
-            "nearer, by [actuator.parameters]"
-        ), False
-    if not seen.explained and seen.share < _LEAST_SHARE:
-        return (
-            f"the records contradict the model: it explains only {100.0 * max(seen.share, 0.0):.0f}"
-            " % of the variance of a signal. Check the mass, the amplifier's gain, the units and "
-            "that all records are of one actuator, or start nearer, by [actuator.parameters]"
-        ), False
-    if not converged:
-        return "the search did not converge; start nearer, by [actuator.parameters]", False
-    if abs(scale - 1.0) > _SCALE:
-        return (
-            f"the records contradict each other: the capacitances are {scale:.3g} times those that "
-            "the forces need. Check the mass, the amplifier's gain and the calibration"
-        ), False
-    if not seen.explained:
-        return (
-            f"model error: the {largest} are off by {ratio:.3g} times the noise, and the "
-            "intervals are wider for it"
-        ), True
-    if preferred:
-        return (
-            f"model error: {preferred[0].law} explains the records better (logarithm of evidence "
-            f"{preferred[0].log_evidence:.3g}), so the values of the elastic force may be wrong"
-        ), True
-    return "ok", True
-
-
-def _notes(scale: float) -> tuple[str, ...]:
-    if abs(scale - 1.0) <= _GOOD_SCALE:
-        return ()
-    return (
-        f"The capacitances are {scale:.4g} times those that the forces need. If they are well "
-        "calibrated, the amplifier's gain or the mass is wrong, and so are permittivity and "
-        "stiffness, although their intervals are narrow.",
-    )
 
 
 def _pairs(values: NDArray[np.complex128]) -> list[list[float]]:

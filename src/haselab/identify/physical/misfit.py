@@ -95,6 +95,7 @@ def modelled(
         _highest_v(record),
         names,
         added_inertia_kg=added_kg,
+        drifts=unknowns.drifts,
     )
     held_n = unknowns.value(START_HYSTERESIS) if START_HYSTERESIS in unknowns.names else None
     response = _respond(sampled, record, unknowns.value(CAMERA_LATENCY), held_n, longest_m)

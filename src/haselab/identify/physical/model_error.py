@@ -9,6 +9,11 @@ $\sqrt{E\,(J^\top J)^{-1}_{kk}}$
 
 This counts as one standard deviation: at 1.96 standard deviations, the hidden energy would be
 almost four times the visible one.
+
+A prediction depends on many directions. For it, the hidden part has no particular one of the $P$
+directions, which gives the parameters the further covariance
+
+$(E/P)\,(J^\top J)^{-1}$
 """
 
 from __future__ import annotations

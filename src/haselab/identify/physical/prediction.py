@@ -6,9 +6,8 @@ noise $\sigma$ of the measured ones, the 95 % band is
 $\pm 1.96 \sqrt{\mathrm{diag}(J S J^\top) + \sigma^2 + m^2}$
 
 where $m$ is the rms of a model error in the worst experiment of the fit, or 0 if the fit has no
-model error. $S$ does not include the widening by `model_error`. That allows for the worst of all
-directions, whereas the error of a motion that resembles those of the fit is about as large as
-theirs.
+model error. Of a model error, $S$ does not allow for the worst of all directions, as the intervals
+of the parameters do, but for one that is hidden in no particular direction, see `model_error`.
 
 Correlations matter: errors of the parameters can be large and still cancel in the prediction. The
 tracker finds the marks of each session anew, so all lengths of a session share an error of 2 µm.
@@ -151,7 +150,7 @@ class IdentifiedModel:
         unknowns, explained = fit.unknowns(), fit.status == "ok"
         return cls(
             unknowns,
-            fit.covariance / np.outer(fit.widening, fit.widening),
+            fit.covariance / np.outer(fit.widening, fit.widening) * (1.0 + fit.hidden_variance),
             ChannelNoise(fit.length_factor, fit.length_noise_m, fit.length_worst_m, explained),
             ChannelNoise(
                 fit.capacitance_factor, fit.capacitance_noise_f, fit.capacitance_worst_f, explained

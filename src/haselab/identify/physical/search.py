@@ -67,7 +67,8 @@ def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | Non
     that the model misses altogether, such as a collapse that the start predicts, count little
     there; if much of the records remains so after the first stage, another start is drawn within
     the widths. In the last stage, Levenberg-Marquardt, the start counts with ten times the widths:
-    too little to move what the data determine, enough to end the search for what they do not.
+    too little to move what the data determine, enough to end the search for what they do not. A
+    stage that leaves more than the noise it assumed is the last one.
 
     Args:
         misfit: to minimise.
@@ -84,6 +85,11 @@ def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | Non
         noise = max(1.0, 0.1 * noise)
         now, used = _descend(misfit, now, start, noise, _STEPS)
         count += used
+        if float(np.mean(now.residuals**2)) > noise**2:  # a law that lacks something ends here
+            return Found(
+                now.unknowns, now.residuals, now.jacobian, 0.0 * now.unknowns.values, False,
+                evaluations + count,
+            )  # fmt: skip
     return _last_stage(misfit, now, start, evaluations + count)
 
 
@@ -199,7 +205,8 @@ def _descend(
     misfit: Misfit, now: _State, start: Unknowns, noise: float, most: int, *, last: bool = False
 ) -> tuple[_State, int]:
     """One stage: state, evaluations used."""
-    widths = now.unknowns.widths
+    # at its limit, the own width of an inverse square is hardly more than 0
+    widths = start.vague_widths
     pull = vague_information(now.unknowns) if last else widths**-2.0
 
     def cost_of(unknowns: Unknowns, residuals: Floats) -> float:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import ADDED_INERTIA, ActuatorLaw, Scales, with_parameters
+from haselab.actuators import (
+    ADDED_INERTIA,
+    DRIFT_LIMITS,
+    DRIFT_TIMES,
+    DRIFTS,
+    ActuatorLaw,
+    Scales,
+    with_parameters,
+)
 
 __all__ = [
     "CAMERA_LATENCY",
@@ -36,7 +45,8 @@ _SCALES = {CAMERA_SCALE, SENSING_SCALE}  # 1 where they are not estimated; 0 for
 _WIDTH = 0.4
 _LEAST_WIDTH = 0.02
 _WIDTHS = {CAMERA_LATENCY: 2e-3, CAMERA_OFFSET: 1e-3, CAMERA_SCALE: 1e-3, SENSING_LATENCY: 2e-3,
-           SENSING_SCALE: 0.05, START_HYSTERESIS: 0.1}  # fmt: skip
+           SENSING_SCALE: 0.05, START_HYSTERESIS: 0.1,
+           **{name: 3e-5 for name in DRIFTS if name not in DRIFT_TIMES}}  # fmt: skip
 _INERTIA_WIDTH = 0.1  # of the mass
 _AT_LIMIT = 1e-6  # relative distance from a limit
 
@@ -93,8 +103,8 @@ class Unknowns:
 
     Args:
         law: to start from; parameters that are not estimated stay those of this law.
-        names: of the parameters of the law, of `ADDED_INERTIA`, of `INSTRUMENTS` and, with
-            hysteresis, of `START_HYSTERESIS`.
+        names: of the parameters of the law, of `ADDED_INERTIA`, of those of `DRIFTS` that the
+            records show, of `INSTRUMENTS` and, with hysteresis, of `START_HYSTERESIS`.
         values: in their units. Shape `(P,)`.
         mass_kg: hung mass, the scale of an added inertia.
     """
@@ -105,12 +115,24 @@ class Unknowns:
     mass_kg: float
 
     @classmethod
-    def of(cls, law: ActuatorLaw, *, added_inertia_kg: float, mass_kg: float) -> Unknowns:
-        """All numbers that can be estimated for a law."""
+    def of(
+        cls,
+        law: ActuatorLaw,
+        *,
+        added_inertia_kg: float,
+        mass_kg: float,
+        drifts: Mapping[str, float] = MappingProxyType({}),
+    ) -> Unknowns:
+        """All numbers that can be estimated for a law, with some of `DRIFTS`."""
         values = fitted_parameters(law)
         more = (START_HYSTERESIS,) if law.losses.hysteresis_n > 0.0 else ()
-        names = (*values, ADDED_INERTIA, *INSTRUMENTS, *more)
-        start = [*values.values(), added_inertia_kg, *map(usual, (*INSTRUMENTS, *more))]
+        names = (*values, ADDED_INERTIA, *drifts, *INSTRUMENTS, *more)
+        start = [
+            *values.values(),
+            added_inertia_kg,
+            *drifts.values(),
+            *map(usual, (*INSTRUMENTS, *more)),
+        ]
         return cls(law, names, np.array(start, dtype=np.float64), mass_kg)
 
     @property
@@ -118,6 +140,24 @@ class Unknowns:
         """Those of which the motion depends, in order; they come first."""
         others = (*INSTRUMENTS, START_HYSTERESIS)
         return tuple(name for name in self.names if name not in others)
+
+    def with_law(self, law: ActuatorLaw, drifts: Mapping[str, float]) -> Unknowns:
+        """All numbers of another law and other drifts, with the values of these where they are.
+
+        Args:
+            law: with effects that this one lacks, or without some of its own.
+            drifts: all that are estimated; the values of these here count.
+        """
+        full = Unknowns.of(
+            law, added_inertia_kg=self.value(ADDED_INERTIA), mass_kg=self.mass_kg, drifts=drifts
+        ).at(self)
+        known = [name for name in INSTRUMENTS if name not in self.names]
+        return full.without(known) if known else full
+
+    @property
+    def drifts(self) -> dict[str, float]:
+        """Slow changes with the record's time, see `DRIFTS`."""
+        return {name: self.value(name) for name in self.names if name in DRIFTS}
 
     @property
     def _scales(self) -> Scales:
@@ -176,6 +216,7 @@ class Unknowns:
     def limits(self) -> tuple[Floats, Floats]:
         """Smallest and largest value of each; infinite where there is no limit. Shapes `(P,)`."""
         ends = {about.key: (about.low, about.high) for about in self.law.described()}
+        ends |= DRIFT_LIMITS
         found = [ends.get(name.partition("[")[0], (-np.inf, np.inf)) for name in self.names]
         low, high = np.array(found, dtype=np.float64).reshape(-1, 2).T
         return low, high

@@ -254,6 +254,8 @@ class ResidualTable(_Section):
     capacitance_rms_f: Annotated[Number, Field(ge=0)] | None = None
     capacitance_worst_f: Annotated[Number, Field(ge=0)] | None = None
     capacitance_factor: _Positive | None = None
+    # of the parameters by the hidden part of a model error, over that by the noise
+    hidden_variance: Annotated[Number, Field(ge=0)] | None = None
 
 
 class PhysicalRecords(_Section):

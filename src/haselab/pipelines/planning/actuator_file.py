@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from haselab.actuators import ACTUATORS, ADDED_INERTIA, with_parameters
+from haselab.actuators import ACTUATORS, ADDED_INERTIA, DRIFTS, with_parameters
 from haselab.base import InputError, LimitError
 from haselab.identify.physical.outlook import Outlook
 from haselab.identify.physical.unknowns import Unknowns
@@ -47,7 +47,10 @@ def planner_of(about: ActuatorSection, model: PhysicalTable, ends_v: Ends, path:
         law = with_parameters(law, {k: v for k, v in values.items() if k.partition("[")[0] in own})
     except (InputError, LimitError) as error:
         raise InputError(f"[model.physical]: {error} {path}") from error
-    unknowns = Unknowns.of(law, added_inertia_kg=values.get(ADDED_INERTIA, 0.0), mass_kg=mass_kg)
+    unknowns = Unknowns.of(
+        law, added_inertia_kg=values.get(ADDED_INERTIA, 0.0), mass_kg=mass_kg,
+        drifts={name: value for name, value in values.items() if name in DRIFTS},
+    )  # fmt: skip
     if set(unknowns.names) != set(covariance.names) or set(unknowns.names) - set(values):
         odd = sorted(set(unknowns.names) ^ set(covariance.names)) or sorted(unknowns.names)
         raise InputError(

@@ -16,15 +16,12 @@ from haselab.sensing import ChargeConfig, LockinConfig
 from haselab.store.columns.reader import (
     ColumnStream,
     check_rate,
-    head_of_times,
-    open_archive,
+    check_times,
     open_columns,
 )
 from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
     ColumnOptions,
-    assumed_seconds,
-    time_column,
 )
 from haselab.store.columns.units import Unit
 from haselab.store.session.reader import SessionReader, session_file
@@ -285,19 +282,7 @@ def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None
     if stream.rate_hz is not None:
         check_rate(given, stream.rate_hz, _RATE_ROWS, "the file's own rate", path)
         return given
-    head = head_of_times(path, request.columns, _RATE_ROWS)
-    if head is None:
-        return given
-    name, time_s = head
-    steps = np.diff(time_s)
-    # Times with few digits repeat, so they state the rate less exactly.
-    if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
-        found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
-        nearest = min(found, key=lambda rate: abs(rate / given - 1.0))
-        with open_archive(path) as archive:
-            full = time_column(archive, request.columns) or name
-            assumed = name if assumed_seconds(archive, full, request.columns) else ""
-        check_rate(given, nearest, steps.size, f"column {name}", path, assumed=assumed)
+    check_times(path, given, request.columns)
     return given
 
 

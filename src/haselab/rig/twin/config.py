@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "READINGS",
+    "SETTLE_S",
     "AcquisitionConfig",
     "Amplifier",
     "Dielectric",
@@ -31,6 +32,7 @@ __all__ = [
     "twin_of_reading",
 ]
 
+SETTLE_S = 120.0  # how long the mass has hung when a study begins
 _PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "hysteresis", "dielectric")
 
 
@@ -91,9 +93,10 @@ class Unmodelled(Section):
     )
     warming_s: float = Field(600.0, gt=0, description="time constant of that")
     stiffness_loss: float = Field(
-        0.0, ge=0, lt=0.5, description="share of the elastic force that ageing takes away"
+        0.0, gt=-0.5, lt=0.5, description="share of the elastic force that ageing takes away"
     )
     ageing_s: float = Field(600.0, gt=0, description="time constant of that")
+    begins_s: float = Field(0.0, ge=0, description="when both begin, s after the start of the twin")
     resonance_mass_kg: float = Field(
         0.0, ge=0, lt=20, description="mass on a spring at the moving end, 0: off"
     )

@@ -15,7 +15,7 @@ from haselab.actuators import GRAVITY_M_S2
 from haselab.base import LimitError, Limits, SafetyError
 from haselab.rig import Frames, Rig, RigDescription
 from haselab.rig.twin.camera import TwinCamera
-from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.config import SETTLE_S, TwinConfig
 
 __all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench", "rig_of"]
 
@@ -25,7 +25,6 @@ _SLOWEST_FRAMES_HZ = 0.01  # a lower frame rate is a mistake
 _SUB = 20  # samples in one mechanical step, TWIN_SUB of native/twin/twin.h
 _THREADS = os.cpu_count() or 1
 _RAMP_S = 1.0  # a person takes this long to hang or lift a weight
-_SETTLE_S = 120.0  # how long the mass has hung when a study begins
 _LONGEST_WAIT_S = 86400.0
 _SMALLEST_F, _LARGEST_F = 1e-12, 1e-6  # of the fixture
 _MOST_STEPS = 5_000_000  # mechanical steps per call, to limit memory
@@ -92,6 +91,7 @@ def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:
         "warming_s": extra.warming_s,
         "stiffness_loss": extra.stiffness_loss,
         "ageing_s": extra.ageing_s,
+        "begins_s": extra.begins_s,
         "second_kg": extra.resonance_mass_kg,
         "second_rad_s": 2.0 * math.pi * extra.resonance_hz,
         "second_damping": extra.resonance_damping_ratio,
@@ -156,7 +156,7 @@ class TwinBench:
         self._trace: list[NDArray[np.float64]] = []
         self._trace_start_s = 0.0
         self.hang(config.load.mass_kg)
-        self.wait(_SETTLE_S)
+        self.wait(SETTLE_S)
 
     # VoltageSource
     def write(self, voltage_v: float) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from haselab.actuators import (
     ACTUATORS,
     ADDED_INERTIA,
+    DRIFTS,
     ActuatorLaw,
     Scales,
     draw_parameters,
@@ -20,7 +21,7 @@ from haselab.base import InputError, JsonObject, LimitError, table_at
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.sections import PhysicalTable
 from haselab.rig.protocols import PLANAR_HASEL
-from haselab.rig.twin.config import READINGS, Origin, TwinConfig
+from haselab.rig.twin.config import READINGS, SETTLE_S, Origin, TwinConfig
 from haselab.store.actuator_file import read_actuator
 from haselab.store.manifest import sha256_of
 from haselab.store.toml import read_toml, validated
@@ -113,9 +114,9 @@ def identified_twin(path: Path, bench: TwinConfig, draw: int | None = None) -> T
     try:
         law = with_parameters(ACTUATORS.find(model.kind)(), about.parameters)
         if draw is None:
-            law, added_kg, scale = _with(law, model, model.parameters)
+            law, added_kg, scale, drift = _with(law, model, model.parameters)
         else:
-            law, added_kg, scale = _drawn(law, model, about.distribution, draw)
+            law, added_kg, scale, drift = _drawn(law, model, about.distribution, draw)
     except (InputError, LimitError) as error:
         raise InputError(f"{error} {path}") from error
     hashes = table_at(sections, "provenance", "model", "physical").get("sha256")
@@ -135,6 +136,7 @@ def identified_twin(path: Path, bench: TwinConfig, draw: int | None = None) -> T
         "name": f"twin of the identified actuator {name!r}",
         "load": {"mass_kg": mass_kg, "added_inertia_kg": added_kg},
         "amplifier": {**data["amplifier"], "i_monitor_gain_error": monitor},
+        "unmodelled": {**data["unmodelled"], **drift},
         "origin": origin.model_dump(),
     }
     return validated(TwinConfig, data, path)
@@ -157,8 +159,8 @@ def _with_law(data: dict[str, Any], law: ActuatorLaw) -> dict[str, Any]:
 
 def _with(
     law: ActuatorLaw, model: PhysicalTable, values: Mapping[str, float]
-) -> tuple[ActuatorLaw, float, float]:
-    """Law, added inertia and error of the capacitance with the values of a model.
+) -> tuple[ActuatorLaw, float, float, dict[str, float]]:
+    """Law, added inertia, error of the capacitance and drift with the values of a model.
 
     Raises:
         InputError: A name is unknown, or a value cannot be.
@@ -172,7 +174,20 @@ def _with(
         raise InputError(f"{ADDED_INERTIA} is {added_kg:g} kg, but it must not be below 0.")
     if not scale > 0.0:
         raise InputError(f"{_SCALE} is {scale:g}, but it must be above 0. Change it.")
-    return changed, max(added_kg, 0.0), scale
+    return changed, max(added_kg, 0.0), scale, _drift(values)
+
+
+def _drift(values: Mapping[str, float]) -> dict[str, float]:
+    """Slow changes as the twin has them, from the beginning of a study on."""
+    found: dict[str, float] = {}
+    for (rate, time), change, constant, sign in (
+        (DRIFTS[:2], "stiffness_loss", "ageing_s", -1.0),
+        (DRIFTS[2:], "capacitance_rise", "warming_s", 1.0),
+    ):
+        if rate in values:
+            found |= {change: sign * values[rate] * values[time], constant: values[time]}
+            found["begins_s"] = SETTLE_S
+    return found
 
 
 def _drawn(
@@ -180,7 +195,7 @@ def _drawn(
     model: PhysicalTable,
     distribution: Mapping[str, tuple[float, float]],
     seed: int,
-) -> tuple[ActuatorLaw, float, float]:
+) -> tuple[ActuatorLaw, float, float, dict[str, float]]:
     """The same with all parameters drawn.
 
     Raises:

@@ -28,6 +28,7 @@ __all__ = [
     "FORMATS",
     "ColumnStream",
     "check_rate",
+    "check_times",
     "head_of_times",
     "open_archive",
     "open_columns",
@@ -292,7 +293,7 @@ class ColumnStream(Closing):
         self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
         if self.rate_hz and assumed_seconds(self._archive, full, self._options):
-            check_assumed_seconds(full, self.rate_hz, self._archive.file)
+            check_assumed_seconds(full, self.rate_hz, self._archive.file, monitors=True)
             self.assumed_seconds = full
 
     def _check_stated_rate(self, stated_hz: float) -> None:
@@ -379,6 +380,31 @@ class ColumnStream(Closing):
     def close(self) -> None:
         """Close the file."""
         self._archive.close()
+
+
+def check_times(path: Path, given_hz: float, options: ColumnOptions) -> None:
+    """Refuse a rate that contradicts the column of times of a file, if it has one.
+
+    Args:
+        path: of the file.
+        given_hz: by the user.
+        options: what the user states about its columns.
+    Raises:
+        InputError: they contradict each other.
+    """
+    head = head_of_times(path, options, _HEAD_ROWS)
+    if head is None:
+        return
+    name, time_s = head
+    steps = np.diff(time_s)
+    # Times with few digits repeat, so they state the rate less exactly.
+    if steps.size and (steps > 0.0).all() and np.isfinite(steps).all():
+        found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
+        nearest = min(found, key=lambda rate: abs(rate / given_hz - 1.0))
+        with open_archive(path) as archive:
+            full = time_column(archive, options) or name
+            assumed = name if assumed_seconds(archive, full, options) else ""
+        check_rate(given_hz, nearest, steps.size, f"column {name}", path, assumed=assumed)
 
 
 def head_of_times(

@@ -21,7 +21,8 @@ __all__ = [
     "why_no_times",
 ]
 
-_AMBIGUOUS_HZ = 10.0 * 1.001  # with the rounding of times of few digits
+# With the rounding of times of few digits.
+_AMBIGUOUS_HZ, _AMBIGUOUS_MONITORS_HZ = 10.0 * 1.001, 1e3 * 1.001
 TIME_NAMES = ("time_s", "time", "zeit", "t", "x_value", "times", "temps", "tiempo", "tempo")
 
 
@@ -133,19 +134,21 @@ def assumed_seconds(archive: Archive, full: str, options: ColumnOptions) -> bool
     return not name.endswith("_s") and stated_unit(archive, full, options) is None
 
 
-def check_assumed_seconds(name: str, rate_hz: float, file: Path) -> None:
+def check_assumed_seconds(name: str, rate_hz: float, file: Path, *, monitors: bool = False) -> None:
     """Refuse times without a unit whose rate is so low in seconds that ms are as likely.
 
-    Records of moving actuators have 50 Hz to 10 kHz: in milliseconds these are 0.05 to 10.
+    Records of moving actuators have 50 Hz to 10 kHz: in milliseconds these are 0.05 to 10. Monitors
+    have up to 1 MHz.
 
     Args:
         name: of the column.
         rate_hz: rows per second, if the times are in s.
         file: where they are from.
+        monitors: whether the file has voltage and current.
     Raises:
-        InputError: at most 10 rows per second.
+        InputError: at most 10 rows per second, or 1000 of monitors.
     """
-    if rate_hz <= _AMBIGUOUS_HZ:
+    if rate_hz <= (_AMBIGUOUS_MONITORS_HZ if monitors else _AMBIGUOUS_HZ):
         raise InputError(
             f"Column {name} states no unit: in seconds it has {rate_hz:.4g} rows per second, in "
             f"milliseconds {1e3 * rate_hz:.4g}. State which: --unit {name}=s or --unit {name}=ms: "

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, JsonObject
-from haselab.store.columns.reader import ColumnStream, open_columns
+from haselab.store.columns.reader import ColumnStream, check_times, open_columns
 from haselab.store.columns.selection import AS_THE_FILE_STATES, ColumnOptions
 from haselab.store.manifest import Manifest, sha256_of
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
@@ -173,6 +173,8 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
     """
     with _open(file, plan) as stream:
         rate_hz, assumed = plan.rate_hz or stream.rate_hz, stream.assumed_seconds
+    if plan.rate_hz:
+        check_times(file, plan.rate_hz, plan.options)
     if not rate_hz:
         raise InputError(
             "The file states no sampling rate. Add --rate-hz, or name the column of the times with "

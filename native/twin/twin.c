@@ -154,6 +154,27 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
     s->time_s += n_steps * dt;
 }
 
+double twin_update(const twin_parameters *p, twin_state *s, const twin_update_input *in,
+                   double *lengths, int32_t at)
+{
+    const double before_s = s->time_s;
+    double sum = 0.0;
+    int32_t k;
+    if (in->switch_at > 0) {
+        twin_move(p, s, &in->before_v, 1, 1, in->load_n, in->switch_at, lengths + at);
+    }
+    if (in->switch_at < in->steps) {
+        twin_move(p, s, &in->after_v, 1, 1, in->load_n, in->steps - in->switch_at,
+                  lengths + at + in->switch_at);
+    }
+    for (k = in->first; k <= in->last; ++k) { /* trapezoidal rule */
+        const double volt = p->gain * (k > in->switch_at ? in->after_v : in->before_v);
+        const double weight = k == in->first || k == in->last ? 0.5 : 1.0;
+        sum += weight * motion_capacitance(&p->law, lengths[at - 1 + k], volt);
+    }
+    return sum / (double)(in->last - in->first) * permittivity(p, before_s);
+}
+
 /* ---- electricity ---- */
 
 /* First-order lag, exact for an input that is a straight line from sample to sample. Without a lag

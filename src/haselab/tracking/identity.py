@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter, uniform_filter
-from scipy.signal import fftconvolve
 
+from haselab.models.filters import fftconvolve
 from haselab.tracking.options import Floats, Frame, Poses
 from haselab.tracking.subsets import Subsets
 

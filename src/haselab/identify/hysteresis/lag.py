@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.signal import lfilter
 
 from haselab.identify.hysteresis.loops import LoopRecord
 from haselab.identify.model_choice import bic, effective_count
+from haselab.models.filters import lfilter
 
 __all__ = ["LagAlternative", "fit_lag"]
 

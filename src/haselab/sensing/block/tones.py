@@ -7,8 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, signal, special
+from scipy import fft, special
 
+from haselab.models.filters import blackmanharris
 from haselab.sensing.sensed import LockinConfig
 
 __all__ = [
@@ -119,7 +120,7 @@ def _without_staircase(shown: Floats, spacing: float, lobe: int) -> None:
 
 @lru_cache(maxsize=8)
 def _window(samples: int) -> Floats:
-    return np.asarray(signal.windows.blackmanharris(samples, sym=False))
+    return np.asarray(blackmanharris(samples))
 
 
 def _floor(power: Floats) -> Floats:

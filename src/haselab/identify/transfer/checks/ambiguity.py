@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.signal import lfilter
 
 from haselab.base import Estimate
 from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
 from haselab.identify.transfer.problem import Found, TransferProblem
+from haselab.models.filters import lfilter
 
 __all__ = ["OtherMinimum", "ambiguity", "find_other_minima", "has_unique_delay", "whitened_energy"]
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
-from scipy.stats import ks_2samp
 
 from haselab.base import InputError
 from haselab.identify.record import Record
@@ -138,6 +137,8 @@ def _follow_input(records: Sequence[Record], marks: Sequence[NDArray[np.bool_]])
     mark = np.concatenate(list(marks))
     if mark.sum() < _FEW:
         return False
+    from scipy.stats import ks_2samp  # the import takes half a second
+
     return bool(ks_2samp(since_s[mark], since_s, alternative="greater").pvalue < _BY_CHANCE)
 
 

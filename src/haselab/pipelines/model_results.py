@@ -34,6 +34,7 @@ _ROWS = ("S14.", "S15.", "S16.", "S17.", "S18.", "S19.", "S20.", "S21.")
 _IN_STEPS = ("S15.slope_at_strain", "S15.offset_at_strain")  # a sample more changes the cells
 _DRAWS = 8
 _SEED = 20181001
+_RIDGE = 1e-12  # of a correlation matrix: rounding may make it slightly indefinite
 
 
 def results_of_model(
@@ -105,14 +106,18 @@ def _fitted(analysis: Analysis) -> dict[str, Estimate]:
 
 
 def _draws(covariance: Floats, slopes: Floats) -> Floats:
-    """Random changes of what varies, with its covariance. Shape `(K, P)`."""
+    """Random changes of what varies, with its covariance. Shape `(K, P)`.
+
+    A triangular factor varies smoothly with the covariance, so equal runs on different processors
+    give equal results; eigenvectors may change their signs.
+    """
     known = np.isfinite(np.diag(covariance))
+    std = np.sqrt(np.diag(covariance)[known])
+    correlation = covariance[np.ix_(known, known)] / np.outer(std, std)
+    factor = np.linalg.cholesky(correlation + _RIDGE * np.eye(std.size))
+    normal = np.random.default_rng(_SEED).standard_normal((_DRAWS, std.size))
     changes = np.zeros((_DRAWS, slopes.size))
-    rng = np.random.default_rng(_SEED)
-    drawn = rng.multivariate_normal(
-        np.zeros(int(known.sum())), covariance[np.ix_(known, known)], _DRAWS, method="eigh"
-    )
-    changes[:, known] = drawn / slopes[known]
+    changes[:, known] = std * (normal @ factor.T) / slopes[known]
     return changes
 
 

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from haselab.base import Estimate, JsonObject, ResultError
 from haselab.control import over_trials
 from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
+from haselab.models.filters import find_peaks
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.resolution import with_resolution
 from haselab.study.fits.trials import normal_equivalent

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["blackmanharris", "fftconvolve", "find_peaks", "lfilter", "resample_poly"]
+__all__ = ["fftconvolve", "find_peaks", "lfilter", "resample_poly"]
 
 
 def lfilter(b: Any, a: Any, x: Any, **options: Any) -> Any:
@@ -26,13 +26,6 @@ def resample_poly(x: Any, up: int, down: int, **options: Any) -> Any:
     from scipy import signal
 
     return signal.resample_poly(x, up, down, **options)
-
-
-def blackmanharris(samples: int) -> Any:
-    """`scipy.signal.windows.blackmanharris`, periodic."""
-    from scipy import signal
-
-    return signal.windows.blackmanharris(samples, sym=False)
 
 
 def find_peaks(x: Any, **options: Any) -> Any:

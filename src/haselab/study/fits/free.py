@@ -141,7 +141,6 @@ def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float)
 
     The amplitude of eq. 6 is not used: with the decay of the peaks it misses them.
     """
-    from scipy.signal import find_peaks  # the import takes half a second
 
     apart = max(1, round(0.7 * 2.0 * math.pi / omega / float(np.median(np.diff(time_s)))))
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)

@@ -213,3 +213,12 @@ def test_the_identified_stack_is_that_of_the_bench_within_its_standard_deviation
     for share in (0.1, 0.5, 0.9):
         strain = low + share * (high - low)
         assert known.static_drive_v(strain) == pytest.approx(true.static_drive_v(strain), rel=5e-3)
+
+
+def test_a_device_that_is_not_identified_leaves_its_tasks_not_done(monkeypatch):
+    monkeypatch.setattr(board, "_identify", lambda name: (None, "the records contradict the model"))
+    game = play_board(Plan(("open-loop", "force"), ("T4",), ("host-100hz",), seeds=1))
+    assert {one.failure for one in game.played} == {"the records contradict the model"}
+    rows = board_rows(game)
+    assert rows and all(row.median is None and row.bound is None for row in rows)
+    assert "the records contradict the model" in scoreboard_page(game)

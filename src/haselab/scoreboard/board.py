@@ -19,7 +19,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import HaselabError, Progress, SilentProgress
+from haselab.base import HaselabError, Progress, ResultError, SilentProgress
 from haselab.controllers import CONTROLLERS, ChosenController, KnownActuator
 from haselab.scoreboard.devices import Device, find_device
 from haselab.scoreboard.entrants import Designed, designed
@@ -140,9 +140,13 @@ def known_in_class(known: KnownActuator, device: Device, loop: LoopClass) -> Kno
 # ---- jobs of the processes -----------------------------------------------------------------------
 
 
-def _identify(name: str) -> tuple[KnownActuator, str]:
+def _identify(name: str) -> tuple[KnownActuator | None, str]:
+    """What is known of a device, and the status of its fit; None: the fit has no result."""
     device = find_device(name)
-    fit = identified(device)
+    try:
+        fit = identified(device)
+    except ResultError as error:
+        return None, str(error)
     return known_by(device, fit), fit.status
 
 
@@ -151,11 +155,14 @@ class _DesignJob:
     controller: str
     loop: str
     device: str
-    known: KnownActuator
+    known: KnownActuator | None
+    status: str
 
 
 def _design(job: _DesignJob) -> Entry:
     loop, device = CLASSES[job.loop], find_device(job.device)
+    if job.known is None:
+        return Entry(job.controller, job.loop, job.device, reason=job.status)
     known = known_in_class(job.known, device, loop)
     try:
         with _deadline(600.0, "the design takes longer than 10 minutes"):
@@ -172,17 +179,19 @@ class _PlayJob:
     task: str
     index: int
     seed: int
-    known: KnownActuator
+    known: KnownActuator | None
 
 
 def _play(job: _PlayJob) -> Played:
     entry, task, loop = job.entry, TASKS[job.task], CLASSES[job.entry.loop]
     device = find_device(task.device)
     rng = _random(job.seed, job.task, job.index)
-    scenario = task.scenario(job.known, rng)
-    bounds = _bounds(task, scenario, loop)
     nothing = {metric.name: math.nan for metric in task.metrics}
     about = (entry.controller, entry.loop, job.task, job.index)
+    if job.known is None:
+        return Played(*about, nothing, {}, entry.reason, violates=False)
+    scenario = task.scenario(job.known, rng)
+    bounds = _bounds(task, scenario, loop)
     if entry.reason:
         return Played(*about, nothing, bounds, entry.reason, violates=False)
     kind = CONTROLLERS.find(entry.controller)
@@ -263,7 +272,7 @@ def play_board(plan: Plan, progress: Progress | None = None) -> Game:
         with _mapper(plan.workers, bar) as mapped:
             found = dict(zip(devices, mapped("identify", _identify, devices), strict=True))
             jobs = [
-                _DesignJob(controller, loop, device, found[device][0])
+                _DesignJob(controller, loop, device, *found[device])
                 for controller, loop in pairs for device in devices
             ]  # fmt: skip
             entries = tuple(mapped("design", _design, jobs))

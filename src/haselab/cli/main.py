@@ -42,7 +42,7 @@ _COMMANDS = {
     "margins": ("haselab.cli.model.margins", "Compute the stability margins of given gains."),
     "scoreboard": (
         "haselab.cli.study.scoreboard",
-        "Compare controllers on simulated tasks with the physical limit.",
+        "Compare controllers with the physical limits.",
     ),
     "export": ("haselab.cli.model.export", "Convert a model for another tool."),
     "session": ("haselab.cli.data.session", "Export a recording for another tool, or import one."),

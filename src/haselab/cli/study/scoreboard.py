@@ -52,15 +52,14 @@ _MOST_WORKERS = 256
     "--seeds", type=click.IntRange(1, 1000),
     help="Play each task with this many seeds. Default: 5, with --quick 1.",
 )  # fmt: skip
-@click.option(
-    "--quick", is_flag=True,
-    help="Play T1 to T4 at 100 Hz with one seed.",
-)  # fmt: skip
+@shared_option("--quick", is_flag=True, detail="It has T1 to T4 at 100 Hz and one seed.")
 @click.option(
     "--workers", type=click.IntRange(1, _MOST_WORKERS),
     help="Use this many processes. Default: one for each processor.",
 )  # fmt: skip
-@answer_options(OutputRule("folder"), "The folder of scoreboard.json and scoreboard.html.")
+@answer_options(
+    OutputRule("folder"), "The folder of scoreboard.json and scoreboard.html.  [required]"
+)
 def command(
     controllers: tuple[str, ...],
     tasks: tuple[str, ...],

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab import _motion
-from haselab.actuators.drift import DRIFTS, drift_pairs
 from haselab.actuators.law import ActuatorLaw
+from haselab.actuators.losses import DRIFTS, drift_pairs
 from haselab.actuators.operating_point import equilibrium_m
 from haselab.actuators.table import law_table
 from haselab.base import InputError, LimitError

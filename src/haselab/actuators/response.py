@@ -297,7 +297,7 @@ class SampledLaw:
             elastic.append((last.elastic_n - first.elastic_n) / width)
             capacitance.append((last.capacitance_f - first.capacitance_f) / width)
             pull.append((last.pull_n_v2 - first.pull_n_v2) / width)
-            free.append(self._free_change(low, high) / width)
+            free.append(self._free_moved_m(low, high) / width)
             changed = _losses_of(_parameters(high)) - _losses_of(_parameters(low))
             if name in _BESIDE_THE_LAW:
                 changed[_BESIDE_THE_LAW[name]] += width
@@ -322,7 +322,7 @@ class SampledLaw:
         # derivatives by the columns of the motion, to those by the parameters
         self._joined = np.vstack([np.eye(count)[own], losses_by[:, used].T])
 
-    def _free_change(self, low: ActuatorLaw, high: ActuatorLaw) -> float:
+    def _free_moved_m(self, low: ActuatorLaw, high: ActuatorLaw) -> float:
         """Difference of the free lengths of two laws beside this one, where the forces are 0."""
         free_m = self.law.free_length_m
         step_m = _STEP * free_m

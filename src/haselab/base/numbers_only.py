@@ -26,7 +26,7 @@ def numbers_only(model: Any, value: Any, info: Any) -> Any:
     kinds, is_table = set(_leaves(annotation)), "dict[" in str(annotation)
     if not kinds & {int, float}:
         return value
-    for name, part in _parts(value, str(info.field_name) if is_table else "input"):
+    for name, part in _parts(value, str(info.field_name) if is_table else "Input"):
         estimate = not is_table and isinstance(value, Mapping)  # with the text of its unit
         wrong = "true or false" if isinstance(part, bool) and bool not in kinds else ""
         if isinstance(part, str) and kinds <= {int, float, NoneType} and not estimate:

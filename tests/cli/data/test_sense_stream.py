@@ -367,7 +367,6 @@ def test_updates_at_known_times_cost_no_accuracy(tmp_path):
 @pytest.mark.parametrize(
     ("header", "options", "words"),
     [
-        ({}, [], "a session with the experiments play. Name one with --experiment"),
         ({}, ["--experiment", "never"], "no experiment 'never' with blocks, only play."),
         ({}, ["--experiment", "play", "--block-s", "0.02"], "with one output each, have 0.01 s"),
         ({"rig": {}}, ["--experiment", "play"], "lacks rig.rate_hz"),

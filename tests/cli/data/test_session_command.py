@@ -251,3 +251,12 @@ def test_an_import_does_not_believe_a_rate_that_contradicts_the_times(
     code, _, err = typed(capsys, "session", "import", tmp_path / "m.csv", "--v", "u", "--i", "i",
                          *options, "--out", tmp_path / "o")  # fmt: skip
     assert code == (2 if words else 0) and words in err
+
+
+def test_a_session_of_two_experiments_is_sensed_by_name(tmp_path, capsys) -> None:
+    plans = [ExperimentPlan(name, "test", 1, {}) for name in "ab"]
+    with SessionWriter(tmp_path / "session.h5", plans, 100, HEADER) as writer:
+        for name in "ab":
+            writer.append_block(name, np.zeros((100, 2), np.int16), 0.0, 0.5, float("nan"))
+    code, _, err = typed(capsys, "sense", tmp_path / "session.h5")
+    assert code == 2 and "experiments a, b. Name one with --experiment" in err

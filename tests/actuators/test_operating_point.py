@@ -61,7 +61,7 @@ def identified(law: ActuatorLaw, volt: float, mass_kg: float) -> tuple[Operating
         records.append(Record(width_v * shape, 1.0 / HOLD_S, moved, time_s))
     poles = point.poles.size
     structure = TransferStructure(poles=poles, zeros=poles - 2, delay=0.0)
-    return point, fit_transfer(records, structure)
+    return point, fit_transfer(records, structure, applied=True)  # without noise, none is white
 
 
 def resonance(fit: TransferFit) -> tuple[float, float]:

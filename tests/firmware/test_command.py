@@ -140,6 +140,27 @@ def test_a_twin_with_another_capacitance_is_refused_before_anything_is_built(
     assert "accepts 14 to 419 pF" in err and "--twin TWIN.toml" in err
 
 
+def test_a_capacitance_that_saturates_the_converter_is_refused_with_the_gain_that_it_needs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """240 V of 5 kHz at 2 nF are 15.1 mA, 3.62 V behind the stage of 0.8 * 0.5996; 2.5 V fit."""
+    path, rig = tmp_path / "large.toml", tmp_path / "chip.toml"
+    path.write_text(
+        SMALL.replace("slope_per_f = 5.33e8", "slope_per_f = 5.33e7").replace(
+            "[1.49e-10, 2.84e-10]", "[1.49e-9, 2e-9]"
+        )
+    )
+    for words in (("simulate",), ("build", "--build-dir", tmp_path / "fw")):
+        code, _, err = run(capsys, "firmware", words[0], path, *words[1:])
+        assert code == 2 and "reaches 2 nF" in err and "saturates at 1.38 nF" in err
+        assert "i_stage = 0.44 in [front_end]" in err
+    rig.write_text(f'kind = "chip"\nrun = "{path}"\n[simulator]\n[front_end]\ni_stage = 0.44\n')
+    code, _, err = run(
+        capsys, "firmware", "build", path, "--build-dir", tmp_path / "fw", "--rig", rig
+    )
+    assert code == 0, err
+
+
 @pytest.mark.parametrize(
     ("recorded", "front_end", "code"), [(1000.0, None, 2), (5050.0, None, 0), (1000.0, 1000.0, 0)]
 )

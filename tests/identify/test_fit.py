@@ -34,6 +34,7 @@ from haselab.identify import (
     fit_voltage_plant,
 )
 from haselab.identify.fit import rescaled
+from haselab.identify.noise import whiteness_p
 from haselab.models import Gent, Plant, PrandtlIshlinskii, PronyCreep, VoltageMap, VoltagePlant
 from haselab.models.filters import lfilter
 
@@ -322,3 +323,9 @@ def test_rescaling_keeps_correlations_and_marks_what_is_not_identifiable():
 def test_what_is_no_record_is_refused_with_how_to_make_one(fit, wrong):
     with pytest.raises(InputError, match=r" is .*; it must be a .*\. Make .* haselab\."):
         fit(wrong)
+
+
+def test_residuals_without_a_finite_autocovariance_are_not_white():
+    assert whiteness_p([np.array([1.0])]) == 1.0
+    assert whiteness_p([np.array([1e200, -1e200, 1.0])]) == 0.0
+    assert whiteness_p([np.zeros(3)]) == 1.0

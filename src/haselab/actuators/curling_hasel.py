@@ -9,12 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from haselab.actuators.law import ActuatorLaw, LawValues, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.peano_hasel import PeanoHasel
 from haselab.base import LimitError, Limits
+from haselab.base.root import root
 
 __all__ = ["CurlingHasel"]
 
@@ -172,7 +172,7 @@ class CurlingHasel(ActuatorLaw):
         def force_n(length_m: float) -> float:
             return float(self.elastic_force_n(length_m))
 
-        return float(brentq(force_n, limits.low, limits.high, xtol=1e-15))
+        return root(force_n, limits.low, limits.high, xtol=1e-15)
 
     @property
     def length_limits_m(self) -> Limits:

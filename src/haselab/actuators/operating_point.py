@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigvals
-from scipy.optimize import brentq
 
 from haselab.actuators.law import ActuatorLaw
 from haselab.base import LimitError
+from haselab.base.root import root
 
 __all__ = ["OperatingPoint", "equilibrium_m", "linearise"]
 
@@ -102,7 +102,7 @@ def _next_rest_m(
         return near
     if ahead(far) >= 0.0:
         return far
-    return float(brentq(ahead, near, far, xtol=_CLOSE_M, rtol=4.0 * np.finfo(np.float64).eps))
+    return root(ahead, near, far, xtol=_CLOSE_M, rtol=4.0 * np.finfo(np.float64).eps)
 
 
 def equilibrium_m(

@@ -9,13 +9,13 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 from scipy.special import expit, spence
 
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, LawValues, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.pouch import Pouch
 from haselab.base import LimitError, Limits
+from haselab.base.root import root
 
 __all__ = ["PeanoHasel"]
 
@@ -216,7 +216,7 @@ class PeanoHasel(ActuatorLaw):
         def force_n(length_m: float) -> float:
             return float(self.elastic_force_n(length_m))
 
-        return float(brentq(force_n, limits.low, limits.high, xtol=1e-15))
+        return root(force_n, limits.low, limits.high, xtol=1e-15)
 
     @property
     def length_limits_m(self) -> Limits:

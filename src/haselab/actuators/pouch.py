@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from haselab.base import LimitError
+from haselab.base.root import root
 
 __all__ = ["Pouch"]
 
@@ -68,7 +68,7 @@ class Pouch:
         def missing(angle: float) -> float:
             return (angle - math.sin(angle) * math.cos(angle)) / angle**2 - wanted
 
-        return float(brentq(missing, 1e-4, 0.5 * math.pi, xtol=1e-16, rtol=1e-15))
+        return root(missing, 1e-4, 0.5 * math.pi, xtol=1e-16, rtol=1e-15)
 
     @property
     def rest_m(self) -> float:

@@ -103,7 +103,7 @@ def simulate_ensemble(
         >>> loop = LoopSetting(100.0, 0.005)
         >>> found = simulate_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, loop)
         >>> found.settling_time_s.round(2), bool(found.unstable.any())
-        (array([1.17, 1.2 , 1.21]), False)
+        (array([1.15, 1.18, 1.2 ]), False)
     """
     loops, desired, noise = _prepared(plants, gains, reference, setting, measurement_noise)
     window = _Window.of(desired)

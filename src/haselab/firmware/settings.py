@@ -100,6 +100,16 @@ class FrontEnd:
         """Gain of the current channel's stage at the carrier."""
         return self.i_stage * _BAND_PASS
 
+    def current_codes(self, capacitance_f: float) -> float:
+        """Expected peak amplitude of the current channel, in codes.
+
+        Args:
+            capacitance_f: of the actuator.
+        """
+        ampere = 2.0 * math.pi * CARRIER_HZ * capacitance_f * self.carrier_high_v
+        volt = ampere / self.ampere_per_monitor_volt * self.i_stage_at_carrier
+        return volt * self.converter_codes / self.converter_v
+
     @property
     def carrier_codes(self) -> float:
         """Expected peak amplitude of the voltage channel, in codes."""

@@ -72,10 +72,14 @@ def whiteness_p(residuals: Sequence[Floats], lags: int = _MAX_ORDER) -> float:
     Source: Ljung and Box, Biometrika 65 (1978), 297.
     """
     count = sum(e.size for e in residuals)
+    if count < 2:
+        return 1.0
     lags = max(1, min(lags, count // 5))
     covariance = _autocovariance(residuals, lags)
     if covariance[0] <= 0.0:
         return 1.0
+    if not np.isfinite(covariance).all():
+        return 0.0
     correlation = covariance[1:] / covariance[0]
     q = count * (count + 2) * float((correlation**2 / (count - np.arange(1, lags + 1))).sum())
     return float(chdtrc(lags, q))

@@ -23,7 +23,6 @@ from haselab.rig.bench_config import (
 from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.instruments.registry import instrument_of
 from haselab.rig.real_bench import RealBench
-from haselab.rig.replay import ReplayBench
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.rig.twin.twin_file import identified_twin, is_actuator_file, load_twin
@@ -212,5 +211,7 @@ def opened_rig(file: RigFile, path: Path, gate: Gate) -> Iterator[Rig]:
         with opened_chip(file, path, gate) as chip:
             yield chip.rig
     else:
+        from haselab.rig.replay import ReplayBench  # readers of videos, which others do not need
+
         with ReplayBench(path.parent / file.session, file.experiments) as replay:
             yield replace(replay.rig, gate=gate)

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from haselab.actuators import PlanarHasel
+from haselab.base import InputError
+from haselab.cli.actuator_file import load_actuator
+from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.main import main
 from haselab.pipelines.motion import motion_of_session
+from haselab.store.columns.selection import ColumnOptions
 from haselab.store.session.reader import SessionReader
 from tests.cli.model.physical_files import (
     CAPACITANCE_STD_F,
@@ -175,6 +179,18 @@ def test_a_status_that_is_not_ok_needs_the_size_of_the_error(tmp_path, capsys):
     assert code == 0 and "warning: [model.physical] has the status 'model error" in error
 
 
+def test_a_drift_is_part_of_the_prediction(tmp_path, capsys):
+    """8 s of the law itself, which does not drift."""
+    file = table(tmp_path / "new.csv")
+    none = {"drift__stiffness_per_s": 1e-9, "drift__stiffness_s": 600.0}
+    code, text, _ = run(capsys, "compare", written(tmp_path / "A.toml", **none), file, "--json")
+    assert (code, json.loads(text)["status"]) == (0, "ok")
+    # 0.4 % of the force after 8 s is 40 um of 10 mm, ten times the noise
+    fast = none | {"drift__stiffness_per_s": -5e-4}
+    code, text, _ = run(capsys, "compare", written(tmp_path / "B.toml", **fast), file, "--json")
+    assert code == 3 and json.loads(text)["status"].startswith("model error: only ")
+
+
 def test_another_kind_of_actuator_is_refused(tmp_path, capsys):
     model = written(tmp_path / "A.toml", kind="dea-stack")
     code, _, error = run(capsys, "compare", model, table(tmp_path / "new.csv"))
@@ -189,3 +205,18 @@ def test_options_of_tables_and_unknown_experiments_are_refused_for_sessions(
     assert code == 2 and "--mass-kg is for tables, but a session states this itself" in error
     code, _, error = run(capsys, "compare", actuator, session, "--experiment", "chirp")
     assert code == 2 and "has no experiment chirp" in error and "It has held, step." in error
+
+
+@pytest.mark.long
+def test_a_session_of_another_kind_is_warned_of(session, tmp_path, capsys):
+    columns = ColumnOptions()
+    options = TableOptions(None, (), None, None, None, None, columns)
+    for kind, words in (
+        ("planar-hasel", ""),
+        ("dea-stack", "states a planar-hasel, but [actuator]"),
+    ):
+        known = load_actuator(written(tmp_path / f"{kind}.toml", kind=kind))
+        motion_of_file(session, options, known)
+        assert words in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"--mass-kg is for tables, but a session states this"):
+        motion_of_file(session, TableOptions(None, (), None, 0.2, None, None, columns), known)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +18,7 @@ from haselab.identify.physical import MotionRecord
 from haselab.models.actuator import ActuatorTables
 from haselab.pipelines.motion import motion_of_session
 from haselab.pipelines.motion_table import motion_of_table
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table
 from haselab.store.session.opening import is_session
@@ -101,9 +103,20 @@ def motion_of_file(
         options.refuse_for_session(file)
         with SessionReader(file, unverified=unverified) as reader:
             warn_unverified(reader.doubt, file)
-            gain_v_per_v = float(reader.header["rig"]["amplifier_gain"])
+            rig = reader.header["rig"]
+            _warn_of_kind(rig.get("actuator_kind", PLANAR_HASEL), known.actuator.kind, file)
+            gain_v_per_v = float(rig["amplifier_gain"])
             return motion_of_session(reader, session_file(file)), gain_v_per_v
     return _table(file, options, known, std or {})
+
+
+def _warn_of_kind(recorded: str, stated: str, file: Path) -> None:
+    if recorded != stated:
+        click.echo(
+            f"haselab: warning: the rig of this session states a {recorded}, but [actuator] kind "
+            f"is {stated}. {file}",
+            err=True,
+        )
 
 
 def _table(

@@ -45,7 +45,9 @@ from haselab.study.simulated.truth import twin_of
 __all__ = ["build", "command", "flash", "simulate"]
 
 _BAUD = 115_200  # baud rate of the boot loader
+_BOARD = "atmega2560"
 _GAIN_TOLERANCE = 0.02  # of two statements of the same gain
+_FILLED = 0.8  # of the converter's range, by the current of the largest capacitance
 _UPDATE_CYCLES = 16_000
 _PREDICTED = ("rise_time_s", "overshoot", "settling_time_s", "steady_state_error")
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
@@ -67,10 +69,10 @@ def command() -> None:
 
 def _chip_file(rig: Path, board: str) -> ChipFile:
     file = load_rig(rig)
-    if not isinstance(file, ChipFile) or board != "atmega2560":
+    if not isinstance(file, ChipFile) or board != _BOARD:
         raise InputError(
             f"--rig has kind {file.kind!r} and --board is {board}, but only kind 'chip' with board "
-            f"atmega2560 is supported. Leave one of the options out. {rig}"
+            f"{_BOARD} is supported. Leave one of the options out. {rig}"
         )
     return file
 
@@ -88,7 +90,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
     show_default=True, help="Write settings.h, firmware.elf and firmware.hex to this folder.",
 )  # fmt: skip
 @shared_option(
-    "--board", default="atmega2560", show_default=True, metavar="BOARD",
+    "--board", default=_BOARD, show_default=True, metavar="BOARD",
     detail="It is the name of a folder in firmware/board.",
 )  # fmt: skip
 @shared_option(
@@ -118,6 +120,7 @@ def build(
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     design = read_design(run, structure, front_end, source)
     _check_gain(design.tables.drive.gain_v_per_v, front_end.gain, run)
+    _check_current(design, front_end, run, "Lower its gain:")
     settings = design.settings if file is None else file.limited(design.settings)
     _say_narrowed(settings, design.limits, run)
     built = build_firmware(settings, folder, board)
@@ -133,6 +136,22 @@ def _check_gain(recorded: float | None, module: float, run: Path) -> None:
             f"has a gain of {module:g}: it would put out {module / recorded:.3g} times the high "
             "voltage of the records. Identify the voltage map from the drive that this module "
             f"needs, or state the module's gain in [front_end] (--rig). {run}"
+        )
+
+
+def _check_current(design: ChipDesign, front_end: FrontEnd, run: Path, advice: str) -> None:
+    """Refuse capacitances whose current saturates the converter: the chip would trip."""
+    recorded_f = design.tables.strain_map().range_f
+    if recorded_f is None:
+        return
+    highest_f = recorded_f[1]
+    most, codes = 0.5 * front_end.converter_codes, front_end.current_codes(highest_f)
+    if codes > most:
+        raise InputError(
+            f"The strain map reaches {1e9 * highest_f:.3g} nF, but the current channel of the "
+            f"front end saturates at {1e9 * highest_f * most / codes:.3g} nF. {advice} "
+            f"i_stage = {front_end.i_stage * _FILLED * most / codes:.2g} in [front_end] of a rig "
+            f"file with kind 'chip' (haselab firmware build --rig). {run}"
         )
 
 
@@ -211,7 +230,11 @@ def simulate(
     config = _twin(run, options["reading"], options["twin"], options["draw"])
     refuse_linked_folders(run, "firmware", "figures")
     warn_doubts(run, structure)
-    design = read_design(run, structure, FrontEnd(), source)
+    front_end = FrontEnd()
+    design = read_design(run, structure, front_end, source)
+    _check_current(
+        design, front_end, run, "It cannot be simulated with another gain; build it with"
+    )
     settings, zero_m = design.settings, design.zero_length_m
     _say_narrowed(settings, design.limits, run)
     before, after = options["step"] or (0.0, _step_of(design))

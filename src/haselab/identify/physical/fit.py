@@ -310,10 +310,10 @@ def _with_effects(
         if better is None:
             break
         again = refine(misfit, better.start, found.evaluations)
-        if again is None or not _explains(misfit, found, again):
+        if again is not None and again.converged and not _explains(misfit, found, again):
             break
         again = _from_start(misfit, better.start.at(start), again, explained=True)
-        if again is None or rms_of([again.residuals]) > rms_of([found.residuals]):
+        if again is None or not _explains(misfit, found, again):
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))

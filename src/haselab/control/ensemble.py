@@ -100,8 +100,7 @@ def simulate_ensemble(
     Source: variation of constants; controller as in `core/hs_pid.c`.
     Example:
         >>> plants = [Plant(1.0, omega, 0.5) for omega in (25.0, 32.0, 40.0)]
-        >>> loop = LoopSetting(100.0, 0.005)
-        >>> found = simulate_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, loop)
+        >>> found = simulate_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, LoopSetting())
         >>> found.settling_time_s.round(2), bool(found.unstable.any())
         (array([1.15, 1.18, 1.2 ]), False)
     """
@@ -136,8 +135,7 @@ def trace_ensemble(
         InputError: as for `simulate_ensemble`.
     Example:
         >>> plants = [Plant(1.0, omega, 0.5) for omega in (25.0, 32.0, 40.0)]
-        >>> loop = LoopSetting(100.0, 0.005)
-        >>> found = trace_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, loop)
+        >>> found = trace_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, LoopSetting())
         >>> found.measured[:, -1].round(4).tolist() == [np.float32(0.02)] * 3
         True
     """

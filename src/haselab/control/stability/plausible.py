@@ -109,8 +109,7 @@ def plausible_margins(
     Example:
         >>> from haselab.models import Plant
         >>> plants = [Plant(1.0, omega, 0.3) for omega in (25.0, 32.0, 40.0)]
-        >>> loop = LoopSetting(100.0, 0.005)
-        >>> found = plausible_margins(plants, PidGains(0.0, 5.0), loop, DesignSpec())
+        >>> found = plausible_margins(plants, PidGains(0.0, 5.0), LoopSetting(), DesignSpec())
         >>> found.phase_margin_deg.round(1), found.keeps_gain
         (array([79.6, 81.5, 82.7]), array([ True,  True,  True]))
     """

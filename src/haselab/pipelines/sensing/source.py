@@ -282,7 +282,7 @@ def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None
     if stream.rate_hz is not None:
         check_rate(given, stream.rate_hz, _RATE_ROWS, "the file's own rate", path)
         return given
-    check_times(path, given, request.columns)
+    check_times(path, given, request.columns, (request.v_column, request.i_column))
     return given
 
 

@@ -8,16 +8,19 @@ longer counts as noise: the uncertainty is that of the model's parameters.
 from __future__ import annotations
 
 import contextlib
+import pickle
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, ResultError
+from haselab.base import DeviceError, Estimate, ResultError
 from haselab.identify.physical import ActuatorFit, MotionRecord
 from haselab.identify.physical.misfit import Modelled, modelled
 from haselab.rig import RigDescription
+from haselab.runtime.helper_process import HelperProcess
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import NotPlayedError
@@ -29,6 +32,7 @@ __all__ = ["results_of_model"]
 
 Floats = NDArray[np.float64]
 _ROWS = ("S14.", "S15.", "S16.", "S17.", "S18.", "S19.", "S20.", "S21.")
+_PATIENCE_S = 600.0  # of all fits in the second process
 _IN_STEPS = ("S15.slope_at_strain", "S15.offset_at_strain")  # a sample more changes the cells
 
 
@@ -70,17 +74,9 @@ def results_of_model(
             seen[name] = source(name)
         return seen[name]
 
-    def rows(change: Floats) -> dict[str, Estimate]:
-        moved = replace(
-            centre,
-            length_m=centre.length_m + centre.length_by @ change,
-            capacitance_f=centre.capacitance_f + centre.capacitance_by @ change,
-        )
-        motion = _Motion(recorded, record, moved)
-        return _fitted(Analysis(study, rig, motion, repeated=direct.values, known=known))
-
-    middle = rows(np.zeros(unknowns.values.size))
-    axes = [rows(change) for change in _axes(fit.covariance, unknowns.slopes)]
+    problem = _Problem(centre, record, study, rig, direct.values, known)
+    middle = problem.rows(recorded, np.zeros(unknowns.values.size))
+    axes = _along(problem, recorded, seen, _axes(fit.covariance, unknowns.slopes))
     found = {}
     for key, estimate in middle.items():
         moved = np.array([along[key].value - estimate.value for along in axes if key in along])
@@ -88,6 +84,62 @@ def results_of_model(
             std = float(np.linalg.norm(moved))
             found[key] = Estimate.normal(estimate.value, std, estimate.unit)
     return found
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The fits on a model's motion, see `results_of_model`."""
+
+    centre: Modelled
+    record: MotionRecord
+    study: Study
+    rig: RigDescription
+    values: Mapping[type, object]
+    known: Mapping[type, object] | None
+
+    def rows(self, source: Source, change: Floats) -> dict[str, Estimate]:
+        """Results after a change of what varies."""
+        centre = self.centre
+        moved = replace(
+            centre,
+            length_m=centre.length_m + centre.length_by @ change,
+            capacitance_f=centre.capacitance_f + centre.capacitance_by @ change,
+        )
+        motion = _Motion(source, self.record, moved)
+        return _fitted(
+            Analysis(self.study, self.rig, motion, repeated=self.values, known=self.known)
+        )
+
+
+def rows_of_changes(
+    problem: _Problem, seen: Mapping[str, Observation], changes: Floats
+) -> list[dict[str, Estimate]]:
+    """Results after each of some changes; a function of the module, for a helper process."""
+    return [problem.rows(seen.__getitem__, change) for change in changes]
+
+
+def _along(
+    problem: _Problem, source: Source, seen: Mapping[str, Observation], changes: Floats
+) -> list[dict[str, Estimate]]:
+    """Results after each change; a second process makes half of these fits.
+
+    It makes none where a value of another package cannot be sent to it, or if it ends early.
+    """
+    there = changes[1::2]
+    with contextlib.ExitStack() as opened:
+        try:
+            pickle.dumps((problem.values, problem.known, problem.study))
+            pool = opened.enter_context(ThreadPoolExecutor(1))
+            helper = HelperProcess([__name__], _PATIENCE_S)
+            opened.callback(helper.close)  # also if this process is interrupted meanwhile
+        except (DeviceError, pickle.PicklingError, TypeError, AttributeError):
+            return [problem.rows(source, change) for change in changes]
+        sent = pool.submit(helper.call, rows_of_changes, problem, seen, there)
+        found = [problem.rows(source, change) for change in changes[::2]]
+        try:
+            return found + sent.result()
+        except (DeviceError, KeyError):
+            return found + [problem.rows(source, change) for change in there]
 
 
 def _fitted(analysis: Analysis) -> dict[str, Estimate]:

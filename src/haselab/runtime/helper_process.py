@@ -34,6 +34,7 @@ class HelperProcess:
 
     Args:
         modules: modules to load at once, so that the first call need not wait for them.
+        patience_s: longest time of a call.
     Raises:
         DeviceError: The process cannot be started.
     Example:
@@ -44,8 +45,8 @@ class HelperProcess:
         >>> helper.close()
     """
 
-    def __init__(self, modules: Sequence[str]) -> None:
-        self._patience_s = _PATIENCE_S
+    def __init__(self, modules: Sequence[str], patience_s: float = _PATIENCE_S) -> None:
+        self._patience_s = patience_s
         command = [sys.executable, "-m", __name__, *modules]
         try:
             self._process = subprocess.Popen(

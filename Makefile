@@ -103,6 +103,7 @@ $(VENV)/.packages: pyproject.toml | $(VENV)/bin/python
 $(VENV)/.built: $(NATIVE) $(VENV)/.packages
 	@echo 'setup: extensions'
 	@$(PIP) install --no-build-isolation --no-deps --editable .
+	@$(BIN)/python -m compileall -q src/haselab # else each process compiles it, where no cache may be written
 	@touch $@
 
 $(VENV)/.bench: pyproject.toml $(VENV)/.packages

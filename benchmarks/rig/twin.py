@@ -6,35 +6,40 @@ python -m benchmarks.rig.twin
 import numpy as np
 
 from benchmarks.rows import Row, medians
+from haselab.actuators import ACTUATORS
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.twin_bench import TwinBench, native_bench
+from haselab.rig.twin.twin_bench import TwinBench
 
 BLOCK_S = 0.01
 
 
 def rows() -> list[Row]:
-    return [*rig_rows(), camera_row()]
+    return [*(row for kind in ACTUATORS.packages() for row in kind_rows(kind)), camera_row()]
 
 
-def rig_rows() -> list[Row]:
-    config = TwinConfig()
-    bench = TwinBench(config, 1)
-    bench.sine(2000.0, 0.02)
-    bench.write(1.0)
-    native = native_bench(config, 1)
+def kind_rows(kind: str) -> list[Row]:
+    """Acquisition and motion of one kind of actuator under a drive that sweeps to 2 Hz."""
+    time_s = BLOCK_S * np.arange(2000)
+    drive_v = 0.4 + 0.3 * np.sin(2.0 * np.pi * (0.1 + 0.05 * time_s) * time_s)
+    bench = TwinBench(TwinConfig(kind=kind), 1)
+    load_n = bench.load_n
     lengths = np.empty(200_000)  # 20 s in steps of 0.1 ms
 
-    def acquire() -> None:
-        for _ in range(50):
-            bench.read()
-
     def move() -> None:
-        native.move(np.array([1.0]), lengths.size, 2.45, lengths)
+        bench.native.move(drive_v, 100, load_n, lengths)
+
+    acquiring = TwinBench(TwinConfig(kind=kind), 1)
+    acquiring.sine(2000.0, 0.02)
+
+    def acquire() -> None:
+        for volt in drive_v[:50].tolist():
+            acquiring.write(volt)
+            acquiring.read()
 
     acquired_s, moved_s = medians(acquire, move)
     return [
-        Row("twin with both monitors at 200 kHz", 50 * BLOCK_S / acquired_s, "rig s / s", 20.0),
-        Row("twin, mechanics alone", 20.0 / moved_s, "rig s / s", 1000.0),
+        Row(f"{kind}, both monitors at 200 kHz", 50 * BLOCK_S / acquired_s, "rig s / s", 100.0),
+        Row(f"{kind}, mechanics alone", drive_v.size * BLOCK_S / moved_s, "rig s / s", 10_000.0),
     ]
 
 

@@ -102,6 +102,20 @@ class Bench {
                   load_n, static_cast<int32_t>(lengths.shape(0)), lengths.data());
     }
 
+    // timing: steps, switch_at, first, last of twin_update
+    double update(double before_v, double after_v, double load_n,
+                  std::tuple<int32_t, int32_t, int32_t, int32_t> timing, Lengths lengths,
+                  int32_t at)
+    {
+        const auto [steps, switch_at, first, last] = timing;
+        if (steps < 1 || switch_at < 0 || switch_at > steps || last > steps || first >= last ||
+            at + first < 1 || at + steps > static_cast<int32_t>(lengths.shape(0))) {
+            throw std::invalid_argument("an update within the lengths, and a window within it");
+        }
+        const twin_update_input in = {before_v, after_v, load_n, steps, switch_at, first, last};
+        return twin_update(&p_, &s_, &in, lengths.data(), at);
+    }
+
     void connect(double farad, double series_ohm) { twin_connect(&s_, farad, series_ohm); }
 
     double elastic_force(double length_m) const
@@ -130,6 +144,7 @@ NB_MODULE(_twin, m)
                       Values, Rows, Rows>())
         .def("acquire", &Bench::acquire)
         .def("move", &Bench::move)
+        .def("update", &Bench::update)
         .def("connect", &Bench::connect)
         .def("elastic_force", &Bench::elastic_force)
         .def("capacitance", &Bench::capacitance, nb::arg("length_m"), nb::arg("voltage_v") = 0.0)

@@ -32,6 +32,8 @@ inline void fill_law(motion_law &law, double low_m, double step_m, double step_v
     law.low_m = low_m;
     law.step_m = step_m;
     law.step_v = step_v;
+    law.per_step_m = 1.0 / step_m;
+    law.per_step_v = 1.0 / step_v;
     std::memcpy(law.elastic_n, elastic_n.data(), n * sizeof(double));
     std::memcpy(law.gap_m, gap_m.data(), n * sizeof(double));
     for (size_t k = 0; k < rows; ++k) {

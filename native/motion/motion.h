@@ -25,6 +25,7 @@ typedef struct {
     int32_t voltages;     /* 1: nothing depends on the voltage; else 4 to MOTION_VOLTAGES */
     double low_m, step_m; /* first length and distance of two */
     double step_v;        /* voltages are 0, step_v, 2 step_v, ... */
+    double per_step_m, per_step_v; /* 1 over these distances */
     double elastic_n[MOTION_LENGTHS];
     double gap_m[MOTION_LENGTHS]; /* thickness of the dielectric */
     double capacitance_f[MOTION_VOLTAGES][MOTION_LENGTHS]; /* differential: dQ / dV */
@@ -121,6 +122,10 @@ void motion_step(const motion_law *law, const motion_parameters *p, motion_state
 /* Number of equal steps that a duration needs from this state on. */
 int32_t motion_steps(const motion_law *law, const motion_parameters *p, const motion_state *s,
                      double duration_s);
+
+/* Whether one step is enough for a duration; 0 also with hysteresis, where this needs more work. */
+int motion_fits(const motion_law *law, const motion_parameters *p, const motion_state *s,
+                double duration_s);
 
 /* A duration in that many steps. */
 void motion_advance(const motion_law *law, const motion_parameters *p, motion_state *s,

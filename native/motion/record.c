@@ -47,13 +47,13 @@ typedef struct {
     double start_s, dt;
 } step;
 
-HS_CLONES static void blend_rows(const ends *e, int32_t n, const double *kept, const double *rows,
-                                 double *out)
+HS_CLONES static void blend_rows(const ends *e, int32_t n, const double *restrict kept,
+                                 const double *restrict rows, double *restrict out)
 {
+    const double from_m = e->from_m, from_m_s = e->from_m_s, to_m = e->to_m, to_m_s = e->to_m_s;
     int32_t j;
     for (j = 0; j < n; ++j) {
-        out[j] = e->from_m * kept[j] + e->from_m_s * kept[n + j] + e->to_m * rows[j] +
-                 e->to_m_s * rows[n + j];
+        out[j] = from_m * kept[j] + from_m_s * kept[n + j] + to_m * rows[j] + to_m_s * rows[n + j];
     }
 }
 

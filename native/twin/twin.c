@@ -5,6 +5,10 @@
 #include <stddef.h>
 #include <string.h>
 
+#ifndef HS_CLONES
+#define HS_CLONES
+#endif
+
 /* ---- random numbers: xoshiro256++, Box-Muller ---- */
 
 static uint64_t rotate(uint64_t x, int k) { return (x << k) | (x >> (64 - k)); }
@@ -33,14 +37,73 @@ void twin_seed(twin_state *s, uint64_t seed)
     }
 }
 
-static void normal_pair(uint64_t *r, float *a, float *b)
+/* Natural logarithm of a positive normal number, to 1e-12. */
+static inline double logarithm(float x)
 {
-    const uint64_t bits = draw(r);
-    const float u = ((float)(uint32_t)(bits >> 40) + 0.5f) * 5.9604645e-8f;  /* 24 bits */
-    const float w = (float)(uint32_t)(bits & 0xFFFFFFu) * 3.7450703e-7f;     /* 2 pi / 2^24 */
-    const float radius = sqrtf(-2.0f * logf(u));
-    *a = radius * cosf(w);
-    *b = radius * sinf(w);
+    int32_t bits, exponent;
+    float share; /* x = share * 2^exponent, share from 2/3 to 4/3 */
+    double s, z;
+    memcpy(&bits, &x, sizeof bits);
+    bits -= 0x3f2aaaab;
+    exponent = bits >> 23;
+    bits = (bits & 0x7fffff) + 0x3f2aaaab;
+    memcpy(&share, &bits, sizeof share);
+    s = ((double)share - 1.0) / ((double)share + 1.0);
+    z = s * s;
+    return (double)exponent * 0.6931471805599453 +
+           2.0 * s *
+               (1.0 + z * (1.0 / 3.0 +
+                           z * (1.0 / 5.0 +
+                                z * (1.0 / 7.0 +
+                                     z * (1.0 / 9.0 +
+                                          z * (1.0 / 11.0 +
+                                               z * (1.0 / 13.0 + z * (1.0 / 15.0))))))));
+}
+
+/* Sine and cosine of an angle from 0 to 2 pi, to 1e-13. */
+static inline void sine_cosine(double angle, double *sine, double *cosine)
+{
+    const double nearest = 6755399441055744.0; /* 1.5 * 2^52: a sum with it is a whole number */
+    const double quarters = (angle * 0.6366197723675814 + nearest) - nearest;
+    const double y = (angle - quarters * 1.5707963267948966) - quarters * 6.123233995736766e-17;
+    const double z = y * y;
+    const double s =
+        y + y * z * (-1.0 / 6.0 + z * (1.0 / 120.0 + z * (-1.0 / 5040.0 + z * (1.0 / 362880.0 -
+            z * (1.0 / 39916800.0 - z * (1.0 / 6227020800.0))))));
+    const double c =
+        1.0 - z * (0.5 - z * (1.0 / 24.0 - z * (1.0 / 720.0 - z * (1.0 / 40320.0 -
+            z * (1.0 / 3628800.0 - z * (1.0 / 479001600.0 - z * (1.0 / 87178291200.0)))))));
+    const int odd = quarters == 1.0 || quarters == 3.0;
+    const double first = odd ? c : s, second = odd ? s : c;
+    *sine = quarters == 2.0 || quarters == 3.0 ? -first : first;
+    *cosine = quarters == 1.0 || quarters == 2.0 ? -second : second;
+}
+
+/* Two normal numbers of each pair of 24 bits. */
+HS_CLONES static void normal_of(const int32_t *length, const int32_t *turn, float *a, float *b)
+{
+    int j;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        const float u = ((float)length[j] + 0.5f) * 5.9604645e-8f; /* 2^-24 */
+        const float w = (float)turn[j] * 3.7450703e-7f;            /* 2 pi / 2^24 */
+        const float radius = sqrtf(-2.0f * (float)logarithm(u));
+        double sine, cosine;
+        sine_cosine((double)w, &sine, &cosine);
+        a[j] = radius * (float)cosine;
+        b[j] = radius * (float)sine;
+    }
+}
+
+static void normal_pairs(uint64_t *r, float *a, float *b)
+{
+    int32_t length[TWIN_SUB], turn[TWIN_SUB];
+    int j;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        const uint64_t bits = draw(r);
+        length[j] = (int32_t)(bits >> 40);
+        turn[j] = (int32_t)(bits & 0xFFFFFFu);
+    }
+    normal_of(length, turn, a, b);
 }
 
 /* ---- motion ---- */
@@ -79,13 +142,16 @@ static void move_further(const twin_parameters *p, twin_state *s, const motion_i
     }
 }
 
-/* Moves on from a time under a voltage and its ripple; the law is valid inside its table only. */
+/* Moves on from a time under a voltage and its ripple; the law is valid inside its table only.
+ * `fits`: one step is enough. */
 static void move_on(const twin_parameters *p, twin_state *s, const motion_input *in, double time_s,
-                    double dt)
+                    double dt, int fits)
 {
     const motion_law *law = &p->law;
     if (p->capacitance_rise != 0.0 || p->stiffness_loss != 0.0 || p->second_kg > 0.0) {
         move_further(p, s, in, time_s, dt);
+    } else if (fits) {
+        motion_step(law, &p->motion, &s->motion, NULL, in, dt);
     } else {
         motion_advance(law, &p->motion, &s->motion, NULL, in, dt);
     }
@@ -114,36 +180,69 @@ static double carrier_at_output(const twin_parameters *p)
     return p->gain * p->carrier_v / sqrt(real * real + imaginary * imaginary);
 }
 
+/* Lengths at `steps` equal parts of the time from a length and speed to a state: Hermite's cubic, by
+ * its powers. */
+HS_CLONES static void lengths_between(double start, double start_m_s, const motion_state *after,
+                                      double whole_s, int32_t steps, double *lengths)
+{
+    const double per = 1.0 / (double)steps;
+    const double from = whole_s * start_m_s, to = whole_s * after->speed_m_s;
+    const double rise = after->length_m - start;
+    const double second = 3.0 * rise - 2.0 * from - to, third = from + to - 2.0 * rise;
+    int32_t i;
+    for (i = 0; i < steps; ++i) {
+        const double t = (double)(i + 1) * per;
+        lengths[i] = start + t * (from + t * (second + t * third));
+    }
+}
+
+#define SAME_STEPS 64 /* that long at most, before longer ones are tried */
+
+/* Moves on by `steps` under a voltage in steps that are as equal as possible; lengths may be NULL. */
+static void move_value(const twin_parameters *p, twin_state *s, double volt, double ripple_v2,
+                       double load_n, double time_s, int32_t steps, double *lengths)
+{
+    const double dt = TWIN_SUB * p->sample_s;
+    int32_t k = 0, equal = steps, until = steps;
+    while (k < steps) {
+        const int32_t left = steps - k;
+        const double from_m = s->motion.length_m, from_m_s = s->motion.speed_m_s;
+        motion_input in = {0.0, 0.0, load_n};
+        int32_t now = equal < left ? equal : left;
+        const int fits = motion_fits(&p->law, &p->motion, &s->motion, dt * (double)now);
+        if (!fits || k >= until) {
+            const int32_t parts =
+                motion_steps(&p->law, &p->motion, &s->motion, dt * (double)left);
+            now = equal = parts < left ? left / parts : 1;
+            until = k + SAME_STEPS * equal;
+        }
+        if (p->second_kg > 0.0) {
+            now = 1;
+        }
+        if (!s->broken && !(s->reference_f > 0.0)) {
+            in.volt = volt;
+            in.ripple_v2 = ripple_v2;
+        }
+        watch_field(p, s, in.volt);
+        move_on(p, s, &in, time_s + dt * (double)k, dt * (double)now, fits);
+        if (lengths != NULL) {
+            lengths_between(from_m, from_m_s, &s->motion, dt * (double)now, now, lengths + k);
+        }
+        k += now;
+    }
+}
+
 void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, int32_t n_drive,
                int32_t steps_per_value, double load_n, int32_t n_steps, double *lengths)
 {
     const double dt = TWIN_SUB * p->sample_s, carrier = carrier_at_output(p);
-    int32_t k = 0;
-    while (k < n_steps) {
-        const int32_t value = k / steps_per_value, last = n_drive - 1;
-        const int32_t held = value < last ? (value + 1) * steps_per_value - k : n_steps - k;
-        const int32_t left = held < n_steps - k ? held : n_steps - k;
-        const int32_t parts = motion_steps(&p->law, &p->motion, &s->motion, dt * (double)left);
-        const int32_t steps = parts < left && !(p->second_kg > 0.0) ? left / parts : 1;
-        const motion_state before = s->motion;
-        motion_input in = {0.0, 0.0, load_n};
-        int32_t i;
-        if (!s->broken && !(s->reference_f > 0.0)) {
-            in.volt = p->gain * drive_v[value < last ? value : last];
-            in.ripple_v2 = 0.5 * carrier * carrier;
-        }
-        watch_field(p, s, in.volt);
-        move_on(p, s, &in, s->time_s + dt * (double)k, dt * (double)steps);
-        if (lengths != NULL) { /* Hermite's cubic, by its powers */
-            const double whole = dt * (double)steps, per = 1.0 / (double)steps;
-            const double from = whole * before.speed_m_s, to = whole * s->motion.speed_m_s;
-            const double rise = s->motion.length_m - before.length_m;
-            for (i = 0; i < steps; ++i) {
-                const double t = (double)(i + 1) * per;
-                const double bend = 3.0 * rise - 2.0 * from - to + t * (from + to - 2.0 * rise);
-                lengths[k + i] = before.length_m + t * (from + t * bend);
-            }
-        }
+    int32_t value, k = 0;
+    for (value = 0; value < n_drive && k < n_steps; ++value) {
+        const int32_t left = n_steps - k;
+        const int32_t steps =
+            value < n_drive - 1 && steps_per_value < left ? steps_per_value : left;
+        move_value(p, s, p->gain * drive_v[value], 0.5 * carrier * carrier, load_n,
+                   s->time_s + dt * (double)k, steps, lengths == NULL ? NULL : lengths + k);
         k += steps;
     }
     s->amp_v = p->gain * drive_v[n_drive - 1];
@@ -152,6 +251,27 @@ void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, i
     s->v_seen = s->v_shown = s->amp_v;
     s->i_seen = s->i_shown = 0.0;
     s->time_s += n_steps * dt;
+}
+
+double twin_update(const twin_parameters *p, twin_state *s, const twin_update_input *in,
+                   double *lengths, int32_t at)
+{
+    const double before_s = s->time_s;
+    double sum = 0.0;
+    int32_t k;
+    if (in->switch_at > 0) {
+        twin_move(p, s, &in->before_v, 1, 1, in->load_n, in->switch_at, lengths + at);
+    }
+    if (in->switch_at < in->steps) {
+        twin_move(p, s, &in->after_v, 1, 1, in->load_n, in->steps - in->switch_at,
+                  lengths + at + in->switch_at);
+    }
+    for (k = in->first; k <= in->last; ++k) { /* trapezoidal rule */
+        const double volt = p->gain * (k > in->switch_at ? in->after_v : in->before_v);
+        const double weight = k == in->first || k == in->last ? 0.5 : 1.0;
+        sum += weight * motion_capacitance(&p->law, lengths[at - 1 + k], volt);
+    }
+    return sum / (double)(in->last - in->first) * permittivity(p, before_s);
 }
 
 /* ---- electricity ---- */
@@ -166,13 +286,6 @@ static void prepare_lag(twin_lag *lag, double lag_s, double sample_s)
     lag->last_output = decay;
     lag->last_input = mean - decay;
     lag->input = 1.0 - mean;
-}
-
-static double follow(const twin_lag *lag, double *shown, double *seen, double input)
-{
-    *shown = lag->last_output * *shown + lag->last_input * *seen + lag->input * input;
-    *seen = input;
-    return *shown;
 }
 
 void twin_connect(twin_state *s, double farad, double series_ohm)
@@ -200,26 +313,6 @@ void twin_prepare(twin_parameters *p)
     p->amp_r[1] = 1.0 / t + 2.0 * z / (w * t) * p->amp_a[1][0] - p->amp_a[1][1] / t;
     prepare_lag(&p->v_lag, p->v_monitor_lag_s, t);
     prepare_lag(&p->i_lag, p->i_monitor_lag_s, t);
-}
-
-/* The amplifier for one sample: linear dynamics, then the slew and the current it can deliver. */
-/* One sample: the input is `held_v` and rises by `rise_v` in a straight line. */
-static void amplify(const twin_parameters *p, twin_state *s, double held_v, double rise_v,
-                    double largest_step)
-{
-    const double v0 = s->amp_v, r0 = s->amp_v_s;
-    double v = p->amp_a[0][0] * v0 + p->amp_a[0][1] * r0 + p->amp_b[0] * held_v +
-               p->amp_r[0] * rise_v;
-    double rate = p->amp_a[1][0] * v0 + p->amp_a[1][1] * r0 + p->amp_b[1] * held_v +
-                  p->amp_r[1] * rise_v;
-    if (fabs(v - v0) > largest_step) {
-        const double step = v > v0 ? largest_step : -largest_step;
-        v = v0 + step;
-        rate = step / p->sample_s;
-        ++s->limited;
-    }
-    s->amp_v = v;
-    s->amp_v_s = rate;
 }
 
 /* What is connected to the output. */
@@ -273,94 +366,208 @@ static element connected(const twin_parameters *p, const twin_state *s, double s
     return load;
 }
 
-/* Series R-C with leakage, and the stray capacitance beside them, for one sample in which the
- * voltage follows the cubic from v0 with the rate r0 to the amplifier's output and rate. Exact for
- * it: with the derivatives v1, v2, v3 of that voltage, the capacitor has v - rc v1 + rc^2 v2 -
- * rc^3 v3 and a lag that decays. Returns the current when the second channel is converted. */
-static double charge(const twin_parameters *p, twin_state *s, double v0, double r0, element load)
+/* Samples of one mechanical step, one array for each quantity: most of the work needs no earlier
+ * sample and is done on vectors. A voltage and its rate have one value more, at the end. */
+typedef struct {
+    double held_v[TWIN_SUB], rise_v[TWIN_SUB]; /* input of the amplifier, straight from v to v + rise */
+    double amp_v[TWIN_SUB + 1], amp_v_s[TWIN_SUB + 1];
+    double start_v[TWIN_SUB], end_v[TWIN_SUB]; /* of the capacitor, without what is left of a lag */
+    double plate_v[TWIN_SUB + 1], lag_v[TWIN_SUB];
+    double flow_a[TWIN_SUB], amps[TWIN_SUB];
+    float noise_v[TWIN_SUB], noise_i[TWIN_SUB];
+    double sine, cosine; /* of the carrier's phase, means over the step */
+} samples;
+
+/* The amplifier: linear dynamics, then the slew and the current it can deliver. */
+static void amplify(const twin_parameters *p, twin_state *s, double largest_step, samples *x)
 {
-    const double dt = p->sample_s, t = p->skew_s, farad = load.farad;
-    const double rc = load.series_ohm * farad, mean = (s->amp_v - v0) / dt;
-    const double twist = 6.0 * (r0 + s->amp_v_s - 2.0 * mean) / (dt * dt);
-    const double bend0 = 2.0 * (3.0 * mean - 2.0 * r0 - s->amp_v_s) / dt;
-    const double bend1 = bend0 + twist * dt, bend = bend0 + twist * t;
-    const double rate = r0 + t * (bend0 + 0.5 * twist * t);
-    const double lag = s->plate_v - (v0 - rc * (r0 - rc * (bend0 - rc * twist)));
-    const double left = load.decay > 0.0 ? lag * load.decay_read / load.series_ohm : 0.0;
-    const double flow = farad * (rate - rc * (bend - rc * twist)) - left;
-    s->plate_v = s->amp_v - rc * (s->amp_v_s - rc * (bend1 - rc * twist)) + lag * load.decay;
-    return flow + s->plate_v / load.leakage_ohm + p->stray_f * rate;
+    double v = s->amp_v, rate = s->amp_v_s;
+    int j;
+    x->amp_v[0] = v;
+    x->amp_v_s[0] = rate;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        const double held = x->held_v[j], rise = x->rise_v[j], before = v;
+        v = p->amp_a[0][0] * before + p->amp_a[0][1] * rate + p->amp_b[0] * held +
+            p->amp_r[0] * rise;
+        rate = p->amp_a[1][0] * before + p->amp_a[1][1] * rate + p->amp_b[1] * held +
+               p->amp_r[1] * rise;
+        if (fabs(v - before) > largest_step) {
+            const double step = v > before ? largest_step : -largest_step;
+            v = before + step;
+            rate = step / p->sample_s;
+            ++s->limited;
+        }
+        x->amp_v[j + 1] = v;
+        x->amp_v_s[j + 1] = rate;
+    }
+    s->amp_v = v;
+    s->amp_v_s = rate;
 }
 
-static int16_t convert(double volt, double lsb)
+/* Series R-C in samples in which the voltage follows the cubic from one output and rate of the
+ * amplifier to the next. Exact for it: with the derivatives v1, v2, v3 of that voltage, the capacitor
+ * has v - rc v1 + rc^2 v2 - rc^3 v3 and a lag that decays. `flow_a`: the current of the former when
+ * the second channel is converted, with that through the stray capacitance. */
+HS_CLONES static void follow_cubics(const twin_parameters *p, const element *load, samples *x)
 {
-    const double code = volt / lsb;
-    if (code >= 32767.0) {
-        return 32767;
+    const double dt = p->sample_s, t = p->skew_s, farad = load->farad, stray = p->stray_f;
+    const double rc = load->series_ohm * farad, dt2 = dt * dt;
+    int j;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        const double v0 = x->amp_v[j], r0 = x->amp_v_s[j], v1 = x->amp_v[j + 1];
+        const double r1 = x->amp_v_s[j + 1], mean = (v1 - v0) / dt;
+        const double twist = 6.0 * (r0 + r1 - 2.0 * mean) / dt2;
+        const double bend0 = 2.0 * (3.0 * mean - 2.0 * r0 - r1) / dt;
+        const double bend1 = bend0 + twist * dt, bend = bend0 + twist * t;
+        const double rate = r0 + t * (bend0 + 0.5 * twist * t);
+        x->start_v[j] = v0 - rc * (r0 - rc * (bend0 - rc * twist));
+        x->end_v[j] = v1 - rc * (r1 - rc * (bend1 - rc * twist));
+        x->flow_a[j] = farad * (rate - rc * (bend - rc * twist));
+        x->amps[j] = stray * rate;
     }
-    if (code <= -32768.0) {
-        return -32768;
+}
+
+static void charge(twin_state *s, const element *load, samples *x)
+{
+    double plate = s->plate_v;
+    int j;
+    x->plate_v[0] = plate;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        x->lag_v[j] = plate - x->start_v[j];
+        plate = x->end_v[j] + x->lag_v[j] * load->decay;
+        x->plate_v[j + 1] = plate;
     }
-    return (int16_t)lrint(code);
+    s->plate_v = plate;
+}
+
+/* Adds the current of the lag, and the leakage. */
+HS_CLONES static void add_currents(const element *load, samples *x)
+{
+    const double ohm = load->decay > 0.0 ? load->series_ohm : INFINITY;
+    const double read = load->decay_read, leakage = load->leakage_ohm;
+    int j;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        x->amps[j] += x->flow_a[j] - x->lag_v[j] * read / ohm + x->plate_v[j + 1] / leakage;
+    }
+}
+
+/* What the monitors show, from their inputs, in place. */
+static void follow(const twin_lag *lag, double *shown, double *seen, double *values)
+{
+    double last = *seen, now = *shown;
+    int j;
+    if (lag->last_output == 0.0 && lag->last_input == 0.0 && lag->input == 1.0) {
+        *seen = *shown = values[TWIN_SUB - 1];
+        return;
+    }
+    for (j = 0; j < TWIN_SUB; ++j) {
+        now = lag->last_output * now + lag->last_input * last + lag->input * values[j];
+        last = values[j];
+        values[j] = now;
+    }
+    *seen = last;
+    *shown = now;
+}
+
+HS_CLONES static void convert(const double *values, double scale, double offset_v,
+                              const float *noise, double noise_v, double lsb_v, int16_t *codes)
+{
+    int32_t rounded[TWIN_SUB];
+    int j;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        double code = (values[j] * scale + noise_v * (double)noise[j] + offset_v) / lsb_v;
+        code = code < 32767.0 ? code : 32767.0;
+        code = code > -32768.0 ? code : -32768.0;
+        rounded[j] = (int32_t)nearbyint(code);
+    }
+    for (j = 0; j < TWIN_SUB; ++j) {
+        codes[2 * j] = (int16_t)rounded[j];
+    }
+}
+
+/* Generator and drive, from a sample of the block on; moves the carrier's (cosine, sine) on. */
+static void generate(const twin_parameters *p, double gain, const double drive_v[2], int32_t until,
+                     const double turn[2], double carrier[2], samples *x)
+{
+    double c = carrier[0], q = carrier[1], sine = 0.0, cosine = 0.0;
+    int j;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        const double now = q, before = c;
+        q = now * turn[0] + c * turn[1];
+        c = c * turn[0] - now * turn[1];
+        x->held_v[j] = gain * (drive_v[j >= until] + p->carrier_v * now);
+        x->rise_v[j] = gain * p->carrier_v * (q - now);
+        sine += 0.5 * (now + q);
+        cosine += 0.5 * (before + c);
+    }
+    x->sine = sine / TWIN_SUB;
+    x->cosine = cosine / TWIN_SUB;
+    carrier[0] = c;
+    carrier[1] = q;
+}
+
+static void read_monitors(const twin_parameters *p, twin_state *s, samples *x, int16_t *codes)
+{
+    if (p->v_noise_v != 0.0 || p->i_noise_v != 0.0) {
+        normal_pairs(s->random, x->noise_v, x->noise_i);
+    }
+    follow(&p->v_lag, &s->v_shown, &s->v_seen, x->amp_v); /* at the begin of each sample */
+    follow(&p->i_lag, &s->i_shown, &s->i_seen, x->amps);
+    convert(x->amp_v, p->v_monitor, p->v_offset_v, x->noise_v, p->v_noise_v, p->lsb_v, codes);
+    convert(x->amps, p->i_monitor, p->i_offset_v, x->noise_i, p->i_noise_v, p->lsb_v, codes + 1);
+}
+
+/* Mean voltage and its ripple over the step, by the trapezoidal rule. */
+static motion_input pull_of(const samples *x, double load_n)
+{
+    motion_input pull = {0.0, 0.0, load_n};
+    double sum = 0.0, sum2 = 0.0;
+    int j;
+    for (j = 0; j < TWIN_SUB; ++j) {
+        const double v0 = x->plate_v[j], v1 = x->plate_v[j + 1];
+        sum += 0.5 * (v0 + v1);
+        sum2 += 0.5 * (v0 * v0 + v1 * v1);
+    }
+    pull.volt = sum / TWIN_SUB;
+    pull.ripple_v2 = sum2 / TWIN_SUB - pull.volt * pull.volt;
+    return pull;
 }
 
 void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, double after_v,
                   int32_t switch_at, double load_n, int32_t n_samples, int16_t *codes,
                   double *lengths)
 {
-    const double dt = TWIN_SUB * p->sample_s;
-    const double turn_c = cos(p->carrier_rad_s * p->sample_s);
-    const double turn_s = sin(p->carrier_rad_s * p->sample_s);
+    const double dt = TWIN_SUB * p->sample_s, drive_v[2] = {before_v, after_v};
+    const double turned = p->carrier_rad_s * p->sample_s, turn[2] = {cos(turned), sin(turned)};
     const double phase = fmod(p->carrier_rad_s * s->time_s, 6.283185307179586);
-    const int noisy = p->v_noise_v != 0.0 || p->i_noise_v != 0.0;
     const double warm = permittivity(p, s->time_s);
-    double c = cos(phase), q = sin(phase);
-    int32_t n = 0, step;
+    double carrier[2] = {cos(phase), sin(phase)};
+    samples x = {0};
+    int32_t step;
 
     for (step = 0; step < n_samples / TWIN_SUB; ++step) {
-        const element load = connected(p, s, q, c, warm);
+        const element load = connected(p, s, carrier[1], carrier[0], warm);
         const carried rides = carrier_behind(p, load.series_ohm * load.farad);
         const double by_current = p->current_limit_a / (load.farad + p->stray_f);
         const double reach =
             p->sample_s * (by_current < p->slew_v_s ? by_current : p->slew_v_s);
-        const double gain = s->broken ? 0.0 : p->gain;
-        const double pulls = s->reference_f > 0.0 ? 0.0 : 1.0; /* a reference moves nothing */
         motion_input pull = {0.0, 0.0, load_n};
-        double sum = 0.0, sum2 = 0.0, swing = 0.0;
-        int j;
-        for (j = 0; j < TWIN_SUB; ++j, ++n) {
-            const double drive = n < switch_at ? before_v : after_v;
-            const double v0 = s->amp_v, r0 = s->amp_v_s, plate0 = s->plate_v;
-            const double now = q, before = c;
-            float noise_v = 0.0f, noise_i = 0.0f;
-            double amps;
-            q = now * turn_c + c * turn_s;
-            c = c * turn_c - now * turn_s;
-            amplify(p, s, gain * (drive + p->carrier_v * now), gain * p->carrier_v * (q - now),
-                    reach);
-            amps = charge(p, s, v0, r0, load);
-            if (noisy) {
-                normal_pair(s->random, &noise_v, &noise_i);
+        generate(p, s->broken ? 0.0 : p->gain, drive_v, switch_at - step * TWIN_SUB, turn, carrier,
+                 &x);
+        amplify(p, s, reach, &x);
+        follow_cubics(p, &load, &x);
+        charge(s, &load, &x);
+        add_currents(&load, &x);
+        read_monitors(p, s, &x, codes + 2 * TWIN_SUB * step);
+        if (!(s->reference_f > 0.0)) { /* a reference moves nothing */
+            pull = pull_of(&x, load_n);
+            if (p->law.voltages > 1) {
+                pull.volt -= rides.sine * x.sine + rides.cosine * x.cosine;
+                pull.ripple_v2 = rides.square;
             }
-            codes[2 * n] = convert(follow(&p->v_lag, &s->v_shown, &s->v_seen, v0) * p->v_monitor +
-                                       p->v_noise_v * (double)noise_v + p->v_offset_v,
-                                   p->lsb_v);
-            codes[2 * n + 1] =
-                convert(follow(&p->i_lag, &s->i_shown, &s->i_seen, amps) * p->i_monitor +
-                            p->i_noise_v * (double)noise_i + p->i_offset_v,
-                        p->lsb_v);
-            sum += 0.5 * pulls * (plate0 + s->plate_v);
-            sum2 += 0.5 * pulls * (plate0 * plate0 + s->plate_v * s->plate_v);
-            swing += 0.5 * pulls * (rides.sine * (now + q) + rides.cosine * (before + c));
+            watch_field(p, s, s->plate_v);
         }
-        watch_field(p, s, pulls * s->plate_v);
-        pull.volt = sum / TWIN_SUB;
-        pull.ripple_v2 = sum2 / TWIN_SUB - pull.volt * pull.volt;
-        if (p->law.voltages > 1) {
-            pull.volt -= swing / TWIN_SUB;
-            pull.ripple_v2 = pulls * rides.square;
-        }
-        move_on(p, s, &pull, s->time_s + dt * (double)step, dt);
+        move_on(p, s, &pull, s->time_s + dt * (double)step, dt, 0);
         lengths[step] = s->motion.length_m;
     }
     s->time_s += n_samples * p->sample_s;

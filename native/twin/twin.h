@@ -76,4 +76,16 @@ void twin_connect(twin_state *s, double farad, double series_ohm);
 void twin_move(const twin_parameters *p, twin_state *s, const double *drive_v, int32_t n_drive,
                int32_t steps_per_value, double load_n, int32_t n_steps, double *lengths);
 
+/* One update of a loop, by motion alone: `steps` times of `TWIN_SUB * sample_s`, with the drive
+ * `before_v` up to step `switch_at`, `after_v` from there on. Writes `steps` lengths from
+ * lengths[at] on; those before are of earlier updates. Returns the mean capacitance from step
+ * `first` to step `last` after lengths[at - 1], which may be negative, as a lock-in senses it
+ * without noise; at + first must be at least 1. */
+typedef struct {
+    double before_v, after_v, load_n;
+    int32_t steps, switch_at, first, last;
+} twin_update_input;
+double twin_update(const twin_parameters *p, twin_state *s, const twin_update_input *in,
+                   double *lengths, int32_t at);
+
 #endif

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from haselab.actuators import DRIFTS, Drive, PeanoHasel, PlanarHasel, SampledLaw
-from haselab.actuators.drift import drift_pairs
+from haselab.actuators.losses import drift_pairs
 from haselab.base import LimitError
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import native_bench

@@ -63,9 +63,10 @@ def test_the_twin_moves_as_its_law_does(name):
     np.testing.assert_allclose(on_the_twin(config, voltage_v, 0.3), expected, rtol=3e-9)
 
 
-def test_a_wait_of_the_twin_ends_where_its_short_steps_do():
-    """Steps of 2.5 ms instead of 0.1 ms: 1e-6 of the motion, and the lengths between them too."""
-    config = CONFIGS["planar"]
+@pytest.mark.parametrize("kind", ["planar-hasel", "peano-hasel", "curling-hasel", "dea-stack"])
+def test_a_wait_of_the_twin_ends_where_its_short_steps_do(kind):
+    """Steps of up to 2.5 ms instead of 0.1 ms: 1e-6 of the motion, and the lengths between too."""
+    config = TwinConfig(kind=kind)
     bench, lengths = native_bench(config, 0), np.empty(6000)
     bench.move(np.array([0.8, 0.0, 1.2]), 2000, 2.0, lengths)
     expected = by_law(config, np.repeat([4e3, 0.0, 6e3], 2000), 2.0)

@@ -277,7 +277,7 @@ CALLS = {
     hl.find_regions: {
         "stretch": (STRETCH, VECTOR),
         "load_n": (STRETCH, VECTOR),
-        "pieces": (2, WHOLE_OR_NONE),
+        "segments": (2, WHOLE_OR_NONE),
     },
     hl.fit_hyperelastic: {
         "stretch": (STRETCH, VECTOR),

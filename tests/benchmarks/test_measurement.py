@@ -18,8 +18,17 @@ def arguments_of(path, function):
     """Names of the arguments of a function, without importing what the benchmark needs."""
     for node in ast.parse(path.read_text()).body:
         if isinstance(node, ast.FunctionDef) and node.name == function:
-            return {one.arg for one in node.args.args}
+            names = {one.arg for one in node.args.args}
+            return names | (counts_of(path) if node.args.kwarg else set())
     raise AssertionError(f"{path} has no function {function}")
+
+
+def counts_of(path):
+    """Keys of the table COUNTS, which `**counts` takes."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign) and node.targets[0].id == "COUNTS":
+            return {*ast.literal_eval(node.value)}
+    return set()
 
 
 def test_each_measurement_has_rows_that_take_its_sizes(benchmarks):

@@ -46,6 +46,7 @@ COMMANDS = {
     "design": "m.json --structure pi --out {out}",
     "margins": "m.json --kp 1 --ki 1 --out {out}",
     "export": "m.json --to json --out {out}",
+    "scoreboard": "--quick --out {folder}",
     "session export": "run --to csv --out {folder}",
     "session import": "a.csv --out {folder}",
     "example": "chirp --out {folder}",

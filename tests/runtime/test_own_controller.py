@@ -10,13 +10,19 @@ import pytest
 
 from haselab.base import InputError, SafetyError, SilentProgress
 from haselab.control import Saturation
-from haselab.controllers import ControllerKind, ControllerSetting, Measurement, Parameter
+from haselab.controllers import (
+    ControllerKind,
+    ControllerSetting,
+    KnownActuator,
+    Measurement,
+    Parameter,
+)
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
-from haselab.runtime.lockin import lockin_of
+from haselab.runtime.lockin import counted_s, lockin_of
 from haselab.runtime.loop import LoopSettings, RunningController
 from haselab.runtime.runner import Runner
 from haselab.store.session.writer import ExperimentPlan, SessionWriter
@@ -54,6 +60,13 @@ class Scene:
         witness = CameraRecorder(self.rig.camera, self.session, folder / "video", "none")
         self.runner = Runner(self.rig, self.session, witness, 2000.0, 0.02, SilentProgress())
 
+    def play_kind(self, kind, reference, actuator=None) -> None:
+        loop = LoopSettings(
+            kind.choose(), Saturation(-0.04, 0.1), EQ4, TO_STRAIN, actuator=actuator
+        )
+        with self.runner as runner:
+            runner.close_loop("x", np.asarray(reference), loop, 50.0, 0.25)
+
     def play(self, make, reference, **values: float) -> None:
         parameters = tuple(Parameter(name, "1/s") for name in values)
         loop = LoopSettings(
@@ -72,7 +85,11 @@ def scene(tmp_path) -> Scene:
 def test_a_controller_gets_period_limits_and_each_block_s_measurement(scene):
     spy = Spy(0.01)
     scene.play(lambda: spy, [math.nan] * 3 + [0.02] * 20)
-    assert spy.setting == ControllerSetting(scene.rig.description.block_s, -0.04, 0.1)
+    about = scene.rig.description
+    window_s = counted_s(about, 2000.0)  # of which the capacitance is the mean
+    assert spy.setting == ControllerSetting(
+        about.block_s, -0.04, 0.1, delay_s=0.5 * window_s + about.switch_sample / about.rate_hz
+    )
     record = scene.session.experiment("x")
     lockin = lockin_of(scene.rig.description, 2000.0)
     farad = [lockin.step(codes)[0] for codes in record.codes]
@@ -99,8 +116,47 @@ def test_the_loop_s_saturation_limits_every_controller(asked, put_out):
     loop = LoopSettings(
         ControllerKind("spy", lambda: Spy(asked)).choose(), Saturation(-0.04, 0.1), EQ4, TO_STRAIN
     )
-    running = RunningController(loop, 0.01)
+    running = RunningController(loop.controller, loop.setting(0.01, None, (0.0, 2.0)))
     assert running.step(0.0, Measurement(0.0, 6e-10, 1.0, 0.0)) == put_out
+
+
+LAW = KnownActuator(twin_of_reading("hz").law, 0.25, 0.051, 0.0, 1.8, 5000.0)
+
+
+class Volts(Spy):
+    """Puts out a voltage near that of zero strain."""
+
+    def __init__(self) -> None:
+        super().__init__(1.1)
+
+
+def test_a_kind_with_voltage_output_puts_out_its_voltage_and_gets_the_actuator(scene):
+    spy = Volts()
+    kind = ControllerKind("volts", lambda: spy, output="voltage", preview_s=0.03)
+    reference = [*np.linspace(0.0, 0.01, 20)]
+    scene.play_kind(kind, reference, actuator=LAW)
+    drive_v = scene.session.experiment("x").drive_v
+    np.testing.assert_allclose(drive_v[0], EQ4.voltage_v(0.0), rtol=1e-6)
+    assert drive_v[1:].tolist() == [1.1] * 19
+    assert spy.setting.actuator is LAW
+    assert (spy.setting.drive_low, spy.setting.drive_high) == (0.0, 1.8)  # of the actuator's file
+    padded = [*reference, *[reference[-1]] * 3]
+    assert [seen.preview for _, seen in spy.seen] == [
+        tuple(padded[k + 1 : k + 4]) for k in range(20)
+    ]
+
+
+def test_a_voltage_outside_the_limits_stops_the_run(scene):
+    kind = ControllerKind("volts", lambda: Spy(1.85), output="voltage")
+    with pytest.raises(SafetyError, match=r"returned 1\.85 V, outside its limits of 0 to 1\.8 V"):
+        scene.play_kind(kind, [0.0] * 5, actuator=LAW)
+    assert scene.twin.output_v == 0.0
+
+
+def test_a_kind_with_voltage_output_is_refused_without_a_physical_model(scene):
+    kind = ControllerKind("volts", Volts, output="voltage")
+    with pytest.raises(InputError, match=r"haselab identify actuator RUN --actuator A\.toml"):
+        scene.play_kind(kind, [0.0] * 5)
 
 
 def test_the_output_holds_while_the_measurement_is_not_valid():
@@ -108,7 +164,8 @@ def test_the_output_holds_while_the_measurement_is_not_valid():
         ControllerKind("spy", lambda: Spy(math.nan)).choose(), Saturation(), EQ4, TO_STRAIN
     )
     lost = Measurement(math.nan, math.nan, 1.0, 0.0, valid=False)
-    assert RunningController(loop, 0.01).step(0.0, lost) is None
+    running = RunningController(loop.controller, loop.setting(0.01, None, (0.0, 2.0)))
+    assert running.step(0.0, lost) is None
 
 
 def test_kind_parameters_and_drive_are_in_the_session(scene):
@@ -227,5 +284,6 @@ def test_any_real_number_is_a_drive(drive):
     loop = LoopSettings(
         ControllerKind("spy", lambda: Spy(drive)).choose(), Saturation(), EQ4, TO_STRAIN
     )
-    found = RunningController(loop, 0.01).step(0.0, Measurement(0.0, 6e-10, 1.0, 0.0))
+    running = RunningController(loop.controller, loop.setting(0.01, None, (0.0, 2.0)))
+    found = running.step(0.0, Measurement(0.0, 6e-10, 1.0, 0.0))
     assert type(found) is float and found == pytest.approx(float(drive))

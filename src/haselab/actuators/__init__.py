@@ -2,9 +2,8 @@
 
 from haselab.actuators.curling_hasel import CurlingHasel
 from haselab.actuators.dea_stack import DeaStack
-from haselab.actuators.drift import DRIFT_LIMITS, DRIFT_TIMES, DRIFT_UNITS, DRIFTS
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, LawValues, Parameter, parameter
-from haselab.actuators.losses import Circuit, Losses
+from haselab.actuators.losses import DRIFT_LIMITS, DRIFT_TIMES, DRIFT_UNITS, DRIFTS, Circuit, Losses
 from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
 from haselab.actuators.peano_hasel import PeanoHasel

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.actuators.law import ActuatorLaw, LawValues, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.peano_hasel import PeanoHasel
-from haselab.actuators.root import root
 from haselab.base import LimitError, Limits
+from haselab.base.root import root
 
 __all__ = ["CurlingHasel"]
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg import eigvals
 
 from haselab.actuators.law import ActuatorLaw
-from haselab.actuators.root import root
 from haselab.base import LimitError
+from haselab.base.root import root
 
 __all__ = ["OperatingPoint", "equilibrium_m", "linearise"]
 

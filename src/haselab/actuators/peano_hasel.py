@@ -14,8 +14,8 @@ from scipy.special import expit, spence
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, LawValues, parameter
 from haselab.actuators.losses import Circuit, Losses
 from haselab.actuators.pouch import Pouch
-from haselab.actuators.root import root
 from haselab.base import LimitError, Limits
+from haselab.base.root import root
 
 __all__ = ["PeanoHasel"]
 

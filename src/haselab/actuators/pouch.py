@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.actuators.root import root
 from haselab.base import LimitError
+from haselab.base.root import root
 
 __all__ = ["Pouch"]
 

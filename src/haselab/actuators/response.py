@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab import _motion
-from haselab.actuators.drift import DRIFTS, drift_pairs
 from haselab.actuators.law import ActuatorLaw
+from haselab.actuators.losses import DRIFTS, drift_pairs
 from haselab.actuators.operating_point import equilibrium_m
 from haselab.actuators.table import law_table
 from haselab.base import InputError, LimitError
@@ -44,6 +44,7 @@ ADDED_INERTIA = "load.added_inertia_kg"
 GRAVITY_M_S2 = 9.81
 _LONGEST_STEP_S = 2.5e-3
 _CORES = os.cpu_count() or 1
+_VECTOR = 4  # numbers in a register of AVX2
 _COLUMNS_EACH = 8  # for fewer columns another thread does not pay
 _PHASE = 0.1  # of the fastest motion in a step, rad
 _SHORTEST_STEP_S = 1e-6
@@ -418,22 +419,30 @@ class SampledLaw:
         length_by, mean_by = np.empty((times.size, columns)), np.empty((intervals, columns))
 
         def part(chosen: NDArray[np.int64]) -> tuple[NDArray[np.void], tuple[Floats, ...]]:
-            """Some of the columns; the motion itself is the same in each part."""
+            """Some of the columns; the motion itself is the same in each part.
+
+            Columns of zeros make their number a multiple of the processor's vectors.
+            """
             moved, size = start.copy(), chosen.size
+            padded = -(-size // _VECTOR) * _VECTOR
             seen = (
                 np.empty(times.size),
                 np.empty(times.size),
                 np.empty(intervals),
                 np.empty(intervals),
             )
-            own_rows = np.ascontiguousarray(rows[:, chosen])
-            lengths, means = np.empty((times.size, size)), np.empty((intervals, size))
+            own_kinds = np.full(padded, _motion.START, dtype=np.int32)
+            own_kinds[:size] = kinds[chosen]
+            own_rows = np.zeros((rows.shape[0], padded))
+            own_rows[:, :size] = rows[:, chosen]
+            lengths, means = np.empty((times.size, padded)), np.empty((intervals, padded))
             _motion.play(
                 self._native, self.parameters, moved, drive.edge_s, acts, drive.mass_kg, wanted,
-                times, *seen, kinds[chosen], self._elastic, self._pull, self._capacitance,
+                times, *seen, own_kinds, self._elastic, self._pull, self._capacitance,
                 self._free_by, own_rows, lengths, means,
             )  # fmt: skip
-            rows[:, chosen], length_by[:, chosen], mean_by[:, chosen] = own_rows, lengths, means
+            rows[:, chosen] = own_rows[:, :size]
+            length_by[:, chosen], mean_by[:, chosen] = lengths[:, :size], means[:, :size]
             return moved, seen
 
         workers = min(_CORES, 1 + columns // _COLUMNS_EACH)

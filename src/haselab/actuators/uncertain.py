@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators.drift import DRIFT_TIMES
 from haselab.actuators.law import ActuatorLaw
+from haselab.actuators.losses import DRIFT_TIMES
 
 __all__ = ["Scales", "draw_parameters"]
 

@@ -37,6 +37,8 @@ class Limits:
 
     def check(self, value: ArrayLike) -> None:
         """Raise `LimitError` unless every element of `value` is finite and inside the range."""
+        if type(value) is float and self.low <= value <= self.high:
+            return  # one number of a block, without an array
         values = np.atleast_1d(np.asarray(value, dtype=float))
         outside = ~((values >= self.low) & (values <= self.high))
         if outside.any():

@@ -40,6 +40,10 @@ _COMMANDS = {
     "design": ("haselab.cli.model.design", "Design controller gains and report their margins."),
     "compare": ("haselab.cli.model.compare", "Predict records that were not used for the fit."),
     "margins": ("haselab.cli.model.margins", "Compute the stability margins of given gains."),
+    "scoreboard": (
+        "haselab.cli.study.scoreboard",
+        "Compare controllers with the physical limits.",
+    ),
     "export": ("haselab.cli.model.export", "Convert a model for another tool."),
     "session": ("haselab.cli.data.session", "Export a recording for another tool, or import one."),
     "example": ("haselab.cli.data.example", "Write example data and the commands that use it."),

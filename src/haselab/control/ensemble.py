@@ -102,7 +102,7 @@ def simulate_ensemble(
         >>> plants = [Plant(1.0, omega, 0.5) for omega in (25.0, 32.0, 40.0)]
         >>> found = simulate_ensemble(plants, [PidGains(0.0, 3.0)] * 3, [0.02] * 400, LoopSetting())
         >>> found.settling_time_s.round(2), bool(found.unstable.any())
-        (array([1.17, 1.2 , 1.21]), False)
+        (array([1.15, 1.18, 1.2 ]), False)
     """
     loops, desired, noise = _prepared(plants, gains, reference, setting, measurement_noise)
     window = _Window.of(desired)

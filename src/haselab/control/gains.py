@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import InputError
 from haselab.controllers import ChosenController, pid_controller
 
-__all__ = ["PidGains", "Saturation", "sampled_responses"]
+__all__ = ["PidGains", "Saturation", "responses_at", "sampled_responses"]
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,15 @@ def sampled_responses(
     Returns:
         Complex responses. Shape `(C, ...)`.
     """
+    z = np.exp(1j * np.asarray(omega_rad_s, dtype=float) * (1.0 / rate_hz))
+    return responses_at(gains, z, rate_hz)
+
+
+def responses_at(
+    gains: Sequence[PidGains], z: NDArray[np.complex128], rate_hz: float
+) -> NDArray[np.complex128]:
+    """`sampled_responses` at points of the unit circle, `z = exp(j omega / rate)`."""
     period_s = 1.0 / rate_hz
-    z = np.exp(1j * np.asarray(omega_rad_s, dtype=float) * period_s)
     numbers = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains])
     kp, ki, kd, tau = numbers.T.reshape(4, len(gains), *(1,) * z.ndim)
     response = kp + ki * period_s * z / (z - 1.0)

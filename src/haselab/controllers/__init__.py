@@ -2,6 +2,7 @@
 
 from haselab.controllers.builtin import OpenLoop, PidController, pid_controller
 from haselab.controllers.kind import ChosenController, ControllerKind, Parameter
+from haselab.controllers.known_actuator import KnownActuator, known_actuator
 from haselab.controllers.protocol import (
     Controller,
     ControllerSetting,
@@ -16,12 +17,14 @@ __all__ = [
     "Controller",
     "ControllerKind",
     "ControllerSetting",
+    "KnownActuator",
     "LinearisableController",
     "Measurement",
     "OpenLoop",
     "Parameter",
     "PidController",
     "chosen_controller",
+    "known_actuator",
     "parameters_of",
     "pid_controller",
 ]

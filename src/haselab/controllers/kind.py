@@ -6,12 +6,17 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from haselab.base import InputError
-from haselab.controllers.protocol import Controller
+from haselab.controllers.protocol import Controller, ControllerSetting
 
 __all__ = ["ChosenController", "ControllerKind", "Parameter"]
 
+_NO_ACTUATOR = (
+    "needs the physical model of the actuator, which the file does not have. Add it with: haselab "
+    "identify actuator RUN --actuator A.toml"
+)
 MOST_C_PARAMETERS = 8  # HS_CONTROLLER_PARAMETERS of core/include/hs_controller.h
 
 
@@ -44,12 +49,37 @@ class ControllerKind:
         parameters: in the order in which the C step gets them.
         c_source: file with `hs_controller_init` and `hs_controller_step` for the microcontroller;
             None: the kind runs only on the computer.
+        output: what `step` returns: the corrected strain, which the voltage map of the loop turns
+            into a voltage, or the voltage itself, before the amplifier.
+        needs_actuator: whether the controller uses `ControllerSetting.actuator`.
+        design: computes the parameters from the actuator and the timing of the loop, which the
+            setting states; None: the parameters are typed, or searched by `haselab design`.
+        preview_s: how far the controller looks ahead in the reference, see `Measurement.preview`.
     """
 
     name: str
     make: Callable[..., Controller]
     parameters: tuple[Parameter, ...] = ()
     c_source: Path | None = None
+    output: Literal["strain", "voltage"] = "strain"
+    needs_actuator: bool = False
+    design: Callable[[ControllerSetting], Mapping[str, float]] | None = None
+    preview_s: float = 0.0
+
+    def check(self, setting: ControllerSetting) -> None:
+        """Refuse a setting that lacks what the kind needs.
+
+        Args:
+            setting: in which a controller would be started or designed.
+        Raises:
+            InputError: The kind needs the identified actuator, and there is none.
+        """
+        if setting.actuator is None and (self.needs_actuator or self.output == "voltage"):
+            raise InputError(f"Controller of kind {self.name!r} {_NO_ACTUATOR}")
+
+    def preview_steps(self, period_s: float) -> int:
+        """Number of coming desired strains that the controller gets in each step."""
+        return math.ceil(self.preview_s / period_s - 1e-9)
 
     def choose(
         self, values: Mapping[str, object] | None = None, source: object = ""

@@ -5,25 +5,35 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from haselab.controllers.known_actuator import KnownActuator
+
 __all__ = ["Controller", "ControllerSetting", "LinearisableController", "Measurement"]
 
 
 @dataclass(frozen=True)
 class ControllerSetting:
-    """Period and limits of the loop in which a controller is started.
+    """Timing and limits of the loop in which a controller is started, and what is known of it.
+
+    The drives are strains, or voltages of a kind with `output = "voltage"`.
 
     Args:
         period_s: time between two steps, in s.
-        drive_low: lowest drive that the loop puts out, in strain.
-        drive_high: highest one. The loop limits every drive to this range; a controller with an
-            integrator needs it against windup.
-        drive_start: drive before the first step, in strain.
+        drive_low: lowest drive that the loop puts out.
+        drive_high: highest one. The loop limits a strain to this range; a controller with an
+            integrator needs it against windup. A voltage outside stops the run.
+        drive_start: drive before the first step.
+        delay_s: age of a measurement when the output computed from it takes effect, in s, without
+            the hold of the output; None: not known.
+        actuator: the identified actuator; None: its file has no physical model. A kind with
+            `needs_actuator` always gets it.
     """
 
     period_s: float
     drive_low: float
     drive_high: float
     drive_start: float = 0.0
+    delay_s: float | None = None
+    actuator: KnownActuator | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +49,8 @@ class Measurement:
             result of the step is ignored; five such blocks in a row stop the run.
         in_range: whether the strain map was fitted at this capacitance. While it is False, the
             strain is extrapolated and the map's band is not valid.
+        preview: desired strains of the coming steps, as many as `preview_s` of the kind covers;
+            the first one is that of the next step.
     """
 
     strain: float
@@ -47,13 +59,15 @@ class Measurement:
     time_s: float
     valid: bool = True
     in_range: bool = True
+    preview: tuple[float, ...] = ()
 
 
 class Controller(Protocol):
     """One controller in one loop.
 
     The drive is a strain: the static strain of the voltage to put out. The voltage map of the
-    loop turns it into a voltage, so a controller that returns the reference is an open loop.
+    loop turns it into a voltage, so a controller that returns the reference is an open loop. If its
+    kind has `output = "voltage"`, the drive is that voltage, before the amplifier.
     """
 
     def start(self, setting: ControllerSetting) -> None:
@@ -70,7 +84,7 @@ class Controller(Protocol):
             reference: desired strain.
             measurement: of the block that has just ended.
         Returns:
-            The drive, in strain, until the next step.
+            The drive until the next step, in strain or in V.
         """
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from haselab.base import InputError
@@ -15,6 +16,10 @@ def _fault(kind: object, name: str) -> str:
     """Return what is wrong with the object of an entry point, or an empty text."""
     if not isinstance(kind, ControllerKind):
         return f"it is of the type {type(kind).__name__!r}, not a ControllerKind"
+    if kind.output not in ("strain", "voltage"):
+        return f"its output is {kind.output!r}, neither 'strain' nor 'voltage'"
+    if not 0.0 <= kind.preview_s < math.inf:
+        return f"its preview_s is {kind.preview_s!r}, but must be 0 or more"
     return "" if kind.name == name else f"its name is {kind.name!r}"
 
 
@@ -25,6 +30,7 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "open-loop": "haselab.controllers.builtin:OPEN_LOOP",
         "pi": "haselab.controllers.builtin:PI",
         "pid": "haselab.controllers.builtin:PID",
+        "force": "haselab.controllers.force:FORCE",
     },
     _fault,
 )

@@ -1,10 +1,10 @@
-"""Filters of scipy, imported at first use, since the import takes half a second."""
+"""Filters of scipy.signal, imported at first use, since the import takes half a second."""
 
 from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["fftconvolve", "lfilter", "resample_poly"]
+__all__ = ["fftconvolve", "find_peaks", "lfilter", "resample_poly"]
 
 
 def lfilter(b: Any, a: Any, x: Any, **options: Any) -> Any:
@@ -26,3 +26,10 @@ def resample_poly(x: Any, up: int, down: int, **options: Any) -> Any:
     from scipy import signal
 
     return signal.resample_poly(x, up, down, **options)
+
+
+def find_peaks(x: Any, **options: Any) -> Any:
+    """`scipy.signal.find_peaks`."""
+    from scipy import signal
+
+    return signal.find_peaks(x, **options)

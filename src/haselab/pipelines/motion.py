@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from haselab.store.session.layout import ExperimentRecord
 from haselab.store.session.reader import SessionReader
 from haselab.study.fits.observe import gauge_length
 
-__all__ = ["motion_of_session"]
+__all__ = ["motion_of_session", "motions_of_session"]
 
 Floats = NDArray[np.float64]
 _SAME_S = 1e-7  # times closer than that are one
@@ -71,24 +71,61 @@ def motion_of_session(
     Raises:
         InputError: The session has no conditions, no rig, or neither lengths nor capacitances.
     """
+    return motions_of_session(reader, path, (lockin,))[0]
+
+
+def motions_of_session(
+    reader: SessionReader, path: Path, lockins: Sequence[Lockin | None]
+) -> list[MotionRecord]:
+    """The same motion with the capacitances of several lock-ins; the session is read once.
+
+    Args:
+        reader: of the session, open.
+        path: of the session, for messages.
+        lockins: see `motion_of_session`.
+    Returns:
+        One motion for each.
+    Raises:
+        InputError: See `motion_of_session`.
+    """
     conditions = reader.conditions()
     if conditions.size == 0:
         raise InputError(
             "The session does not say what acted on the actuator between its experiments: it was "
             f"recorded by an older version, imported, or by a chip. Record it again. {path}"
         )
+    records: list[ExperimentRecord] = []
+    blocks: list[dict[str, _Blocks]] = [{} for _ in lockins]
+    for name in reader.names:
+        if name == "particles":
+            continue
+        record = reader.experiment(name)
+        if len(record.codes):
+            sensed = _sensed(reader, record, path, lockins)
+            for found, part in zip(blocks, sensed, strict=True):
+                found[name] = part
+        records.append(replace(record, codes=record.codes[:0]))  # they are large
+    lengths = _lengths(records, float(reader.header["rig"]["scale_m_per_px"]))
+    names = tuple(record.name for record in records)
+    return [_joined(reader, path, conditions, names, lengths, part) for part in blocks]
+
+
+def _joined(
+    reader: SessionReader,
+    path: Path,
+    conditions: NDArray[np.void],
+    names: tuple[str, ...],
+    lengths: tuple[Floats, Floats, Floats, NDArray[np.int64]],
+    blocks: Mapping[str, _Blocks],
+) -> MotionRecord:
     rig = reader.header["rig"]
     block_s = rig["block_samples"] / rig["rate_hz"]
     switch_s = rig["switch_sample"] / rig["rate_hz"]
-    records = [reader.experiment(name) for name in reader.names]
-    records = [record for record in records if record.name != "particles"]
-    blocks = {r.name: _sensed(reader, r, path, lockin) for r in records if len(r.codes)}
     drive = _drive(
         conditions, blocks.values(), _late_s(blocks.values(), rig["rate_hz"]),
         (block_s, switch_s), float(rig["amplifier_gain"]),
     )  # fmt: skip
-    names = tuple(record.name for record in records)
-    time_s, length_m, std_m, of_length = _lengths(records, float(rig["scale_m_per_px"]))
+    time_s, length_m, std_m, of_length = lengths
     inside = (time_s >= drive.edge_s[0]) & (time_s <= drive.edge_s[-1])
     order = np.argsort(time_s[inside], kind="stable")
     chosen = np.flatnonzero(inside)[order]
@@ -136,25 +173,31 @@ def _windows(drive: Drive, blocks: _Blocks) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _sensed(
-    reader: SessionReader, record: ExperimentRecord, path: Path, lockin: Lockin | None
-) -> _Blocks:
+    reader: SessionReader, record: ExperimentRecord, path: Path, lockins: Sequence[Lockin | None]
+) -> list[_Blocks]:
     config = session_config(reader, record.codes.shape[1], DEFAULT_REQUEST, path)
     whole = Lockin(config)  # knows when the output is updated
-    lockin = lockin or whole
-    sensed = lockin.sense(record.codes)
+    rise = _rise(record.codes[:, :, 0], whole)
+    return [_blocks(reader, record, lockin or whole, rise) for lockin in lockins]
+
+
+def _blocks(
+    reader: SessionReader, record: ExperimentRecord, lockin: Lockin, rise: Floats
+) -> _Blocks:
+    rig, config = reader.header["rig"], lockin.config
     block_s = config.block_samples / config.rate_hz
+    sensed = lockin.sense(record.codes)
     middle_s = sensed.time_s - block_s * np.arange(len(record.codes))
     # other models than the plain one use other samples
     plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz
     used = sensed.valid & plain & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_std_f > 0)
     changes = np.flatnonzero(np.diff(np.pad(lockin.counted, 1).astype(np.int8)))
-    rig = reader.header["rig"]
     volt_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]
     carrier_v = 0.5 * volt_per_code * float(np.median(sensed.v_pp[used])) if used.any() else np.nan
     return _Blocks(
         record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
-        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v,
-        _rise(record.codes[:, :, 0], whole), _later_s(record.codes[:, :, 0], lockin),
+        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v, rise,
+        _later_s(record.codes[:, :, 0], lockin),
     )  # fmt: skip
 
 

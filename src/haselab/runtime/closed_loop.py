@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from haselab import _core
 from haselab.base import SafetyError
 from haselab.controllers import Measurement
-from haselab.runtime.lockin import lockin_of, printed_chain_of
+from haselab.runtime.lockin import counted_s, lockin_of, printed_chain_of
 from haselab.runtime.loop import LoopSettings, RunningController
 from haselab.runtime.observer import Observer
 from haselab.runtime.sensors import (
@@ -53,7 +53,12 @@ class ClosedLoop:
         name: str,
     ) -> None:
         self._rig, self._loop, self._name = rig, loop, name
-        self._controller = RunningController(loop, rig.description.block_s)
+        limits, block_s = rig.description.drive_limits, rig.description.block_s
+        delay_s = _delay_s(rig, carrier[0], loop)
+        setting = loop.setting(block_s, delay_s, (limits.low, limits.high))
+        self._controller = RunningController(loop.controller, setting)
+        self._in_volts = loop.controller.kind.output == "voltage"
+        self._ahead = loop.controller.kind.preview_steps(block_s)
         self._sensor = _sensor(rig, camera_recorder, carrier[0], loop)
         self._watchdog = _watchdog(rig, carrier, loop)
         self._lost = self._outside = 0  # blocks
@@ -62,6 +67,11 @@ class ClosedLoop:
         rig.description.drive_limits.check(voltages)
         self._output_v = self._voltage(0.0)
         self._waiting = deque([self._output_v] * loop.extra_delay_blocks)
+
+    @property
+    def preview_blocks(self) -> int:
+        """How many coming desired strains the controller gets."""
+        return self._ahead
 
     @property
     def watches_camera(self) -> bool:
@@ -73,12 +83,15 @@ class ClosedLoop:
         self._waiting.append(self._output_v)
         return self._waiting.popleft()
 
-    def step(self, codes: NDArray[np.int16], desired: float) -> None:
+    def step(
+        self, codes: NDArray[np.int16], desired: float, preview: tuple[float, ...] = ()
+    ) -> None:
         """Compute the drive from a block.
 
         Args:
             codes: the block just read.
             desired: strain; NaN: the loop is still open.
+            preview: the next desired strains, `preview_blocks` of them.
         Raises:
             SafetyError: The sensor was lost, the watchdog found a fault, or the controller failed.
         """
@@ -94,10 +107,11 @@ class ClosedLoop:
             raise safety.trip(fault)
         if desired == desired:
             try:
-                drive = self._controller.step(desired, self._measured(strain))
+                drive = self._controller.step(desired, self._measured(strain, preview))
             except SafetyError as error:
                 raise safety.trip(str(error)) from error
-            self._output_v = self._output_v if drive is None else self._voltage(drive)
+            if drive is not None:
+                self._output_v = drive if self._in_volts else self._voltage(drive)
 
     def note(self, played: int) -> str:
         """How often the loop left the range in which its strain map was fitted, or an empty text.
@@ -123,7 +137,7 @@ class ClosedLoop:
             strain, sensor.capacitance_f, rig.present_drive_v, desired, sensor.fresh, age_s
         )
 
-    def _measured(self, strain: float) -> Measurement:
+    def _measured(self, strain: float, preview: tuple[float, ...]) -> Measurement:
         """Collect what a controller gets of the block just read."""
         farad = self._sensor.capacitance_f
         return Measurement(
@@ -133,6 +147,7 @@ class ClosedLoop:
             time_s=self._rig.acquisition.time_s,
             valid=not math.isnan(strain),
             in_range=self._sensor.in_range,
+            preview=preview,
         )
 
     def _voltage(self, strain: float) -> float:
@@ -148,6 +163,15 @@ def _sensor(
     if loop.printed_chain:
         return PrintedChainSensor(printed_chain_of(rig.description, carrier_hz), loop.strain_map)
     return CapacitanceSensor(lockin_of(rig.description, carrier_hz), loop.strain_map)
+
+
+def _delay_s(rig: GuardedRig, carrier_hz: float, loop: LoopSettings) -> float | None:
+    """Age of the capacitance when its output takes effect; None: the camera's is not known."""
+    if loop.video_zero_px is not None:
+        return None
+    about = rig.description
+    blocks = loop.extra_delay_blocks * about.block_s
+    return 0.5 * counted_s(about, carrier_hz) + about.switch_sample / about.rate_hz + blocks
 
 
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 from haselab.base import InputError, SafetyError, described, is_real, shown
 from haselab.base.exits import no_exit
 from haselab.control import Saturation
-from haselab.controllers import ChosenController, ControllerSetting, Measurement
+from haselab.controllers import (
+    ChosenController,
+    Controller,
+    ControllerSetting,
+    KnownActuator,
+    Measurement,
+)
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 
@@ -29,6 +35,7 @@ class LoopSettings:
         printed_chain: capacitance by the reference study's own chain instead of the lock-in.
         extra_delay_blocks: blocks by which each output is delayed beyond the rig's own delay.
         carrier_v: peak amplitude of the sensing signal for this loop; None: that of the run.
+        actuator: the identified actuator, for controllers that use its physics; None: not known.
     """
 
     controller: ChosenController
@@ -39,30 +46,60 @@ class LoopSettings:
     printed_chain: bool = False
     extra_delay_blocks: int = 0
     carrier_v: float | None = None
+    actuator: KnownActuator | None = None
+
+    def setting(
+        self, period_s: float, delay_s: float | None, drive_limits_v: tuple[float, float]
+    ) -> ControllerSetting:
+        """What the controller is told of the loop.
+
+        Args:
+            period_s: time between two steps, in s.
+            delay_s: see `ControllerSetting`.
+            drive_limits_v: lowest and highest voltage of the rig.
+        Raises:
+            InputError: The kind of the controller needs the identified actuator.
+        """
+        low, high, start = self.saturation.low, self.saturation.high, 0.0
+        if self.controller.kind.output == "voltage":
+            (low, high), known = drive_limits_v, self.actuator
+            if known is not None:
+                low, high = max(low, known.low_v), min(high, known.high_v)
+            start = float(self.voltage_map.voltage_v(0.0))
+        found = ControllerSetting(period_s, low, high, start, delay_s, self.actuator)
+        self.controller.kind.check(found)
+        return found
 
 
 class RunningController:
     """A controller running in a loop, with its drive limited and its failures reported.
 
     Args:
-        loop: settings with the controller and its saturation.
-        period_s: time between two steps, in s.
+        chosen: the controller with its parameters.
+        setting: of the loop.
     Raises:
-        InputError: The controller does not start.
+        InputError: The controller does not start, or the setting lacks what its kind needs.
     """
 
-    def __init__(self, loop: LoopSettings, period_s: float) -> None:
-        self._name, limits = loop.controller.kind.name, loop.saturation
-        self._low, self._high = limits.low, limits.high
+    def __init__(self, chosen: ChosenController, setting: ControllerSetting) -> None:
+        kind = chosen.kind
+        kind.check(setting)
+        self._name, self._voltage = kind.name, kind.output == "voltage"
+        self._low, self._high = setting.drive_low, setting.drive_high
         try:
             with no_exit():
-                self._controller = loop.controller.make()
-                self._controller.start(ControllerSetting(period_s, limits.low, limits.high))
+                self._controller = chosen.make()
+                self._controller.start(setting)
         except Exception as error:  # code of another package may raise anything
             raise InputError(
                 f"Controller {self._name!r} does not start: {described(error)}. "
                 "Fix the controller, or change its parameters."
             ) from error
+
+    @property
+    def controller(self) -> Controller:
+        """The controller itself."""
+        return self._controller
 
     def step(self, reference: float, measurement: Measurement) -> float | None:
         """Compute the next drive.
@@ -71,10 +108,11 @@ class RunningController:
             reference: desired strain.
             measurement: of the block that has just ended.
         Returns:
-            The drive within the saturation, in strain; None: keep the output, because the
-            measurement is not valid.
+            The drive, in strain within the saturation or in V within the limits; None: keep the
+            output, because the measurement is not valid.
         Raises:
-            SafetyError: The controller failed, or returned something other than a finite number.
+            SafetyError: The controller failed, or returned something other than a finite number or
+                a voltage outside the limits.
         """
         try:
             with no_exit():
@@ -92,4 +130,10 @@ class RunningController:
                 f"{measurement.strain:.6g}, but a step must return one finite number. Fix it and "
                 "test it on the twin."
             )
-        return min(max(float(drive), self._low), self._high)
+        value = float(drive)
+        if self._voltage and not self._low <= value <= self._high:
+            raise SafetyError(
+                f"Controller {self._name!r} returned {value:.6g} V, outside its limits of "
+                f"{self._low:g} to {self._high:g} V. Limit the voltage in the controller."
+            )
+        return min(max(value, self._low), self._high)

@@ -288,11 +288,12 @@ class Runner:
             self._rig.generator.sine(self._carrier[0], loop.carrier_v)
             self._conditions.carrier(loop.carrier_v)
         self._camera_recorder.start(name, frame_rate_hz, mass_kg)
+        ahead = (*reference.tolist(), *reference[-1:].tolist() * closed.preview_blocks)
         for k, desired in enumerate(reference):
             codes = self._block(
                 name, k, closed.due_v(), float(desired), look=not closed.watches_camera
             )
-            closed.step(codes, float(desired))
+            closed.step(codes, float(desired), ahead[k + 1 : k + 1 + closed.preview_blocks])
         if note := closed.note(len(reference)):
             self._note(note)
         self._end(name)

@@ -46,6 +46,8 @@ _REQUESTS = {
     "sine": ("frequency_hz", "amplitude_v"),
 }
 
+_VALUES = frozenset({type(None), bool, int, float, np.ndarray})  # answers that cannot act later
+
 _NONE = -2  # no permission; `interlock.DAMAGED` is another number below zero
 _CALL_S = 5.0  # longest wait for a program that makes the bench safe and holds the output lock
 
@@ -302,7 +304,9 @@ class Gate:
                     self._forget()
 
         answer = self.interlock.holding_output(checked, _CALL_S)
-        if inspect.isgenerator(answer) or inspect.isawaitable(answer):
+        if type(answer) not in _VALUES and (
+            inspect.isgenerator(answer) or inspect.isawaitable(answer)
+        ):
             raise SafetyError(
                 f"{name} of the driver returned a generator or a coroutine, which could act after "
                 "the bench was made safe. Make it act before it returns."

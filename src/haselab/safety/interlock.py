@@ -43,6 +43,7 @@ __all__ = ["HEARTBEATS", "Interlock", "InterlockBusyError", "interlock_folder"]
 HEARTBEATS = 2  # of the two guardians
 DAMAGED = -1  # revision of a damaged file: no permission has it
 _MAGIC = b"HASELAB4"
+_WHOLE = struct.Struct("q")
 _BYTES = 2048
 _REVISION, _ACKNOWLEDGED, _LIVE, _OWNER, _SAFE, _HOLDER, _BEAT = range(8, 64, 8)
 _LEASE, _TIME, _CALL = (_BEAT + 8 * (HEARTBEATS + k) for k in range(3))
@@ -253,10 +254,12 @@ class Interlock:
             os.pwrite(self._file, data, at)
 
     def _get(self, at: int) -> int:
-        return int(struct.unpack("q", self._bytes(at, 8))[0])
+        if self._file < 0:
+            return int(_WHOLE.unpack_from(self._private, at)[0])
+        return int(_WHOLE.unpack(self._bytes(at, 8))[0])
 
     def _put(self, at: int, value: int) -> None:
-        self._store(at, struct.pack("q", value))
+        self._store(at, _WHOLE.pack(value))
 
     def _number(self, at: int) -> float:
         return float(struct.unpack("d", self._bytes(at, 8))[0])

@@ -22,6 +22,8 @@ def as_number(name: str, value: object) -> float:
     Raises:
         InputError: The value is a text, a truth value, an array, or None.
     """
+    if type(value) is float:
+        return value
     kind = type(value).__name__
     if isinstance(value, (bool, np.bool_, str, bytes)) or np.ndim(value) != 0:  # type: ignore[arg-type]
         raise InputError(f"{name} is {value!r} ({kind}), but it must be one number.")

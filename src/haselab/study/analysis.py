@@ -84,6 +84,11 @@ class Analysis:
                 raise _NotRecordedError(str(error)) from error
         return self._seen[name]
 
+    @property
+    def observed(self) -> Mapping[str, Observation]:
+        """What `observe` has returned so far, by name."""
+        return self._seen
+
     def need(self, kind: type[Value]) -> Value:
         """Return a value that an experiment finds, or that of the actuator file, such as `Maps`.
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 
 from haselab.base import InputError
-from haselab.controllers import CONTROLLERS
+from haselab.controllers import CONTROLLERS, KnownActuator, known_actuator
 from haselab.models.actuator import ActuatorTables
 from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
@@ -20,12 +21,18 @@ def known_values(tables: ActuatorTables) -> dict[type, object]:
     Args:
         tables: of the actuator file.
     Returns:
-        The maps, if the file has both of them and the length at zero strain; else nothing.
+        The maps, if the file has both of them and the length at zero strain; the physical model,
+        if the file has all that a controller needs of it.
     """
     length_m, drive = tables.actuator.geometry.zero_length_m, tables.drive
+    found: dict[type, object] = {}
+    with contextlib.suppress(InputError):  # of a model that no controller of the study may need
+        if (actuator := known_actuator(tables)) is not None:
+            found[KnownActuator] = actuator
     if length_m is None or tables.sensing.strain_map is None or drive.voltage_map is None:
-        return {}
-    return {Maps: Maps(length_m, tables.voltage_map(), tables.strain_map(), {}, {}, {})}
+        return found
+    maps = Maps(length_m, tables.voltage_map(), tables.strain_map(), {}, {}, {})
+    return found | {Maps: maps}
 
 
 def with_known(study: Study, tables: ActuatorTables) -> Study:

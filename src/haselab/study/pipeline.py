@@ -13,7 +13,7 @@ from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Chart, ExperimentResult, NotPlayedError
 from haselab.study.experiments.foreign import foreign, rows_of_experiment
-from haselab.study.fits.observe import Source
+from haselab.study.fits.observe import Observation, Source
 from haselab.study.player import Player
 
 __all__ = ["Findings", "investigate"]
@@ -34,6 +34,7 @@ class Findings:
         missing: why a result was not found, by id.
         direct: results of the experiments' own fits, by id, where those of the identified physical
             model stand in `quantities`.
+        observations: what the fits have seen, by the recording's name.
     """
 
     quantities: Mapping[str, Estimate]
@@ -43,6 +44,7 @@ class Findings:
     charts: tuple[Chart, ...] = ()
     missing: Mapping[str, str] = field(default_factory=dict)
     direct: Mapping[str, Estimate] = field(default_factory=dict)
+    observations: Mapping[str, Observation] = field(default_factory=dict, repr=False)
 
     def find(self, kind: type[Value]) -> Value | None:
         """Return a value by its type; None if this study has not found one."""
@@ -112,6 +114,7 @@ def investigate(
         values={type(value): value for part in outcomes for value in part.values},
         charts=tuple(chart for part in outcomes for chart in part.charts),
         missing=_joined([part.missing for part in outcomes]),
+        observations=analysis.observed,
     )
 
 

@@ -349,7 +349,7 @@ def test_a_section_with_a_wrong_value_is_named(files, capsys):
     actuator, first, _ = files
     actuator.write_text(actuator.read_text().replace("low_v = 0.0", 'low_v = "zero"'))
     code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
-    assert code == 2 and "drive.low_v: Input should be a valid number" in error
+    assert code == 2 and "drive.low_v: Input should be a number, not a text" in error
 
 
 def test_a_design_keeps_the_controllers_of_other_kinds_beside_its_own(known, capsys):

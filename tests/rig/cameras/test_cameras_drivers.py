@@ -286,6 +286,10 @@ from haselab.rig.cameras.opening import open_camera
 start_s = time.monotonic()
 clock = lambda: (time.monotonic() - start_s, time.monotonic())
 settings = dict(item.split("=") for item in sys.argv[2:])
+settings = {
+    name: float(value) if value.replace(".", "").isdigit() else value
+    for name, value in settings.items()
+}
 rate_hz = float(settings.pop("rate_hz", 100.0))
 try:
     config = V4l2Config(kind="v4l2", device=sys.argv[1], timeout_s=1.0, **settings)

@@ -19,6 +19,7 @@ import pytest
 
 from haselab.base import DeviceError, InputError
 from haselab.store.session import writer as module
+from haselab.store.session.growing import GrowingDataset
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 
 SAMPLES = 400
@@ -310,7 +311,7 @@ def test_a_write_that_hdf5_refuses_is_a_device_error(tmp_path, monkeypatch, meth
         "flush": lambda: None,
     }
     with monkeypatch.context() as patch:
-        patch.setattr(h5py.Dataset, "resize", refused)
+        patch.setattr(GrowingDataset, "_grow", refused)
         with pytest.raises(DeviceError, match=r"cannot be written \(Unable .*s\.h5$") as caught:
             calls[method]()
             session.flush("a")

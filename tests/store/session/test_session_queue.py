@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from haselab.base import DeviceError
+from haselab.store.session.growing import GrowingDataset
 from haselab.store.session.queue import JobQueue
 from haselab.store.session.tail import TailReader
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
@@ -165,18 +166,18 @@ def test_no_reader_sees_rows_that_a_dataset_has_room_for_but_does_not_hold_yet(
 ) -> None:
     """Reads after every growth of a dataset, before its new rows are written."""
     path, blocks = tmp_path / "session.h5", blocks_of(43)
-    grow, seen = h5py.Dataset.resize, []
+    grow, seen = GrowingDataset._grow, []
 
-    def grow_and_read(dataset: h5py.Dataset, *args: object, **more: object) -> None:
-        grow(dataset, *args, **more)
-        rows = reader.follow("a", 0)
-        np.testing.assert_array_equal(rows.drive_v, np.arange(1.0, 1.0 + len(rows.drive_v)))
-        np.testing.assert_array_equal(rows.codes, blocks[: len(rows.codes)])
+    def grow_and_read(dataset: GrowingDataset, rows: int) -> None:
+        grow(dataset, rows)
+        found = reader.follow("a", 0)
+        np.testing.assert_array_equal(found.drive_v, np.arange(1.0, 1.0 + len(found.drive_v)))
+        np.testing.assert_array_equal(found.codes, blocks[: len(found.codes)])
         record = reader.experiment("a")
         assert np.all(record.frame_time_s > 0.0)
         assert np.all(record.tracks["x_px"] == 7.0)
         assert {what for _, what in reader.events()} <= {"one", "two"}
-        seen.append(dataset.name)
+        seen.append(h5py.h5i.get_name(dataset._id).decode())
 
     tracks = np.zeros((1, 1), SessionWriter.track_dtype())
     tracks["x_px"] = 7.0
@@ -184,7 +185,7 @@ def test_no_reader_sees_rows_that_a_dataset_has_room_for_but_does_not_hold_yet(
         session.append_block("a", blocks[0], 0.0, 1.0, 0.0)
         session.flush("a")
         with SessionReader(path) as reader:
-            monkeypatch.setattr(h5py.Dataset, "resize", grow_and_read)
+            monkeypatch.setattr(GrowingDataset, "_grow", grow_and_read)
             for k, block in enumerate(blocks[1:], 1):
                 session.append_block("a", block, 0.01 * k, 1.0 + k, 0.0)
             session.append_frames("a", np.array([1.0]), tracks, 0.0)
@@ -222,3 +223,17 @@ def test_data_are_synchronised_to_the_disk_once_a_second(
             session._jobs.drain()
             now_s = 0.01 * (k + 1)
     assert len(asked) == 2
+
+
+def test_a_growing_dataset_takes_rows_of_its_own_kind_only(tmp_path: Path) -> None:
+    kind = np.dtype([("time_s", "<f8"), ("count", "<u4")])
+    with h5py.File(tmp_path / "rows.h5", "w") as file:
+        growing = GrowingDataset(file.create_dataset("rows", (0, 2), kind, maxshape=(None, 2)))
+        rows = np.zeros((5, 2), kind)
+        rows["time_s"], rows["count"] = 0.5, np.arange(10).reshape(5, 2)
+        growing.extend(rows[:3])
+        growing.extend(rows[::-1][:2])  # not contiguous
+        with pytest.raises(ValueError, match="shape"):
+            growing.extend(np.zeros((1, 3), kind))
+        assert len(growing) == 5
+        np.testing.assert_array_equal(file["rows"][:], np.concatenate([rows[:3], rows[::-1][:2]]))

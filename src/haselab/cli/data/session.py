@@ -117,7 +117,7 @@ def _export(
 )  # fmt: skip
 @click.option(
     "--strain", "strain_column", metavar="COLUMN",
-    help="Name the column of the strain; the mean of each block is kept as the track of a camera. "
+    help="Name the column of the strain. The mean of each block is kept as the track of a camera. "
     "Default: none.",
 )  # fmt: skip
 @click.option(

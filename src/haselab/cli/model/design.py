@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,12 @@ from haselab.control import (
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
 from haselab.control.stability.plausible import PlausibleMargins, binomial_proportion
+from haselab.controllers import (
+    CONTROLLERS,
+    ControllerKind,
+    ControllerSetting,
+    known_actuator,
+)
 from haselab.models.posterior import PlantPosterior
 from haselab.store.actuator_file import read_actuator
 from haselab.store.folder import write_text
@@ -61,8 +68,9 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @shared_option(
     "--controller", "--structure", "structure", default=USUAL_STRUCTURE, show_default=True,
-    detail="pi: as in the paper; pid: with the derivative of the filtered measurement. For any "
-    "other registered kind, only the margins are computed, with the parameters of the file.",
+    detail="pi: as in the paper; pid: with the derivative of the filtered measurement. Another "
+    "registered kind computes its parameters from [model.physical], or has only its margins "
+    "computed, with the parameters of the file.",
 )  # fmt: skip
 @loop_options
 @click.option(
@@ -104,7 +112,11 @@ def command(
     if out is None and model.suffix.lower() == ".toml":
         load_actuator(model, to_write=True)
     if loop["structure"] not in ("pi", "pid"):
-        _judge(model, out, loop, as_json, plot)
+        kind = CONTROLLERS.find(loop["structure"])
+        if kind.design is None:
+            _judge(model, out, loop, as_json, plot)
+        else:
+            emit(_own_design(model, out, kind, loop), as_json=as_json, out=None)
         return
     if model.suffix.lower() == ".toml" and (doubt := model_doubt(model)):
         click.echo(f"haselab: warning: {doubt}", err=True)
@@ -145,6 +157,52 @@ def command(
     step = design.spec.step
     assert step is not None  # of a design that was made
     save_plot(plot, lambda: design_chart(plant, design.gains, setting, step, slowest_s))
+
+
+def _own_design(
+    model: Path, out: Path | None, kind: ControllerKind, loop: dict[str, Any]
+) -> dict[str, Any]:
+    """Let a kind compute its parameters from the physical model, and write [controller]."""
+    if model.suffix.lower() != ".toml":
+        raise InputError(
+            f"--controller {kind.name} reads [model.physical] of an actuator file. Name one: "
+            f"{model}"
+        )
+    tables = load_actuator(model)
+    actuator, usual = known_actuator(tables, model), LoopSetting()
+    stated = (None, None) if tables.model is None else (
+        tables.model.rate_hz, tables.model.loop_delay_s
+    )  # fmt: skip
+    rate_hz, delay_s = (
+        next(value for value in values if value is not None)
+        for values in (
+            (loop["rate_hz"], stated[0], usual.rate_hz),
+            (loop["delay_s"], stated[1], usual.measurement_delay_s),
+        )
+    )
+    strains = (-math.inf, math.inf) if actuator is None else actuator.reachable()
+    low, high = strains
+    if actuator is not None and kind.output == "voltage":
+        low, high = actuator.low_v, actuator.high_v
+    setting = ControllerSetting(1.0 / rate_hz, low, high, delay_s=delay_s, actuator=actuator)
+    kind.check(setting)
+    assert kind.design is not None
+    chosen = kind.choose(kind.design(setting), model)
+    section: dict[str, object] = {
+        "kind": kind.name,
+        "parameters": dict(chosen.values) or None,
+        "limits": dict(zip(("low", "high"), strains, strict=True)) if actuator else None,
+        "loop": {"rate_hz": rate_hz, "measurement_delay_s": delay_s},
+    }
+    _save(model, out, section, None)
+    return {"kind": kind.name, "parameters": dict(chosen.values), "rate_hz": rate_hz,
+            "delay_s": delay_s, "robustness": _first_paragraph(kind.design)}  # fmt: skip
+
+
+def _first_paragraph(design: Callable[..., object]) -> str:
+    """What a design function says of itself."""
+    text = (design.__doc__ or "").split("Args:")[0]
+    return " ".join(text.split())
 
 
 def _judge(

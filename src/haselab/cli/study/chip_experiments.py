@@ -24,6 +24,7 @@ from haselab.rig.chip import ChipFile, SupplyModel, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_file import load_twin
+from haselab.runtime.scheduling import lower_priority
 from haselab.store.actuator_file import ACTUATOR, write_sections
 from haselab.store.folder import read_json, write_json, write_text
 from haselab.store.toml import toml_text
@@ -262,5 +263,6 @@ def _end_with_the_study() -> None:
 
 
 if __name__ == "__main__":
+    lower_priority()  # the study, which takes longest, goes first
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     main(Path(sys.argv[1]), sys.argv[2], sys.argv[3])

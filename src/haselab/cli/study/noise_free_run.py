@@ -19,6 +19,7 @@ from typing import IO, BinaryIO, Self
 from haselab.base import HaselabError, ResultError
 from haselab.models.actuator import ActuatorTables
 from haselab.rig.twin.config import TwinConfig
+from haselab.runtime.scheduling import lower_priority
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
 from haselab.study.experiment import ExperimentResult
@@ -153,6 +154,7 @@ class SentValues(Mapping[type, object]):
 
 def main() -> None:
     """Play and fit what standard input brings, and write the results to standard output."""
+    lower_priority()  # the study, which takes longest, goes first
     source, target = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # nothing that is printed may come between
     config, study, known = pickle.load(source)

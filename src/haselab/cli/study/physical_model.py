@@ -15,7 +15,7 @@ from haselab.cli.identify.actuator import section_of_fit
 from haselab.identify.physical import ActuatorFit, MotionRecord, fit_actuator
 from haselab.models.actuator import ActuatorTables
 from haselab.pipelines.model_results import results_of_model
-from haselab.pipelines.motion import motion_of_session
+from haselab.pipelines.motion import motions_of_session
 from haselab.runtime.lockin import lockin_of
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.session.reader import SessionReader, session_file
@@ -101,17 +101,18 @@ def identified(
     with SessionReader(session, unverified=unverified) as reader:
         header = reader.header
         rig = described(header["rig"])
-        record = motion_of_session(reader, session_file(session))
+        lockin = lockin_of(rig, study.sensing.carrier_hz)  # as the study senses
+        record, observed = motions_of_session(reader, session_file(session), (None, lockin))
         start = ACTUATORS.find(rig.actuator_kind)()
         fit = fit_actuator(start, [record], mass_kg=float(record.drive.mass_kg[0]))
         if fit.status != "ok":
             click.echo(f"haselab: no results of a physical model: {fit.status}", err=True)
             return PhysicalModel(fit, {}, record, rig.amplifier_gain)
-        lockin = lockin_of(rig, study.sensing.carrier_hz)
-        observed = motion_of_session(reader, session_file(session), lockin)  # as the study senses
         events = reader.events()
 
         def source(name: str) -> Observation:
+            if name in found.observations:
+                return found.observations[name]
             return observe(reader.experiment(name), events, lockin, study.sensing, rig)
 
         known = known_values(validated(ActuatorTables, header.get("actuator", {}), session))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.control.gains import PidGains, sampled_responses
+from haselab.control.gains import PidGains, responses_at
 from haselab.control.plants.general import AnyPlant, sampled_response_of
 from haselab.control.simulate import LoopSetting
 from haselab.control.stability.encirclement import axis_factor, open_loop_poles
@@ -66,6 +67,23 @@ class PlantGrid:
         keep = np.isfinite(sampled)
         return cls(plant, setting.rate_hz, omega[keep], sampled[keep])
 
+    @cached_property
+    def _circle(self) -> NDArray[np.complex128]:
+        """Points of the unit circle."""
+        return np.asarray(np.exp(1j * self.omega_rad_s * (1.0 / self.rate_hz)))
+
+    @cached_property
+    def _open_loop(self) -> tuple[int, dict[bool, NDArray[np.complex128]]]:
+        """Number of poles right of the axis, and the factor for those on it.
+
+        The factor depends on whether the controller integrates.
+        """
+        factors = {}
+        for integrates in (True, False):
+            right, axis = open_loop_poles(self.plant, PidGains(1.0, float(integrates)))
+            factors[integrates] = axis_factor(axis, self.omega_rad_s, self.rate_hz, 1.0)
+        return right, factors
+
     def margins(self, candidates: Sequence[PidGains], *, between: bool = False) -> GridMargins:
         """Margins of the loop with each candidate.
 
@@ -77,7 +95,7 @@ class PlantGrid:
             The margins, in the order of the candidates.
         """
         omega = self.omega_rad_s
-        loop = self.response * sampled_responses(candidates, omega, self.rate_hz)
+        loop = self.response * responses_at(candidates, self._circle, self.rate_hz)
         stable, resolved = self._count(loop, candidates)
         above = np.abs(loop) > 1.0
         crosses = above[:, 1:] != above[:, :-1]
@@ -107,12 +125,10 @@ class PlantGrid:
         """The encirclement count on the given grid, and whether a turn may be missed."""
         integrates = np.array([gains.ki > 0.0 for gains in candidates])
         function = 1.0 + loop
-        for flag in (True, False):
+        right, factors = self._open_loop
+        for flag, factor in factors.items():
             if (integrates == flag).any():
-                right, axis = open_loop_poles(self.plant, PidGains(1.0, float(flag)))
-                function[integrates == flag] *= axis_factor(
-                    axis, self.omega_rad_s, self.rate_hz, 1.0
-                )
+                function[integrates == flag] *= factor
         angle = np.angle(function)
         steps = np.diff(angle)
         steps -= 2.0 * math.pi * np.round(steps / (2.0 * math.pi))

@@ -118,7 +118,8 @@ class BlockWatch:
     def _mean_a(self, current: NDArray[np.int16]) -> float:
         if current.size == 0:
             return 0.0
-        return float(current.mean()) * self._rig.volt_per_code / self._rig.i_monitor_v_per_a
+        mean = float(np.add.reduce(current, dtype=np.int64)) / current.size  # exact
+        return mean * self._rig.volt_per_code / self._rig.i_monitor_v_per_a
 
     def _over_current(self, mean_a: float, wrong_v: float | None, output_v: float) -> str:
         limit = f"{1e3 * self._settings.current_limit_a:.3g} mA"

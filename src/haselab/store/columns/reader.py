@@ -382,17 +382,20 @@ class ColumnStream(Closing):
         self._archive.close()
 
 
-def check_times(path: Path, given_hz: float, options: ColumnOptions) -> None:
+def check_times(
+    path: Path, given_hz: float, options: ColumnOptions, names: Sequence[str] = ()
+) -> None:
     """Refuse a rate that contradicts the column of times of a file, if it has one.
 
     Args:
         path: of the file.
         given_hz: by the user.
         options: what the user states about its columns.
+        names: columns that have this rate; times of another table are not theirs.
     Raises:
         InputError: they contradict each other.
     """
-    head = head_of_times(path, options, _HEAD_ROWS)
+    head = head_of_times(path, options, _HEAD_ROWS, names)
     if head is None:
         return
     name, time_s = head
@@ -408,7 +411,7 @@ def check_times(path: Path, given_hz: float, options: ColumnOptions) -> None:
 
 
 def head_of_times(
-    path: Path | str, options: ColumnOptions, rows: int
+    path: Path | str, options: ColumnOptions, rows: int, names: Sequence[str] = ()
 ) -> tuple[str, NDArray[np.float64]] | None:
     """Read the name and the first values, in s, of the column of times; None if there is none.
 
@@ -416,6 +419,7 @@ def head_of_times(
         path: of the file.
         options: what the user states about its columns.
         rows: how many values to read.
+        names: columns to which the times belong; there are none if they have another length.
     Returns:
         The name, and the values of shape `(rows,)` or fewer.
     Raises:
@@ -427,7 +431,7 @@ def head_of_times(
             return None
         unit = stated_unit(archive, name, options)
         try:
-            archive.rows([name])
+            archive.rows([*names, name])
             (values,) = archive.start([name])(rows)
         except InputError:
             if options.time is not None or name == "time_s":

@@ -174,7 +174,7 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
     with _open(file, plan) as stream:
         rate_hz, assumed = plan.rate_hz or stream.rate_hz, stream.assumed_seconds
     if plan.rate_hz:
-        check_times(file, plan.rate_hz, plan.options)
+        check_times(file, plan.rate_hz, plan.options, plan.columns)
     if not rate_hz:
         raise InputError(
             "The file states no sampling rate. Add --rate-hz, or name the column of the times with "

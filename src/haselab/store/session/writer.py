@@ -25,6 +25,7 @@ from haselab.store.session.checksums import (
     frame_checks,
     static_digest,
 )
+from haselab.store.session.growing import GrowingDataset
 from haselab.store.session.layout import (
     BLOCK,
     CONDITION,
@@ -128,6 +129,7 @@ class SessionWriter:
         self._pending = {plan.name: _Pending() for plan in plans}
         self._current = ""
         self._failure: DeviceError | None = None
+        self._datasets: dict[str, GrowingDataset] = {}
         texts = [self._text(plan.name, plan.settings) for plan in plans]
         with ExitStack() as undo:
             raw = self._claimed(path)
@@ -335,9 +337,9 @@ class SessionWriter:
         text = what.encode()[: EVENT["what"].itemsize]
 
         def write() -> None:
-            count = self._file["events"].shape[0]
+            count = len(self._growing("events"))
             row = (time_s, text, event_check(count, time_s, text.rstrip(b"\0")))
-            self._extend("events", np.array([row], EVENT))
+            self._growing("events").extend(np.array([row], EVENT))
 
         self._put(write, always=True)
         if self._queue.patience_s > 0.0:
@@ -358,20 +360,19 @@ class SessionWriter:
         values = time_s, drive_v, carrier_v, pull_n, mass_kg
 
         def write() -> None:
-            count = self._file["conditions"].shape[0]
+            count = len(self._growing("conditions"))
             row = (*values, condition_check(count, values))
-            self._extend("conditions", np.array([row], CONDITION))
+            self._growing("conditions").extend(np.array([row], CONDITION))
 
         self._put(write, always=True)
 
     # ---- in the thread ----------------------------------------------------------------------
 
-    def _extend(self, dataset: str, rows: NDArray[Any]) -> None:
-        target = self._file[dataset]
-        old = target.shape[0]
-        target.resize(old + rows.shape[0], axis=0)
-        target[old:] = rows
-        target.flush()
+    def _growing(self, dataset: str) -> GrowingDataset:
+        found = self._datasets.get(dataset)
+        if found is None:
+            found = self._datasets[dataset] = GrowingDataset(self._file[dataset])
+        return found
 
     def _write_blocks(
         self, name: str, first: int, codes: list[NDArray[np.int16]],
@@ -380,15 +381,12 @@ class SessionWriter:
         group = f"experiments/{name}"
         whole = np.stack(codes)
         if first % self._sampling.chunk_blocks or len(whole) < self._sampling.chunk_blocks:
-            self._extend(f"{group}/codes", whole)
+            self._growing(f"{group}/codes").extend(whole)
         else:
-            packed, target = _packed(whole), self._file[f"{group}/codes"]
-            target.resize(first + len(whole), axis=0)
-            target.id.write_direct_chunk((first, 0, 0), packed)
-            target.flush()
+            self._growing(f"{group}/codes").extend_packed(len(whole), _packed(whole))
         table = np.array(rows, dtype=BLOCK)
-        self._extend(f"{group}/blocks", table)
-        self._extend(f"{group}/start_s", table["start_s"])
+        self._growing(f"{group}/blocks").extend(table)
+        self._growing(f"{group}/start_s").extend(table["start_s"])
         now_s = self._queue.clock_s()
         if now_s - self._synced_s >= self._queue.sync_s:
             self._synced_s = now_s
@@ -396,13 +394,13 @@ class SessionWriter:
 
     def _write_frames(self, name: str, frames: NDArray[np.void], tracks: NDArray[np.void]) -> None:
         group = f"experiments/{name}"
-        first = self._file[f"{group}/frames"].shape[0]
+        first = len(self._growing(f"{group}/frames"))
         frames["check"] = frame_checks(
             self._numbers[name], first, frames["time_s"], frames["mass_kg"], tracks
         )
-        self._extend(f"{group}/tracks", tracks)
-        self._extend(f"{group}/frames", frames)
-        self._extend(f"{group}/frame_s", frames["time_s"])
+        self._growing(f"{group}/tracks").extend(tracks)
+        self._growing(f"{group}/frames").extend(frames)
+        self._growing(f"{group}/frame_s").extend(frames["time_s"])
 
     # ---- what was recorded ------------------------------------------------------------------
 

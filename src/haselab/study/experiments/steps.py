@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from haselab.controllers import KnownActuator
 from haselab.rig import RigDescription
 from haselab.runtime.loop import LoopSettings
 from haselab.safety.feasibility import Drive
@@ -132,9 +133,11 @@ class StepTest(Experiment[Steps]):
             if own is None:
                 return {}
             saturation = loop_saturation(self.study, analysis.rig, maps.voltage_map)
-            return {
-                OWN: LoopSettings(own, saturation, maps.voltage_map, maps.strain_map, video_zero_px)
-            }
+            alone = LoopSettings(
+                own, saturation, maps.voltage_map, maps.strain_map, video_zero_px,
+                actuator=analysis.find(KnownActuator),
+            )  # fmt: skip
+            return {OWN: alone}
         pi = LoopSettings(
             loops.pi.controller(),
             loops.setting.saturation,
@@ -161,7 +164,7 @@ class StepTest(Experiment[Steps]):
                 video_zero_px=None,
             )
         if own is not None:
-            found[OWN] = replace(pi, controller=own)
+            found[OWN] = replace(pi, controller=own, actuator=analysis.find(KnownActuator))
         return found
 
     def fit(self, analysis: Analysis) -> ExperimentResult:

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from haselab.base import Estimate, JsonObject, ResultError
 from haselab.control import over_trials
 from haselab.identify.free.response import FreeResponseFit, FreeTrial, fit_free_response
+from haselab.models.filters import find_peaks
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.resolution import with_resolution
 from haselab.study.fits.trials import normal_equivalent
@@ -140,7 +141,6 @@ def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float)
 
     The amplitude of eq. 6 is not used: with the decay of the peaks it misses them.
     """
-    from scipy.signal import find_peaks  # the import takes half a second
 
     apart = max(1, round(0.7 * 2.0 * math.pi / omega / float(np.median(np.diff(time_s)))))
     peaks, _ = find_peaks(moved_m, height=_LEAST_PEAK * amplitude_m, distance=apart)

@@ -1,0 +1,315 @@
+r"""What a controller may know of its actuator: the identified law and the bench's limits.
+
+All forces act along the length, and the electric one depends on the square of the voltage:
+
+$F_u = k(x, V)\,(V^2 + r)$
+
+with the mean square $r$ of the carrier. `k`, the elastic force and the gap are read from the table
+of the law, so that a controller can call them in each update.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.actuators import (
+    ACTUATORS,
+    ADDED_INERTIA,
+    GRAVITY_M_S2,
+    ActuatorLaw,
+    LawTable,
+    equilibrium_m,
+    law_table,
+    with_parameters,
+)
+from haselab.base import InputError, LimitError
+from haselab.models.actuator import ActuatorTables
+from haselab.models.actuator.sections import PhysicalRecords
+
+__all__ = ["KnownActuator", "known_actuator"]
+
+Floats = NDArray[np.float64]
+_USUAL_GAIN = 5000.0
+_BENCH = ("camera.", "sensing.", "start.")  # parameters of a fit that are none of the law
+
+
+@dataclass(frozen=True)
+class KnownActuator:
+    """An actuator as its file describes it, for controllers that use its physics.
+
+    Args:
+        law: identified.
+        mass_kg: hung mass.
+        zero_length_m: length at strain 0, in lengths of the law.
+        low_v: lowest drive, before the amplifier.
+        high_v: highest drive.
+        gain_v_per_v: of the amplifier.
+        added_inertia_kg: inertia without weight.
+        carrier_v2: mean square of the carrier's voltage at the actuator.
+        sensing_scale: sensed capacitance over that of the law.
+        capacitance_noise_f: standard deviation of the capacitance of one update; NaN: not known.
+        highest_field_v_per_m: that the dielectric may have.
+        longest_m: longest length so far, which softened the actuator; 0: it is new.
+    Raises:
+        InputError: The law cannot be sampled.
+    Example:
+        >>> from haselab.actuators import DeaStack
+        >>> known = KnownActuator(DeaStack(), 0.1, 0.036, 0.0, 1.0, 3000.0)
+        >>> pull_n = known.pull_n(0.036, 0.8)
+        >>> round(known.drive_v(0.036, pull_n), 9)
+        0.8
+    """
+
+    law: ActuatorLaw
+    mass_kg: float
+    zero_length_m: float
+    low_v: float
+    high_v: float
+    gain_v_per_v: float
+    added_inertia_kg: float = 0.0
+    carrier_v2: float = 0.0
+    sensing_scale: float = 1.0
+    capacitance_noise_f: float = math.nan
+    highest_field_v_per_m: float = math.inf
+    longest_m: float = 0.0
+
+    # ---- lengths -----------------------------------------------------------------------------
+
+    def strain(self, length_m: float) -> float:
+        """Strain of a length, in m."""
+        return length_m / self.zero_length_m - 1.0
+
+    def length_m(self, strain: float) -> float:
+        """Length of a strain, in m."""
+        return self.zero_length_m * (1.0 + strain)
+
+    def sensed_length_m(self, capacitance_f: float, drive_v: float = 0.0) -> float:
+        """Length that has a sensed capacitance.
+
+        Args:
+            capacitance_f: sensed, in F; NaN gives NaN.
+            drive_v: in force, in V; it matters only where the capacitance depends on it.
+        Returns:
+            Length, in m, within the limits of the law.
+        """
+        farad = capacitance_f / self.sensing_scale
+        rows, lengths_m = self._by_capacitance
+        if len(rows) == 1:
+            return float(np.interp(farad, rows[0], lengths_m))
+        row, share = self._row(drive_v)
+        found = [float(np.interp(farad, rows[k], lengths_m)) for k in (row, row + 1)]
+        return found[0] + share * (found[1] - found[0])
+
+    # ---- forces ------------------------------------------------------------------------------
+
+    def elastic_n(self, length_m: float) -> float:
+        """Elastic force of the relaxed actuator, softened by its longest length so far."""
+        longest = max(length_m, self.longest_m) / self.law.free_length_m
+        force = float(np.interp(length_m, self._lengths_m, self.table.elastic_n))
+        return force * float(self.law.losses.softening(longest))
+
+    def pull_per_v2(self, length_m: float, drive_v: float = 0.0) -> float:
+        """Electric force over the mean square of the actuator's voltage, in N/V^2."""
+        rows = self.table.pull_n_v2
+        if len(rows) == 1:
+            return float(np.interp(length_m, self._lengths_m, rows[0]))
+        row, share = self._row(drive_v)
+        found = [float(np.interp(length_m, self._lengths_m, rows[k])) for k in (row, row + 1)]
+        return found[0] + share * (found[1] - found[0])
+
+    def pull_n(self, length_m: float, drive_v: float) -> float:
+        """Electric force at a drive, carrier included, in N."""
+        volt = self.gain_v_per_v * drive_v
+        return self.pull_per_v2(length_m, drive_v) * (volt * volt + self.carrier_v2)
+
+    def drive_v(self, length_m: float, pull_n: float) -> float:
+        """Drive that pulls with a force, positive; 0 V for what the carrier alone exceeds.
+
+        Args:
+            length_m: present, in m.
+            pull_n: wanted, in N.
+        Returns:
+            Drive, in V, not limited, but at most what the table of the law reaches.
+        """
+        rows = self.table.pull_n_v2
+        if len(rows) == 1:
+            square = pull_n / self.pull_per_v2(length_m) - self.carrier_v2
+            return math.sqrt(max(square, 0.0)) / self.gain_v_per_v
+        place = (length_m - self.table.low_m) / self.table.step_m
+        column = min(max(int(place), 0), rows.shape[1] - 2)
+        share = min(max(place - column, 0.0), 1.0)
+        volts = self.table.step_v * np.arange(len(rows), dtype=np.float64)
+        per_v2 = rows[:, column] + share * (rows[:, column + 1] - rows[:, column])
+        forces = per_v2 * (volts * volts + self.carrier_v2)
+        step = 1 if forces[-1] > forces[0] else -1
+        volt = float(np.interp(pull_n, forces[::step], volts[::step]))
+        return volt / self.gain_v_per_v
+
+    def highest_drive_v(self, length_m: float) -> float:
+        """Highest drive at a length: that of the limits, or of the highest field, in V."""
+        gap_m = float(np.interp(length_m, self._lengths_m, self.table.gap_m))
+        return min(self.high_v, self.highest_field_v_per_m * gap_m / self.gain_v_per_v)
+
+    # ---- equilibria --------------------------------------------------------------------------
+
+    def static_pull_n(self, strain: float, mass_kg: float | None = None) -> float:
+        """Electric force that holds a strain for long, negative below what the weight stretches.
+
+        Args:
+            strain: wanted.
+            mass_kg: hung; None: the known one.
+        Returns:
+            Force, in N.
+        """
+        mass = self.mass_kg if mass_kg is None else mass_kg
+        return self.elastic_n(self.length_m(strain)) - GRAVITY_M_S2 * mass
+
+    def static_drive_v(self, strain: float, mass_kg: float | None = None) -> float:
+        """Drive that holds a strain for long, in V; 0 below what the weight alone stretches."""
+        return self.drive_v(self.length_m(strain), self.static_pull_n(strain, mass_kg))
+
+    def reachable(self, mass_kg: float | None = None) -> tuple[float, float]:
+        """Lowest and highest strain that can be held for long within drive limits and field.
+
+        The range ends where a higher drive would no longer move the actuator further (pull-in).
+
+        Args:
+            mass_kg: hung; None: the known one.
+        Returns:
+            Both strains; the one without drive is the lower one where the actuator elongates.
+        Raises:
+            InputError: No strain can be held with this mass.
+        """
+        mass = self.mass_kg if mass_kg is None else mass_kg
+        step = 1 if self.elongates else -1  # along the grid, as the drive rises
+        table, lengths = self.table, self._lengths_m[::step]
+        longest = np.maximum(lengths, self.longest_m) / self.law.free_length_m
+        softened = table.elastic_n[::step] * self.law.losses.softening(longest)
+        drives_v = np.array([
+            self.drive_v(float(length), float(force))
+            for length, force in zip(lengths, softened - GRAVITY_M_S2 * mass, strict=True)
+        ])  # fmt: skip
+        field_v = self.highest_field_v_per_m * table.gap_m[::step] / self.gain_v_per_v
+        first = int(np.argmax(drives_v > max(self.low_v, 0.0)))
+        after = drives_v[first:]
+        ends = (after > np.minimum(self.high_v, field_v[first:])) | (
+            np.diff(after, prepend=0.0) <= 0.0
+        )
+        last = first + (int(np.argmax(ends)) if ends.any() else after.size) - 1
+        if last <= first:
+            raise InputError(
+                f"No strain can be held with {mass:g} kg within {self.high_v:g} V and a field of "
+                f"{self.highest_field_v_per_m:g} V/m. Use another mass."
+            )
+        found = self.strain(float(lengths[first])), self.strain(float(lengths[last]))
+        return min(found), max(found)
+
+    # ---- tables ------------------------------------------------------------------------------
+
+    @cached_property
+    def table(self) -> LawTable:
+        """The law on a grid, up to the highest voltage with the carrier."""
+        peak_v = math.sqrt(2.0 * self.carrier_v2)
+        return law_table(self.law, self.gain_v_per_v * max(self.high_v, -self.low_v) + peak_v)
+
+    @cached_property
+    def _lengths_m(self) -> Floats:
+        knots = np.arange(self.table.elastic_n.size, dtype=np.float64)
+        return np.asarray(self.table.low_m + self.table.step_m * knots)
+
+    @cached_property
+    def elongates(self) -> bool:
+        """Whether a voltage makes the actuator longer."""
+        return bool(np.median(self.table.pull_n_v2[0]) > 0.0)
+
+    @cached_property
+    def _by_capacitance(self) -> tuple[Floats, Floats]:
+        """Rising capacitances, one row for each voltage, and their lengths."""
+        step = 1 if np.median(np.diff(self.table.capacitance_f[0])) > 0.0 else -1
+        rows = np.maximum.accumulate(self.table.capacitance_f[:, ::step], axis=1)
+        return np.ascontiguousarray(rows), np.ascontiguousarray(self._lengths_m[::step])
+
+    def _row(self, drive_v: float) -> tuple[int, float]:
+        """Row of the table below a drive, and the share of the way to the next."""
+        place = abs(self.gain_v_per_v * drive_v) / self.table.step_v
+        row = min(int(place), len(self.table.pull_n_v2) - 2)
+        return row, place - row
+
+
+def known_actuator(tables: ActuatorTables, source: object = "") -> KnownActuator | None:
+    """What an actuator file says of its actuator.
+
+    Args:
+        tables: of the file.
+        source: file, for messages.
+    Returns:
+        The actuator; None: the file has no `[model.physical]`.
+    Raises:
+        InputError: A parameter is unknown or out of range, or the file lacks the mass, the length
+            at strain 0 or the limits of the drive.
+    """
+    model = tables.model.physical if tables.model else None
+    if model is None:
+        return None
+    where = f" {source}" if source else ""
+    low_v, high_v = tables.drive.low_v, tables.drive.high_v
+    mass_kg = model.mass_kg or tables.actuator.mass_kg
+    zero_m = tables.actuator.geometry.zero_length_m
+    absent = [
+        name
+        for name, value in (
+            ("actuator.mass_kg", mass_kg),
+            ("actuator.geometry.zero_length_m", zero_m),
+            ("drive.high_v", high_v),
+        )
+        if value is None
+    ]
+    if absent:
+        raise InputError(
+            f"[model.physical] needs {', '.join(absent)} for a controller. Add "
+            f"{'it' if len(absent) == 1 else 'them'} to the actuator file.{where}"
+        )
+    assert mass_kg is not None and zero_m is not None and high_v is not None
+    own = {name: value for name, value in model.parameters.items() if not name.startswith(_BENCH)}
+    try:
+        law = with_parameters(ACTUATORS.find(model.kind)(), tables.actuator.parameters)
+        law = with_parameters(law, own)
+    except (InputError, LimitError) as error:
+        raise InputError(f"[model.physical]: {error}{where}") from error
+    records, given = model.records, model.parameters
+    gain = tables.drive.gain_v_per_v or (records.gain_v_per_v if records else _USUAL_GAIN)
+    shown = (zero_m - given.get("camera.offset_m", 0.0)) / given.get("camera.scale", 1.0)
+    noise = model.residuals.capacitance_noise_f
+    return KnownActuator(
+        law=law,
+        mass_kg=mass_kg,
+        zero_length_m=shown,
+        low_v=0.0 if low_v is None else low_v,
+        high_v=high_v,
+        gain_v_per_v=gain,
+        added_inertia_kg=given.get(ADDED_INERTIA, 0.0),
+        carrier_v2=0.5 * records.carrier_v**2 if records else 0.0,
+        sensing_scale=given.get("sensing.scale", 1.0),
+        capacitance_noise_f=math.nan if noise is None else noise,
+        highest_field_v_per_m=tables.drive.highest_field_v_per_m or math.inf,
+        longest_m=_longest_m(law, gain, mass_kg, records),
+    )
+
+
+def _longest_m(
+    law: ActuatorLaw, gain_v_per_v: float, mass_kg: float, records: PhysicalRecords | None
+) -> float:
+    """Longest length of the records, from their highest voltage and heaviest mass; 0: not known."""
+    found = [0.0]
+    if records is not None:
+        highest_v = gain_v_per_v * records.highest_drive_v
+        for volt, mass in ((highest_v, mass_kg), (0.0, records.heaviest_kg)):
+            with contextlib.suppress(LimitError):
+                found.append(equilibrium_m(law, volt, GRAVITY_M_S2 * mass))
+    return max(found)

@@ -1,0 +1,310 @@
+"""Plays all controllers against all tasks, in several processes, and collects the results.
+
+The results depend on the seed alone: not on the number of processes, nor on the order in which
+they finish. Each task and seed has random numbers of its own, the same for all controllers.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import signal
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import HaselabError, Progress, ResultError, SilentProgress
+from haselab.controllers import CONTROLLERS, ChosenController, KnownActuator
+from haselab.scoreboard.devices import Device, find_device
+from haselab.scoreboard.entrants import Designed, designed
+from haselab.scoreboard.knowledge import identified, known_by, true_actuator
+from haselab.scoreboard.loop_class import CLASSES, LoopClass, noise_of
+from haselab.scoreboard.play import Scenario, play
+from haselab.scoreboard.tasks import TASKS, Task
+
+__all__ = ["Entry", "Game", "Plan", "Played", "known_in_class", "play_board"]
+
+Floats = NDArray[np.float64]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+_SHOWN_S = 4e-3  # between two points of a trace that is kept
+_SLOWEST = 1.0  # times the duration of a task: a controller that takes longer is too slow
+_LEAST_S = 20.0
+_EXCESS = 1.02  # of the permitted field: what a sensed length may miss
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is played.
+
+    Args:
+        controllers: names of kinds.
+        tasks: names.
+        classes: names.
+        seed: of all random numbers.
+        seeds: how often each task is played.
+        workers: number of processes; 1: none but this one.
+    """
+
+    controllers: tuple[str, ...]
+    tasks: tuple[str, ...]
+    classes: tuple[str, ...] = ("host-100hz", "chip-1khz")
+    seed: int = 0
+    seeds: int = 5
+    workers: int = 1
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A controller in a class with its parameters, for one device.
+
+    Args:
+        controller: kind.
+        loop: name of the class.
+        device: public device whose model it was designed with.
+        values: parameters by name.
+        reason: why it has no design; empty: it has one.
+    """
+
+    controller: str
+    loop: str
+    device: str
+    values: Mapping[str, float] = field(default_factory=dict)
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Played:
+    """One controller, task and seed.
+
+    Args:
+        controller: kind.
+        loop: name of the class.
+        task: name.
+        index: of the seed.
+        numbers: by the names of the task's metrics; NaN where the task was not done.
+        bounds: physical limits of the device that was played.
+        failure: why it ended early; empty: it did not.
+        violates: whether it ended early, or the field was above the permitted one.
+        trace: time, reference and strain, of the first seed. Shape `(3, N)`.
+    """
+
+    controller: str
+    loop: str
+    task: str
+    index: int
+    numbers: Mapping[str, float]
+    bounds: Mapping[str, float]
+    failure: str
+    violates: bool
+    trace: Floats | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Game:
+    """All that was played.
+
+    Args:
+        plan: of it.
+        entries: designs.
+        played: in the order of controllers, classes, tasks and seeds.
+        identification: status of the fit of each public device.
+    """
+
+    plan: Plan
+    entries: tuple[Entry, ...]
+    played: tuple[Played, ...]
+    identification: Mapping[str, str]
+
+
+def known_in_class(known: KnownActuator, device: Device, loop: LoopClass) -> KnownActuator:
+    """What controllers of a class know: for the oracle the truth, else the noise of the class.
+
+    Args:
+        known: identified.
+        device: public device.
+        loop: class.
+    """
+    if loop.true_states:
+        known = true_actuator(device)
+    zero_f = float(known.law.capacitance_f(known.zero_length_m))
+    return replace(known, capacitance_noise_f=noise_of(loop, device.config, zero_f))
+
+
+# ---- jobs of the processes -----------------------------------------------------------------------
+
+
+def _identify(name: str) -> tuple[KnownActuator | None, str]:
+    """What is known of a device, and the status of its fit; None: the fit has no result."""
+    device = find_device(name)
+    try:
+        fit = identified(device)
+    except ResultError as error:
+        return None, str(error)
+    return known_by(device, fit), fit.status
+
+
+@dataclass(frozen=True)
+class _DesignJob:
+    controller: str
+    loop: str
+    device: str
+    known: KnownActuator | None
+    status: str
+
+
+def _design(job: _DesignJob) -> Entry:
+    loop, device = CLASSES[job.loop], find_device(job.device)
+    if job.known is None:
+        return Entry(job.controller, job.loop, job.device, reason=job.status)
+    known = known_in_class(job.known, device, loop)
+    try:
+        with _deadline(600.0, "the design takes longer than 10 minutes"):
+            found = designed(CONTROLLERS.find(job.controller), loop, known)
+    except TimeoutError as error:
+        found = Designed(None, str(error))
+    values = {} if found.chosen is None else dict(found.chosen.values)
+    return Entry(job.controller, job.loop, job.device, values, found.reason)
+
+
+@dataclass(frozen=True)
+class _PlayJob:
+    entry: Entry
+    task: str
+    index: int
+    seed: int
+    known: KnownActuator | None
+
+
+def _play(job: _PlayJob) -> Played:
+    entry, task, loop = job.entry, TASKS[job.task], CLASSES[job.entry.loop]
+    device = find_device(task.device)
+    rng = _random(job.seed, job.task, job.index)
+    nothing = {metric.name: math.nan for metric in task.metrics}
+    about = (entry.controller, entry.loop, job.task, job.index)
+    if job.known is None:
+        return Played(*about, nothing, {}, entry.reason, violates=False)
+    scenario = task.scenario(job.known, rng)
+    bounds = _bounds(task, scenario, loop)
+    if entry.reason:
+        return Played(*about, nothing, bounds, entry.reason, violates=False)
+    kind = CONTROLLERS.find(entry.controller)
+    chosen = ChosenController(kind, tuple(entry.values.items()))
+    known = known_in_class(job.known, device, loop)
+    if loop.true_states:  # of the device that is played
+        known = known_in_class(known, scenario.device, loop)
+        known = replace(known, zero_length_m=scenario.zero_m)
+    longest_s = max(_SLOWEST * (scenario.duration_s + scenario.lead_s), _LEAST_S)
+    with _deadline(longest_s, "the controller is slower than real time"):
+        trace = play(scenario, chosen, loop, known, rng)
+    numbers = nothing if trace.failure else {**nothing, **task.score(trace, scenario)}
+    too_high = trace.peak_field_v_per_m > _EXCESS * scenario.device.field_v_per_m
+    kept = None
+    if job.index == 0:
+        every = max(round(_SHOWN_S / 1e-3), 1)
+        time_s = trace.time_s[::every]
+        kept = np.stack([time_s, scenario.reference(time_s), trace.strain[::every]])
+    return Played(*about, numbers, bounds, trace.failure, bool(trace.failure) or too_high, kept)
+
+
+def _bounds(task: Task, scenario: Scenario, loop: LoopClass) -> Mapping[str, float]:
+    true = replace(true_actuator(scenario.device), zero_length_m=scenario.zero_m)
+    try:
+        return task.bounds(true, loop)
+    except HaselabError:  # of a drawn device that does not reach the strain
+        return {}
+
+
+def _random(seed: int, task: str, index: int) -> np.random.Generator:
+    """Random numbers of a task and seed, the same for all controllers and classes."""
+    return np.random.default_rng([seed, zlib.crc32(task.encode()), index])
+
+
+@contextmanager
+def _deadline(duration_s: float, reason: str) -> Iterator[None]:
+    """Raise `TimeoutError` in code that does not return, where the system can."""
+
+    def stop(*_: object) -> None:
+        raise TimeoutError(reason)
+
+    try:
+        before = signal.signal(signal.SIGALRM, stop)
+    except (AttributeError, ValueError):  # no such signal, or not the main thread
+        yield
+        return
+    signal.setitimer(signal.ITIMER_REAL, duration_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+# ---- the whole -----------------------------------------------------------------------------------
+
+
+def play_board(plan: Plan, progress: Progress | None = None) -> Game:
+    """Identify the devices, design the controllers, and play.
+
+    Args:
+        plan: what is played.
+        progress: of the jobs.
+    Returns:
+        All results, in the order of the plan.
+    """
+    bar = progress or SilentProgress()
+    tasks = [TASKS[name] for name in plan.tasks]
+    devices = sorted({task.device for task in tasks})
+    pairs = [(controller, loop) for controller in plan.controllers for loop in plan.classes]
+    plays = [
+        (controller, loop, task, index)
+        for controller, loop in pairs for task in tasks if loop in task.classes
+        for index in range(plan.seeds)
+    ]  # fmt: skip
+    bar.start(len(devices) + len(pairs) * len(devices) + len(plays))
+    try:
+        with _mapper(plan.workers, bar) as mapped:
+            found = dict(zip(devices, mapped("identify", _identify, devices), strict=True))
+            jobs = [
+                _DesignJob(controller, loop, device, *found[device])
+                for controller, loop in pairs for device in devices
+            ]  # fmt: skip
+            entries = tuple(mapped("design", _design, jobs))
+            by_name = {(e.controller, e.loop, e.device): e for e in entries}
+            played = tuple(mapped("play", _play, [
+                _PlayJob(by_name[controller, loop, task.device], task.name, index, plan.seed,
+                         found[task.device][0])
+                for controller, loop, task, index in plays
+            ]))  # fmt: skip
+    finally:
+        bar.stop()
+    statuses = {name: status for name, (_, status) in found.items()}
+    return Game(plan, entries, played, statuses)
+
+
+_Mapped = Callable[[str, Callable[[Item], Result], Sequence[Item]], list[Result]]
+
+
+@contextmanager
+def _mapper(workers: int, bar: Progress) -> Iterator[_Mapped]:  # type: ignore[type-arg]
+    """A map that keeps the order, over processes or in this one."""
+
+    def collect(what: str, results: Iterable[Result]) -> list[Result]:
+        kept = []
+        for result in results:
+            kept.append(result)
+            bar.advance(1.0, what)
+        return kept
+
+    if workers <= 1:
+        yield lambda what, job, items: collect(what, map(job, items))
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        yield lambda what, job, items: collect(what, pool.map(job, items))

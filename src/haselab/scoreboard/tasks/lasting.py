@@ -1,0 +1,90 @@
+"""T6: hold for ten minutes after a large step. T7: periodic work, ten iterations and more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.controllers import KnownActuator
+from haselab.scoreboard.devices import find_device
+from haselab.scoreboard.loop_class import LoopClass
+from haselab.scoreboard.measures import smoothed, tracking_error
+from haselab.scoreboard.play import Scenario, Trace
+from haselab.scoreboard.tasks.task import Metric, Task, staircase
+from haselab.scoreboard.tasks.tracking import trapezoid
+
+__all__ = ["LASTING_TASKS"]
+
+Floats = NDArray[np.float64]
+_HOLD_S, _AFTER_S, _MEAN_S = 600.0, 10.0, 1.0
+_SIZE = 0.10
+_PERIODS, _CENTRE, _AMPLITUDE = 11, 0.03, 0.03
+
+
+def _hold(device: str) -> Callable[[KnownActuator, np.random.Generator], Scenario]:
+    """Scenario of a large step and ten minutes, on a device."""
+
+    def scenario(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+        return Scenario(find_device(device), known.zero_length_m, _HOLD_S,
+                        staircase(((-math.inf, 0.0), (0.0, _SIZE))))  # fmt: skip
+
+    return scenario
+
+
+def _score_hold(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
+    time_s, strain = trace.between(_AFTER_S, _HOLD_S)
+    if time_s.size < round(0.99 * (_HOLD_S - _AFTER_S) / 1e-3):
+        return {}
+    means = smoothed(strain, _MEAN_S)
+    return {
+        "error": float(np.abs(means - _SIZE).max()),
+        "peak_field_v_per_m": trace.peak_field_v_per_m,
+    }
+
+
+def _gait(time_s: Floats) -> Floats:
+    wave = trapezoid(np.maximum(time_s, 0.0), 1.0, _AMPLITUDE)
+    return np.asarray(_CENTRE + np.where(time_s >= 0.0, wave, 0.0))
+
+
+def _periodic(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+    return Scenario(find_device("hz"), known.zero_length_m, float(_PERIODS), _gait)
+
+
+def _score_periodic(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
+    wanted = scenario.reference(trace.time_s)
+    errors = [tracking_error(trace, wanted, float(k), k + 1.0) for k in range(_PERIODS)]
+    return {
+        "error_first": errors[0],
+        "error_after_ten": errors[-1],
+        "left": errors[-1] / errors[0],
+        "peak_field_v_per_m": trace.peak_field_v_per_m,
+    }
+
+
+def _no_bounds(known: KnownActuator, loop: LoopClass) -> Mapping[str, float]:
+    return {}
+
+
+_FIELD = Metric("peak_field_v_per_m", "V/m", "largest field")
+_HELD = (Metric("error", "", "largest error of a mean of 1 s, from 10 s on, in strain"), _FIELD)
+
+LASTING_TASKS = (
+    Task("T6", "hold for 10 min after a step of 0.10", "hz", _HELD, _hold("hz"), _score_hold,
+         _no_bounds, classes=("host-100hz",)),
+    Task("T6-retention", "the same with a fifth of the voltage acting late", "hz", _HELD,
+         _hold("retention"), _score_hold, _no_bounds, classes=("host-100hz",)),
+    Task(
+        "T7", "a trapezoid gait at 1 Hz, eleven times", "hz",
+        (
+            Metric("error_first", "", "rms error over peak-to-peak, first period"),
+            Metric("error_after_ten", "", "the same after ten periods"),
+            Metric("left", "", "the second over the first"),
+            _FIELD,
+        ),
+        _periodic, _score_periodic, _no_bounds,
+    ),
+)  # fmt: skip

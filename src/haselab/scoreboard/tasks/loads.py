@@ -1,0 +1,139 @@
+"""T4: changes of the load while a strain is held. T5: an unknown weight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from haselab.controllers import KnownActuator
+from haselab.scoreboard.bounds import least_peak
+from haselab.scoreboard.devices import find_device
+from haselab.scoreboard.loop_class import LoopClass
+from haselab.scoreboard.measures import (
+    load_response,
+    smoothed,
+    step_response,
+    variation_v_per_s,
+)
+from haselab.scoreboard.play import Scenario, Trace
+from haselab.scoreboard.tasks.task import Metric, Task, staircase
+
+__all__ = ["LOAD_TASKS"]
+
+_LAST_S = 3.0
+_LOW = -0.03  # strain at which a fifth more weight leaves nothing for the drive to do
+_ADDED, _LARGE = 0.1, 0.2  # of the mass
+
+
+def _scenario(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+    mass, t = known.mass_kg, _LAST_S
+    loads = (
+        (0.0, (1.0 + _ADDED) * mass), (t, mass), (2.0 * t, (1.0 - _ADDED) * mass), (3.0 * t, mass),
+        (5.0 * t, (1.0 + _LARGE) * mass), (6.0 * t, mass),
+    )  # fmt: skip
+    points = ((-math.inf, 0.0), (4.0 * t, _LOW))
+    return Scenario(find_device("hz"), known.zero_length_m, 7.0 * t, staircase(points), loads=loads)
+
+
+def _score(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
+    changes = [load_response(trace, at_s, _LAST_S) for at_s, _ in scenario.loads]
+    return {
+        "peak": changes[0][0],
+        "recovery_s": changes[0][1],
+        "worst_peak": float(np.max([peak for peak, _ in changes[:4]])),
+        "worst_recovery_s": float(np.max([back_s for _, back_s in changes[:4]])),
+        "recovery_saturated_s": _after_saturation(trace, scenario.loads[5][0]),
+        "drive_variation_v_per_s": variation_v_per_s(trace),
+        "peak_field_v_per_m": trace.peak_field_v_per_m,
+    }
+
+
+def _after_saturation(trace: Trace, at_s: float) -> float:
+    """Time until the strain is back once the drive can hold it again."""
+    _, strain = trace.between(at_s, at_s + _LAST_S)
+    if strain.size < round(0.9 * _LAST_S / 1e-3):
+        return math.nan
+    outside = np.flatnonzero(np.abs(smoothed(strain) - _LOW) > 2e-3)
+    back = int(outside[-1]) + 1 if outside.size else 0
+    return back * 1e-3 if back < 0.9 * strain.size else math.nan
+
+
+def _bounds(known: KnownActuator, loop: LoopClass) -> Mapping[str, float]:
+    added_kg = _ADDED * known.mass_kg
+    peaks = [least_peak(known, 0.0, sign * added_kg, loop.dead_s) for sign in (1.0, -1.0)]
+    return {"peak": peaks[0], "worst_peak": max(peaks)}
+
+
+# ---- an unknown weight ---------------------------------------------------------------------------
+
+_GRAMS_KG = 0.025
+_WEIGHED_S, _STEP_S, _STEP = 4.0, 8.0, 0.04
+_LIGHTEST, _HEAVIEST = 0.7, 1.6  # of the known mass
+_SHARE = 0.3  # of the new mass's own range, where the step begins
+
+
+def _weights(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+    mass = known.mass_kg
+    new_kg = mass * float(rng.uniform(_LIGHTEST, _HEAVIEST))
+    low, high = known.reachable(new_kg)
+    before = low + _SHARE * (high - low)
+    points = ((-math.inf, 0.0), (_WEIGHED_S, before), (_STEP_S, before + _STEP))
+    loads = ((0.0, mass + _GRAMS_KG), (_WEIGHED_S, new_kg))
+    events = ((_STEP_S, before, before + _STEP),)
+    return Scenario(find_device("hz"), known.zero_length_m, _STEP_S + _LAST_S,
+                    staircase(points), loads=loads, events=events)  # fmt: skip
+
+
+def _score_weights(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
+    new_kg = scenario.loads[1][1]
+
+    def estimate(at_s: float) -> float:
+        """Mean over the 20 ms before."""
+        first, last = np.searchsorted(trace.update_s, [at_s - 0.02, at_s - 1e-9])
+        return float(trace.estimated_kg[first:last].mean()) if last > first else math.nan
+
+    before_kg, (at_s, _, after) = estimate(0.0), scenario.events[0]
+    step = step_response(trace, at_s, _LAST_S, after)
+    return {
+        "change_error_0p2s_kg": abs(estimate(0.2) - before_kg - _GRAMS_KG),
+        "change_error_1s_kg": abs(estimate(1.0) - before_kg - _GRAMS_KG),
+        "mass_error": abs(estimate(_STEP_S) / new_kg - 1.0),
+        "rise_s": step.rise_s,
+        "overshoot": step.overshoot,
+        "peak_field_v_per_m": trace.peak_field_v_per_m,
+    }
+
+
+def _no_bounds(known: KnownActuator, loop: LoopClass) -> Mapping[str, float]:
+    return {}
+
+
+LOAD_TASKS = (
+    Task(
+        "T5", "an unknown weight, then a step", "hz",
+        (
+            Metric("change_error_0p2s_kg", "kg", "error of a change by 25 g after 0.2 s"),
+            Metric("change_error_1s_kg", "kg", "error of a change by 25 g after 1 s"),
+            Metric("mass_error", "", "relative error of the weight after 4 s"),
+            Metric("rise_s", "s", "rise of a step of 0.04 with that weight"),
+            Metric("overshoot", "", "overshoot of that step"),
+            Metric("peak_field_v_per_m", "V/m", "largest field"),
+        ),
+        _weights, _score_weights, _no_bounds,
+    ),
+    Task(
+        "T4", "changes of the load", "hz",
+        (
+            Metric("peak", "", "largest strain after 10 % more weight"),
+            Metric("recovery_s", "s", "time until it is within 0.1 % strain"),
+            Metric("worst_peak", "", "largest of four changes by 10 %"),
+            Metric("worst_recovery_s", "s", "longest of them"),
+            Metric("recovery_saturated_s", "s", "time to 0.2 % strain after the drive saturated"),
+            Metric("drive_variation_v_per_s", "V/s", "changes of the drive"),
+            Metric("peak_field_v_per_m", "V/m", "largest field"),
+        ),
+        _scenario, _score, _bounds,
+    ),
+)  # fmt: skip

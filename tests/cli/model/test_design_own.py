@@ -1,0 +1,57 @@
+"""`haselab design --controller KIND` for kinds that compute their own parameters."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+from haselab.cli.main import main
+
+FILE = """
+[actuator]
+name = "leg"
+mass_kg = 0.25
+geometry = {zero_length_m = 0.051}
+
+[drive]
+low_v = 0.0
+high_v = 2.0
+gain_v_per_v = 5000.0
+highest_field_v_per_m = 34e6
+
+[model.physical]
+kind = "planar-hasel"
+mass_kg = 0.25
+parameters = {"shell.shear_modulus_pa" = 15.6e3}
+"""
+
+
+def run(capsys, *arguments):
+    try:
+        main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        code = stop.code
+    seen = capsys.readouterr()
+    return code, seen.out, seen.err
+
+
+def test_a_kind_with_a_design_writes_its_parameters_into_the_actuator_file(tmp_path, capsys):
+    file = tmp_path / "A.toml"
+    file.write_text(FILE)
+    code, out, _ = run(capsys, "design", file, "--controller", "force", "--delay-s", 0.0056,
+                       "--rate-hz", 100, "--json")  # fmt: skip
+    assert code == 0
+    answer = json.loads(out)
+    section = tomllib.loads(file.read_text())["controller"]
+    assert section["kind"] == "force" and section["parameters"] == answer["parameters"]
+    assert set(answer["parameters"]) == {"kp", "ki", "kd", "filter_s", "reference_s"}
+    assert section["limits"]["low"] < 0.0 < section["limits"]["high"]  # strains, for the loop
+    assert section["loop"] == {"rate_hz": 100.0, "measurement_delay_s": 0.0056}
+    assert "peak sensitivity is at most 1.8" in answer["robustness"]
+
+
+def test_without_a_physical_model_the_command_that_adds_it_is_named(tmp_path, capsys):
+    file = tmp_path / "A.toml"
+    file.write_text(FILE.split("[model.physical]")[0])
+    code, _, error = run(capsys, "design", file, "--controller", "force")
+    assert code == 2 and "haselab identify actuator RUN --actuator A.toml" in error

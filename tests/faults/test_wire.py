@@ -63,22 +63,12 @@ def test_a_fault_on_the_wire_ends_at_zero_with_its_reason_and_all_blocks(
         assert re.search(done, recorded), "the guardian has acted"
 
 
-def _outside(folder: Path, *case: Any, patient: bool = False) -> Any:
-    """Repeat a run that ended by itself before the signal could be sent: it tested nothing."""
-    for trial in range(3):
-        try:
-            return _checked(wire.outside(folder / f"run-{trial}", *case, patient=patient))
-        except wire.NotStruckError as error:
-            reason = error
-    raise reason
-
-
 @pytest.mark.parametrize(("name", "moment"), [c for c in wire.cases() if c[0] in wire.SIGNALS])
 def test_a_signal_ends_a_program_behind_the_real_drivers_at_zero(
     tmp_path: Path, forks: Any, name: str, moment: str
 ) -> None:
     words, _ = wire.SIGNALS[name]
-    outcome = _outside(tmp_path, name, moment, forks)
+    outcome = _checked(wire.outside(tmp_path, name, moment, forks))
     if moment != "before arming":
         assert outcome.highest_v > 4500.0
         assert words in outcome.recorded
@@ -91,7 +81,9 @@ def test_one_guardian_is_enough(
     tmp_path: Path, forks: Any, program: str, helper: str, slot: int
 ) -> None:
     """The program is killed at the same moment, or left alone: it is to notice."""
-    outcome = _outside(tmp_path, program, "in ramp", forks, [(slot, helper)], patient=True)
+    outcome = _checked(
+        wire.outside(tmp_path, program, "in ramp", forks, [(slot, helper)], patient=True)
+    )
     assert outcome.highest_v > 4500.0
     assert re.search("(?i)program has ended|guardian", outcome.recorded)
 

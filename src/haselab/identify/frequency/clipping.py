@@ -69,8 +69,9 @@ def _predicted(
 def _rail(y: Floats, predicted: Floats) -> float | None:
     """The clearest upper limit."""
     best: tuple[float, float] | None = None
-    for level in _LEVELS:
-        beyond = predicted > float(np.quantile(y, level))
+    *levels, extreme = np.quantile(y, [*_LEVELS, _EXTREME]).tolist()
+    for level in levels:
+        beyond = predicted > level
         visits = np.count_nonzero(np.diff(beyond.astype(np.int8), prepend=0) == 1)
         rows = int(beyond.sum())
         if rows < _LEAST_ROWS or visits < _LEAST_VISITS:
@@ -80,7 +81,7 @@ def _rail(y: Floats, predicted: Floats) -> float | None:
         along = modelled - modelled.mean()
         if float(along @ there) > _FOLLOWS * float(along @ along):
             continue
-        if float(np.quantile(y, _EXTREME)) - rail > _CLEAR * float(there.std()):
+        if extreme - rail > _CLEAR * float(there.std()):
             continue  # an extreme value that is reached often, not a limit
         off = float(((there - modelled) ** 2).sum())
         limited = float(((there - rail) ** 2).sum())

@@ -112,10 +112,10 @@ class _Problem:
 
 
 def rows_of_changes(
-    problem: _Problem, seen: Mapping[str, Observation], changes: Floats
+    problem: _Problem, source: Source, changes: Floats
 ) -> list[dict[str, Estimate]]:
     """Results after each of some changes; a function of the module, for a helper process."""
-    return [problem.rows(seen.__getitem__, change) for change in changes]
+    return [problem.rows(source, change) for change in changes]
 
 
 def _along(
@@ -125,7 +125,6 @@ def _along(
 
     It makes none where a value of another package cannot be sent to it, or if it ends early.
     """
-    there = changes[1::2]
     with contextlib.ExitStack() as opened:
         try:
             pickle.dumps((problem.values, problem.known, problem.study))
@@ -133,13 +132,14 @@ def _along(
             helper = HelperProcess([__name__], _PATIENCE_S)
             opened.callback(helper.close)  # also if this process is interrupted meanwhile
         except (DeviceError, pickle.PicklingError, TypeError, AttributeError):
-            return [problem.rows(source, change) for change in changes]
-        sent = pool.submit(helper.call, rows_of_changes, problem, seen, there)
-        found = [problem.rows(source, change) for change in changes[::2]]
+            return rows_of_changes(problem, source, changes)
+        half = len(changes) // 2
+        sent = pool.submit(helper.call, rows_of_changes, problem, seen.__getitem__, changes[half:])
+        found = rows_of_changes(problem, source, changes[:half])
         try:
             return found + sent.result()
         except (DeviceError, KeyError):
-            return found + [problem.rows(source, change) for change in there]
+            return found + rows_of_changes(problem, source, changes[half:])
 
 
 def _fitted(analysis: Analysis) -> dict[str, Estimate]:

@@ -225,7 +225,8 @@ def simulate(
     1 kHz has the delay and the limits of the microcontroller. All three are first calibrated with a
     reference capacitor. The report of a run then shows them. For a PI or PID, the simulated step of
     the microcontroller is compared with the step that [model] predicts. If they differ by more than
-    the design covers, the command names the cause and exits with code 3.
+    `frequency_spread` and the band of the strain map cover, the command names the cause and exits
+    with code 3.
     """
     config = _twin(run, options["reading"], options["twin"], options["draw"])
     refuse_linked_folders(run, "firmware", "figures")
@@ -315,7 +316,8 @@ def _compared(found: Agreement | None) -> dict[str, Any]:
         return {"status": "not compared: only the step of a PI or PID is predicted"}
     sentence = (
         f"The chip's step deviates from the predicted one by up to {100.0 * found.deviation:.3g} % "
-        f"of the step; the design covers {100.0 * found.covered:.3g} %."
+        "of the step; frequency_spread and the band of the strain map cover "
+        f"{100.0 * found.covered:.3g} %."
     )
     if not found.agrees:
         sentence += f" Cause: {'; '.join(found.causes) or 'none of those that are checked'}."

@@ -38,8 +38,7 @@ class _Blocks:
             Shape `(S, 2)`.
         carrier_v: peak of the carrier at the actuator, by the voltage monitor; NaN if it was not
             seen.
-        rise: of the voltage monitor at each switch but the first, see `_rise`. Shape
-            `(4, N - 1)`.
+        rise: of the voltage monitor at each switch, see `_rise`. Shape `(4, N)`.
         weight: of each of those samples' parts in the capacitances, see `_weights`. Shape `(N, S)`.
         later_s: of each capacitance, see `_weights`.
     """
@@ -323,18 +322,23 @@ def _weights(codes: NDArray[np.int16], lockin: Lockin) -> tuple[Floats, Floats]:
 def _rise(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
     """Change and area of the voltage monitor at each switch, and the same of its square.
 
-    The area is the sum of the samples after the switch, less what they reach.
+    The area is the sum of the samples after the switch, less what they reach. Of the first block,
+    the voltage before the switch is that of its own samples, in whole periods of the carrier.
     """
     first, end = lockin.config.blank
+    period = 2.0 * np.pi * lockin.config.rate_hz / lockin.config.omega_rad_s
+    whole = round(int(first / period) * period)
     found = []
     for power in (1, 2):
         level = (codes[:, end:].astype(np.float64) ** power).mean(axis=1)
-        after = codes[1:, first:end].astype(np.float64) ** power
-        found += [np.diff(level), (after - level[1:, None]).sum(axis=1)]
+        before = codes[:1, first - whole : first].astype(np.float64) ** power
+        start = before.mean(axis=1) if whole else level[:1]
+        after = codes[:, first:end].astype(np.float64) ** power
+        found += [np.diff(level, prepend=start), (after - level[:, None]).sum(axis=1)]
     change, area = found[:2]
-    small = np.abs(change) < _LARGE
+    small = np.abs(change[1:]) < _LARGE
     if small.any():  # the carrier's part is the same in all
-        found[1] = area - area[small].mean()
+        found[1] = area - area[1:][small].mean()
     return np.stack(found)
 
 
@@ -345,16 +349,17 @@ def _late_s(blocks: Collection[_Blocks], rate_hz: float) -> list[Floats]:
     are delayed equally.
     """
     rises = [part.rise for part in blocks]
-    small = [rise[:2, np.abs(rise[0]) < _LARGE] for rise in rises]
+    # the generator starts with the first block
+    small = [rise[:2, 1:][:, np.abs(rise[0, 1:]) < _LARGE] for rise in rises]
     change, area = np.concatenate([np.zeros((2, 0)), *small], axis=1)
     size = float(change @ change)
     usual = -float(change @ area) / size if size > 0.0 else 0.5
     found = []
     for rise in rises:
-        late = np.full(rise.shape[1] + 1, usual)  # of the first block nobody knows the step
+        late = np.full(rise.shape[1], usual)
         # a step to the opposite voltage changes no square, hence no force
-        large = np.flatnonzero((np.abs(rise[0]) >= _LARGE) & (np.abs(rise[2]) >= _LARGE**2))
-        late[1 + large] = -rise[3, large] / rise[2, large]
+        large = (np.abs(rise[0]) >= _LARGE) & (np.abs(rise[2]) >= _LARGE**2)
+        late[large] = -rise[3, large] / rise[2, large]
         # the first sample still shows the voltage before: half an interval of the sums
         found.append((late - 0.5) / rate_hz)
     return found

@@ -1,9 +1,11 @@
 """A session as one motion: when each capacitance was sensed."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from haselab.pipelines.motion import _weights
+from haselab.pipelines.motion import _late_s, _rise, _weights
 from haselab.sensing import Lockin, LockinConfig
 
 RATE_HZ, CARRIER_HZ, BLOCK = 200e3, 2000.0, 2000
@@ -43,3 +45,25 @@ def test_the_phase_of_the_carrier_moves_the_time():
     assert np.ptp(later_s) > 5e-5
     # by half a turn of the carrier and on, it repeats
     assert later_s[0] == pytest.approx(later_s[-1], abs=1e-7)
+
+
+@pytest.mark.parametrize("from_v", [0.0, 900.0])
+def test_the_first_step_of_an_experiment_is_as_late_as_its_monitor_shows(from_v):
+    """A slew from one level to the next acts on average half of its duration late."""
+    lockin = Lockin(LockinConfig(RATE_HZ, BLOCK, CARRIER_HZ, 0.0, 1e6, blank=(400, 560)))
+    slew = 60  # samples
+    at = np.arange(BLOCK)
+    ramp = np.clip((at - 400.0) / slew, 0.0, 1.0)
+    carrier = 60.0 * np.sin(2.0 * np.pi * CARRIER_HZ * at / RATE_HZ)
+    first = from_v + (4000.0 - from_v) * ramp + carrier
+    codes = np.round(np.stack([first, np.full(BLOCK, 4000.0) + carrier])).astype(np.int16)
+    found = _rise(codes, lockin)
+    part = SimpleNamespace(rise=found)
+    late_s = _late_s([part], RATE_HZ)[0]
+    # of the square of the voltage, which the force follows; sums of samples
+    square = (4000.0**2 - (from_v + (4000.0 - from_v) * ramp[400:560]) ** 2).sum()
+    expected = square / (4000.0**2 - from_v**2) - 0.5
+    # the carrier in a part of its period of 100 samples: 2 V c 100 / 2 pi, of the change of V^2
+    within = 2.0 * 4000.0 * 60.0 * 100.0 / (2.0 * np.pi) / (4000.0**2 - from_v**2)
+    assert late_s[0] * RATE_HZ == pytest.approx(expected, abs=2.0 * within)
+    assert expected > 0.3 * slew

@@ -1,5 +1,6 @@
 """One physical model from all records: recovery, model errors, contradictions."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -258,3 +259,13 @@ def test_covariances_only_grow():
     covariance = np.array([[4.0, 1.0], [1.0, 1.0]])
     grown = widened(covariance, np.array([1.0, 3.0]))
     np.testing.assert_allclose(grown, [[4.0, 3.0], [3.0, 9.0]])
+
+
+@pytest.mark.long
+def test_softening_that_is_over_before_the_record_is_not_identifiable():
+    """The hung mass alone stretches the actuator beyond the transition of the Mullins effect."""
+    softened = replace(TRUE, softening_stretch=1.30, softening_transition=0.02)
+    fit = fit_actuator(softened, [record(softened, 5, duration_s=15.0)], mass_kg=MASS_KG)
+    assert fit.succeeded
+    assert {"mullins.share", "mullins.stretch", "mullins.width"} <= set(fit.not_identifiable)
+    assert fit.parameters["mullins.share"].std == math.inf

@@ -67,6 +67,7 @@ from haselab.identify.physical.unknowns import (
     SENSING_SCALE,
     START_HYSTERESIS,
     Unknowns,
+    shares_of,
 )
 
 __all__ = ["ActuatorFit", "fit_actuator"]
@@ -80,6 +81,7 @@ _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _APART = 2.0  # rms over noise from which records are compared alone
 _POINTS = 5  # voltages of the linear models
 _UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
+_SEEN = 3.0  # standard deviations from 0: an effect that is seen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -432,6 +434,7 @@ def _result(
               START_HYSTERESIS: "N", **DRIFT_UNITS}  # fmt: skip
     slopes = unknowns.slopes
     weak = (std > largest_std(unknowns)) | (np.abs(found.left) > _UNSETTLED * std)
+    weak |= _unseen(unknowns, std)
     parameters = {}
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
@@ -483,6 +486,24 @@ def _result(
         rejected_laws=_each_once([*rejected, *simpler(found, values)]),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
+
+
+def _unseen(unknowns: Unknowns, std: Floats) -> NDArray[np.bool_]:
+    """Which parameters are those of an effect that may be absent, such as softening.
+
+    A small effect may be the end of a larger one at another stretch or time, which no standard
+    deviation about its estimate covers.
+    """
+    names = list(unknowns.names)
+    unseen = np.zeros(len(names), dtype=bool)
+    for k, name in enumerate(names):
+        for share in set(shares_of(name)) - {name}:
+            if share in names:
+                at = names.index(share)
+                spread = std[at] * abs(unknowns.slopes[at])
+                if not abs(unknowns.values[at]) > _SEEN * spread:
+                    unseen[[k, at]] = True
+    return unseen
 
 
 def _each_once(rivals: Sequence[Rival]) -> tuple[Rival, ...]:

@@ -29,6 +29,7 @@ __all__ = [
     "START_HYSTERESIS",
     "Unknowns",
     "fitted_parameters",
+    "shares_of",
     "usual",
 ]
 
@@ -76,16 +77,24 @@ def fitted_parameters(law: ActuatorLaw) -> dict[str, float]:
         else:
             found[about.key] = value
     idle = {name for name, value in found.items() if value == 0.0}
-    return {name: value for name, value in found.items() if not idle & {name, *_shares_of(name)}}
+    return {name: value for name, value in found.items() if not idle & {name, *shares_of(name)}}
 
 
-def _shares_of(name: str) -> tuple[str, ...]:
-    """The share or force without which a time constant or width has no effect."""
+def shares_of(name: str) -> tuple[str, ...]:
+    """The share or force without which a time constant, width or stretch has no effect.
+
+    Args:
+        name: of a parameter.
+    Returns:
+        Possible names; the name itself if it is no such parameter.
+    """
     return (
         name.replace("relaxation_s", "share"),
         name.replace("relaxation_s", "relaxation_share"),
         name.replace("hysteresis.width", "hysteresis.force_n"),
         name.replace("hysteresis_width", "hysteresis_n"),
+        name.replace("mullins.stretch", "mullins.share"),
+        name.replace("mullins.width", "mullins.share"),
     )
 
 

@@ -107,7 +107,10 @@ def setting_for(
     else:
         low, high = known.reachable()
         start = 0.0
-    return ControllerSetting(loop.period_s, low, high, start, loop.delay_s, known)
+    rate = loop.slew_v_per_s if chosen.kind.output == "voltage" else math.inf
+    return ControllerSetting(
+        loop.period_s, low, high, start, loop.delay_s, known, loop.sensed_before_s, rate
+    )
 
 
 class _Player:

@@ -10,6 +10,7 @@ viscoelastic branches in N, $\Delta$ in N.
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,17 @@ class MotionModel:
         self.inertia_kg = known.mass_kg + known.added_inertia_kg + known.law.moving_mass_kg
         self._damping = losses.damping_n_s_per_m
         self._branches = list(zip(losses.branch_share, losses.branch_relaxation_s, strict=True))
+
+    def stiffened(self, length_m: float, factor: float) -> MotionModel:
+        """The same motion with another stiffness about a length, at which the force stays.
+
+        Args:
+            length_m: of the rest.
+            factor: on the stiffness.
+        """
+        found, rest_n = copy(self), self.elastic_n(length_m)
+        found._elastic = [rest_n + factor * (force - rest_n) for force in self._elastic]
+        return found
 
     def _at(self, length_m: float) -> tuple[int, float]:
         place = (length_m - self._low_m) / self._step_m

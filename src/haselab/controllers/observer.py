@@ -19,28 +19,22 @@ N. Hogan, J. Neurosci. 5 (1985), 1688, for the polynomial.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from haselab.actuators import GRAVITY_M_S2
-from haselab.base import LimitError, ResultError
-from haselab.controllers.kind import ControllerKind, Parameter
-from haselab.controllers.known_actuator import KnownActuator
+from haselab.controllers.linear_loop import LinearLoop
 from haselab.controllers.motion_model import MotionModel
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.reference_plan import ReferencePlan
 
-__all__ = ["OBSERVER", "ObserverController", "design_observer"]
-
 Floats = NDArray[np.float64]
+__all__ = ["ObserverController"]
+
 _POINTS = 9  # strains of the reachable range at which the observer's gains are computed
-_USUAL_NOISE = 2e-4  # strain, where it is not known
-_CREEP_N = 1e-3  # of the weight, per root of a second: how uncertain the branches are
+_CREEP = 1e-3  # of the weight, per root of a second: how uncertain the branches are
 _CORRECTIONS = 2
-_PREVIEW_S = 0.05
 
 
 class ObserverController:
@@ -79,7 +73,9 @@ class ObserverController:
         self._plan = ReferencePlan(
             self._model, known, period_s, self._reserve, setting.highest_rate_per_s
         )
-        self._strains, self._gains = self._observer_gains()
+        low, high = known.reachable()
+        self._strains = np.linspace(low, high, _POINTS).tolist()
+        self._gains = self._observer_gains(self._strains)
         self._state: list[float] | None = None
 
     @property
@@ -101,21 +97,23 @@ class ObserverController:
                 return past_v[0]
             self._state = model.at_rest(length_m, past_v[whole])
             self._plan.begin(length_m)
-        state = model.moved(self._state, past_v[whole + 1], self._late_s)
-        state = model.moved(state, past_v[whole], self._period_s - self._late_s)
-        if not math.isnan(length_m):
-            state = self._corrected(state, length_m)
-        self._state = state
-        # to the time at which the new drive takes effect
-        ahead = model.moved(state, past_v[whole], self._late_s)
-        for k in range(whole - 1, -1, -1):
-            ahead = model.moved(ahead, past_v[k], self._period_s)
+        state = self._state = self._observed(self._state, past_v, length_m)
+        ahead = self._ahead(state, past_v)
         zero_m = self._known.zero_length_m
         wanted = [zero_m * (1.0 + value) for value in (reference, *measurement.preview)]
-        drive_v = self._drive_v(ahead, *self._plan.next(wanted, self._acts_s, ahead))
+        wanted_now = self._plan.next(wanted, self._acts_s, ahead)
+        most_v = self._most_v
+        drive_v = self._drive_v(ahead, wanted_now, (past_v[0] - most_v, past_v[0] + most_v))
         past_v.insert(0, drive_v)
         past_v.pop()
         return drive_v
+
+    def _ahead(self, state: list[float], past_v: list[float]) -> list[float]:
+        """The state when the new drive takes effect."""
+        found = self._model.moved(state, past_v[self._whole], self._late_s)
+        for k in range(self._whole - 1, -1, -1):
+            found = self._model.moved(found, past_v[k], self._period_s)
+        return found
 
     def _sensed_m(self, measurement: Measurement) -> float:
         known = self._known
@@ -123,8 +121,13 @@ class ObserverController:
             return known.length_m(measurement.strain)
         return known.sensed_length_m(measurement.capacitance_f, self._past_v[self._whole])
 
-    def _corrected(self, state: list[float], length_m: float) -> list[float]:
-        """The state with the gains of its length."""
+    def _observed(self, state: list[float], past_v: list[float], length_m: float) -> list[float]:
+        """The state one period later, corrected by the sensed length unless that is NaN."""
+        whole, late_s = self._whole, self._late_s
+        state = self._model.moved(state, past_v[whole + 1], late_s)
+        state = self._model.moved(state, past_v[whole], self._period_s - late_s)
+        if math.isnan(length_m):
+            return state
         missed_m, strain = length_m - state[0], self._known.strain(state[0])
         place = (strain - self._strains[0]) / (self._strains[1] - self._strains[0])
         k = min(max(int(place), 0), len(self._gains) - 2)
@@ -136,93 +139,100 @@ class ObserverController:
         ]
 
     def _drive_v(
-        self, state: list[float], wanted_m: float, wanted_m_s: float, pushed_m_s2: float
+        self, state: list[float], wanted: tuple[float, float, float], limits_v: tuple[float, float]
     ) -> float:
-        """Drive that leads the state back to the reference."""
+        """Drive that leads the state back to the wanted length, speed and acceleration."""
         model, period_s = self._model, self._period_s
         length_m, speed = state[:2]
         pushed = (
-            pushed_m_s2
-            + self._per_m * (wanted_m - length_m)
-            + self._per_m_s * (wanted_m_s - speed)
+            wanted[2] + self._per_m * (wanted[0] - length_m) + self._per_m_s * (wanted[1] - speed)
         )
         half_s = 0.5 * period_s
         middle_m = length_m + half_s * speed + 0.5 * half_s * half_s * pushed
         pull_n = model.needed_n(state, middle_m, speed + half_s * pushed, pushed)
-        low_v, high_v = self._limits_v(max(middle_m, length_m + period_s * max(speed, 0.0)))
+        longest_m = max(middle_m, length_m + period_s * max(speed, 0.0))
+        high_v = min(self._high_v, self._known.highest_drive_v(longest_m), limits_v[1])
+        low_v = min(max(self._low_v, limits_v[0]), high_v)
         for _ in range(_CORRECTIONS):  # until the speed after the whole period is as wanted
             drive_v = max(min(self._known.drive_v(middle_m, pull_n), high_v), low_v)
             missed = speed + period_s * pushed - model.moved(state, drive_v, period_s)[1]
             pull_n += model.inertia_kg * missed / period_s
         return max(min(self._known.drive_v(middle_m, pull_n), high_v), low_v)
 
-    def _limits_v(self, length_m: float) -> tuple[float, float]:
-        """Lowest and highest drive of the next period, in which this length is not exceeded."""
-        high_v = min(self._high_v, self._known.highest_drive_v(length_m))
-        high_v = min(high_v, self._past_v[0] + self._most_v)
-        return min(max(self._low_v, self._past_v[0] - self._most_v), high_v), high_v
+    def linear_loop(
+        self, strain: float, stiffness: float = 1.0, later_s: float = 0.0
+    ) -> LinearLoop:
+        """The closed loop where it holds a strain, limits apart, by central differences.
 
-    def _observer_gains(self) -> tuple[list[float], list[list[float]]]:
-        """Strains, and the steady gains of Kalman's filter there."""
-        known, model = self._known, self._model
-        low, high = known.reachable()
-        strains = np.linspace(low, high, _POINTS)
+        Args:
+            strain: held.
+            stiffness: of the actuator, over the identified one, about that strain.
+            later_s: delay beyond the stated one.
+        """
+        known, period_s = self._known, self._period_s
+        length_m, drive_v = known.length_m(strain), known.static_drive_v(strain)
+        plant = self._model.stiffened(length_m, stiffness)
+        rest = self._model.at_rest(length_m, drive_v)
+        whole = int((self._whole * period_s + self._late_s + later_s) / period_s + 1e-9)
+        late_s = self._whole * period_s + self._late_s + later_s - whole * period_s
+        size, waiting = len(rest), max(whole, self._whole) + 2
+        free = -math.inf, math.inf
+        start = np.array([*rest[:-1], *rest, *[drive_v] * waiting])
+
+        def after(change: Floats, load_n: float, noise_m: float, added_v: float) -> Floats:
+            moved = start + change
+            true = [*moved[: size - 1].tolist(), rest[-1] + load_n]
+            seen, past_v = moved[size - 1 : 2 * size - 1].tolist(), moved[2 * size - 1 :].tolist()
+            seen = self._observed(seen, past_v, true[0] + noise_m)
+            new_v = self._drive_v(self._ahead(seen, past_v), (length_m, 0.0, 0.0), free)
+            # the drives wait one more update: the actuator sees them as the observer does
+            past_v = [new_v, *past_v[:-1]]
+            true = plant.moved(true, past_v[whole + 1] + added_v, late_s)
+            true = plant.moved(true, past_v[whole] + added_v, period_s - late_s)
+            return np.array([*true[:-1], *seen, *past_v])
+
+        small = [1e-7, 1e-5, *[1e-4] * (size - 3)]
+        scales = np.array([*small, *small, 1e-4, *[1e-5] * waiting])
+        none = np.zeros(start.size)
+
+        def slope(k: int | None, load_n: float, noise_m: float, added_v: float) -> Floats:
+            change = none.copy()
+            scale = max(load_n, noise_m, added_v)
+            if k is not None:
+                change[k] = scale = scales[k]
+            ends = [
+                after(sign * change, sign * load_n, sign * noise_m, sign * added_v)
+                for sign in (1.0, -1.0)
+            ]
+            return (ends[0] - ends[1]) / (2.0 * scale)
+
+        a = np.stack([slope(k, 0.0, 0.0, 0.0) for k in range(start.size)], axis=1)
+        load, added = slope(None, 1e-4, 0.0, 0.0), slope(None, 0.0, 0.0, 1e-5)
+        noise = slope(None, 0.0, 1e-7, 0.0)
+        at = 2 * size - 1  # of the newest drive
+        drive = a[at].copy()
+        length = none.copy()
+        length[0] = 1.0
+        return LinearLoop(a, load, noise, added, length, drive, float(noise[at]))
+
+    def _observer_gains(self, strains: list[float]) -> list[list[float]]:
+        """The steady gains of Kalman's filter at each strain."""
+        known, model, period_s = self._known, self._model, self._period_s
+        branches = len(known.law.losses.branch_share)
+        creep = (_CREEP * model.weight_n) ** 2 * period_s
+        noise = np.diag([0.0, 0.0, *[creep] * branches, self._load_n**2 * period_s])
+        shaken = self._shake**2 * period_s
+        noise[:2, :2] = shaken * np.array(
+            [[period_s**2 / 3.0, period_s / 2.0], [period_s / 2.0, 1.0]]
+        )
+        unit = np.array([1e-6, 1e-4, *[1e-3] * branches, 1e-2])  # near 1, for the solver
+        seen = np.zeros((1, unit.size))
+        seen[0, 0] = 1.0
         gains = []
-        for strain in strains.tolist():
+        for strain in strains:
             drive_v = known.static_drive_v(strain)
-            a = model.linear(known.length_m(strain), drive_v, self._period_s)
-            size, period_s = a.shape[0], self._period_s
-            branches = size - 3
-            shaken = self._shake**2 * np.array([period_s**3 / 3.0, period_s])
-            creep = (_CREEP_N * model.weight_n) ** 2 * period_s
-            noise = np.diag(
-                [*shaken, *[creep] * branches, self._load_n**2 * period_s]
-            )
-            noise[0, 1] = noise[1, 0] = self._shake**2 * period_s**2 / 2.0
-            seen = np.zeros((1, size))
-            seen[0, 0] = 1.0
-            r = np.array([[self._noise_m(strain) ** 2]])
-            unit = np.array([1e-6, 1e-4, *[1e-3] * branches, 1e-2])  # for the solver
-            p = solve_discrete_are(
-                (a * unit / unit[:, None]).T, (seen * unit).T / 1e-6,
-                noise / np.outer(unit, unit), r / 1e-12,
-            )
-            gain = p[:, 0] / (p[0, 0] + r[0, 0] / 1e-12) * unit / 1e-6
-            gains.append(gain.tolist())
-        return strains.tolist(), gains
-
-    def _noise_m(self, strain: float) -> float:
-        """Standard deviation of the sensed length."""
-        known = self._known
-        length_m, step_m = known.length_m(strain), known.table.step_m
-        ends = known.law.capacitance_f(np.array([length_m - step_m, length_m + step_m]))
-        per_m = abs(float(ends[1] - ends[0])) / (2.0 * step_m) * known.sensing_scale
-        noise_f = known.capacitance_noise_f
-        return _USUAL_NOISE * known.zero_length_m if math.isnan(noise_f) else noise_f / per_m
-
-
-def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
-    """Rough."""
-    OBSERVER.check(setting)
-    known = setting.actuator
-    assert known is not None
-    weight_n = known.mass_kg * GRAVITY_M_S2
-    delay = (setting.delay_s or 0.0) + 0.5 * setting.period_s
-    return {"bandwidth_rad_s": float(f"{0.5 / delay:.4g}"), "load_n": float(f"{0.5 * weight_n:.4g}"),
-            "shake_m_s2": 0.05, "reserve": 0.15}
-
-
-OBSERVER = ControllerKind(
-    "observer",
-    ObserverController,
-    (
-        Parameter("bandwidth_rad_s", "rad/s", None, 1e-3, 1e4),
-        Parameter("load_n", "N", None, 1e-9, 1e6),
-        Parameter("shake_m_s2", "m/s^2", 0.05, 1e-9, 1e6),
-        Parameter("reserve", "", 0.15, 0.0, 0.9),
-    ),
-    output="voltage",
-    needs_actuator=True,
-    design=design_observer,
-    preview_s=_PREVIEW_S,
-)
+            a = model.linear(known.length_m(strain), drive_v, period_s) * unit / unit[:, None]
+            missed = (known.length_noise_m(strain) / unit[0]) ** 2
+            p = solve_discrete_are(a.T, seen.T, noise / np.outer(unit, unit), [[missed]])
+            gains.append((p[:, 0] / (p[0, 0] + missed) * unit / unit[0]).tolist())
+        return gains

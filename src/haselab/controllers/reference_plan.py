@@ -91,9 +91,7 @@ class ReferencePlan:
         changes = [abs(b - a) for a, b in zip(rises, rises[1:], strict=False)]
         return max(changes) <= self._jump_m_s * self._period_s
 
-    def _plan(
-        self, start: tuple[float, float, float], target_m: float, state: list[float]
-    ) -> None:
+    def _plan(self, start: tuple[float, float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits."""
         self._target_m = target_m
         period_s = self._period_s
@@ -130,9 +128,7 @@ class ReferencePlan:
         return True
 
 
-def _quintic(
-    start: tuple[float, float, float], target_m: float, for_s: float
-) -> tuple[float, ...]:
+def _quintic(start: tuple[float, float, float], target_m: float, for_s: float) -> tuple[float, ...]:
     """Coefficients, lowest power first, of the way to rest at a target."""
     x, v, a = start
     t, gap = for_s, target_m - start[0]

@@ -35,6 +35,7 @@ __all__ = ["ObserverController"]
 _POINTS = 9  # strains of the reachable range at which the observer's gains are computed
 _CREEP = 1e-3  # of the weight, per root of a second: how uncertain the branches are
 _CORRECTIONS = 2
+_WEIGHED_S = 0.04  # time constant of the mean load
 
 
 class ObserverController:
@@ -77,13 +78,12 @@ class ObserverController:
         self._strains = np.linspace(low, high, _POINTS).tolist()
         self._gains = self._observer_gains(self._strains)
         self._state: list[float] | None = None
+        self._load_mean_n, self._forget = 0.0, math.exp(-period_s / _WEIGHED_S)
 
     @property
     def estimated_load_kg(self) -> float:
-        """Hung mass, by the estimated load."""
-        if self._state is None:
-            return self._known.mass_kg
-        return self._known.mass_kg + self._state[-1] / GRAVITY_M_S2
+        """Hung mass, by the estimated load of the last 0.1 s."""
+        return self._known.mass_kg + self._load_mean_n / GRAVITY_M_S2
 
     def step(self, reference: float, measurement: Measurement) -> float:
         """See `Controller`; without a valid measurement the observer goes on alone."""
@@ -98,6 +98,7 @@ class ObserverController:
             self._state = model.at_rest(length_m, past_v[whole])
             self._plan.begin(length_m)
         state = self._state = self._observed(self._state, past_v, length_m)
+        self._load_mean_n = state[-1] + self._forget * (self._load_mean_n - state[-1])
         ahead = self._ahead(state, past_v)
         zero_m = self._known.zero_length_m
         wanted = [zero_m * (1.0 + value) for value in (reference, *measurement.preview)]

@@ -256,5 +256,5 @@ def test_a_grid_solved_from_a_similar_law_is_the_same(kind):
 
 def test_a_law_that_is_valid_at_no_length_is_refused():
     law = PlanarHasel(shell_lateral_stretch=2.59, locking_stretch=1.5)
-    with pytest.raises(LimitError, match="valid from 0.0193867 to 0.0114957 m: at no length"):
+    with pytest.raises(LimitError, match=r"valid from 0\.0193867 to 0\.0114957 m: at no length"):
         SampledLaw(law, 1e4)

@@ -59,13 +59,14 @@ class Demands:
     changed: float = math.inf
 
 
-def cost(loop: LinearLoop, period_s: float, demands: Demands) -> float:
+def cost(loop: LinearLoop, period_s: float, demands: Demands, missed: float = 0.0) -> float:
     """Root of the summed squared length after a load step of 1 N, raised by what is missed.
 
     Args:
         loop: closed.
         period_s: of an update.
         demands: of it.
+        missed: by which a demand of the caller is missed, relative to it.
     Returns:
         In m s^0.5; more than 1e60 for an unstable loop.
     """
@@ -73,7 +74,7 @@ def cost(loop: LinearLoop, period_s: float, demands: Demands) -> float:
     if not size < 1.0 - 1e-6:
         return 2.0 * UNSTABLE * size
     # a lasting load moves the loop to a new rest, in which the length is 0 again
-    rest = np.linalg.solve(np.eye(a.shape[0]) - a, loop.load)
+    rest = np.asarray(np.linalg.solve(np.eye(a.shape[0]) - a, loop.load))
     error = math.sqrt(_squares(a, rest, loop.length) * period_s)
     moved = math.sqrt(_squares(a, loop.noise, loop.length))
     direct = loop.drive_noise
@@ -82,7 +83,7 @@ def cost(loop: LinearLoop, period_s: float, demands: Demands) -> float:
     later = _squares(a, loop.noise, loop.drive @ a - loop.drive)
     changed = math.sqrt(direct * direct + first * first + later)
     sensitivity = float(np.abs(sensitivity_of(loop, period_s)[1]).max())
-    missed = sum(
+    missed += sum(
         max(value / most - 1.0, 0.0)
         for value, most in (
             (sensitivity, demands.peak_sensitivity),
@@ -91,7 +92,7 @@ def cost(loop: LinearLoop, period_s: float, demands: Demands) -> float:
             (changed * demands.noise_m, demands.changed),
         )
     )
-    return error * math.exp(min(_STRICT * missed, 100.0))
+    return error * math.exp(min(_STRICT * missed, 120.0))
 
 
 def sensitivity_of(loop: LinearLoop, period_s: float) -> tuple[Floats, NDArray[np.complex128]]:
@@ -107,7 +108,7 @@ def sensitivity_of(loop: LinearLoop, period_s: float) -> tuple[Floats, NDArray[n
     z = np.exp(1j * omega * period_s)[:, None, None]
     into = np.broadcast_to(loop.added[:, None], (_GRID, loop.added.size, 1))
     states = np.linalg.solve(z * np.eye(loop.added.size) - loop.a, into)[:, :, 0]
-    return omega, 1.0 + states @ loop.drive
+    return np.asarray(omega), np.asarray(1.0 + states @ loop.drive)
 
 
 def _squares(a: Floats, start: Floats, row: Floats) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.motion_model import MotionModel
@@ -87,8 +88,8 @@ class ReferencePlan:
     def _smooth(self, samples: list[float], at: int) -> bool:
         """Whether the speed changes little in the samples about one."""
         some = samples[max(at - 1, 0) : at + 4]
-        rises = [b - a for a, b in zip(some, some[1:], strict=False)]
-        changes = [abs(b - a) for a, b in zip(rises, rises[1:], strict=False)]
+        rises = [b - a for a, b in pairwise(some)]
+        changes = [abs(b - a) for a, b in pairwise(rises)]
         return max(changes) <= self._jump_m_s * self._period_s
 
     def _plan(self, start: tuple[float, float, float], target_m: float, state: list[float]) -> None:

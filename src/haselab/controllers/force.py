@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from haselab.base import LimitError, ResultError
 from haselab.controllers.kind import ControllerKind, Parameter
 from haselab.controllers.known_actuator import KnownActuator
-from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, cost
+from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, squared_error
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.sampled_point import SampledPoint, sampled_point
 
@@ -287,7 +287,9 @@ def _cost(
         _NOISE,
     )  # fmt: skip
     missed = max(gains[0] * _ERROR / spare_n - 1.0, 0.0)
-    return cost(_loop(point, setting, gains, known), setting.period_s, demands, missed)
+    loop = _loop(point, setting, gains, known)
+    factor = penalty(loop, setting.period_s, demands, missed)
+    return factor if factor > UNSTABLE else factor * squared_error(loop, setting.period_s)
 
 
 FORCE = ControllerKind(

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
-__all__ = ["UNSTABLE", "Demands", "LinearLoop", "cost", "sensitivity_of"]
+__all__ = [
+    "UNSTABLE",
+    "Demands",
+    "LinearLoop",
+    "penalty",
+    "sensitivity_of",
+    "squared_error",
+    "timed_error",
+]
 
 Floats = NDArray[np.float64]
 _GRID = 120
@@ -59,8 +67,8 @@ class Demands:
     changed: float = math.inf
 
 
-def cost(loop: LinearLoop, period_s: float, demands: Demands, missed: float = 0.0) -> float:
-    """Root of the summed squared length after a load step of 1 N, raised by what is missed.
+def penalty(loop: LinearLoop, period_s: float, demands: Demands, missed: float = 0.0) -> float:
+    """Factor on the cost of a loop: 1 if it keeps its demands, more by what it misses.
 
     Args:
         loop: closed.
@@ -68,14 +76,11 @@ def cost(loop: LinearLoop, period_s: float, demands: Demands, missed: float = 0.
         demands: of it.
         missed: by which a demand of the caller is missed, relative to it.
     Returns:
-        In m s^0.5; more than 1e60 for an unstable loop.
+        At least 1; more than `UNSTABLE` for an unstable loop.
     """
     a, size = loop.a, float(np.abs(np.linalg.eigvals(loop.a)).max())
     if not size < 1.0 - 1e-6:
         return 2.0 * UNSTABLE * size
-    # a lasting load moves the loop to a new rest, in which the length is 0 again
-    rest = np.asarray(np.linalg.solve(np.eye(a.shape[0]) - a, loop.load))
-    error = math.sqrt(_squares(a, rest, loop.length) * period_s)
     moved = math.sqrt(_squares(a, loop.noise, loop.length))
     direct = loop.drive_noise
     shaken = math.hypot(math.sqrt(_squares(a, loop.noise, loop.drive)), direct)
@@ -92,7 +97,36 @@ def cost(loop: LinearLoop, period_s: float, demands: Demands, missed: float = 0.
             (changed * demands.noise_m, demands.changed),
         )
     )
-    return error * math.exp(min(_STRICT * missed, 120.0))
+    return math.exp(min(_STRICT * missed, 120.0))
+
+
+def squared_error(loop: LinearLoop, period_s: float) -> float:
+    """Root of the integral of the squared length after a load step of 1 N, in m s^0.5.
+
+    Args:
+        loop: closed and stable.
+        period_s: of an update.
+    """
+    # a lasting load moves the loop to a new rest, in which the length is 0 again
+    rest = np.asarray(np.linalg.solve(np.eye(loop.a.shape[0]) - loop.a, loop.load))
+    return math.sqrt(_squares(loop.a, rest, loop.length) * period_s)
+
+
+def timed_error(loop: LinearLoop, period_s: float, for_s: float) -> float:
+    """Root of the integral of time times the squared length after a load step of 1 N, in m s.
+
+    A length that comes back late counts more than in `squared_error`.
+
+    Args:
+        loop: closed.
+        period_s: of an update.
+        for_s: how long it counts.
+    """
+    state, total = np.zeros(loop.load.size), 0.0
+    for k in range(1, round(for_s / period_s) + 1):
+        state = loop.a @ state + loop.load
+        total += k * float(loop.length @ state) ** 2
+    return math.sqrt(total) * period_s
 
 
 def sensitivity_of(loop: LinearLoop, period_s: float) -> tuple[Floats, NDArray[np.complex128]]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
+import numpy as np
+
 from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.motion_model import MotionModel
 
@@ -15,6 +17,8 @@ _LONGER = 1.12  # from one try to the next
 _LEAST = 4  # periods of a plan
 _LONGEST_S = 5.0
 _SOON_S = 0.01
+_ALONE = 3.0  # times its neighbours: a rise that is a step
+_NEAR = 0.3
 _SAME = 1e-9
 
 
@@ -35,6 +39,12 @@ class ReferencePlan:
     ) -> None:  # fmt: skip
         self._model, self._known, self._period_s = model, known, period_s
         self._reserve, self._rate = reserve, rate_v_per_s
+        lengths_m = [known.length_m(strain) for strain in np.linspace(*known.reachable(), 9)]
+        most_n = max(
+            abs(model.pull_n(length_m, known.highest_drive_v(length_m))) for length_m in lengths_m
+        )
+        # the way in a period at a speed that the largest force gives soon
+        self._most_m = most_n / model.inertia_kg * max(period_s, _SOON_S) * period_s
 
     def begin(self, length_m: float) -> None:
         """Rest at a length."""
@@ -42,11 +52,6 @@ class ReferencePlan:
         self._for_s, self._at_s, self._target_m = 0.0, 0.0, length_m
         self._follows, self._last_m = False, length_m
         self._here = (length_m, 0.0, 0.0)  # at the next drive
-        # speed that the spare force gives in a moment
-        known = self._known
-        middle_m = length_m
-        spare_n = abs(self._model.pull_n(middle_m, known.highest_drive_v(middle_m)))
-        self._jump_m_s = 0.5 * spare_n / self._model.inertia_kg * max(self._period_s, _SOON_S)
 
     def next(
         self, wanted_m: list[float], acts_s: float, state: list[float]
@@ -67,16 +72,14 @@ class ReferencePlan:
         if len(samples) >= at + 4 and self._smooth(samples, at):
             given = _cubic(samples, place, period_s)
             rests = self._at_s >= self._for_s - _SAME
-            if self._follows or (
-                rests and abs(given[0] - here[0]) < 0.5 * self._jump_m_s * period_s + _SAME
-            ):
+            if self._follows or (rests and abs(given[0] - here[0]) < _NEAR * self._most_m):
                 self._follows = True
                 after = (*_cubic(samples, place + 1.0, period_s), 0.0)
                 self._here = after
                 return (*given, 2.0 * (after[0] - given[0] - given[1] * period_s) / period_s**2)
         if self._follows or abs(target_m - self._target_m) > _SAME:
             self._follows = False
-            self._plan(here, target_m, state)
+            self._plan((here[0], here[1], 0.0), target_m, state)
         self._at_s += period_s
         if self._at_s >= self._for_s - _SAME:
             self._here = self._target_m, 0.0, 0.0
@@ -86,11 +89,16 @@ class ReferencePlan:
         return here[0], here[1], (self._here[1] - here[1]) / period_s
 
     def _smooth(self, samples: list[float], at: int) -> bool:
-        """Whether the speed changes little in the samples about one."""
-        some = samples[max(at - 1, 0) : at + 4]
-        rises = [b - a for a, b in pairwise(some)]
-        changes = [abs(b - a) for a, b in pairwise(rises)]
-        return max(changes) <= self._jump_m_s * self._period_s
+        """Whether the samples about one are neither a step nor faster than the force of the field.
+
+        In a step, one rise is much larger than both of its neighbours.
+        """
+        rises = [abs(b - a) for a, b in pairwise(samples[max(at - 2, 0) : at + 4])]
+        alone = any(
+            rise > _ALONE * max(before, after) + _SAME
+            for before, rise, after in zip(rises, rises[1:], rises[2:], strict=False)
+        )
+        return not alone and max(rises) <= self._most_m
 
     def _plan(self, start: tuple[float, float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits."""

@@ -34,7 +34,7 @@ from haselab.scoreboard.tasks.task import staircase
 HZ = find_device("hz")
 HOST = CLASSES["host-100hz"]
 OBSERVER = CONTROLLERS.find("observer")
-DESIGNED = OBSERVER.choose({"bandwidth_rad_s": 28.9, "load_n": 0.59, "shake_m_s2": 0.01})
+DESIGNED = OBSERVER.choose({"bandwidth_rad_s": 38.5, "load_n": 0.21, "shake_m_s2": 0.01})
 GRAVITY = 9.80665
 
 
@@ -157,7 +157,7 @@ def test_the_sensitivity_of_a_pure_gain_is_the_closed_form():
 
 
 @given(start=st.floats(-0.03, 0.15), size=st.floats(-0.1, 0.1), reserve=st.floats(0.05, 0.3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_a_plan_ends_at_rest_at_the_target_within_the_force_of_the_field(
     known, start, size, reserve
 ):
@@ -168,7 +168,7 @@ def test_a_plan_ends_at_rest_at_the_target_within_the_force_of_the_field(
     begin_m, target_m = known.length_m(start), known.length_m(target)
     plan.begin(begin_m)
     state = model.at_rest(begin_m, known.static_drive_v(start))
-    steps = [plan.next([target_m], 0.002, state) for _ in range(300)]
+    steps = [plan.next([target_m], 0.002, state) for _ in range(120)]
     assert steps[0][:2] == (begin_m, 0.0)
     assert steps[-1] == (target_m, 0.0, 0.0)
     half_s = 0.5 * period_s

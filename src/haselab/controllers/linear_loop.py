@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_lyapunov
 
 __all__ = [
     "UNSTABLE",
@@ -21,6 +20,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _GRID = 120
+_DOUBLINGS, _GONE = 24, 1e-12
 UNSTABLE = 1e60
 _STRICT = 20.0  # by 1 % missed, the cost rises by a fifth
 
@@ -146,6 +146,11 @@ def sensitivity_of(loop: LinearLoop, period_s: float) -> tuple[Floats, NDArray[n
 
 
 def _squares(a: Floats, start: Floats, row: Floats) -> float:
-    """Sum over all steps of the squared output that follows a start."""
-    total = row @ solve_discrete_lyapunov(a, np.outer(start, start)) @ row
-    return max(float(total), 0.0)
+    """Sum over all steps of the squared output that follows a start, by Smith's doubling."""
+    total, power = np.outer(start, start), a
+    for _ in range(_DOUBLINGS):
+        total = total + power @ total @ power.T
+        power = power @ power
+        if np.abs(power).max() < _GONE:
+            break
+    return max(float(row @ total @ row), 0.0)

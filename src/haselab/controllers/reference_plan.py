@@ -69,7 +69,7 @@ class ReferencePlan:
         place = acts_s / period_s + 2.0  # of the samples, the drive's effect
         at = min(int(place + 1e-9), len(samples) - 1)
         target_m, here = samples[at], self._here
-        if len(samples) >= at + 4 and self._smooth(samples, at):
+        if len(samples) > at + 4 and self._smooth(samples, at):
             given = _cubic(samples, place, period_s)
             rests = self._at_s >= self._for_s - _SAME
             if self._follows or (rests and abs(given[0] - here[0]) < _NEAR * self._most_m):
@@ -77,7 +77,7 @@ class ReferencePlan:
                 after = (*_cubic(samples, place + 1.0, period_s), 0.0)
                 self._here = after
                 return (*given, 2.0 * (after[0] - given[0] - given[1] * period_s) / period_s**2)
-        if self._follows or abs(target_m - self._target_m) > _SAME:
+        if self._follows or target_m != self._target_m:
             self._follows = False
             self._plan((here[0], here[1], 0.0), target_m, state)
         self._at_s += period_s
@@ -93,7 +93,7 @@ class ReferencePlan:
 
         In a step, one rise is much larger than both of its neighbours.
         """
-        rises = [abs(b - a) for a, b in pairwise(samples[max(at - 2, 0) : at + 4])]
+        rises = [abs(b - a) for a, b in pairwise(samples[max(at - 2, 0) : at + 5])]
         alone = any(
             rise > _ALONE * max(before, after) + _SAME
             for before, rise, after in zip(rises, rises[1:], rises[2:], strict=False)

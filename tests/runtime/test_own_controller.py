@@ -88,8 +88,9 @@ def test_a_controller_gets_period_limits_and_each_block_s_measurement(scene):
     about = scene.rig.description
     window_s = counted_s(about, 2000.0)  # of which the capacitance is the mean
     assert spy.setting == ControllerSetting(
-        about.block_s, -0.04, 0.1, delay_s=0.5 * window_s + about.switch_sample / about.rate_hz
-    )
+        about.block_s, -0.04, 0.1, delay_s=0.5 * window_s + about.switch_sample / about.rate_hz,
+        sensed_before_s=0.5 * window_s,
+    )  # fmt: skip
     record = scene.session.experiment("x")
     lockin = lockin_of(scene.rig.description, 2000.0)
     farad = [lockin.step(codes)[0] for codes in record.codes]

@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 from haselab.base import LimitError, ResultError
 from haselab.controllers.kind import ControllerKind, Parameter
 from haselab.controllers.known_actuator import KnownActuator
+from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, squared_error
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.sampled_point import SampledPoint, sampled_point
 
@@ -35,13 +36,9 @@ _SPREAD = ((1.1, 0.0), (0.9, 2e-3))  # stiffness, later_s
 _PEAK_SENSITIVITY = 1.8
 _NOISE = 1.2  # of the length, over that of one measurement
 _SHAKEN = 0.005  # of the highest drive, by noise
-_USUAL_NOISE = 2e-4  # strain, where it is not known
 _AUTHORITY = 0.5  # of the force beyond equilibrium that a step of the reference may take
 _STEP = 0.04
 _ERROR = 0.01  # strain that the proportional part may answer with all the spare force
-_GRID = 120
-_UNSTABLE = 1e60
-_STRICT = 20.0  # by 1 % missed, the cost rises by a fifth
 _LEAST_FILTER = 0.05  # of a period
 _GAIN = 1e6
 
@@ -212,7 +209,7 @@ def design_force(setting: ControllerSetting) -> Mapping[str, float]:
         if best is None or found.fun < best.fun:
             best = found
     assert best is not None
-    if best.fun > _UNSTABLE:
+    if best.fun > UNSTABLE:
         raise ResultError(
             f"No gains of the force loop are stable with a delay of {setting.delay_s or 0.0:g} s. "
             "Shorten the delay."
@@ -250,8 +247,8 @@ def _points(setting: ControllerSetting, known: KnownActuator) -> list[SampledPoi
 
 def _loop(
     point: SampledPoint, setting: ControllerSetting, gains: tuple[float, ...], known: KnownActuator
-) -> tuple[Floats, Floats, Floats, Floats, float]:
-    """Closed loop with filtered rate and integral: matrix, load, noise, and row and noise of w."""
+) -> LinearLoop:
+    """Closed loop with filtered rate and integral; the drive is the square of the voltage."""
     per_m, per_m_s, per_m_filter = (gain / known.zero_length_m for gain in gains[:3])
     keep, period_s = math.exp(-setting.period_s / gains[3]), setting.period_s
     size = point.b.size
@@ -275,56 +272,24 @@ def _loop(
     a[size + 2, size + 2] += 1.0
     load = np.r_[point.load, np.zeros(3)]
     noise = np.r_[point.b * noise_row, 1.0, (1.0 - keep) / period_s, -per_m_s * period_s]
-    return a, load, noise, w_row, noise_row
+    return LinearLoop(a, load, noise, np.r_[point.b, np.zeros(3)], length, w_row, noise_row)
 
 
 def _cost(
     point: SampledPoint, setting: ControllerSetting, gains: tuple[float, ...], spare_n: float
 ) -> float:
-    """Root of the summed squared length after a load step of 1 N, and what the demands miss."""
+    """Cost of the loop, also where the proportional part asks for more than the spare force."""
     known = setting.actuator
     assert known is not None
-    a, load, noise, w_row, noise_w = _loop(point, setting, gains, known)
-    modes, vectors = np.linalg.eig(a)
-    size = float(np.abs(modes).max())
-    if not size < 1.0 - 1e-6:
-        return 2.0 * _UNSTABLE * size
-    # a lasting load moves the loop to a new rest, in which the length is 0 again
-    rest = np.linalg.solve(np.eye(a.shape[0]) - a, load)
-    into = np.stack([rest, noise, np.r_[point.b, np.zeros(3)]], axis=1)
-    rest_by, noise_by, w_by = np.linalg.solve(vectors, into.astype(complex)).T
-    length_by, w_of = point.c @ vectors[: point.c.size], w_row @ vectors
-    error = math.sqrt(_squares(length_by * rest_by, modes) * setting.period_s)
-    moved = math.sqrt(_squares(length_by * noise_by, modes))
-    omega = np.geomspace(1.0, math.pi / setting.period_s, _GRID)
-    z = np.exp(1j * omega * setting.period_s)[:, None]
-    # from an input added to w to the w that acts: 1 + w_row (z - A)^-1 b
-    sensitivity = float(np.abs(1.0 + (w_of * w_by / (z - modes)).sum(axis=1)).max())
-    acting = math.sqrt(_squares(w_of * noise_by, modes) + noise_w * noise_w)  # V^2 per m
-    drive_v = 0.5 * acting * _noise_m(point, known) / math.sqrt(point.volt2) / known.gain_v_per_v
-    demands = (
-        sensitivity / _PEAK_SENSITIVITY,
-        moved / _NOISE,
-        drive_v / (_SHAKEN * known.high_v),
-        gains[0] * _ERROR / spare_n,
-    )
-    missed = sum(max(demand - 1.0, 0.0) for demand in demands)
-    return error * math.exp(min(_STRICT * missed, 100.0))
-
-
-def _noise_m(point: SampledPoint, known: KnownActuator) -> float:
-    """Standard deviation of the sensed length."""
-    length_m, step_m = known.length_m(point.strain), known.table.step_m
-    ends = known.law.capacitance_f(np.array([length_m - step_m, length_m + step_m]))
-    per_m = abs(float(ends[1] - ends[0])) / (2.0 * step_m) * known.sensing_scale
-    noise_f = known.capacitance_noise_f
-    return _USUAL_NOISE * known.zero_length_m if math.isnan(noise_f) else noise_f / per_m
-
-
-def _squares(parts: NDArray[np.complex128], modes: NDArray[np.complex128]) -> float:
-    """Sum over all steps of the squared sum of decaying modes."""
-    total = (np.outer(parts, parts) / (1.0 - np.outer(modes, modes))).sum()
-    return max(float(total.real), 0.0)
+    per_v2 = 0.5 / math.sqrt(point.volt2) / known.gain_v_per_v  # V of drive per V^2
+    demands = Demands(
+        known.length_noise_m(point.strain), _SHAKEN * known.high_v / per_v2, _PEAK_SENSITIVITY,
+        _NOISE,
+    )  # fmt: skip
+    missed = max(gains[0] * _ERROR / spare_n - 1.0, 0.0)
+    loop = _loop(point, setting, gains, known)
+    factor = penalty(loop, setting.period_s, demands, missed)
+    return factor if factor > UNSTABLE else factor * squared_error(loop, setting.period_s)
 
 
 FORCE = ControllerKind(

@@ -36,6 +36,7 @@ __all__ = ["KnownActuator", "known_actuator"]
 
 Floats = NDArray[np.float64]
 _USUAL_GAIN = 5000.0
+_USUAL_NOISE = 2e-4  # strain, where it is not known
 _BENCH = ("camera.", "sensing.", "start.")  # parameters of a fit that are none of the law
 
 
@@ -105,6 +106,14 @@ class KnownActuator:
         row, share = self._row(drive_v)
         found = [float(np.interp(farad, rows[k], lengths_m)) for k in (row, row + 1)]
         return found[0] + share * (found[1] - found[0])
+
+    def length_noise_m(self, strain: float) -> float:
+        """Standard deviation of a sensed length; 0.02 % of it where the noise is not known."""
+        length_m, step_m = self.length_m(strain), self.table.step_m
+        ends = self.law.capacitance_f(np.array([length_m - step_m, length_m + step_m]))
+        per_m = abs(float(ends[1] - ends[0])) / (2.0 * step_m) * self.sensing_scale
+        noise_f = self.capacitance_noise_f
+        return _USUAL_NOISE * self.zero_length_m if math.isnan(noise_f) else noise_f / per_m
 
     # ---- forces ------------------------------------------------------------------------------
 

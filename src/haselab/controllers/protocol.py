@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -26,6 +27,8 @@ class ControllerSetting:
             the hold of the output; None: not known.
         actuator: the identified actuator; None: its file has no physical model. A kind with
             `needs_actuator` always gets it.
+        sensed_before_s: age of a measurement at the end of its block, in s; None: not known.
+        highest_rate_per_s: fastest change of the drive that the loop puts out, per s.
     """
 
     period_s: float
@@ -34,6 +37,8 @@ class ControllerSetting:
     drive_start: float = 0.0
     delay_s: float | None = None
     actuator: KnownActuator | None = None
+    sensed_before_s: float | None = None
+    highest_rate_per_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,7 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "pi": "haselab.controllers.builtin:PI",
         "pid": "haselab.controllers.builtin:PID",
         "force": "haselab.controllers.force:FORCE",
+        "observer": "haselab.controllers.observer_design:OBSERVER",
     },
     _fault,
 )

@@ -54,8 +54,8 @@ class ClosedLoop:
     ) -> None:
         self._rig, self._loop, self._name = rig, loop, name
         limits, block_s = rig.description.drive_limits, rig.description.block_s
-        delay_s = _delay_s(rig, carrier[0], loop)
-        setting = loop.setting(block_s, delay_s, (limits.low, limits.high))
+        age_s, delay_s = _timing_s(rig, carrier[0], loop)
+        setting = loop.setting(block_s, delay_s, (limits.low, limits.high), age_s)
         self._controller = RunningController(loop.controller, setting)
         self._in_volts = loop.controller.kind.output == "voltage"
         self._ahead = loop.controller.kind.preview_steps(block_s)
@@ -165,13 +165,19 @@ def _sensor(
     return CapacitanceSensor(lockin_of(rig.description, carrier_hz), loop.strain_map)
 
 
-def _delay_s(rig: GuardedRig, carrier_hz: float, loop: LoopSettings) -> float | None:
-    """Age of the capacitance when its output takes effect; None: the camera's is not known."""
+def _timing_s(
+    rig: GuardedRig, carrier_hz: float, loop: LoopSettings
+) -> tuple[float | None, float | None]:
+    """Age of the capacitance when its block ends, and when its output takes effect.
+
+    None: those of the camera are not known.
+    """
     if loop.video_zero_px is not None:
-        return None
+        return None, None
     about = rig.description
     blocks = loop.extra_delay_blocks * about.block_s
-    return 0.5 * counted_s(about, carrier_hz) + about.switch_sample / about.rate_hz + blocks
+    age_s = 0.5 * counted_s(about, carrier_hz)
+    return age_s, age_s + about.switch_sample / about.rate_hz + blocks
 
 
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:

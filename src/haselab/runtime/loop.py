@@ -49,7 +49,11 @@ class LoopSettings:
     actuator: KnownActuator | None = None
 
     def setting(
-        self, period_s: float, delay_s: float | None, drive_limits_v: tuple[float, float]
+        self,
+        period_s: float,
+        delay_s: float | None,
+        drive_limits_v: tuple[float, float],
+        sensed_before_s: float | None = None,
     ) -> ControllerSetting:
         """What the controller is told of the loop.
 
@@ -57,6 +61,7 @@ class LoopSettings:
             period_s: time between two steps, in s.
             delay_s: see `ControllerSetting`.
             drive_limits_v: lowest and highest voltage of the rig.
+            sensed_before_s: see `ControllerSetting`.
         Raises:
             InputError: The kind of the controller needs the identified actuator.
         """
@@ -66,7 +71,9 @@ class LoopSettings:
             if known is not None:
                 low, high = max(low, known.low_v), min(high, known.high_v)
             start = float(self.voltage_map.voltage_v(0.0))
-        found = ControllerSetting(period_s, low, high, start, delay_s, self.actuator)
+        found = ControllerSetting(
+            period_s, low, high, start, delay_s, self.actuator, sensed_before_s
+        )
         self.controller.kind.check(found)
         return found
 

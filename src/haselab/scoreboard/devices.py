@@ -29,6 +29,8 @@ class Device:
         high_v: highest drive.
         zero_v: drive whose static strain is 0.
         late_s: added to the delay of the output, unknown to the controller.
+        stated_inertia_kg: inertia without weight that a person states who hangs the device, from
+            which its identification starts; None: nobody has hung any.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Device:
     high_v: float
     zero_v: float
     late_s: float = 0.0
+    stated_inertia_kg: float | None = None
 
     @property
     def law(self) -> ActuatorLaw:
@@ -74,7 +77,7 @@ DEVICES = {
     for one in (
         Device("hz", "planar HASEL, 0.25 kg, 5 Hz", _HZ, 2.0, 1.04),
         Device("rad", "planar HASEL with 9.3 kg of inertia, 0.8 Hz", twin_of_reading("rad"),
-               2.0, 1.04),
+               2.0, 1.04, stated_inertia_kg=8.0),
         Device("retention", "planar HASEL, a fifth of the voltage acts with a delay of 5.7 s",
                _changed(dielectric={"relaxation_share": 0.2}), 2.0, 1.04),
         Device("hysteresis", "planar HASEL with rate-independent hysteresis of 0.06 N",

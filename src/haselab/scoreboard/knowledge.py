@@ -27,7 +27,6 @@ __all__ = ["TRAINED", "identified", "known_by", "simulated_record", "true_actuat
 
 Floats = NDArray[np.float64]
 TRAINED = 2.4  # times the hung mass: before a task, the actuator was stretched by that weight
-_ROUGHLY = 0.8  # of an added inertia: where its estimate starts
 _BLOCK_S = 0.02
 _FRAME_S = 0.04
 _LENGTH_STD_M = 3e-6
@@ -112,10 +111,8 @@ def identified(device: Device) -> ActuatorFit:
     """
     record = simulated_record(device, np.random.default_rng(_SEED))
     law = ACTUATORS.find(device.config.kind)()
-    added_kg = device.config.load.added_inertia_kg
-    # a person who hangs 9 kg of inertia knows that, within a fifth
-    start_kg = _ROUGHLY * added_kg if added_kg > 0.0 else None
-    fit = fit_actuator(law, [record], mass_kg=device.mass_kg, added_inertia_kg=start_kg)
+    stated_kg = device.stated_inertia_kg
+    fit = fit_actuator(law, [record], mass_kg=device.mass_kg, added_inertia_kg=stated_kg)
     if not fit.succeeded:
         raise ResultError(
             f"The model of the device {device.name!r} is not identified: {fit.status}"

@@ -59,6 +59,11 @@ class LoopClass:
         return (self.steps - 0.5 * (self.first + self.last) + self.switch_at) * STEP_S
 
     @property
+    def sensed_before_s(self) -> float:
+        """Age of a measurement at the end of its update."""
+        return (self.steps - 0.5 * (self.first + self.last)) * STEP_S
+
+    @property
     def dead_s(self) -> float:
         """Time from an event at the beginning of an update to the first output that knows of it."""
         return (self.steps + self.switch_at) * STEP_S

@@ -107,7 +107,13 @@ def setting_for(
     else:
         low, high = known.reachable()
         start = 0.0
-    return ControllerSetting(loop.period_s, low, high, start, loop.delay_s, known)
+    if loop.relative_noise is not None:
+        farad = known.sensing_scale * float(known.law.capacitance_f(known.zero_length_m))
+        known = replace(known, capacitance_noise_f=loop.relative_noise * farad)
+    rate = loop.slew_v_per_s if chosen.kind.output == "voltage" else math.inf
+    return ControllerSetting(
+        loop.period_s, low, high, start, loop.delay_s, known, loop.sensed_before_s, rate
+    )
 
 
 class _Player:

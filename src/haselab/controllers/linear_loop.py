@@ -1,0 +1,156 @@
+"""A sampled loop about an equilibrium: how well it rejects a load, and how robust it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "UNSTABLE",
+    "Demands",
+    "LinearLoop",
+    "penalty",
+    "sensitivity_of",
+    "squared_error",
+    "timed_error",
+]
+
+Floats = NDArray[np.float64]
+_GRID = 120
+_DOUBLINGS, _GONE = 24, 1e-12
+UNSTABLE = 1e60
+_STRICT = 20.0  # by 1 % missed, the cost rises by a fifth
+
+
+@dataclass(frozen=True)
+class LinearLoop:
+    """A closed loop with one state vector for actuator and controller.
+
+    Args:
+        a: from one update to the next. Shape `(n, n)`.
+        load: change of the state by a force of 1 N that acts on. Shape `(n,)`.
+        noise: by an error of the sensed length of 1 m. Shape `(n,)`.
+        added: by a unit that is added to the drive on its way to the actuator. Shape `(n,)`.
+        length: of the state, in m. Shape `(n,)`.
+        drive: computed from the state, in units of `added`. Shape `(n,)`.
+        drive_noise: computed drive by the error of the sensed length, in the same update.
+    """
+
+    a: Floats
+    load: Floats
+    noise: Floats
+    added: Floats
+    length: Floats
+    drive: Floats
+    drive_noise: float
+
+
+@dataclass(frozen=True)
+class Demands:
+    """What a loop must keep.
+
+    Args:
+        noise_m: standard deviation of one sensed length.
+        shaken: highest standard deviation of the drive, by noise; infinite: any.
+        peak_sensitivity: highest.
+        moved: standard deviation of the length by noise, over that of one sensed length.
+        changed: highest standard deviation of the drive's change in one update; infinite: any.
+    """
+
+    noise_m: float
+    shaken: float
+    peak_sensitivity: float = 1.8
+    moved: float = 1.2
+    changed: float = math.inf
+
+
+def penalty(loop: LinearLoop, period_s: float, demands: Demands, missed: float = 0.0) -> float:
+    """Factor on the cost of a loop: 1 if it keeps its demands, more by what it misses.
+
+    Args:
+        loop: closed.
+        period_s: of an update.
+        demands: of it.
+        missed: by which a demand of the caller is missed, relative to it.
+    Returns:
+        At least 1; more than `UNSTABLE` for an unstable loop.
+    """
+    a, size = loop.a, float(np.abs(np.linalg.eigvals(loop.a)).max())
+    if not size < 1.0 - 1e-6:
+        return 2.0 * UNSTABLE * size
+    moved = math.sqrt(_squares(a, loop.noise, loop.length))
+    direct = loop.drive_noise
+    shaken = math.hypot(math.sqrt(_squares(a, loop.noise, loop.drive)), direct)
+    first = float(loop.drive @ loop.noise) - direct
+    later = _squares(a, loop.noise, loop.drive @ a - loop.drive)
+    changed = math.sqrt(direct * direct + first * first + later)
+    sensitivity = float(np.abs(sensitivity_of(loop, period_s)[1]).max())
+    missed += sum(
+        max(value / most - 1.0, 0.0)
+        for value, most in (
+            (sensitivity, demands.peak_sensitivity),
+            (moved, demands.moved),
+            (shaken * demands.noise_m, demands.shaken),
+            (changed * demands.noise_m, demands.changed),
+        )
+    )
+    return math.exp(min(_STRICT * missed, 120.0))
+
+
+def squared_error(loop: LinearLoop, period_s: float) -> float:
+    """Root of the integral of the squared length after a load step of 1 N, in m s^0.5.
+
+    Args:
+        loop: closed and stable.
+        period_s: of an update.
+    """
+    # a lasting load moves the loop to a new rest, in which the length is 0 again
+    rest = np.asarray(np.linalg.solve(np.eye(loop.a.shape[0]) - loop.a, loop.load))
+    return math.sqrt(_squares(loop.a, rest, loop.length) * period_s)
+
+
+def timed_error(loop: LinearLoop, period_s: float, for_s: float) -> float:
+    """Root of the integral of time times the squared length after a load step of 1 N, in m s.
+
+    A length that comes back late counts more than in `squared_error`.
+
+    Args:
+        loop: closed.
+        period_s: of an update.
+        for_s: how long it counts.
+    """
+    state, total = np.zeros(loop.load.size), 0.0
+    for k in range(1, round(for_s / period_s) + 1):
+        state = loop.a @ state + loop.load
+        total += k * float(loop.length @ state) ** 2
+    return math.sqrt(total) * period_s
+
+
+def sensitivity_of(loop: LinearLoop, period_s: float) -> tuple[Floats, NDArray[np.complex128]]:
+    """Response of the drive that acts to what is added to it.
+
+    Args:
+        loop: closed.
+        period_s: of an update.
+    Returns:
+        Frequencies in rad/s, up to half the rate of the updates, and the sensitivity there.
+    """
+    omega = np.geomspace(1.0, math.pi / period_s, _GRID)
+    z = np.exp(1j * omega * period_s)[:, None, None]
+    into = np.broadcast_to(loop.added[:, None], (_GRID, loop.added.size, 1))
+    states = np.linalg.solve(z * np.eye(loop.added.size) - loop.a, into)[:, :, 0]
+    return np.asarray(omega), np.asarray(1.0 + states @ loop.drive)
+
+
+def _squares(a: Floats, start: Floats, row: Floats) -> float:
+    """Sum over all steps of the squared output that follows a start, by Smith's doubling."""
+    total, power = np.outer(start, start), a
+    for _ in range(_DOUBLINGS):
+        total = total + power @ total @ power.T
+        power = power @ power
+        if np.abs(power).max() < _GONE:
+            break
+    return max(float(row @ total @ row), 0.0)

@@ -1,0 +1,183 @@
+"""Automatic design of the observer with inverse dynamics, and its kind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from haselab.actuators import GRAVITY_M_S2
+from haselab.base import ResultError
+from haselab.controllers.kind import ControllerKind, Parameter
+from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, timed_error
+from haselab.controllers.observer import ObserverController
+from haselab.controllers.observer_law import ObserverLaw
+from haselab.controllers.protocol import ControllerSetting
+
+__all__ = ["OBSERVER", "design_observer", "linear_loop"]
+
+Floats = NDArray[np.float64]
+_PREVIEW_S = 0.05
+_FREE = -math.inf, math.inf
+_POINTS = (0.1, 0.5, 0.9)  # of the reachable range
+# stiffness; longer delay, of the stated one; peak sensitivity
+_SPREAD = ((1.1, 0.0, 2.5), (0.9, 0.2, 2.5), (1.0, 0.5, 5.0))
+_SHAKEN = 0.04  # of the highest drive, by noise
+_COUNTED_S = 0.5  # after a change of the load
+_CHANGED = 1.0  # of the highest change of the drive in one update, by noise
+_MOVED = 1.5
+_SHAKE, _RESERVE = 0.01, 0.15
+
+
+def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
+    """Choose bandwidth and expected load so that a change of load is rejected best.
+
+    Minimises the integral of time times the squared error after a step of the load, over three
+    strains of the reachable range. The peak sensitivity is at most 2.5 with the stiffness 10 %
+    higher, and with it 10 % lower and the delay a fifth longer; at most 5 with the delay longer
+    by half. Noise moves the actuator by at most 1.5 times the noise of the sensed length, the drive
+    by at most 4 % of its range and from one update to the next by at most what the loop allows
+    (standard deviations).
+
+    Args:
+        setting: timing and limits of the loop, and the actuator.
+    Returns:
+        The parameters of `ObserverController`.
+    Raises:
+        ResultError: No parameters keep the loop stable.
+    """
+    OBSERVER.check(setting)
+    known = setting.actuator
+    assert known is not None
+    low, high = known.reachable()
+    strains = [low + share * (high - low) for share in _POINTS]
+    weight_n = known.mass_kg * GRAVITY_M_S2
+    delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
+    allowed_v = setting.highest_rate_per_s * setting.period_s
+
+    def of(values: Floats) -> float:
+        bandwidth, load_n = np.exp(values).tolist()
+        if bandwidth * delay_s > 1.0:  # beyond, limits of the drive hide what it does
+            return float(2.0 * UNSTABLE * bandwidth * delay_s)
+        law = ObserverLaw(setting, bandwidth, load_n, _SHAKE)
+        total = 0.0
+        for strain in strains:
+            noise_m = known.length_noise_m(strain)
+            for stiffness, longer, peak in _SPREAD:
+                demands = Demands(
+                    noise_m, _SHAKEN * known.high_v, peak, _MOVED, _CHANGED * allowed_v
+                )
+                loop = linear_loop(law, setting, strain, (stiffness, longer * delay_s))
+                factor = penalty(loop, setting.period_s, demands)
+                if factor > UNSTABLE:
+                    return factor
+                total += factor * timed_error(loop, setting.period_s, _COUNTED_S)
+        return total
+
+    start = np.log([0.1 / delay_s, 0.1 * weight_n])
+    found = minimize(of, start, method="Nelder-Mead",
+                     options={"maxfev": 60, "xatol": 0.02, "fatol": 1e-9})  # fmt: skip
+    if found.fun > UNSTABLE:
+        raise ResultError(
+            f"No gains of the observer are stable with a delay of {setting.delay_s or 0.0:g} s. "
+            "Shorten the delay."
+        )
+    bandwidth, load_n = np.exp(found.x).tolist()
+    return {"bandwidth_rad_s": float(f"{bandwidth:.4g}"), "load_n": float(f"{load_n:.4g}"),
+            "shake_m_s2": _SHAKE, "reserve": _RESERVE}  # fmt: skip
+
+
+class _Joint:
+    """Actuator and observer as one system, about the rest at a strain.
+
+    Args:
+        law: of observer and feedback.
+        setting: of the loop.
+        strain: held.
+        other: stiffness of the actuator over the identified one; delay beyond the stated one, s.
+    """
+
+    def __init__(
+        self, law: ObserverLaw, setting: ControllerSetting, strain: float,
+        other: tuple[float, float],
+    ) -> None:  # fmt: skip
+        known, period_s = setting.actuator, setting.period_s
+        assert known is not None
+        self._law, self._length_m = law, known.length_m(strain)
+        drive_v = known.static_drive_v(strain)
+        self._plant = law.model.stiffened(self._length_m, other[0])
+        rest = law.model.at_rest(self._length_m, drive_v)
+        self._whole = int((law.delay_s + other[1]) / period_s + 1e-9)
+        self._late_s = law.delay_s + other[1] - self._whole * period_s
+        self._period_s, self._load_n = period_s, rest[-1]
+        self.size = len(rest)
+        self.waiting = max(self._whole, law.whole) + 2
+        self.start = np.array([*rest[:-1], *rest, *[drive_v] * self.waiting])
+
+    def after(self, change: Floats, load_n: float, noise_m: float, added_v: float) -> Floats:
+        """The states after one update, from a change of those at rest."""
+        moved, size = (self.start + change).tolist(), self.size
+        true = [*moved[: size - 1], self._load_n + load_n]
+        seen, past_v = moved[size - 1 : 2 * size - 1], moved[2 * size - 1 :]
+        law, plant = self._law, self._plant
+        seen = law.observed(seen, past_v, true[0] + noise_m)
+        new_v = law.drive_v(law.ahead(seen, past_v), (self._length_m, 0.0, 0.0), _FREE)
+        past_v = [new_v, *past_v[:-1]]
+        true = plant.moved(true, past_v[self._whole + 1] + added_v, self._late_s)
+        true = plant.moved(true, past_v[self._whole] + added_v, self._period_s - self._late_s)
+        return np.array([*true[:-1], *seen, *past_v])
+
+
+def linear_loop(
+    law: ObserverLaw, setting: ControllerSetting, strain: float, other: tuple[float, float]
+) -> LinearLoop:
+    """The closed loop where it holds a strain, by central differences, its rate limit apart.
+
+    Args:
+        law: of observer and feedback.
+        setting: of the loop.
+        strain: held.
+        other: stiffness of the actuator over the identified one; delay beyond the stated one, s.
+    """
+    joint = _Joint(law, setting, strain, other)
+    small = [1e-7, 1e-5, *[1e-4] * (joint.size - 3)]  # m, m/s, N
+    scales = [*small, *small, 1e-4, *[1e-5] * joint.waiting]
+    none = np.zeros(len(scales))
+
+    def slope(change: Floats, scale: float, *inputs: float) -> Floats:
+        ends = [joint.after(k * change, *(k * value for value in inputs)) for k in (1.0, -1.0)]
+        return np.asarray((ends[0] - ends[1]) / (2.0 * scale))
+
+    a = np.stack(
+        [
+            slope(np.where(np.arange(none.size) == k, scale, 0.0), scale, 0.0, 0.0, 0.0)
+            for k, scale in enumerate(scales)
+        ],
+        axis=1,
+    )
+    noise = slope(none, 1e-7, 0.0, 1e-7, 0.0)
+    newest, length = 2 * joint.size - 1, none.copy()
+    length[0] = 1.0
+    return LinearLoop(
+        a, slope(none, 1e-4, 1e-4, 0.0, 0.0), noise, slope(none, 1e-5, 0.0, 0.0, 1e-5), length,
+        a[newest].copy(), float(noise[newest]),
+    )  # fmt: skip
+
+
+OBSERVER = ControllerKind(
+    "observer",
+    ObserverController,
+    (
+        Parameter("bandwidth_rad_s", "rad/s", None, 1e-3, 1e4),
+        Parameter("load_n", "N", None, 1e-9, 1e6),
+        Parameter("shake_m_s2", "m/s^2", _SHAKE, 1e-9, 1e6),
+        Parameter("reserve", "", _RESERVE, 0.0, 0.9),
+    ),
+    output="voltage",
+    needs_actuator=True,
+    design=design_observer,
+    preview_s=_PREVIEW_S,
+)

@@ -1,0 +1,168 @@
+"""A desired length that an actuator can follow: planned after a jump, as given where smooth."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from haselab.controllers.known_actuator import KnownActuator
+from haselab.controllers.motion_model import MotionModel
+
+__all__ = ["ReferencePlan"]
+
+_CHECKED = 16  # times of a plan at which its force is checked
+_LONGER = 1.12  # from one try to the next
+_LEAST = 4  # periods of a plan
+_LONGEST_S = 5.0
+_SOON_S = 0.01
+_ALONE = 3.0  # times its neighbours: a rise that is a step
+_NEAR = 0.3
+_SAME = 1e-9
+
+
+class ReferencePlan:
+    """The desired length at the time at which a drive acts, with its speed and acceleration.
+
+    Args:
+        model: of the motion.
+        known: limits of drive and field.
+        period_s: between two drives.
+        reserve: share of the force's range that a plan leaves to the feedback.
+        rate_v_per_s: fastest change of the drive.
+    """
+
+    def __init__(
+        self, model: MotionModel, known: KnownActuator, period_s: float, reserve: float,
+        rate_v_per_s: float,
+    ) -> None:  # fmt: skip
+        self._model, self._known, self._period_s = model, known, period_s
+        self._reserve, self._rate = reserve, rate_v_per_s
+        lengths_m = [known.length_m(strain) for strain in np.linspace(*known.reachable(), 9)]
+        most_n = max(
+            abs(model.pull_n(length_m, known.highest_drive_v(length_m))) for length_m in lengths_m
+        )
+        # the way in a period at a speed that the largest force gives soon
+        self._most_m = most_n / model.inertia_kg * max(period_s, _SOON_S) * period_s
+
+    def begin(self, length_m: float) -> None:
+        """Rest at a length."""
+        self._curve: tuple[float, ...] = ()
+        self._for_s, self._at_s, self._target_m = 0.0, 0.0, length_m
+        self._follows, self._last_m = False, length_m
+        self._here = (length_m, 0.0, 0.0)  # at the next drive
+
+    def next(
+        self, wanted_m: list[float], acts_s: float, state: list[float]
+    ) -> tuple[float, float, float]:
+        """Length, speed, and mean acceleration until the next drive.
+
+        Args:
+            wanted_m: desired length of the block that ended, and of those that come.
+            acts_s: from the end of that block to the effect of the drive.
+            state: then.
+        """
+        period_s = self._period_s
+        samples = [self._last_m, *wanted_m]
+        self._last_m = wanted_m[0]
+        place = acts_s / period_s + 2.0  # of the samples, the drive's effect
+        at = min(int(place + 1e-9), len(samples) - 1)
+        target_m, here = samples[at], self._here
+        if len(samples) > at + 4 and self._smooth(samples, at):
+            given = _cubic(samples, place, period_s)
+            rests = self._at_s >= self._for_s - _SAME
+            if self._follows or (rests and abs(given[0] - here[0]) < _NEAR * self._most_m):
+                self._follows = True
+                after = (*_cubic(samples, place + 1.0, period_s), 0.0)
+                self._here = after
+                return (*given, 2.0 * (after[0] - given[0] - given[1] * period_s) / period_s**2)
+        if self._follows or target_m != self._target_m:
+            self._follows = False
+            self._plan((here[0], here[1], 0.0), target_m, state)
+        self._at_s += period_s
+        if self._at_s >= self._for_s - _SAME:
+            self._here = self._target_m, 0.0, 0.0
+        else:  # as a drive that is held can lead it
+            _, speed, pushed = _value(self._curve, self._at_s)
+            self._here = here[0] + 0.5 * period_s * (here[1] + speed), speed, pushed
+        return here[0], here[1], (self._here[1] - here[1]) / period_s
+
+    def _smooth(self, samples: list[float], at: int) -> bool:
+        """Whether the samples about one are neither a step nor faster than the force of the field.
+
+        In a step, one rise is much larger than both of its neighbours.
+        """
+        rises = [abs(b - a) for a, b in pairwise(samples[max(at - 2, 0) : at + 5])]
+        alone = any(
+            rise > _ALONE * max(before, after) + _SAME
+            for before, rise, after in zip(rises, rises[1:], rises[2:], strict=False)
+        )
+        return not alone and max(rises) <= self._most_m
+
+    def _plan(self, start: tuple[float, float, float], target_m: float, state: list[float]) -> None:
+        """Plan the fastest polynomial within the limits."""
+        self._target_m = target_m
+        period_s = self._period_s
+        for_s = _LEAST * period_s
+        while for_s < _LONGEST_S:
+            curve = _quintic(start, target_m, for_s)
+            if self._possible(curve, for_s, target_m, state):
+                break
+            for_s = period_s * math.ceil(_LONGER * for_s / period_s)
+        self._curve, self._for_s, self._at_s = _quintic(start, target_m, for_s), for_s, 0.0
+
+    def _possible(
+        self, curve: tuple[float, ...], for_s: float, target_m: float, state: list[float]
+    ) -> bool:
+        model, known = self._model, self._known
+        rest_n = [model.needed_n(state, length_m, 0.0, 0.0) for length_m in (curve[0], target_m)]
+        before_v = math.nan
+        for k in range(_CHECKED + 1):
+            length_m, speed, pushed = _value(curve, for_s * k / _CHECKED)
+            needed_n = model.needed_n(state, length_m, speed, pushed)
+            ends_n = sorted(
+                model.pull_n(length_m, volt)
+                for volt in (max(known.low_v, 0.0), known.highest_drive_v(length_m))
+            )
+            spare_n = self._reserve * (ends_n[1] - ends_n[0])
+            low_n = min(ends_n[0] + spare_n, *rest_n)
+            if not low_n - _SAME <= needed_n <= max(ends_n[1] - spare_n, *rest_n) + _SAME:
+                return False
+            if math.isfinite(self._rate):
+                drive_v = known.drive_v(length_m, needed_n)
+                if abs(drive_v - before_v) > self._rate * for_s / _CHECKED:
+                    return False
+                before_v = drive_v
+        return True
+
+
+def _quintic(start: tuple[float, float, float], target_m: float, for_s: float) -> tuple[float, ...]:
+    """Coefficients, lowest power first, of the way to rest at a target."""
+    x, v, a = start
+    t, gap = for_s, target_m - start[0]
+    c3 = (10.0 * gap - 6.0 * v * t - 1.5 * a * t * t) / t**3
+    c4 = (-15.0 * gap + 8.0 * v * t + 1.5 * a * t * t) / t**4
+    c5 = (6.0 * gap - 3.0 * v * t - 0.5 * a * t * t) / t**5
+    return x, v, 0.5 * a, c3, c4, c5
+
+
+def _value(curve: tuple[float, ...], t: float) -> tuple[float, float, float]:
+    c0, c1, c2, c3, c4, c5 = curve
+    return (
+        c0 + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5)))),
+        c1 + t * (2.0 * c2 + t * (3.0 * c3 + t * (4.0 * c4 + t * 5.0 * c5))),
+        2.0 * c2 + t * (6.0 * c3 + t * (12.0 * c4 + t * 20.0 * c5)),
+    )
+
+
+def _cubic(samples: list[float], place: float, period_s: float) -> tuple[float, float]:
+    """Value and slope by the four samples about a place."""
+    first = min(max(int(place + 1e-9) - 1, 0), len(samples) - 4)
+    t = place - first - 1.0
+    a, b, c, d = samples[first : first + 4]
+    one, two, three = (
+        -a / 3.0 - b / 2.0 + c - d / 6.0, a / 2.0 - b + c / 2.0, (d - a) / 6.0 + (b - c) / 2.0,
+    )  # fmt: skip
+    slope = one + t * (2.0 * two + t * 3.0 * three)
+    return b + t * (one + t * (two + t * three)), slope / period_s

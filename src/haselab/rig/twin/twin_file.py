@@ -16,6 +16,7 @@ from haselab.actuators import (
     Scales,
     draw_parameters,
     with_parameters,
+    with_stated,
 )
 from haselab.base import InputError, JsonObject, LimitError, table_at
 from haselab.models.actuator import ActuatorTables
@@ -112,7 +113,7 @@ def identified_twin(path: Path, bench: TwinConfig, draw: int | None = None) -> T
             f"Correct the kind, or identify the actuator again. {path}"
         )
     try:
-        law = with_parameters(ACTUATORS.find(model.kind)(), about.parameters)
+        law = with_stated(ACTUATORS.find(model.kind)(), about.parameters)
         if draw is None:
             law, added_kg, scale, drift = _with(law, model, model.parameters)
         else:

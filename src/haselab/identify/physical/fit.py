@@ -448,11 +448,13 @@ def _result(
     parameters = {}
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
-        if unknowns.by_logarithm[k] or unknowns.by_inverse_square[k]:
+        if unknowns.by_logarithm[k] or unknowns.inverse_power[k]:
             share = np.inf if weak[k] else std[k] * abs(slopes[k]) / unknowns.values[k]
             parameters[name] = (
-                Estimate.inverse_square(unknowns.values[k], share, unit, described[name].high)
-                if unknowns.by_inverse_square[k]
+                Estimate.inverse(
+                    unknowns.values[k], share, unit, described[name].high, unknowns.inverse_power[k]
+                )
+                if unknowns.inverse_power[k]
                 else Estimate.lognormal(unknowns.values[k], share, unit)
             )
         else:

@@ -139,7 +139,8 @@ def status_of(
     if abs(scale - 1.0) > _SCALE:
         return (
             f"the records contradict each other: the capacitances are {scale:.3g} times those that "
-            "the forces need. Check the mass, the amplifier's gain and the calibration"
+            "the forces need. Check the mass, the amplifier's gain and the calibration, or start "
+            "nearer, by [actuator.parameters]"
         ), False
     if not seen.explained:
         return (

@@ -238,7 +238,7 @@ def _drawn(
         found = draw_parameters(scales, values, spread, by_index, rng)
         drawn = {**known, **dict(zip(names, found.tolist(), strict=True))}
         if not np.isfinite(found).all():
-            reason = "An inverse square is negative."
+            reason = "An inverse is negative."
             continue
         if drawn.get(ADDED_INERTIA, 0.0) < 0.0:
             reason = f"{ADDED_INERTIA} is below 0."

@@ -16,6 +16,7 @@ from haselab.actuators import (
     Losses,
     PeanoHasel,
     PlanarHasel,
+    SampledLaw,
     actuator_law,
     equilibrium_m,
     with_stated,
@@ -267,3 +268,9 @@ def test_a_stated_list_is_the_whole_list():
     for wrong, what in (("branch_share", "a list of numbers"), ("permittivity[0]", "one number")):
         with pytest.raises(InputError, match=f"{wrong.split('[')[0]} is {what}"):
             with_stated(DeaStack(), {f"actuator.{wrong}": 3.0})
+
+
+def test_a_law_that_is_valid_at_no_length_is_refused():
+    law = PlanarHasel(shell_lateral_stretch=2.59, locking_stretch=1.5)
+    with pytest.raises(LimitError, match=r"valid from 0\.0193867 to 0\.0114957 m: at no length"):
+        SampledLaw(law, 1e4)

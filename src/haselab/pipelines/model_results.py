@@ -111,7 +111,7 @@ class _Problem:
         )
 
 
-def rows_of_changes(
+def _rows_of_changes(
     problem: _Problem, source: Source, changes: Floats
 ) -> list[dict[str, Estimate]]:
     """Results after each of some changes; a function of the module, for a helper process."""
@@ -132,14 +132,14 @@ def _along(
             helper = HelperProcess([__name__], _PATIENCE_S)
             opened.callback(helper.close)  # also if this process is interrupted meanwhile
         except (DeviceError, pickle.PicklingError, TypeError, AttributeError):
-            return rows_of_changes(problem, source, changes)
+            return _rows_of_changes(problem, source, changes)
         half = len(changes) // 2
-        sent = pool.submit(helper.call, rows_of_changes, problem, seen.__getitem__, changes[half:])
-        found = rows_of_changes(problem, source, changes[:half])
+        sent = pool.submit(helper.call, _rows_of_changes, problem, seen.__getitem__, changes[half:])
+        found = _rows_of_changes(problem, source, changes[:half])
         try:
             return found + sent.result()
         except (DeviceError, KeyError):
-            return found + rows_of_changes(problem, source, changes[half:])
+            return found + _rows_of_changes(problem, source, changes[half:])
 
 
 def _fitted(analysis: Analysis) -> dict[str, Estimate]:

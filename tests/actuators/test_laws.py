@@ -19,6 +19,7 @@ from haselab.actuators import (
     SampledLaw,
     actuator_law,
     equilibrium_m,
+    with_stated,
 )
 from haselab.base import InputError, LimitError, Limits
 from haselab.rig.twin.config import TwinConfig
@@ -252,6 +253,21 @@ def test_a_grid_solved_from_a_similar_law_is_the_same(kind):
             rounding = 1e-10 * np.abs(getattr(near, name)).max()
             within = 1e-4 * np.abs(exact).max() + rounding
             assert np.abs(found - exact).max() <= within, (about.name, name)
+
+
+def test_a_stated_list_is_the_whole_list():
+    times = {"actuator.branch_relaxation_s[0]": 2.0}
+    one = with_stated(DeaStack(), {"actuator.branch_share[0]": 0.2, **times})
+    assert one.losses.branch_share == (0.2,) and one.losses.branch_relaxation_s == (2.0,)
+    third = {
+        f"actuator.branch_{of}[{k}]": 0.1 for of in ("share", "relaxation_s") for k in range(3)
+    }
+    assert with_stated(DeaStack(), third).losses.branch_share == (0.1, 0.1, 0.1)
+    with pytest.raises(LimitError, match="2 branch shares and 1 relaxation times"):
+        with_stated(DeaStack(), times)
+    for wrong, what in (("branch_share", "a list of numbers"), ("permittivity[0]", "one number")):
+        with pytest.raises(InputError, match=f"{wrong.split('[')[0]} is {what}"):
+            with_stated(DeaStack(), {f"actuator.{wrong}": 3.0})
 
 
 def test_a_law_that_is_valid_at_no_length_is_refused():

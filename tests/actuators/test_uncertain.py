@@ -1,4 +1,4 @@
-"""Parameters vary by logarithm, inverse square or value, and are drawn jointly."""
+"""Parameters vary by logarithm, power of the inverse or value, and are drawn jointly."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from haselab.actuators import ADDED_INERTIA, PlanarHasel, Scales, draw_parameters
+from haselab.actuators import ADDED_INERTIA, DeaStack, PlanarHasel, Scales, draw_parameters
+from haselab.base import Estimate
 
 NAMES = ["dielectric.permittivity", "shell.locking_stretch", "viscosity.share[1]", ADDED_INERTIA]
 SCALES = Scales.of(PlanarHasel(), NAMES)
@@ -16,7 +17,7 @@ VALUES = np.array([3.0, 3.9, 0.02, -1e-3])
 
 def test_each_parameter_varies_by_its_own_scale() -> None:
     assert SCALES.by_logarithm.tolist() == [True, False, True, False]
-    assert SCALES.by_inverse_square.tolist() == [False, True, False, False]
+    assert SCALES.inverse_power.tolist() == [0.0, 2.0, 0.0, 0.0]
 
 
 @given(st.lists(st.floats(-0.01, 0.01), min_size=4, max_size=4))
@@ -25,6 +26,17 @@ def test_a_step_is_the_difference_of_what_varies(steps: list[float]) -> None:
     moved = SCALES.moved(VALUES, step)
     found = SCALES.varying(moved) - SCALES.varying(VALUES)
     np.testing.assert_allclose(found, step, rtol=1e-9, atol=1e-12)
+
+
+def test_the_limit_of_extension_varies_by_its_inverse() -> None:
+    """Gent's stress is linear in 1/J where the stretch is small against J."""
+    scales, values = Scales.of(DeaStack(), ["actuator.extension_limit"]), np.array([20.0])
+    assert scales.moved(values, np.array([-0.03])) == pytest.approx([50.0])
+    assert scales.slopes(values) == pytest.approx([-400.0])
+    found = Estimate.inverse(20.0, 0.25, "", 1e6, 1.0)
+    inverse = 1.0 / np.array(found.ci95)
+    assert np.diff(inverse) == pytest.approx([-2.0 * 1.959964 * 0.25 / 20.0])
+    assert inverse.mean() == pytest.approx(1.0 / 20.0)
 
 
 def test_an_inverse_square_below_zero_is_no_number() -> None:

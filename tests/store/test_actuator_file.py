@@ -65,6 +65,18 @@ def test_a_section_says_where_its_numbers_come_from(path, tmp_path):
     }
 
 
+def test_files_of_one_name_are_all_among_the_sources(tmp_path):
+    """Two runs both have a session.h5; `compare` must recognise each."""
+    files = [tmp_path / run / "session.h5" for run in ("first", "second")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text(file.parent.name)
+    found = hashed([*files, tmp_path / "absent"])
+    assert list(found) == [file.as_posix() for file in files]
+    assert len(set(found.values())) == 2
+    assert list(hashed(files[:1])) == ["session.h5"]
+
+
 def test_values_written_after_a_subsection_stay_in_their_section(path):
     write_section(path, "sensing.strain_map", {"offset": -0.3}, provenance())
     write_section(path, "sensing", {"carrier_hz": 2e3, "reference": [{"a": 1.0}, {"a": 2.0}]}, None)

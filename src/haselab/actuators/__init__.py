@@ -18,6 +18,7 @@ from haselab.actuators.response import (
     SampledLaw,
     motion_parameters,
     with_parameters,
+    with_stated,
 )
 from haselab.actuators.table import LawTable, law_table
 from haselab.actuators.uncertain import Scales, draw_parameters
@@ -57,4 +58,5 @@ __all__ = [
     "parameter",
     "rates",
     "with_parameters",
+    "with_stated",
 ]

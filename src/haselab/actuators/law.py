@@ -49,7 +49,7 @@ class Parameter:
         high: largest permitted value.
         description: short text for people.
         fitted: whether `identify actuator` estimates it; False: measured otherwise.
-        inverse_square: see `parameter`.
+        inverse_power: see `parameter`.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Parameter:
     high: float
     description: str
     fitted: bool = True
-    inverse_square: bool = False
+    inverse_power: int = 0
 
 
 def parameter(
@@ -71,7 +71,7 @@ def parameter(
     description: str,
     key: str = "",
     fitted: bool = True,
-    inverse_square: bool = False,
+    inverse_power: int = 0,
 ) -> AnyValue:
     """A field of a law with its unit and limits.
 
@@ -84,8 +84,8 @@ def parameter(
         key: in TWIN.toml; empty: the name of the field in the table `actuator`.
         fitted: whether `identify actuator` estimates it; False: measured otherwise, such as a
             width, or without effect on motion and capacitance.
-        inverse_square: whether the forces are nearly linear in its inverse square, as in that of a
-            locking stretch; False: it is varied by its logarithm.
+        inverse_power: power of its inverse in which the forces are nearly linear, such as 2 of a
+            locking stretch; 0: it is varied by its logarithm.
     Returns:
         The dataclass field.
     """
@@ -96,7 +96,7 @@ def parameter(
         "high": high,
         "description": description,
         "fitted": fitted,
-        "inverse_square": inverse_square,
+        "inverse_power": inverse_power,
     }
     field: AnyValue = dataclasses.field(default=default, metadata={_KEY: about})
     return field

@@ -37,6 +37,7 @@ __all__ = [
     "SampledLaw",
     "motion_parameters",
     "with_parameters",
+    "with_stated",
 ]
 
 Floats = NDArray[np.float64]
@@ -178,9 +179,12 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
                 f"{', '.join(names)}."
             )
         field = names[name]
-        if index:
-            old = changed.get(field, getattr(law, field))
-            parts = list(old) if isinstance(old, tuple) else []
+        old = changed.get(field, getattr(law, field))
+        if isinstance(old, tuple) != bool(index):
+            many = "a list of numbers" if isinstance(old, tuple) else "one number"
+            raise InputError(f"{name} is {many}. Change it.")
+        if isinstance(old, tuple):
+            parts = list(old)
             if not index[:-1].isdigit() or int(index[:-1]) > len(parts):
                 raise InputError(f"{key} does not exist: {name} has {len(parts)} values.")
             place = int(index[:-1])
@@ -189,6 +193,35 @@ def with_parameters(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLa
         else:
             changed[field] = float(value)
     return dataclasses.replace(law, **changed)
+
+
+def with_stated(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLaw:
+    """Replace parameters of a law by those of an actuator file, where a list replaces all values.
+
+    Args:
+        law: to start from.
+        values: see `with_parameters`; those of a list are complete from the index 0 on.
+    Returns:
+        The changed law, with as many branches as the lists state.
+    Raises:
+        InputError: A name is unknown, or a list is stated for a number.
+        LimitError: A value is outside its limits, or the lists of the branches differ in length.
+    Example:
+        >>> from haselab.actuators import DeaStack
+        >>> stated = {"actuator.branch_share[0]": 0.2, "actuator.branch_relaxation_s[0]": 1.0}
+        >>> with_stated(DeaStack(), stated).losses.branch_share
+        (0.2,)
+    """
+    shorter = {}
+    for about in law.described():
+        stated = {key for key in values if key.startswith(f"{about.key}[")}
+        complete = stated == {f"{about.key}[{k}]" for k in range(len(stated))}
+        default = getattr(law, about.name)
+        if stated and complete and isinstance(default, tuple):
+            shorter[about.name] = default[: len(stated)]
+    found = with_parameters(dataclasses.replace(law, **shorter), values)
+    _ = found.losses  # refuses lists of different lengths
+    return found
 
 
 _LOSSES = (

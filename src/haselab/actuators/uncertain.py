@@ -1,7 +1,7 @@
-"""Parameters of a law as they vary: by their logarithm, by their inverse square, or by value.
+"""Parameters of a law as they vary: by logarithm, by a power of the inverse, or by value.
 
 What is positive varies by its logarithm, so that it stays positive; what the forces follow nearly
-linearly in its inverse square varies by that (see `parameter`); all others vary by their value.
+linearly in a power of its inverse varies by that (see `parameter`); all others vary by their value.
 """
 
 from __future__ import annotations
@@ -26,22 +26,27 @@ class Scales:
 
     Args:
         by_logarithm: Shape `(P,)`.
-        by_inverse_square: Shape `(P,)`.
+        inverse_power: of those that vary by a power of their inverse; 0 of others. Shape `(P,)`.
     """
 
     by_logarithm: NDArray[np.bool_]
-    by_inverse_square: NDArray[np.bool_]
+    inverse_power: Floats
 
     @classmethod
     def of(cls, law: ActuatorLaw, names: Sequence[str]) -> Scales:
         """Those of parameters of a law; other names, such as an added inertia, vary by value."""
-        marked = {about.key: about.inverse_square for about in law.described()}
-        marked |= dict.fromkeys(DRIFT_TIMES, False)
-        inverse = [marked.get(name.partition("[")[0]) for name in names]
+        powers = {about.key: about.inverse_power for about in law.described()}
+        powers |= dict.fromkeys(DRIFT_TIMES, 0)
+        inverse = [powers.get(name.partition("[")[0]) for name in names]
         return cls(
-            np.array([mark is False for mark in inverse], dtype=bool),
-            np.array([mark is True for mark in inverse], dtype=bool),
+            np.array([power == 0 for power in inverse], dtype=bool),
+            np.array([power or 0 for power in inverse], dtype=np.float64),
         )
+
+    @property
+    def by_inverse(self) -> NDArray[np.bool_]:
+        """Which of them vary by a power of their inverse. Shape `(P,)`."""
+        return self.inverse_power > 0.0
 
     def slopes(self, values: Floats) -> Floats:
         """Change of the values per change of what varies.
@@ -52,7 +57,9 @@ class Scales:
             Slopes. Shape `(P,)`.
         """
         found = np.where(self.by_logarithm, values, 1.0)
-        return np.where(self.by_inverse_square, -0.5 * values**3, found)
+        inverse, power = self.by_inverse, self.inverse_power[self.by_inverse]
+        found[inverse] = -(values[inverse] ** (power + 1.0)) / power
+        return found
 
     def varying(self, values: Floats) -> Floats:
         """What varies.
@@ -60,11 +67,12 @@ class Scales:
         Args:
             values: Shape `(P,)`.
         Returns:
-            Logarithms, inverse squares and values. Shape `(P,)`.
+            Logarithms, powers of inverses and values. Shape `(P,)`.
         """
         found = values.astype(np.float64)
         found[self.by_logarithm] = np.log(values[self.by_logarithm])
-        found[self.by_inverse_square] = values[self.by_inverse_square] ** -2.0
+        inverse = self.by_inverse
+        found[inverse] = values[inverse] ** -self.inverse_power[inverse]
         return found
 
     def moved(self, values: Floats, step: Floats) -> Floats:
@@ -74,13 +82,14 @@ class Scales:
             values: Shape `(P,)`.
             step: changes. Shape `(P,)`.
         Returns:
-            The new values; not a number where an inverse square became negative. Shape `(P,)`.
+            The new values; not a number where an inverse became negative. Shape `(P,)`.
         """
-        logarithm, inverse = self.by_logarithm, self.by_inverse_square
+        logarithm, inverse = self.by_logarithm, self.by_inverse
+        power = self.inverse_power[inverse]
         found = values + step
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             found[logarithm] = values[logarithm] * np.exp(np.minimum(step[logarithm], 50.0))
-            found[inverse] = (values[inverse] ** -2.0 + step[inverse]) ** -0.5
+            found[inverse] = (values[inverse] ** -power + step[inverse]) ** (-1.0 / power)
         return found
 
 

@@ -48,20 +48,21 @@ class Estimate:
         return cls(value, abs(value) * relative_std, (low, high), unit)
 
     @classmethod
-    def inverse_square(
-        cls, value: float, relative_std: float, unit: str, largest: float
+    def inverse(
+        cls, value: float, relative_std: float, unit: str, largest: float, power: float
     ) -> Estimate:
-        """Estimate of a positive quantity whose inverse square has a normal error.
+        """Estimate of a positive quantity with a normal error in a power of its inverse.
 
         Args:
             value: best value.
             relative_std: standard deviation of the quantity over its value, for small errors.
             unit: of both.
-            largest: upper end of the interval where the inverse square may as well be 0.
+            largest: upper end of the interval where the inverse may as well be 0.
+            power: of the inverse.
         """
-        spread = 2.0 * Z95 * float(relative_std)
-        high = value / math.sqrt(1.0 - spread) if spread < 1.0 else math.inf
-        ends = value / math.sqrt(1.0 + spread), max(min(high, largest), value)
+        spread = power * Z95 * float(relative_std)
+        high = value / (1.0 - spread) ** (1.0 / power) if spread < 1.0 else math.inf
+        ends = value / (1.0 + spread) ** (1.0 / power), max(min(high, largest), value)
         return cls(float(value), value * relative_std, ends, unit)
 
     def scaled(self, factor: float, unit: str) -> Estimate:

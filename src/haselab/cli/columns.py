@@ -156,7 +156,7 @@ def check_strain(
     """
     if unit is not None:
         return
-    size = float(np.abs(values).max())
+    size = float(np.nanmax(np.abs(values)))
     place, largest = "", _LARGE_STRAIN / _FAR
     for section, strain in _largest_strains(known):
         if strain < largest:

@@ -27,6 +27,7 @@ from haselab.actuators import (
     equilibrium_m,
     law_table,
     with_parameters,
+    with_stated,
 )
 from haselab.base import InputError, LimitError
 from haselab.models.actuator import ActuatorTables
@@ -287,7 +288,7 @@ def known_actuator(tables: ActuatorTables, source: object = "") -> KnownActuator
     assert mass_kg is not None and zero_m is not None and high_v is not None
     own = {name: value for name, value in model.parameters.items() if not name.startswith(_BENCH)}
     try:
-        law = with_parameters(ACTUATORS.find(model.kind)(), tables.actuator.parameters)
+        law = with_stated(ACTUATORS.find(model.kind)(), tables.actuator.parameters)
         law = with_parameters(law, own)
     except (InputError, LimitError) as error:
         raise InputError(f"[model.physical]: {error}{where}") from error

@@ -38,7 +38,7 @@ def motion_of_table(
         time_s: of the rows, rising. Shape `(N,)`.
         voltage_v: of the actuator. Shape `(N,)`.
         mass_kg: that hangs.
-        length_m: measured; None: it was not. Shape `(N,)`.
+        length_m: measured, NaN where it was not; None: nowhere. Shape `(N,)`.
         capacitance_f: likewise. Shape `(N,)`.
         length_std_m: standard deviation of the lengths; None: estimated from neighbouring rows.
         capacitance_std_f: likewise.
@@ -54,24 +54,28 @@ def motion_of_table(
         )
     step_s = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])
     no, none = np.zeros(0), np.zeros(0, dtype=np.int64)
-    starts_s, volt, sensed, later_s = time_s, voltage_v, none, no
+    starts_s, volt, sensed, later_s, seen_s = time_s, voltage_v, none, no, no
+    if length_m is not None:
+        seen = np.isfinite(length_m)
+        seen_s, length_m = time_s[seen], length_m[seen]
     if capacitance_f is not None:
         # a capacitance is the mean over an interval, so each row begins with a short one
         glimpse_s = _GLIMPSE * step_s
         starts_s = np.stack([time_s, time_s + glimpse_s], axis=1).ravel()
-        volt, sensed, later_s = np.repeat(voltage_v, 2), np.arange(time_s.size), -0.5 * glimpse_s
+        volt, sensed = np.repeat(voltage_v, 2), np.flatnonzero(np.isfinite(capacitance_f))
+        capacitance_f, later_s = capacitance_f[sensed], -0.5 * glimpse_s[sensed]
     count = starts_s.size
     drive = Drive(
         np.append(starts_s, time_s[-1] + step_s[-1]), volt,
         np.full(count, mass_kg * GRAVITY_M_S2), np.full(count, mass_kg), np.zeros(count),
     )  # fmt: skip
-    seen = [
+    measured = [
         (no, no) if values is None else (values, np.full(values.size, std or _noise(name, values)))
         for values, std in ((length_m, length_std_m), (capacitance_f, capacitance_std_f))
     ]
-    (length_m, length_std), (capacitance_f, capacitance_std) = seen
+    (length_m, length_std), (capacitance_f, capacitance_std) = measured
     return MotionRecord(
-        name, drive, time_s[: length_m.size], length_m, length_std, 2 * sensed, sensed,
+        name, drive, seen_s, length_m, length_std, 2 * sensed, np.arange(sensed.size),
         capacitance_f, capacitance_std, (name,), np.zeros(length_m.size, np.int64),
         np.zeros(sensed.size, np.int64), capacitance_later_s=later_s,
     )  # fmt: skip

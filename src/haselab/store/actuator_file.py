@@ -66,8 +66,16 @@ class Provenance:
 
 
 def hashed(paths: Sequence[Path]) -> Mapping[str, str]:
-    """Name and SHA-256 of each file; paths that are not files are left out."""
-    return {path.name: sha256_of(path) for path in paths if path.is_file()}
+    """Name and SHA-256 of each file; paths that are not files are left out.
+
+    Files of one name, such as the session.h5 of several runs, are named by their whole path.
+    """
+    names = [path.name for path in paths]
+    return {
+        path.name if names.count(path.name) == 1 else path.as_posix(): sha256_of(path)
+        for path in paths
+        if path.is_file()
+    }
 
 
 def read_actuator(path: Path) -> JsonObject:

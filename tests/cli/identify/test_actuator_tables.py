@@ -8,6 +8,7 @@ import pytest
 
 from haselab.actuators import GRAVITY_M_S2, DeaStack, Drive, SampledLaw
 from haselab.cli.main import main
+from haselab.pipelines.motion_table import motion_of_table
 
 LAW = DeaStack(shear_modulus_pa=18e3, permittivity=3.3, damping_n_s_per_m=1.6)
 GAIN, LENGTH_STD_M, CAPACITANCE_STD_F = 4000.0, 4e-6, 3e-13
@@ -98,6 +99,26 @@ def test_a_wrong_mass_gain_or_unit_gives_no_numbers(actuator, tmp_path, capsys, 
     assert actuator.read_text() == before
 
 
+@pytest.mark.long
+def test_intervals_allow_for_the_gain_or_mass_that_the_capacitances_contradict(
+    actuator, tmp_path, capsys
+):
+    files = [table(tmp_path / f"{m}.csv", m, seed=k) for k, m in enumerate((0.1, 0.3))]
+    for gain, masses in ((1.02 * GAIN, (0.1, 0.3)), (GAIN, (0.1, 0.309))):
+        stated = "--mass-kg", masses[0], "--mass-kg", masses[1], "--gain-v-per-v", gain
+        code, text, _ = run(capsys, *files, "--actuator", actuator, *COLUMNS, *stated, "--json")
+        answer = json.loads(text)
+        assert code == 0 and "allow for it" in answer["notes"][0], answer
+        for name, true in (("actuator.shear_modulus_pa", 18e3), ("actuator.permittivity", 3.3),
+                           ("actuator.damping_n_s_per_m", 1.6), ("sensing.scale", 1.0),
+                           ("load.added_inertia_kg", 0.0)):  # fmt: skip
+            found = answer["parameters"][name]
+            low, high = found["ci95"]
+            assert low < true < high, (name, found)
+            # 4 * 1.96 times an error of 4.4 % of each; of the lighter mass, as an inertia
+            assert high - low < 0.35 * (true or 0.3), (name, found)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -118,3 +139,57 @@ def test_what_cannot_be_read_is_refused(actuator, tmp_path, capsys, options, wor
     assert error.splitlines()[0].endswith("was converted from mV to V. " + str(file)) or (
         error.count("\n") == 1
     )
+
+
+def test_a_record_with_few_values_gives_no_numbers(actuator, tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, rows=100)
+    lines = file.read_text().splitlines()
+    kept = [*lines[:5], *lines[8:11]]  # rows 5 to 7 are missing
+    file.write_text("\n".join(kept))
+    code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS)
+    assert code == 3 and "the records have 14 values, too few for the 15 unknowns" in error, error
+    assert "1 steps of the times are longer than the usual 0.01 s, the longest is 0.04 s" in error
+
+
+def test_times_that_fall_and_records_given_twice_are_refused(actuator, tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, rows=100)
+    copy = tmp_path / "b.csv"
+    copy.write_bytes(file.read_bytes())
+    for twice in ((file, file), (file, copy)):
+        code, _, error = run(capsys, *twice, "--actuator", actuator, *COLUMNS)
+        assert code == 2 and "are the same record" in error, error
+    head, first, second, *rest = file.read_text().splitlines()
+    file.write_text("\n".join([head, second, first, *rest]))
+    code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS)
+    assert code == 2 and "does not increase after row 1" in error, error
+
+
+def test_rows_without_a_measured_value_keep_their_voltage():
+    time_s, voltage_v = 0.1 * np.arange(6), np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+    length_m = np.array([0.1, np.nan, 0.3, np.nan, 0.5, 0.7])
+    capacitance_f = np.array([np.nan, 2.0, 3.0, 5.0, np.nan, 4.0])
+    whole, parts = (
+        motion_of_table(
+            "a", time_s, voltage_v, mass_kg=0.1, length_m=m, capacitance_f=f, length_std_m=0.1,
+            capacitance_std_f=0.1,
+        )
+        for m, f in ((np.arange(6.0), np.arange(6.0)), (length_m, capacitance_f))
+    )  # fmt: skip
+    assert np.array_equal(whole.drive.voltage_v, parts.drive.voltage_v)
+    assert np.array_equal(parts.length_time_s, time_s[[0, 2, 4, 5]])
+    assert np.array_equal(parts.length_m, length_m[[0, 2, 4, 5]])
+    kept = [1, 2, 3, 5]
+    assert np.array_equal(parts.capacitance_f, capacitance_f[kept])
+    assert np.array_equal(parts.window, whole.window[kept])
+    assert np.array_equal(parts.capacitance_later_s, whole.capacitance_later_s[kept])
+
+
+def test_cells_may_be_empty_and_invalid_rows_keep_their_voltage(actuator, tmp_path, capsys):
+    file = tmp_path / "a.csv"
+    rows = [f"{0.01 * k},{k},{0.03 + 0.001 * (k % 3)},{int(k != 2)}" for k in range(12)]
+    rows[4] = "0.04,4,nan,1"
+    file.write_text("\n".join(["time_s,u,length_m,valid", *rows]))
+    code, _, error = run(capsys, file, "--actuator", actuator)
+    # 12 rows without rows 2 and 4, and no gap
+    assert code == 3 and "the records have 10 values" in error, error
+    assert "left out 1 rows with 0 in column valid" in error and "steps of the times" not in error

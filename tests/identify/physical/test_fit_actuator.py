@@ -19,7 +19,7 @@ from haselab.actuators import (
 )
 from haselab.base import InputError
 from haselab.identify.physical import MotionRecord, fit_actuator
-from haselab.identify.physical.misfit import SHARED_PX, SharedErrors
+from haselab.identify.physical.misfit import SESSION_OFFSET_M, SHARED_PX, Misfit, SharedErrors
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
@@ -178,6 +178,22 @@ def test_no_record_is_refused():
         fit_actuator(TRUE, [], mass_kg=MASS_KG)
 
 
+def test_the_zero_of_the_camera_may_move_between_records():
+    """The misfit of an offset is its own square, not once more that of each length."""
+    records = [record(TRUE, seed, duration_s=2.0) for seed in (1, 2)]
+    moved = replace(records[1], length_m=records[1].length_m + 2.0 * SESSION_OFFSET_M)
+    start = Unknowns.of(TRUE, added_inertia_kg=0.0, mass_kg=MASS_KG)
+
+    def squares(*seen):
+        return float(np.sum(Misfit(seen).residuals(start) ** 2))
+
+    # mean of 100 lengths with 4 um of noise: 0.4 um, which moves the 2 deviations by 0.2
+    change = squares(records[0], moved) - squares(*records)
+    assert 0.5 < change < 10.0
+    # all lengths of a lone record share the offset that is estimated
+    assert squares(moved) - squares(records[1]) > 50.0
+
+
 @given(st.lists(st.floats(0.03, 0.05), min_size=3, max_size=20), st.floats(1e-7, 1e-5))
 def test_shared_errors_of_tracking_are_whitened(lengths, std_m):
     count = len(lengths)
@@ -191,6 +207,10 @@ def test_shared_errors_of_tracking_are_whitened(lengths, std_m):
     pixel = np.floor(seen.length_m / seen.pixel_m)
     shared = (SHARED_PX * seen.pixel_m) ** 2 * (pixel[:, None] == pixel)
     covariance = np.diag(stds**2) + shared
+    both = white @ (covariance / np.outer(stds, stds)) @ white.T
+    np.testing.assert_allclose(both, np.eye(count), atol=1e-6)
+    zero = SharedErrors.of_zero(SharedErrors.of(seen, stds), stds, SESSION_OFFSET_M)
+    white, covariance = zero.whitened(white), covariance + SESSION_OFFSET_M**2
     both = white @ (covariance / np.outer(stds, stds)) @ white.T
     np.testing.assert_allclose(both, np.eye(count), atol=1e-6)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,7 +11,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from haselab.actuators import ACTUATORS, ActuatorLaw, with_parameters
+from haselab.actuators import ACTUATORS, ActuatorLaw, with_stated
 from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
@@ -25,6 +26,7 @@ from haselab.pipelines.planning.actuator_file import planner_of
 from haselab.pipelines.planning.proposal import DETERMINED, Proposal
 from haselab.pipelines.planning.records import summary_of
 from haselab.store.columns.selection import ColumnOptions
+from haselab.store.manifest import sha256_of
 from haselab.store.session.opening import is_session
 from haselab.store.session.reader import session_file
 from haselab.store.toml import validated
@@ -99,8 +101,9 @@ def actuator(
             "No mass hangs on the actuator in these records. Record at least one with a mass, or "
             "state it with --mass-kg or as mass_kg in [actuator]."
         )
-    fit = fit_actuator(law, records, mass_kg=mass_kg)
     inputs = [session_file(file) for file in files]
+    _refuse_twice(inputs)
+    fit = fit_actuator(law, records, mass_kg=mass_kg)
     if not fit.succeeded:
         give(fit, inputs, as_json, out)
     section = section_of_fit(fit, records, gains_v_per_v[0])
@@ -109,6 +112,14 @@ def actuator(
     give(fit, inputs, as_json, out, listed)
     save_plot(plot, fit.chart)
     save_section(actuator, "model.physical", section, inputs, status=fit.status)
+
+
+def _refuse_twice(inputs: Sequence[Path]) -> None:
+    """Refuse the same record under two names: it would count as two."""
+    for one, other in itertools.combinations(inputs, 2):
+        same_size = one.stat().st_size == other.stat().st_size
+        if one.samefile(other) or (same_size and sha256_of(one) == sha256_of(other)):
+            raise InputError(f"{one} and {other} are the same record. Leave out one of them.")
 
 
 def _each_mass(masses_kg: Sequence[float], count: int) -> Sequence[float | None]:
@@ -142,7 +153,7 @@ def law_of_section(section: ActuatorSection | None, path: Path) -> ActuatorLaw:
     section = section or ActuatorSection()
     law = ACTUATORS.find(section.kind)()
     try:
-        return with_parameters(law, section.parameters)
+        return with_stated(law, section.parameters)
     except (InputError, LimitError) as error:
         raise InputError(f"[actuator.parameters]: {error} {path}") from error
 

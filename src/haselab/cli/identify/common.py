@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -220,6 +220,7 @@ def read_valid(
     names: Sequence[str],
     columns: ColumnOptions,
     options: Sequence[str] = ("--input", "--output"),
+    may_lack: Collection[str] = (),
 ) -> Table:
     """Read columns without the rows that a column `valid` marks with 0; print how many.
 
@@ -228,11 +229,12 @@ def read_valid(
         names: of the columns.
         columns: what the user states about them.
         options: the options that name these columns.
+        may_lack: columns in which values may be NaN; only they lack the values of such rows.
     Returns:
         The columns.
     """
     with advice_on_columns(options):
-        table = read_table(file, names, columns)
+        table = read_table(file, names, columns, may_lack)
     note_units(table, file)
     if table.left_out:
         click.echo(

@@ -18,6 +18,7 @@ from haselab.identify.physical import MotionRecord
 from haselab.models.actuator import ActuatorTables
 from haselab.pipelines.motion import motion_of_session
 from haselab.pipelines.motion_table import motion_of_table
+from haselab.pipelines.time_axis import check_rising
 from haselab.rig.protocols import PLANAR_HASEL
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table
@@ -31,6 +32,7 @@ _VOLTAGE = Quantity("--input", ("u", "voltage_v", "voltage"), "V", "the voltage"
 _MEASURED = Quantity(
     "--output", ("y", "length_m", "strain", "capacitance_f"), None, "what was measured"
 )
+_GAP = 1.5  # usual steps, from which rows may be missing
 _ENDINGS = {"strain": "1", "_m": "m", "_f": "F"}
 
 
@@ -124,7 +126,7 @@ def _table(
 ) -> tuple[MotionRecord, float]:
     source = _VOLTAGE.column(file, options.source)
     outputs = [_MEASURED.column(file, name) for name in options.outputs or (None,)]
-    table = read_valid(file, (source, *outputs), options.columns)
+    table = read_valid(file, (source, *outputs), options.columns, may_lack=outputs)
     stated = table.units[source]
     if stated is not None and stated.si != "V":
         raise InputError(
@@ -134,6 +136,8 @@ def _table(
     time_s = table.time_s
     if time_s is None or options.rate_hz is not None:
         time_s = np.arange(table[source].size) / rate_hz_of(table, options.rate_hz, file)
+    check_rising(time_s, file, table.time_name or "time_s")
+    _warn_of_gaps(time_s, file)
     mass_kg = options.mass_kg if options.mass_kg is not None else known.actuator.mass_kg
     if mass_kg is None:
         raise InputError(
@@ -149,6 +153,10 @@ def _table(
         )
     measured: dict[str, Floats] = {}
     for output in outputs:
+        if np.isnan(table[output]).all():
+            raise InputError(
+                f"Column {output} has no values. Name another one with --output. {file}"
+            )
         si, values = _values(table, output, options, known, file)
         if si in measured:
             raise InputError(
@@ -162,6 +170,19 @@ def _table(
         length_std_m=std.get("m"), capacitance_std_f=std.get("F"),
     )  # fmt: skip
     return record, gain_v_per_v
+
+
+def _warn_of_gaps(time_s: Floats, file: Path) -> None:
+    steps_s = np.diff(time_s)
+    if steps_s.size and (long := steps_s > _GAP * np.median(steps_s)).any():
+        at = int(steps_s.argmax())
+        click.echo(
+            f"haselab: warning: {long.sum()} steps of the times are longer than the usual "
+            f"{np.median(steps_s):g} s, the longest is {steps_s[at]:g} s, after row {at + 1}. The "
+            "voltage before a step is assumed to act until its end. If the voltage changed, add "
+            f"these rows with it; what was not measured may be empty (nan). {file}",
+            err=True,
+        )
 
 
 def _values(

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from haselab.actuators import ACTUATORS, with_parameters
+from haselab.actuators import ACTUATORS, with_stated
 from haselab.base import InputError, LimitError, table_at
 from haselab.cli.actuator_file import load_actuator
 from haselab.identify.physical import ChannelNoise, IdentifiedModel
@@ -88,7 +88,7 @@ def read_physical_model(path: Path) -> tuple[IdentifiedModel, ActuatorTables]:
     widening = np.array(model.covariance.widening or [1.0] * len(names))
     explained = model.status == "ok"
     try:
-        law = with_parameters(ACTUATORS.find(model.kind)(), about.parameters)
+        law = with_stated(ACTUATORS.find(model.kind)(), about.parameters)
         found = IdentifiedModel.of(
             law,
             model.parameters,

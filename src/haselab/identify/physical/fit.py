@@ -40,6 +40,7 @@ from haselab.identify.physical.information import (
     vague_information,
 )
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
+from haselab.identify.physical.misstated import misstated_std, scale_error
 from haselab.identify.physical.model_error import hidden_std, widened
 from haselab.identify.physical.plausible import implausible
 from haselab.identify.physical.record import MotionRecord
@@ -79,6 +80,7 @@ _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _APART = 2.0  # rms over noise from which records are compared alone
+_LEAST_VALUES = 2  # for each unknown, without which nobody sees the noise
 _POINTS = 5  # voltages of the linear models
 _UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
 _SEEN = 3.0  # standard deviations from 0: an effect that is seen
@@ -108,7 +110,8 @@ class ActuatorFit(Fit):
         capacitance_factor: the same of the capacitances.
         length_worst_m: rms of the residuals in the experiment that the model explains least.
         capacitance_worst_f: the same of the capacitances.
-        widening: of the standard deviations, by which a model error raised those of `covariance`.
+        widening: of the standard deviations, by which a model error, or a misstated gain or mass,
+            raised those of `covariance`.
         hidden_variance: of the parameters by a model error of no particular direction, over that
             by the noise; see `model_error`.
         evaluations: of the model, until it was found.
@@ -258,6 +261,13 @@ def fit_actuator(
     if added_inertia_kg is None:
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
+    count = sum(record.length_m.size + record.capacitance_f.size for record in records)
+    if count < _LEAST_VALUES * start.values.size:
+        return ActuatorFit(
+            status=f"the records have {count} values, too few for the {start.values.size} unknowns "
+            "of the model. Record longer",
+            kind=law.kind,
+        )
     known: dict[str, float] = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
     # far from the minimum, errors of tracking that a pixel shares would only hide the misfit
     plain = Misfit([replace(record, pixel_m=0.0) for record in records], known=known)
@@ -425,6 +435,9 @@ def _result(
     energy = seen.excess_energy if status != "ok" else 0.0
     if status != "ok":
         covariance = widened(covariance, hidden_std(found.jacobian, energy, prior))
+    scale_std = float(np.sqrt(np.diag(covariance))[unknowns.names.index(SENSING_SCALE)])
+    error = scale_error(unknowns.value(SENSING_SCALE), scale_std)
+    covariance = widened(covariance, misstated_std(misfit, found, error, prior))
     std = np.sqrt(np.diag(covariance))
     widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
     described = {about.key: about for about in unknowns.law.described()}
@@ -438,11 +451,13 @@ def _result(
     parameters = {}
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
-        if unknowns.by_logarithm[k] or unknowns.by_inverse_square[k]:
+        if unknowns.by_logarithm[k] or unknowns.inverse_power[k]:
             share = np.inf if weak[k] else std[k] * abs(slopes[k]) / unknowns.values[k]
             parameters[name] = (
-                Estimate.inverse_square(unknowns.values[k], share, unit, described[name].high)
-                if unknowns.by_inverse_square[k]
+                Estimate.inverse(
+                    unknowns.values[k], share, unit, described[name].high, unknowns.inverse_power[k]
+                )
+                if unknowns.inverse_power[k]
                 else Estimate.lognormal(unknowns.values[k], share, unit)
             )
         else:
@@ -456,7 +471,7 @@ def _result(
     values = covariance * np.outer(slopes, slopes)
     return ActuatorFit(
         status=status,
-        notes=notes_of(unknowns.value(SENSING_SCALE)),
+        notes=notes_of(error),
         parameters=parameters,
         covariance=values,
         residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),

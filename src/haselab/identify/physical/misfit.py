@@ -29,6 +29,7 @@ from haselab.identify.physical.unknowns import (
 __all__ = [
     "CAPACITANCE",
     "LENGTH",
+    "SESSION_OFFSET_M",
     "SHARED_PX",
     "Misfit",
     "Modelled",
@@ -40,6 +41,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 LENGTH, CAPACITANCE = "length", "capacitance"
+SESSION_OFFSET_M = 2e-6  # by which tracks of 0.02 px move the zero from one record to the next
 SHARED_PX = 3e-4  # error of tracking that all frames with the same pixels share
 _LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
@@ -226,6 +228,20 @@ class SharedErrors:
         gain = np.divide(1.0 - (1.0 + total) ** -0.5, total, where=total > 0.0, out=0.0 * total)
         return cls(csr_array((share, (pixel, np.arange(count))), shape=(total.size, count)), gain)
 
+    @classmethod
+    def of_zero(cls, own: SharedErrors, length_std_m: Floats, zero_std_m: float) -> SharedErrors:
+        """The error of the zero that all lengths of a record share, after other errors.
+
+        Args:
+            own: of the same record, which are taken away first.
+            length_std_m: standard deviation of each length's own error. Shape `(F,)`.
+            zero_std_m: standard deviation of the zero.
+        """
+        share = own.whitened(zero_std_m / length_std_m)
+        total = np.array([float(share @ share)])
+        gain = np.divide(1.0 - (1.0 + total) ** -0.5, total, where=total > 0.0, out=0.0 * total)
+        return cls(csr_array(share[None]), gain)
+
     def whitened(self, values: Floats) -> Floats:
         r"""Multiply by $(1 + u u^\top)^{-1/2}$, with the weights $u$ of each pixel.
 
@@ -235,6 +251,12 @@ class SharedErrors:
         sums = self.weights @ values
         gain = self.gain if values.ndim == 1 else self.gain[:, None]
         return np.asarray(values - self.weights.T @ (gain * sums))
+
+
+def _whitened(shared: Sequence[SharedErrors], values: Floats) -> Floats:
+    for part in shared:
+        values = part.whitened(values)
+    return values
 
 
 @dataclass(frozen=True)
@@ -272,8 +294,16 @@ class Misfit:
     strict: bool = False
 
     @cached_property
-    def _shared(self) -> list[SharedErrors]:
-        return [SharedErrors.of(r, self.length_factor * r.length_std_m) for r in self.records]
+    def _shared(self) -> list[list[SharedErrors]]:
+        """Of each record, one after the other. Between records, the zero of the camera moves."""
+        found = []
+        for record in self.records:
+            std_m = self.length_factor * record.length_std_m
+            parts = [SharedErrors.of(record, std_m)]
+            if len(self.records) > 1:
+                parts.append(SharedErrors.of_zero(parts[0], std_m, SESSION_OFFSET_M))
+            found.append(parts)
+        return found
 
     @cached_property
     def segments(self) -> list[Segment]:
@@ -318,7 +348,7 @@ class Misfit:
         by = []
         for part, record, shared in zip(found, self.records, self._shared, strict=True):
             std_m = self.length_factor * record.length_std_m
-            by.append(shared.whitened(part.length_by / std_m[:, None]))
+            by.append(_whitened(shared, part.length_by / std_m[:, None]))
             std_f = self.capacitance_factor * record.capacitance_std_f
             by.append(part.capacitance_by / std_f[:, None])
         for name, std in self.known.items():
@@ -341,7 +371,7 @@ class Misfit:
         parts = []
         for part, record, shared in zip(found, self.records, self._shared, strict=True):
             std_m = self.length_factor * record.length_std_m
-            parts.append(shared.whitened((record.length_m - part.length_m) / std_m))
+            parts.append(_whitened(shared, (record.length_m - part.length_m) / std_m))
             std_f = self.capacitance_factor * record.capacitance_std_f
             parts.append((record.capacitance_f - part.capacitance_f) / std_f)
         known = [(usual(name) - unknowns.value(name)) / std for name, std in self.known.items()]

@@ -107,7 +107,7 @@ class Outlook:
             added: square roots of the informations of further experiments.
         Returns:
             Standard deviations of what varies over 2.5 widths: those of the logarithms, of
-            latencies over 5 ms, and so on; of an inverse square, that of at most the default value.
+            latencies over 5 ms, and so on; of an inverse, that of at most the default value.
             Shape `(P,)`.
         """
         covariance = covariance_of([self.present, *added])

@@ -26,7 +26,13 @@ from haselab.base import InputError, LimitError, ResultError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.base.estimate import Z95
 from haselab.identify.physical.fit import ActuatorFit
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, SHARED_PX, modelled
+from haselab.identify.physical.misfit import (
+    CAPACITANCE,
+    LENGTH,
+    SESSION_OFFSET_M,
+    SHARED_PX,
+    modelled,
+)
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Unknowns
 
@@ -36,7 +42,6 @@ Floats = NDArray[np.float64]
 _FAR = 3.5  # standard deviations of an error that all values share, beyond which it is no chance
 _NOISE_OFF = 0.1  # relative error of the stated variance of the noise
 _MOST_POINTS = 4000  # of a curve in a chart
-_SESSION_OFFSET_M = 2e-6  # by which tracks of 0.02 px move the zero from one session to the next
 _MATTERS = 0.5  # of the noise: effect of a parameter without a standard deviation
 
 
@@ -383,7 +388,7 @@ def predict_motion(
               if not experiments or name in experiments]  # fmt: skip
     frames = np.isin(record.length_experiment, wanted)
     length_by, offset_m = found.length_by, 0.0
-    zero_m = 0.0 if free_offset else _SESSION_OFFSET_M
+    zero_m = 0.0 if free_offset else SESSION_OFFSET_M
     if free_offset and frames.any():
         weights = np.where(frames, noise_m**-2.0, 0.0)
         weights /= weights.sum()

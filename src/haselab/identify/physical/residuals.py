@@ -30,7 +30,6 @@ __all__ = [
 Floats = NDArray[np.float64]
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
-_GOOD_SCALE = 0.005  # and a careful one
 _LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
 _WHITE = 1e-3  # probability of the residuals under white noise
 _ENOUGH = 20  # values of an experiment, for an rms of its own
@@ -140,7 +139,8 @@ def status_of(
     if abs(scale - 1.0) > _SCALE:
         return (
             f"the records contradict each other: the capacitances are {scale:.3g} times those that "
-            "the forces need. Check the mass, the amplifier's gain and the calibration"
+            "the forces need. Check the mass, the amplifier's gain and the calibration, or start "
+            "nearer, by [actuator.parameters]"
         ), False
     if not seen.explained:
         return (
@@ -155,12 +155,12 @@ def status_of(
     return "ok", True
 
 
-def notes_of(scale: float) -> tuple[str, ...]:
-    """Remarks for the user on the scale of the capacitances."""
-    if abs(scale - 1.0) <= _GOOD_SCALE:
+def notes_of(error: float) -> tuple[str, ...]:
+    """Remarks for the user on the capacitances; for the error, see `scale_error`."""
+    if error == 0.0:
         return ()
     return (
-        f"The capacitances are {scale:.4g} times those that the forces need. If they are well "
-        "calibrated, the amplifier's gain or the mass is wrong, and so are permittivity and "
-        "stiffness, although their intervals are narrow.",
+        f"The capacitances are {math.exp(error):.4g} times those that the forces need. If they are "
+        "well calibrated, the amplifier's gain or a mass is wrong, and so are permittivity and "
+        "stiffness. Their intervals allow for it.",
     )

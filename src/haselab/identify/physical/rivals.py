@@ -122,15 +122,16 @@ def simpler(found: Found, covariance: Floats) -> list[Rival]:
         if about is None:
             continue
         size, std = unknowns.values[k], math.sqrt(covariance[k, k])
-        if about.inverse_square:
-            effect, size, std = f"{about.key} (infinite)", size**-2.0, 2.0 * std / size**3
+        if power := about.inverse_power:
+            effect, std = f"{about.key} (infinite)", power * std / size ** (power + 1)
+            size = size**-power
         elif about.name == "branch_share":
             effect = f"the branch {name}"
         elif about.name in _NAMES:
             effect = _NAMES[about.name]
         else:
             continue
-        evidence = _log_evidence(size, std, 1 if about.inverse_square else 2, found.residuals.size)
+        evidence = _log_evidence(size, std, 1 if power else 2, found.residuals.size)
         if evidence > DECISIVE:
             rivals.append(Rival(f"without {effect}", -evidence))
     return rivals

@@ -205,7 +205,7 @@ def _descend(
     misfit: Misfit, now: _State, start: Unknowns, noise: float, most: int, *, last: bool = False
 ) -> tuple[_State, int]:
     """One stage: state, evaluations used."""
-    # at its limit, the own width of an inverse square is hardly more than 0
+    # at its limit, the own width of an inverse is hardly more than 0
     widths = start.vague_widths
     pull = vague_information(now.unknowns) if last else widths**-2.0
 

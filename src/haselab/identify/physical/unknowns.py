@@ -107,8 +107,8 @@ def usual(name: str) -> float:
 class Unknowns:
     """Names, scales and values of what a fit estimates.
 
-    Positive parameters of the law vary by their logarithm or by their inverse square, all others
-    by their value.
+    Positive parameters of the law vary by their logarithm or by a power of their inverse, all
+    others by their value.
 
     Args:
         law: to start from; parameters that are not estimated stay those of this law.
@@ -172,7 +172,7 @@ class Unknowns:
     def _scales(self) -> Scales:
         found = Scales.of(self.law, self.names)
         positive = np.array([name in _SCALES for name in self.names])
-        return Scales(found.by_logarithm | positive, found.by_inverse_square)
+        return Scales(found.by_logarithm | positive, found.inverse_power)
 
     @property
     def by_logarithm(self) -> NDArray[np.bool_]:
@@ -180,9 +180,9 @@ class Unknowns:
         return self._scales.by_logarithm
 
     @property
-    def by_inverse_square(self) -> NDArray[np.bool_]:
-        """Which of them vary by their inverse square. Shape `(P,)`."""
-        return self._scales.by_inverse_square
+    def inverse_power(self) -> Floats:
+        """Power of the inverse by which they vary; 0 of others. Shape `(P,)`."""
+        return self._scales.inverse_power
 
     @property
     def widths(self) -> Floats:
@@ -191,25 +191,27 @@ class Unknowns:
         about = {one.key: one for one in self.law.described()}
         for name, value in zip(self.names, self.values.tolist(), strict=True):
             known = about.get(name.partition("[")[0])
-            if known is not None and value > 0.0 and not known.inverse_square:
+            if known is not None and value > 0.0 and not known.inverse_power:
                 widths[name] = max(_WIDTH * (1.0 - known.low / value), _LEAST_WIDTH)
         found = np.array([widths.get(name, _WIDTH) for name in self.names])
-        inverse = self.by_inverse_square
-        found[inverse] *= 2.0 / self.values[inverse] ** 2
+        power = self.inverse_power
+        inverse = power > 0.0
+        found[inverse] *= power[inverse] / self.values[inverse] ** power[inverse]
         return found
 
     @property
     def vague_widths(self) -> Floats:
-        """The same, but of an inverse square at least that at the default of the kind.
+        """The same, but of an inverse at least that at the default of the kind.
 
-        Near its highest value, where an inverse square is 0, its own width would be as good as 0,
+        Near its highest value, where the inverse is 0, its own width would be as good as 0,
         and a parameter that nobody knows would look known. Shape `(P,)`.
         """
         usual_law, found = type(self.law)(), self.widths
         fields = {about.key: about.name for about in self.law.described()}
-        for k in np.flatnonzero(self.by_inverse_square):
+        power = self.inverse_power
+        for k in np.flatnonzero(power):
             default = float(getattr(usual_law, fields[self.names[k]]))
-            found[k] = max(found[k], 2.0 * _WIDTH / default**2)
+            found[k] = max(found[k], power[k] * _WIDTH / default ** power[k])
         return found
 
     @property

@@ -122,6 +122,8 @@ def _by_full_name(values: Any) -> Any:
             else:
                 found[name] = value
         return found
+    if isinstance(values, list) and not values:
+        raise ValueError("a list is empty; for no branch, state one with a share of 0")
     return {f"[{k}]": part for k, part in enumerate(values)} if isinstance(values, list) else values
 
 

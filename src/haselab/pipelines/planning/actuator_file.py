@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from haselab.actuators import ACTUATORS, ADDED_INERTIA, DRIFTS, with_parameters
+from haselab.actuators import ACTUATORS, ADDED_INERTIA, DRIFTS, with_parameters, with_stated
 from haselab.base import InputError, LimitError
 from haselab.identify.physical.outlook import Outlook
 from haselab.identify.physical.unknowns import Unknowns
@@ -41,7 +41,7 @@ def planner_of(about: ActuatorSection, model: PhysicalTable, ends_v: Ends, path:
             f"or its covariance is missing, or mass_kg. {_AGAIN} {path}"
         )
     try:
-        law = with_parameters(ACTUATORS.find(model.kind)(), about.parameters)
+        law = with_stated(ACTUATORS.find(model.kind)(), about.parameters)
         values = dict(model.parameters)
         own = {about.key for about in law.described()}
         law = with_parameters(law, {k: v for k, v in values.items() if k.partition("[")[0] in own})

@@ -16,6 +16,7 @@ from haselab.actuators import (
     Scales,
     draw_parameters,
     with_parameters,
+    with_stated,
 )
 from haselab.base import InputError, JsonObject, LimitError, table_at
 from haselab.models.actuator import ActuatorTables
@@ -112,7 +113,7 @@ def identified_twin(path: Path, bench: TwinConfig, draw: int | None = None) -> T
             f"Correct the kind, or identify the actuator again. {path}"
         )
     try:
-        law = with_parameters(ACTUATORS.find(model.kind)(), about.parameters)
+        law = with_stated(ACTUATORS.find(model.kind)(), about.parameters)
         if draw is None:
             law, added_kg, scale, drift = _with(law, model, model.parameters)
         else:
@@ -237,7 +238,7 @@ def _drawn(
         found = draw_parameters(scales, values, spread, by_index, rng)
         drawn = {**known, **dict(zip(names, found.tolist(), strict=True))}
         if not np.isfinite(found).all():
-            reason = "An inverse square is negative."
+            reason = "An inverse is negative."
             continue
         if drawn.get(ADDED_INERTIA, 0.0) < 0.0:
             reason = f"{ADDED_INERTIA} is below 0."

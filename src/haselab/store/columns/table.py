@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -141,7 +141,10 @@ def read_every_column(path: Path | str) -> Table:
 
 
 def read_table(
-    path: Path | str, columns: Sequence[str], options: ColumnOptions = AS_THE_FILE_STATES
+    path: Path | str,
+    columns: Sequence[str],
+    options: ColumnOptions = AS_THE_FILE_STATES,
+    may_lack: Collection[str] = (),
 ) -> Table:
     """Read named columns of a file.
 
@@ -154,6 +157,8 @@ def read_table(
         path: as `open_columns`, which reads larger files.
         columns: wanted names, as `open_columns` takes them.
         options: the column of times, and units, where the file does not state them.
+        may_lack: columns in which values may be NaN. A row with 0 in a column `valid` is then kept,
+            without these values.
     Returns:
         The wanted columns in SI units, and the rate.
     Raises:
@@ -165,10 +170,16 @@ def read_table(
         stream = ColumnStream(archive, wanted, use_times=False, options=options)
         chunks = list(stream.chunks(_CHUNK_ROWS))
         whole = {name: np.concatenate([p[k] for p in chunks]) for k, name in enumerate(wanted)}
-        kept = _valid_rows(archive, wanted, len(whole[wanted[0]]))
-        values = {name: _finite(name, column[kept], archive.file) for name, column in whole.items()}
-        left_out = int(np.count_nonzero(~kept))
-        rate_hz = None if left_out else stream.rate_hz
+        valid = _valid_rows(archive, wanted, len(whole[wanted[0]]))
+        kept = np.ones_like(valid) if may_lack else valid
+        for lacking in may_lack:
+            whole[lacking] = np.where(valid, whole[lacking], np.nan)
+        values = {
+            name: _finite(name, column[kept], archive.file, may_lack=name in may_lack)
+            for name, column in whole.items()
+        }
+        left_out = int(np.count_nonzero(~valid))
+        rate_hz = stream.rate_hz if kept.all() else None
         name, time_s = _times(archive, kept, options) if rate_hz is None else (None, None)
         if time_s is not None:
             rate_hz = rate_of_times(time_s)
@@ -230,9 +241,9 @@ def _times(
     return name, time_s
 
 
-def _finite(name: str, values: NDArray[Any], file: Path) -> Floats:
+def _finite(name: str, values: NDArray[Any], file: Path, *, may_lack: bool) -> Floats:
     vector = np.ascontiguousarray(values, dtype=np.float64)
-    bad = np.flatnonzero(~(np.abs(vector) <= _LARGEST))
+    bad = np.flatnonzero(~((np.abs(vector) <= _LARGEST) | (may_lack & np.isnan(vector))))
     if bad.size:
         raise InputError(
             f"Column {name} has {vector[bad[0]]:g} in row {bad[0] + 1} ({bad.size} such rows). "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,19 +63,31 @@ class MotionRecord:
     capacitance_later_s: Floats | float = 0.0
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
+    @cached_property
+    def sensed(self) -> NDArray[np.bool_]:
+        """The intervals of the drive in which a capacitance was sensed. Shape `(N,)`."""
+        found = np.zeros(self.drive.voltage_v.size, dtype=np.bool_)
+        found[self.window] = True
+        return found
+
+    @cached_property
+    def _shares(self) -> csr_array:
+        """Share of each sensed interval in each capacitance. Shape `(C, S)`."""
+        duration_s = np.diff(self.drive.edge_s)[self.window]
+        share = duration_s / np.bincount(self.window_of, duration_s)[self.window_of]
+        place = np.cumsum(self.sensed) - 1
+        shape = self.capacitance_f.size, int(np.count_nonzero(self.sensed))
+        return csr_array((share, (self.window_of, place[self.window])), shape=shape)
+
     def over_windows(self, values: Floats) -> Floats:
         """Means over the intervals in which each capacitance was sensed.
 
         Args:
-            values: means over each interval of the drive. Shape `(N,)` or `(N, P)`.
+            values: means over each interval of `sensed`. Shape `(S,)` or `(S, P)`.
         Returns:
             One per capacitance. Shape `(C,)` or `(C, P)`.
         """
-        duration_s = np.diff(self.drive.edge_s)[self.window]
-        share = duration_s / np.bincount(self.window_of, duration_s)[self.window_of]
-        shape = self.capacitance_f.size, values.shape[0]
-        weights = csr_array((share, (self.window_of, self.window)), shape=shape)
-        return np.asarray(weights @ values)
+        return np.asarray(self._shares @ values)
 
     def __post_init__(self) -> None:
         frames = (self.length_m, self.length_std_m, self.length_experiment)

@@ -421,14 +421,21 @@ class SampledLaw:
         wanted = np.ones(intervals, np.uint8) if sensed is None else np.asarray(sensed, np.uint8)
         means_wanted = int(np.count_nonzero(wanted))
 
-        def part(chosen: NDArray[np.int64]) -> tuple[NDArray[np.void], list[Floats], list[Floats]]:
+        def part(
+            chosen: NDArray[np.int64],
+        ) -> tuple[NDArray[np.void], tuple[Floats, ...], list[Floats]]:
             """What some of the columns give; the motion itself is the same in each part.
 
             Columns of zeros make their number a multiple of the processor's vectors.
             """
             moved, size = start.copy(), chosen.size
             padded = -(-size // _VECTOR) * _VECTOR
-            seen = [np.empty(n) for n in (times.size, times.size, intervals, intervals)]
+            seen = (
+                np.empty(times.size),
+                np.empty(times.size),
+                np.empty(intervals),
+                np.empty(intervals),
+            )
             own_kinds = np.full(padded, _motion.START, dtype=np.int32)
             own_kinds[:size] = kinds[chosen]
             own_rows = np.zeros((rows.shape[0], padded))

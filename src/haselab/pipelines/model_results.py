@@ -11,7 +11,7 @@ import contextlib
 import pickle
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,11 +75,15 @@ def results_of_model(
         return seen[name]
 
     problem = _Problem(centre, record, study, rig, direct.values, known)
-    middle = problem.rows(recorded, np.zeros(unknowns.values.size))
-    axes = _along(problem, recorded, seen, _axes(fit.covariance, unknowns.slopes))
+    middle, near = problem.fitted(recorded, np.zeros(unknowns.values.size))
+    problem = replace(problem, near=near)
+    changes = _axes(fit.covariance, unknowns.slopes)
+    # that of no change, which is found in the same way, shares what the searches leave
+    still, *axes = _along(problem, recorded, seen, np.vstack([0.0 * changes[:1], changes]))
     found = {}
     for key, estimate in middle.items():
-        moved = np.array([along[key].value - estimate.value for along in axes if key in along])
+        ends = [along[key].value for along in axes if key in along and key in still]
+        moved = np.array([end - still[key].value for end in ends])
         if key not in _IN_STEPS and len(moved) == len(axes) and moved.any():
             std = float(np.linalg.norm(moved))
             found[key] = Estimate.normal(estimate.value, std, estimate.unit)
@@ -88,7 +92,11 @@ def results_of_model(
 
 @dataclass(frozen=True)
 class _Problem:
-    """The fits on a model's motion, see `results_of_model`."""
+    """The fits on a model's motion, see `results_of_model`.
+
+    Args:
+        near: values that the fits found on almost the same motion, where they start; empty: none.
+    """
 
     centre: Modelled
     record: MotionRecord
@@ -96,9 +104,12 @@ class _Problem:
     rig: RigDescription
     values: Mapping[type, object]
     known: Mapping[type, object] | None
+    near: Mapping[type, object] = field(default_factory=dict)
 
-    def rows(self, source: Source, change: Floats) -> dict[str, Estimate]:
-        """Results after a change of what varies."""
+    def fitted(
+        self, source: Source, change: Floats
+    ) -> tuple[dict[str, Estimate], dict[type, object]]:
+        """Results and values after a change of what varies."""
         centre = self.centre
         moved = replace(
             centre,
@@ -107,15 +118,18 @@ class _Problem:
         )
         motion = _Motion(source, self.record, moved)
         return _fitted(
-            Analysis(self.study, self.rig, motion, repeated=self.values, known=self.known)
-        )
+            Analysis(
+                self.study, self.rig, motion,
+                repeated=self.values, known=self.known, near=self.near,
+            )
+        )  # fmt: skip
 
 
 def rows_of_changes(
     problem: _Problem, source: Source, changes: Floats
 ) -> list[dict[str, Estimate]]:
     """Results after each of some changes; a function of the module, for a helper process."""
-    return [problem.rows(source, change) for change in changes]
+    return [problem.fitted(source, change)[0] for change in changes]
 
 
 def _along(
@@ -127,7 +141,7 @@ def _along(
     """
     with contextlib.ExitStack() as opened:
         try:
-            pickle.dumps((problem.values, problem.known, problem.study))
+            pickle.dumps((problem.values, problem.known, problem.near, problem.study))
             pool = opened.enter_context(ThreadPoolExecutor(1))
             helper = HelperProcess([__name__], _PATIENCE_S)
             opened.callback(helper.close)  # also if this process is interrupted meanwhile
@@ -142,13 +156,16 @@ def _along(
             return found + rows_of_changes(problem, source, changes[half:])
 
 
-def _fitted(analysis: Analysis) -> dict[str, Estimate]:
+def _fitted(analysis: Analysis) -> tuple[dict[str, Estimate], dict[type, object]]:
     found: dict[str, Estimate] = {}
+    values: dict[type, object] = {}
     for experiment in analysis.experiments:
         if any(key.startswith(_ROWS) for key in rows_of_experiment(experiment)):
             with contextlib.suppress(NotPlayedError):
-                found |= analysis.outcome(experiment).quantities
-    return {key: estimate for key, estimate in found.items() if key.startswith(_ROWS)}
+                outcome = analysis.outcome(experiment)
+                found |= outcome.quantities
+                values |= {type(value): value for value in outcome.values}
+    return {key: estimate for key, estimate in found.items() if key.startswith(_ROWS)}, values
 
 
 def _axes(covariance: Floats, slopes: Floats) -> Floats:

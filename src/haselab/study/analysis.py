@@ -50,6 +50,8 @@ class Analysis:
         fitted: called with each outcome, as soon as it is known.
         repeated: values of another run, by type, to play instead of those found here.
         known: values of an actuator file, by type, that no experiment of the study finds.
+        near: values of the same fits on almost the same observations, by type. A fit may start
+            there, and may leave out figures and intervals.
     """
 
     def __init__(
@@ -61,12 +63,14 @@ class Analysis:
         fitted: Callable[[ExperimentResult], None] = lambda outcome: None,
         repeated: Mapping[type, object] | None = None,
         known: Mapping[type, object] | None = None,
+        near: Mapping[type, object] | None = None,
     ) -> None:
         self.study, self.rig = study, rig
         self.experiments = experiments_of(study)
         self._source, self._on_fit, self._fitted = source, on_fit, fitted
         self._repeated = {} if repeated is None else repeated
         self._known = known or {}
+        self._near = near or {}
         self._seen: dict[str, Observation] = {}
         self._outcomes: dict[str, ExperimentResult | NotPlayedError] = {}
         self._under_way: list[str] = []
@@ -121,6 +125,10 @@ class Analysis:
     def repeated(self, kind: type[Value]) -> Value | None:
         """Return the value of the run that is repeated; None if there is none."""
         return cast("Value | None", self._repeated.get(kind))
+
+    def near(self, kind: type[Value]) -> Value | None:
+        """Return the value of a fit of almost the same observations; None if there is none."""
+        return cast("Value | None", self._near.get(kind))
 
     def to_play(self, kind: type[Value]) -> Value:
         """Return the value to play: that of a run that is repeated, else the one found here.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -66,20 +66,22 @@ def results_of_model(
     if not fit.succeeded:
         raise ResultError(fit.status)
     unknowns = fit.unknowns()
-    centre = modelled(unknowns, record)
-    seen: dict[str, Observation] = {}
+    with _second_process() as helper:  # it loads its modules during the first fit
+        centre = modelled(unknowns, record)
+        seen: dict[str, Observation] = {}
 
-    def recorded(name: str) -> Observation:
-        if name not in seen:
-            seen[name] = source(name)
-        return seen[name]
+        def recorded(name: str) -> Observation:
+            if name not in seen:
+                seen[name] = source(name)
+            return seen[name]
 
-    problem = _Problem(centre, record, study, rig, direct.values, known)
-    middle, near = problem.fitted(recorded, np.zeros(unknowns.values.size))
-    problem = replace(problem, near=near)
-    changes = _axes(fit.covariance, unknowns.slopes)
-    # that of no change, which is found in the same way, shares what the searches leave
-    still, *axes = _along(problem, recorded, seen, np.vstack([0.0 * changes[:1], changes]))
+        problem = _Problem(centre, record, study, rig, direct.values, known)
+        middle, near = problem.fitted(recorded, np.zeros(unknowns.values.size))
+        problem = replace(problem, near=near)
+        changes = _axes(fit.covariance, unknowns.slopes)
+        # that of no change, which is found in the same way, shares what the searches leave
+        changes = np.vstack([0.0 * changes[:1], changes])
+        still, *axes = _along(problem, recorded, seen, changes, helper)
     found = {}
     for key, estimate in middle.items():
         ends = [along[key].value for along in axes if key in along and key in still]
@@ -88,6 +90,20 @@ def results_of_model(
             std = float(np.linalg.norm(moved))
             found[key] = Estimate.normal(estimate.value, std, estimate.unit)
     return found
+
+
+@contextlib.contextmanager
+def _second_process() -> Iterator[HelperProcess | None]:
+    """A process for half of the fits; None if it cannot be started."""
+    try:
+        helper = HelperProcess([__name__], _PATIENCE_S)
+    except DeviceError:
+        yield None
+        return
+    try:
+        yield helper
+    finally:
+        helper.close()
 
 
 @dataclass(frozen=True)
@@ -133,21 +149,26 @@ def rows_of_changes(
 
 
 def _along(
-    problem: _Problem, source: Source, seen: Mapping[str, Observation], changes: Floats
+    problem: _Problem,
+    source: Source,
+    seen: Mapping[str, Observation],
+    changes: Floats,
+    helper: HelperProcess | None,
 ) -> list[dict[str, Estimate]]:
     """Results after each change; a second process makes half of these fits.
 
     It makes none where a value of another package cannot be sent to it, or if it ends early.
     """
+    try:
+        pickle.dumps((problem.values, problem.known, problem.near, problem.study))
+    except (pickle.PicklingError, TypeError, AttributeError):
+        helper = None
+    if helper is None:
+        return rows_of_changes(problem, source, changes)
+    half = len(changes) // 2
     with contextlib.ExitStack() as opened:
-        try:
-            pickle.dumps((problem.values, problem.known, problem.near, problem.study))
-            pool = opened.enter_context(ThreadPoolExecutor(1))
-            helper = HelperProcess([__name__], _PATIENCE_S)
-            opened.callback(helper.close)  # also if this process is interrupted meanwhile
-        except (DeviceError, pickle.PicklingError, TypeError, AttributeError):
-            return rows_of_changes(problem, source, changes)
-        half = len(changes) // 2
+        pool = opened.enter_context(ThreadPoolExecutor(1))
+        opened.callback(helper.close)  # first, also if this process is interrupted meanwhile
         sent = pool.submit(helper.call, rows_of_changes, problem, seen.__getitem__, changes[half:])
         found = rows_of_changes(problem, source, changes[:half])
         try:

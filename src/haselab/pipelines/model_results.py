@@ -21,7 +21,7 @@ from haselab.identify.physical import ActuatorFit, MotionRecord
 from haselab.identify.physical.misfit import Modelled, modelled
 from haselab.rig import RigDescription
 from haselab.runtime.helper_process import HelperProcess
-from haselab.study.analysis import Analysis
+from haselab.study.analysis import Analysis, Given
 from haselab.study.definition import Study
 from haselab.study.experiment import NotPlayedError
 from haselab.study.experiments.foreign import rows_of_experiment
@@ -133,15 +133,11 @@ class _Problem:
             capacitance_f=centre.capacitance_f + centre.capacitance_by @ change,
         )
         motion = _Motion(source, self.record, moved)
-        return _fitted(
-            Analysis(
-                self.study, self.rig, motion,
-                repeated=self.values, known=self.known, near=self.near,
-            )
-        )  # fmt: skip
+        given = Given(self.values, self.known or {}, self.near)
+        return _fitted(Analysis(self.study, self.rig, motion, given=given))
 
 
-def rows_of_changes(
+def _rows_of_changes(
     problem: _Problem, source: Source, changes: Floats
 ) -> list[dict[str, Estimate]]:
     """Results after each of some changes; a function of the module, for a helper process."""
@@ -164,17 +160,17 @@ def _along(
     except (pickle.PicklingError, TypeError, AttributeError):
         helper = None
     if helper is None:
-        return rows_of_changes(problem, source, changes)
+        return _rows_of_changes(problem, source, changes)
     half = len(changes) // 2
     with contextlib.ExitStack() as opened:
         pool = opened.enter_context(ThreadPoolExecutor(1))
         opened.callback(helper.close)  # first, also if this process is interrupted meanwhile
-        sent = pool.submit(helper.call, rows_of_changes, problem, seen.__getitem__, changes[half:])
-        found = rows_of_changes(problem, source, changes[:half])
+        sent = pool.submit(helper.call, _rows_of_changes, problem, seen.__getitem__, changes[half:])
+        found = _rows_of_changes(problem, source, changes[:half])
         try:
             return found + sent.result()
         except (DeviceError, KeyError):
-            return found + rows_of_changes(problem, source, changes[half:])
+            return found + _rows_of_changes(problem, source, changes[half:])
 
 
 def _fitted(analysis: Analysis) -> tuple[dict[str, Estimate], dict[type, object]]:

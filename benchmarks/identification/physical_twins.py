@@ -32,7 +32,7 @@ _DRAWS = 50
 _DRIVE = ("edge_s", "voltage_v", "load_n", "mass_kg", "ripple_v2")
 _SEEN = ("length_time_s", "length_m", "length_std_m", "window", "window_of", "capacitance_f",
          "capacitance_std_f", "length_experiment", "capacitance_experiment",
-         "capacitance_later_s")  # fmt: skip
+         "capacitance_later_s", "window_weight")  # fmt: skip
 
 
 class Twin:

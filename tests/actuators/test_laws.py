@@ -16,6 +16,7 @@ from haselab.actuators import (
     Losses,
     PeanoHasel,
     PlanarHasel,
+    SampledLaw,
     actuator_law,
     equilibrium_m,
 )
@@ -251,3 +252,9 @@ def test_a_grid_solved_from_a_similar_law_is_the_same(kind):
             rounding = 1e-10 * np.abs(getattr(near, name)).max()
             within = 1e-4 * np.abs(exact).max() + rounding
             assert np.abs(found - exact).max() <= within, (about.name, name)
+
+
+def test_a_law_that_is_valid_at_no_length_is_refused():
+    law = PlanarHasel(shell_lateral_stretch=2.59, locking_stretch=1.5)
+    with pytest.raises(LimitError, match=r"valid from 0\.0193867 to 0\.0114957 m: at no length"):
+        SampledLaw(law, 1e4)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.actuators.law import ActuatorLaw, LawValues
-from haselab.base import InputError
+from haselab.base import InputError, LimitError
 
 __all__ = ["LawTable", "law_table"]
 
@@ -74,6 +74,7 @@ def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
     Returns:
         The table.
     Raises:
+        LimitError: The law is valid at no length.
         InputError: The law gives a value that is not finite, a capacitance or gap of 0 or less, or
             is not smooth enough to interpolate.
     Example:
@@ -82,6 +83,11 @@ def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
         (1, 1024)
     """
     limits = law.length_limits_m
+    if not limits.low < limits.high:
+        raise LimitError(
+            f"The {law.kind} is valid from {limits.low:g} to {limits.high:g} m: at no length. "
+            "Change its parameters."
+        )
     lengths_m, step_m = np.linspace(limits.low, limits.high, LENGTHS, retstep=True)
     voltages_v = np.linspace(0.0, highest_v, VOLTAGES)
     with np.errstate(all="ignore"):  # the values are checked below

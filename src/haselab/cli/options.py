@@ -54,7 +54,7 @@ _SHARED: dict[str, tuple[str | None, str]] = {
         None,
         "Identify the physical model from the recording.",
     ),
-    "--quick": (None, "Play the short version of the study."),
+    "--quick": (None, "Use the short version."),
     "--rate-hz": (None, "Set the sampling rate in Hz."),
     "--reading": (
         None,

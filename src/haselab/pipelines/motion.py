@@ -38,9 +38,9 @@ class _Blocks:
             Shape `(S, 2)`.
         carrier_v: peak of the carrier at the actuator, by the voltage monitor; NaN if it was not
             seen.
-        rise: of the voltage monitor at each switch but the first, see `_rise`. Shape
-            `(4, N - 1)`.
-        later_s: of each capacitance, see `_later_s`.
+        rise: of the voltage monitor at each switch, see `_rise`. Shape `(4, N)`.
+        weight: of each of those samples' parts in the capacitances, see `_weights`. Shape `(N, S)`.
+        later_s: of each capacitance, see `_weights`.
     """
 
     start_s: Floats
@@ -51,6 +51,7 @@ class _Blocks:
     used: NDArray[np.bool_]
     carrier_v: float
     rise: Floats
+    weight: Floats
     later_s: Floats
 
 
@@ -131,15 +132,16 @@ def _joined(
     chosen = np.flatnonzero(inside)[order]
     none, no = np.zeros(0, dtype=np.int64), np.zeros(0)
     window, window_of, of_block, block = [none], [none], [none], [none]
-    farad, std_f, later_s = [no], [no], [no]
+    weight, farad, std_f, later_s = [no], [no], [no], [no]
     count = 0
     for k, name in enumerate(names):
         if name not in blocks:
             continue
         part = blocks[name]
-        intervals, values = _windows(drive, part)
+        intervals, values, weights = _windows(drive, part)
         window.append(intervals)
         window_of.append(values + count)
+        weight.append(weights)
         farad.append(part.capacitance_f[part.used])
         std_f.append(part.std_f[part.used])
         later_s.append(part.later_s[part.used])
@@ -152,24 +154,31 @@ def _joined(
         np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
         float(rig.get("exposure_s", 0.0)), float(rig["scale_m_per_px"]),
         np.concatenate(later_s),
-        np.concatenate(block),
+        np.concatenate(block), np.concatenate(weight),
     )  # fmt: skip
 
 
-def _windows(drive: Drive, blocks: _Blocks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Intervals that count for the used blocks, and the index of the block of each."""
-    intervals, values = [], []
+def _windows(drive: Drive, blocks: _Blocks) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    """Intervals that count for the used blocks, the block of each, and weights of their seconds."""
+    intervals, values, weights = [], [], []
     start_s = blocks.start_s[blocks.used]
-    for low_s, high_s in blocks.spans_s.tolist():
+    for (low_s, high_s), weight in zip(
+        blocks.spans_s.tolist(), blocks.weight[blocks.used].T, strict=True
+    ):
         at, end = np.searchsorted(
             drive.edge_s, [start_s + low_s - _SAME_S, start_s + high_s - _SAME_S]
         )
         while (left := at < end).any():
             intervals.append(at[left])
             values.append(np.flatnonzero(left))
+            weights.append(weight[left] / (high_s - low_s))
             at = at + 1
     none = np.zeros(0, dtype=np.int64)
-    return np.concatenate([none, *intervals]), np.concatenate([none, *values])
+    return (
+        np.concatenate([none, *intervals]),
+        np.concatenate([none, *values]),
+        np.concatenate([np.zeros(0), *weights]),
+    )
 
 
 def _sensed(
@@ -197,7 +206,7 @@ def _blocks(
     return _Blocks(
         record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
         sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v, rise,
-        _later_s(record.codes[:, :, 0], lockin),
+        *_weights(record.codes[:, :, 0], lockin),
     )  # fmt: skip
 
 
@@ -271,11 +280,18 @@ def _carrier_gain(conditions: NDArray[np.void], blocks: Collection[_Blocks], gai
     return float(np.median(found)) if found else gain
 
 
-def _later_s(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
-    r"""How much later than the middle of its samples the capacitance of each block is.
+def _weights(codes: NDArray[np.int16], lockin: Lockin) -> tuple[Floats, Floats]:
+    r"""How the capacitance of a block follows from that of each moment in it.
 
-    In a number of carrier periods that is not whole, a capacitance that rises with the time from
-    the middle, $t - t_m$, changes the fitted carrier of the current, by the carrier's phase.
+    In a number of carrier periods that is not whole, a capacitance that changes in the block
+    changes the fitted carrier of the current by the carrier's phase.
+
+    Args:
+        codes: of the voltage monitor. Shape `(N, samples)`.
+        lockin: that sensed them.
+    Returns:
+        Weights of the uninterrupted parts that count, shape `(N, S)`, whose sum is 1; by how much
+        later than the mean of all parts with these weights a steady rise is sensed, shape `(N,)`.
     """
     at = np.flatnonzero(lockin.counted)
     config = lockin.config
@@ -286,30 +302,43 @@ def _later_s(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
     side = at >= config.blank[1]
     basis = np.stack([turn.real, turn.imag, side, ~side, ramp_s / np.ptp(ramp_s)], axis=1)
     fit = np.linalg.pinv(basis)[:2]  # to the coefficients of cosine and sine
-    cosine, sine = fit @ np.stack([ramp_s * turn.real, ramp_s * turn.imag], axis=1)
     voltage = codes[:, at].astype(np.float32) @ fit.T.astype(np.float32)
     current = 1j * (voltage[:, 0] - 1j * voltage[:, 1])  # ahead by a quarter of a period
     size = np.maximum(np.abs(current), np.finfo(np.float32).tiny)
     c, s = current.real / size, -current.imag / size  # c cos + s sin is the current
-    found = (cosine[0] * c + cosine[1] * s) * c + (sine[0] * c + sine[1] * s) * s
-    return np.asarray(found, dtype=np.float64)
+
+    def sensed(change: Floats) -> Floats:
+        cosine, sine = fit @ np.stack([change * turn.real, change * turn.imag], axis=1)
+        found = (cosine[0] * c + cosine[1] * s) * c + (sine[0] * c + sine[1] * s) * s
+        return np.asarray(found, dtype=np.float64)
+
+    part = np.cumsum(np.diff(at, prepend=at[:1]) > 1)
+    inside = [part == k for k in range(part[-1] + 1)]
+    weight = np.stack([sensed(chosen.astype(np.float64)) for chosen in inside], axis=1)
+    middle_s = np.array([ramp_s[chosen].mean() for chosen in inside])
+    return weight, sensed(ramp_s) - weight @ middle_s
 
 
 def _rise(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
     """Change and area of the voltage monitor at each switch, and the same of its square.
 
-    The area is the sum of the samples after the switch, less what they reach.
+    The area is the sum of the samples after the switch, less what they reach. Of the first block,
+    the voltage before the switch is that of its own samples, in whole periods of the carrier.
     """
     first, end = lockin.config.blank
+    period = 2.0 * np.pi * lockin.config.rate_hz / lockin.config.omega_rad_s
+    whole = round(int(first / period) * period)
     found = []
     for power in (1, 2):
         level = (codes[:, end:].astype(np.float64) ** power).mean(axis=1)
-        after = codes[1:, first:end].astype(np.float64) ** power
-        found += [np.diff(level), (after - level[1:, None]).sum(axis=1)]
+        before = codes[:1, first - whole : first].astype(np.float64) ** power
+        start = before.mean(axis=1) if whole else level[:1]
+        after = codes[:, first:end].astype(np.float64) ** power
+        found += [np.diff(level, prepend=start), (after - level[:, None]).sum(axis=1)]
     change, area = found[:2]
-    small = np.abs(change) < _LARGE
+    small = np.abs(change[1:]) < _LARGE
     if small.any():  # the carrier's part is the same in all
-        found[1] = area - area[small].mean()
+        found[1] = area - area[1:][small].mean()
     return np.stack(found)
 
 
@@ -320,16 +349,17 @@ def _late_s(blocks: Collection[_Blocks], rate_hz: float) -> list[Floats]:
     are delayed equally.
     """
     rises = [part.rise for part in blocks]
-    small = [rise[:2, np.abs(rise[0]) < _LARGE] for rise in rises]
+    # the generator starts with the first block
+    small = [rise[:2, 1:][:, np.abs(rise[0, 1:]) < _LARGE] for rise in rises]
     change, area = np.concatenate([np.zeros((2, 0)), *small], axis=1)
     size = float(change @ change)
     usual = -float(change @ area) / size if size > 0.0 else 0.5
     found = []
     for rise in rises:
-        late = np.full(rise.shape[1] + 1, usual)  # of the first block nobody knows the step
+        late = np.full(rise.shape[1], usual)
         # a step to the opposite voltage changes no square, hence no force
-        large = np.flatnonzero((np.abs(rise[0]) >= _LARGE) & (np.abs(rise[2]) >= _LARGE**2))
-        late[1 + large] = -rise[3, large] / rise[2, large]
+        large = (np.abs(rise[0]) >= _LARGE) & (np.abs(rise[2]) >= _LARGE**2)
+        late[large] = -rise[3, large] / rise[2, large]
         # the first sample still shows the voltage before: half an interval of the sums
         found.append((late - 0.5) / rate_hz)
     return found

@@ -294,7 +294,8 @@ def capacitance_map(
     """Fit the strain as a function of capacitance.
 
     The map is eq. 5, a straight line. FILE holds the columns of capacitance and strain. The slope
-    is per F for a capacitance in F, and per unit of relative capacitance otherwise.
+    is per F for a capacitance in F, and per unit of relative capacitance otherwise. For
+    --actuator, a polynomial of degree 1 to 3 is fitted too.
     """
     known = None if actuator is None else load_actuator(actuator, to_write=True)
     files = [file] if strain_file is None else [file, strain_file]

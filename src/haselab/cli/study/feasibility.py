@@ -39,7 +39,7 @@ def _page(found: Feasibility) -> str:
 @click.command("feasibility")
 @click.argument("study", type=click.Path(path_type=Path))
 @shared_option("--rig", required=True, type=click.Path(path_type=Path))
-@shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
+@shared_option("--quick", is_flag=True, detail="The table [quick] of STUDY describes it.")
 @actuator_option("Uses its voltage of zero strain and its controller, as haselab run does.")
 @answer_options(plot=True)
 def command(

@@ -66,7 +66,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
 )  # fmt: skip
 @shared_option("--twin", type=click.Path(path_type=Path), detail="Default: that of --rig.")
 @draw_option
-@shared_option("--quick", is_flag=True, detail="It is described by its table [quick].")
+@shared_option("--quick", is_flag=True, detail="The table [quick] of STUDY describes it.")
 @keep_video_option
 @actuator_option(
     "Its limits and its calibration apply; its maps are used if the study has no "

@@ -37,7 +37,8 @@ _MOST_WORKERS = 256
 @click.command("scoreboard")
 @shared_option(
     "--controller", "controllers", multiple=True,
-    detail="Repeat the option for several. Default: all kinds that have an automatic design.",
+    detail="Repeat the option for several. Default: all kinds with an automatic design or "
+    "defaults.",
 )  # fmt: skip
 @click.option(
     "--task", "tasks", multiple=True, metavar="NAME",

@@ -41,6 +41,8 @@ class MotionRecord:
         capacitance_later_s: by how much later than the middle of its intervals each capacitance
             was sensed, for all of them or for each. Shape `()` or `(C,)`.
         block: of each capacitance within its experiment, shape `(C,)`; empty if it is not known.
+        window_weight: of a second of each interval in its capacitance, shape `(W,)`; empty: all
+            weigh the same.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -62,6 +64,7 @@ class MotionRecord:
     pixel_m: float = 0.0
     capacitance_later_s: Floats | float = 0.0
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    window_weight: Floats = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def sensed(self) -> NDArray[np.bool_]:
@@ -73,14 +76,16 @@ class MotionRecord:
     @cached_property
     def _shares(self) -> csr_array:
         """Share of each sensed interval in each capacitance. Shape `(C, S)`."""
-        duration_s = np.diff(self.drive.edge_s)[self.window]
-        share = duration_s / np.bincount(self.window_of, duration_s)[self.window_of]
+        weight = np.diff(self.drive.edge_s)[self.window]
+        if self.window_weight.size:
+            weight = weight * self.window_weight
+        share = weight / np.bincount(self.window_of, weight)[self.window_of]
         place = np.cumsum(self.sensed) - 1
         shape = self.capacitance_f.size, int(np.count_nonzero(self.sensed))
         return csr_array((share, (self.window_of, place[self.window])), shape=shape)
 
     def over_windows(self, values: Floats) -> Floats:
-        """Means over the intervals in which each capacitance was sensed.
+        """Weighted means over the intervals in which each capacitance was sensed.
 
         Args:
             values: means over each interval of `sensed`. Shape `(S,)` or `(S, P)`.

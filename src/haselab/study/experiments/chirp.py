@@ -30,6 +30,7 @@ __all__ = ["ChirpTest"]
 
 _PER_VOLT = {"S20.gain_per_volt": Quantity("plant, gain from the drive voltage", "1/V")}
 _ABOUT = "strain for a volt before the amplifier, about the baseline; no voltage map is known"
+_NO_SLOW = "the open-loop trials do not determine a slow branch of the plant"
 _LEAD_S = 1.0  # recorded at the baseline before the chirp
 
 
@@ -79,7 +80,10 @@ class ChirpTest(Experiment[Chirp]):
         opened = [analysis.observe(name) for name in open_names(self.study)]
         near = analysis.near(Dynamics)
         both = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig, near)
-        return ExperimentResult(both.quantities, figures=both.figures, values=(both,))
+        missing = {key: _NO_SLOW for key in self.rows() if key not in both.quantities}
+        return ExperimentResult(
+            both.quantities, figures=both.figures, values=(both,), missing=missing
+        )
 
     def _alone(
         self, quantities: Mapping[str, Estimate], figures: Mapping[str, object], needs: str

@@ -76,6 +76,8 @@ def fit_chirp_and_steps(
 ) -> Dynamics:
     """Fit the second order to the chirp and the slow branch to the steps; join them to one plant.
 
+    If the steps do not determine the slow branch, the plant is the second order alone.
+
     Args:
         chirp: the chirp.
         steps: the open-loop trials.
@@ -111,6 +113,8 @@ def fit_chirp_and_steps(
         "steps, slow branch",
     )
     (slow_gain, slow_tau) = slow.slow_modes[0]
+    if not (np.isfinite(slow_gain.value) and np.isfinite(slow_tau.value)):
+        return _fast_alone(printed, sweep, study)
     both = _checked(
         fit_transfer(
             [sweep],
@@ -202,6 +206,25 @@ def fit_chirp_of_voltage(
         "S20.gain_per_volt": gain_per_v, "S20.eq8_omega_n": omega, "S20.eq8_zeta": zeta
     }  # fmt: skip
     return results, {"chirp": figure}
+
+
+def _fast_alone(printed: TransferFit, sweep: Record, study: Study) -> Dynamics:
+    """The plant of a slow branch that the steps do not determine: without it."""
+    e = printed.parameters
+    gain, wn, zeta, delay = (
+        e[name] for name in ("gain", "natural_frequency_rad_s", "damping_ratio", "delay_s")
+    )
+    return Dynamics(
+        plant=Plant(gain.value, wn.value, zeta.value, max(delay.value, 0.0)),
+        second_order=printed,
+        quantities={
+            "S20.gain": gain, "S20.omega_n": wn, "S20.zeta": zeta, "S20.delay": delay,
+            **_second_order_results(printed),
+        },
+        figures={"chirp": _chirp_figure(sweep, printed, None, study.chirp.stop_hz)},
+        posterior=printed.posterior,
+        residual_std=float(np.sqrt(np.mean(printed.residuals[0] ** 2))),
+    )  # fmt: skip
 
 
 def _second_order(sweep: Record, near: TransferFit | None = None) -> TransferFit:

@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <stdexcept>
 #include <vector>
@@ -61,6 +62,8 @@ struct Tangent {
                 table.push_back(static_cast<size_t>(kind.data()[j]));
                 law_column.push_back(static_cast<int32_t>(j));
                 free_length.push_back(free_m.data()[table.back()]);
+            } else if (kind.data()[j] > MOTION_START) {
+                other_column.push_back(static_cast<int32_t>(j));
             }
         }
         beside(elastic.data(), n, table, elastic_by);
@@ -70,6 +73,8 @@ struct Tangent {
         c.laws = static_cast<int32_t>(table.size());
         c.kind = kind.data();
         c.law_column = law_column.data();
+        c.others = static_cast<int32_t>(other_column.size());
+        c.other_column = other_column.data();
         c.elastic = elastic_by.data();
         c.pull = pull_by.data();
         c.capacitance = capacitance_by.data();
@@ -87,7 +92,7 @@ struct Tangent {
         }
     }
     std::vector<double> work, kept, elastic_by, pull_by, capacitance_by, free_length;
-    std::vector<int32_t> law_column;
+    std::vector<int32_t> law_column, other_column;
     motion_tangent c{};
 };
 
@@ -116,9 +121,11 @@ void play(const Law &law, nb::handle parameters, nb::handle state, Values edge_s
         motion_play(&law.law, p.data(), s.data(), nullptr, &record, &output);
         return;
     }
+    const auto wanted = static_cast<size_t>(
+        std::count_if(sensed.data(), sensed.data() + n, [](uint8_t is) { return is != 0; }));
     need(rows.shape(0) == MOTION_ROWS && rows.shape(1) == columns &&
              length_by.shape(0) == time_s.size() && length_by.shape(1) == columns &&
-             mean_by.shape(0) == n && mean_by.shape(1) == columns,
+             mean_by.shape(0) == wanted && mean_by.shape(1) == columns,
          "one column of derivatives for each kind");
     Tangent tangent(law, kind, elastic, pull, capacitance, free_m);
     tangent.c.rows = rows.data();

@@ -123,10 +123,16 @@ typedef struct {
     double acting_v;
 } rates;
 
+/* Derivatives of the factor of softening by its parameters and by the longest stretch. */
+typedef struct {
+    double longest_m, share, stretch, width, reached;
+} softening_slopes;
+
 /* What one smooth step takes for granted: softening at its begin, the sign of the speed, and the
  * forces between the two knots where it is. */
 typedef struct {
     double softening, sign;
+    softening_slopes softens; /* with a tangent */
     place at;
     double knot; /* the lower one of the two */
     polynomial elastic, pull;

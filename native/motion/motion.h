@@ -83,12 +83,13 @@ enum motion_column {
     MOTION_BRANCH_SHARE = 1100, /* + branch */
     MOTION_BRANCH_S = 1200      /* + branch */
 };
-enum { MOTION_ROWS = 5 + MOTION_BRANCHES, MOTION_WORK = 3 * MOTION_ROWS + 6 };
+enum { MOTION_ROWS = 5 + MOTION_BRANCHES, MOTION_WORK = 3 * MOTION_ROWS + MOTION_BRANCHES + 6 };
 
 typedef struct {
-    int32_t columns, laws;
+    int32_t columns, laws, others;
     const int32_t *kind;
     const int32_t *law_column;        /* [laws]: their columns */
+    const int32_t *other_column;      /* [others]: those of kinds above MOTION_START */
     const double *elastic;            /* [lengths][laws] */
     const double *pull, *capacitance; /* [voltages][lengths][laws] */
     const double *free_length;        /* [laws]: derivative of the free length */

@@ -90,10 +90,11 @@ static double root_v(const motion_input *in)
     return sqrt(in->volt * in->volt + in->ripple_v2);
 }
 
-/* Adds the integral of the capacitance over the step by Simpson's rule; `scale` multiplies it. */
+/* Adds the integral of the capacitance over the step by Simpson's rule; `scale` multiplies it. `by`:
+ * derivatives of the interval, of which there may be none. */
 static void integrate(const motion_law *law, const step *now, const motion_tangent *t,
                       double scale, const motion_input *in, const motion_output *output,
-                      int32_t interval)
+                      int32_t interval, double *by)
 {
     const double volt = root_v(in);
     static const double at[3] = {0.0, 0.5, 1.0}, weight[3] = {1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0};
@@ -105,7 +106,6 @@ static void integrate(const motion_law *law, const step *now, const motion_tange
         if (t == NULL) {
             output->mean_f[interval] += share * motion_capacitance(law, length_m, volt);
         } else {
-            double *by = output->mean_by + (int64_t)interval * t->columns;
             double *rows = output->kept + 2 * t->columns, *own = rows + t->columns;
             const motion_capacitance_slopes c =
                 motion_capacitance_by(law, t, length_m, volt, own);
@@ -135,6 +135,7 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
                  motion_tangent *tangent, const motion_record *record, const motion_output *output)
 {
     motion_parameters moving = *p;
+    double *mean_by = output->mean_by;
     int32_t k, next = 0;
     for (k = 0; k < record->intervals; ++k) {
         const double from_s = record->edge_s[k], to_s = record->edge_s[k + 1];
@@ -146,10 +147,9 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
         if (record->sensed[k]) {
             const double scale = drifted(p->electric_drift, from_s - record->edge_s[0], drift + 2);
             before_f = scale * motion_capacitance(law, s->length_m, volt * sqrt(scale));
-        }
-        if (tangent != NULL) {
-            memset(output->mean_by + (int64_t)k * tangent->columns, 0,
-                   (size_t)tangent->columns * sizeof(double));
+            if (tangent != NULL) {
+                memset(mean_by, 0, (size_t)tangent->columns * sizeof(double));
+            }
         }
         while (at_s < to_s) {
             const double next_s =
@@ -177,7 +177,7 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
             motion_step(law, &moving, s, tangent, &in, now.dt);
             next = sample(&now, tangent, record, output, next, until_s);
             if (record->sensed[k]) {
-                integrate(law, &now, tangent, scale, &in, output, k);
+                integrate(law, &now, tangent, scale, &in, output, k, mean_by);
             }
             at_s = until_s;
         }
@@ -187,8 +187,9 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
             output->drift_f_s[k] = (after_f - before_f) / (to_s - from_s);
             output->mean_f[k] /= to_s - from_s;
             for (j = 0; tangent != NULL && j < tangent->columns; ++j) {
-                output->mean_by[(int64_t)k * tangent->columns + j] /= to_s - from_s;
+                mean_by[j] /= to_s - from_s;
             }
+            mean_by += tangent != NULL ? tangent->columns : 0;
         }
     }
 }

@@ -18,7 +18,7 @@ typedef struct {
 
 /* lengths, speeds: [times]; means and drifts (change of the capacitance from an interval's start to
  * its end, over its duration): [intervals], 0 where not sensed. The derivatives have
- * [times][columns] and [intervals][columns] values and may be NULL without a tangent, whose rows
+ * [times][columns] and [sensed intervals][columns] values and may be NULL without a tangent, whose rows
  * and 2 * MOTION_ROWS * columns values of `kept` the caller gives. */
 typedef struct {
     double *length_m, *speed_m_s, *mean_f, *drift_f_s;

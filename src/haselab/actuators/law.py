@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
@@ -315,6 +316,7 @@ class ActuatorLaw(abc.ABC):
         return {}
 
     @classmethod
+    @functools.cache
     def described(cls) -> tuple[Parameter, ...]:
         """All parameters of the law, with units and limits."""
         found = []

@@ -135,7 +135,7 @@ class Response:
         drift_f_s: change of the capacitance over each interval, over its duration. Shape `(N,)`.
         end: after the last interval, a record of `haselab._motion.STATE`. Shape `(1,)`.
         length_by: derivatives of the lengths. Shape `(T, P)`.
-        capacitance_by: derivatives of the capacitances. Shape `(N, P)`.
+        capacitance_by: derivatives of the capacitances that were wanted. Shape `(S, P)`.
         end_by: derivatives of the state at the end, in the rows of the compiled motion.
             Shape `(ROWS, P)`.
     """
@@ -447,12 +447,17 @@ class SampledLaw:
         shares = np.divide(1.0, self._joined, where=self._joined != 0.0, out=0.0 * self._joined)
         shares[self._free_by.size :, self._own] = 0.0
         rows = np.ascontiguousarray(np.hstack([given[:, :count] @ shares.T, given[:, count:]]))
-        columns = kinds.size
+        joined = np.block([
+            [self._joined, np.zeros((self._joined.shape[0], extra))],
+            [np.zeros((extra, count)), np.eye(extra)],
+        ])  # fmt: skip
         wanted = np.ones(intervals, np.uint8) if sensed is None else np.asarray(sensed, np.uint8)
-        length_by, mean_by = np.empty((times.size, columns)), np.empty((intervals, columns))
+        means_wanted = int(np.count_nonzero(wanted))
 
-        def part(chosen: NDArray[np.int64]) -> tuple[NDArray[np.void], tuple[Floats, ...]]:
-            """Some of the columns; the motion itself is the same in each part.
+        def part(
+            chosen: NDArray[np.int64],
+        ) -> tuple[NDArray[np.void], tuple[Floats, ...], list[Floats]]:
+            """What some of the columns give; the motion itself is the same in each part.
 
             Columns of zeros make their number a multiple of the processor's vectors.
             """
@@ -468,30 +473,25 @@ class SampledLaw:
             own_kinds[:size] = kinds[chosen]
             own_rows = np.zeros((rows.shape[0], padded))
             own_rows[:, :size] = rows[:, chosen]
-            lengths, means = np.empty((times.size, padded)), np.empty((intervals, padded))
+            own_joined = np.zeros((padded, joined.shape[1]))
+            own_joined[:size] = joined[chosen]
+            lengths, means = np.empty((times.size, padded)), np.empty((means_wanted, padded))
             _motion.play(
                 self._native, self.parameters, moved, drive.edge_s, acts, drive.mass_kg, wanted,
                 times, *seen, own_kinds, self._elastic, self._pull, self._capacitance,
                 self._free_by, own_rows, lengths, means,
             )  # fmt: skip
-            rows[:, chosen] = own_rows[:, :size]
-            length_by[:, chosen], mean_by[:, chosen] = lengths[:, :size], means[:, :size]
-            return moved, seen
+            return moved, seen, [by @ own_joined for by in (lengths, means, own_rows)]
 
-        workers = min(_CORES, 1 + columns // _COLUMNS_EACH)
-        parts = np.array_split(np.arange(columns), workers)
+        workers = min(_CORES, 1 + kinds.size // _COLUMNS_EACH)
+        parts = np.array_split(np.arange(kinds.size), workers)
         if workers == 1:
-            state, seen = part(parts[0])
+            found = [part(parts[0])]
         else:
             with ThreadPoolExecutor(workers) as pool:
                 found = list(pool.map(part, parts))  # all: who stops at the first cancels the rest
-            state, seen = found[0]
-        length, speed, mean, drift = seen
-        joined = np.block([
-            [self._joined, np.zeros((self._joined.shape[0], extra))],
-            [np.zeros((extra, count)), np.eye(extra)],
-        ])  # fmt: skip
-        return Response(
-            length, speed, mean, drift, state,
-            length_by @ joined, mean_by @ joined, rows @ joined,
-        )  # fmt: skip
+        state, (length, speed, mean, drift), total = found[0]
+        for _, _, more in found[1:]:
+            for by, added in zip(total, more, strict=True):
+                by += added
+        return Response(length, speed, mean, drift, state, *total)

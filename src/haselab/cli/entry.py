@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 try:
+    import gc
     import os
     import signal
     import sys
@@ -76,6 +77,7 @@ class StartUp:
 
     def imported(self) -> None:
         """Note that all modules are imported: from now on there may be something to clean up."""
+        gc.freeze()  # the garbage collector need not look at what the imports left, again and again
         self._importing = False
 
     def finished(self) -> None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from haselab.identify.physical import ActuatorFit, MotionRecord
 from haselab.identify.physical.misfit import Modelled, modelled
 from haselab.rig import RigDescription
 from haselab.runtime.helper_process import HelperProcess
-from haselab.study.analysis import Analysis
+from haselab.study.analysis import Analysis, Given
 from haselab.study.definition import Study
 from haselab.study.experiment import NotPlayedError
 from haselab.study.experiments.foreign import rows_of_experiment
@@ -66,29 +66,53 @@ def results_of_model(
     if not fit.succeeded:
         raise ResultError(fit.status)
     unknowns = fit.unknowns()
-    centre = modelled(unknowns, record)
-    seen: dict[str, Observation] = {}
+    with _second_process() as helper:  # it loads its modules during the first fit
+        centre = modelled(unknowns, record)
+        seen: dict[str, Observation] = {}
 
-    def recorded(name: str) -> Observation:
-        if name not in seen:
-            seen[name] = source(name)
-        return seen[name]
+        def recorded(name: str) -> Observation:
+            if name not in seen:
+                seen[name] = source(name)
+            return seen[name]
 
-    problem = _Problem(centre, record, study, rig, direct.values, known)
-    middle = problem.rows(recorded, np.zeros(unknowns.values.size))
-    axes = _along(problem, recorded, seen, _axes(fit.covariance, unknowns.slopes))
+        problem = _Problem(centre, record, study, rig, direct.values, known)
+        middle, near = problem.fitted(recorded, np.zeros(unknowns.values.size))
+        problem = replace(problem, near=near)
+        changes = _axes(fit.covariance, unknowns.slopes)
+        # that of no change, which is found in the same way, shares what the searches leave
+        changes = np.vstack([0.0 * changes[:1], changes])
+        still, *axes = _along(problem, recorded, seen, changes, helper)
     found = {}
     for key, estimate in middle.items():
-        moved = np.array([along[key].value - estimate.value for along in axes if key in along])
+        ends = [along[key].value for along in axes if key in along and key in still]
+        moved = np.array([end - still[key].value for end in ends])
         if key not in _IN_STEPS and len(moved) == len(axes) and moved.any():
             std = float(np.linalg.norm(moved))
             found[key] = Estimate.normal(estimate.value, std, estimate.unit)
     return found
 
 
+@contextlib.contextmanager
+def _second_process() -> Iterator[HelperProcess | None]:
+    """A process for half of the fits; None if it cannot be started."""
+    try:
+        helper = HelperProcess([__name__], _PATIENCE_S)
+    except DeviceError:
+        yield None
+        return
+    try:
+        yield helper
+    finally:
+        helper.close()
+
+
 @dataclass(frozen=True)
 class _Problem:
-    """The fits on a model's motion, see `results_of_model`."""
+    """The fits on a model's motion, see `results_of_model`.
+
+    Args:
+        near: values that the fits found on almost the same motion, where they start; empty: none.
+    """
 
     centre: Modelled
     record: MotionRecord
@@ -96,9 +120,12 @@ class _Problem:
     rig: RigDescription
     values: Mapping[type, object]
     known: Mapping[type, object] | None
+    near: Mapping[type, object] = field(default_factory=dict)
 
-    def rows(self, source: Source, change: Floats) -> dict[str, Estimate]:
-        """Results after a change of what varies."""
+    def fitted(
+        self, source: Source, change: Floats
+    ) -> tuple[dict[str, Estimate], dict[type, object]]:
+        """Results and values after a change of what varies."""
         centre = self.centre
         moved = replace(
             centre,
@@ -106,34 +133,38 @@ class _Problem:
             capacitance_f=centre.capacitance_f + centre.capacitance_by @ change,
         )
         motion = _Motion(source, self.record, moved)
-        return _fitted(
-            Analysis(self.study, self.rig, motion, repeated=self.values, known=self.known)
-        )
+        given = Given(self.values, self.known or {}, self.near)
+        return _fitted(Analysis(self.study, self.rig, motion, given=given))
 
 
 def _rows_of_changes(
     problem: _Problem, source: Source, changes: Floats
 ) -> list[dict[str, Estimate]]:
     """Results after each of some changes; a function of the module, for a helper process."""
-    return [problem.rows(source, change) for change in changes]
+    return [problem.fitted(source, change)[0] for change in changes]
 
 
 def _along(
-    problem: _Problem, source: Source, seen: Mapping[str, Observation], changes: Floats
+    problem: _Problem,
+    source: Source,
+    seen: Mapping[str, Observation],
+    changes: Floats,
+    helper: HelperProcess | None,
 ) -> list[dict[str, Estimate]]:
     """Results after each change; a second process makes half of these fits.
 
     It makes none where a value of another package cannot be sent to it, or if it ends early.
     """
+    try:
+        pickle.dumps((problem.values, problem.known, problem.near, problem.study))
+    except (pickle.PicklingError, TypeError, AttributeError):
+        helper = None
+    if helper is None:
+        return _rows_of_changes(problem, source, changes)
+    half = len(changes) // 2
     with contextlib.ExitStack() as opened:
-        try:
-            pickle.dumps((problem.values, problem.known, problem.study))
-            pool = opened.enter_context(ThreadPoolExecutor(1))
-            helper = HelperProcess([__name__], _PATIENCE_S)
-            opened.callback(helper.close)  # also if this process is interrupted meanwhile
-        except (DeviceError, pickle.PicklingError, TypeError, AttributeError):
-            return _rows_of_changes(problem, source, changes)
-        half = len(changes) // 2
+        pool = opened.enter_context(ThreadPoolExecutor(1))
+        opened.callback(helper.close)  # first, also if this process is interrupted meanwhile
         sent = pool.submit(helper.call, _rows_of_changes, problem, seen.__getitem__, changes[half:])
         found = _rows_of_changes(problem, source, changes[:half])
         try:
@@ -142,13 +173,16 @@ def _along(
             return found + _rows_of_changes(problem, source, changes[half:])
 
 
-def _fitted(analysis: Analysis) -> dict[str, Estimate]:
+def _fitted(analysis: Analysis) -> tuple[dict[str, Estimate], dict[type, object]]:
     found: dict[str, Estimate] = {}
+    values: dict[type, object] = {}
     for experiment in analysis.experiments:
         if any(key.startswith(_ROWS) for key in rows_of_experiment(experiment)):
             with contextlib.suppress(NotPlayedError):
-                found |= analysis.outcome(experiment).quantities
-    return {key: estimate for key, estimate in found.items() if key.startswith(_ROWS)}
+                outcome = analysis.outcome(experiment)
+                found |= outcome.quantities
+                values |= {type(value): value for value in outcome.values}
+    return {key: estimate for key, estimate in found.items() if key.startswith(_ROWS)}, values
 
 
 def _axes(covariance: Floats, slopes: Floats) -> Floats:

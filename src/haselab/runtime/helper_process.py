@@ -7,6 +7,7 @@ process, including one that communicates with a board. So long, rare computation
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
 import os
 import pickle
@@ -131,6 +132,7 @@ def _main() -> None:
     os.dup2(2, 1)  # printed text must not get between two replies
     for name in sys.argv[1:]:
         importlib.import_module(name)
+    gc.freeze()  # the garbage collector need not look at them again
     with contextlib.suppress(BrokenPipeError):
         _serve(come, go)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import TypeVar, cast
 
 from haselab.base import InputError, ResultError
@@ -20,7 +21,7 @@ from haselab.study.experiments.foreign import (
 from haselab.study.fits.observe import Observation, Source
 from haselab.study.registry import EXPERIMENTS
 
-__all__ = ["Analysis", "experiments_of", "fitting"]
+__all__ = ["Analysis", "Given", "experiments_of", "fitting"]
 
 Value = TypeVar("Value")
 
@@ -39,6 +40,22 @@ def experiments_of(study: Study) -> tuple[AnyExperiment, ...]:
     return experiments
 
 
+@dataclass(frozen=True)
+class Given:
+    """Values that an analysis does not find itself, by type.
+
+    Args:
+        repeated: of another run, to play instead of those found here.
+        known: of an actuator file, that no experiment of the study finds.
+        near: of the same fits on almost the same observations. A fit may start there, and may leave
+            out figures and intervals.
+    """
+
+    repeated: Mapping[type, object] = field(default_factory=dict)
+    known: Mapping[type, object] = field(default_factory=dict)
+    near: Mapping[type, object] = field(default_factory=dict)
+
+
 class Analysis:
     """The findings of a study while its fits are made.
 
@@ -48,8 +65,7 @@ class Analysis:
         source: returns observations by name; the fits have no other access to the session.
         on_fit: called with the title of each fit as it begins.
         fitted: called with each outcome, as soon as it is known.
-        repeated: values of another run, by type, to play instead of those found here.
-        known: values of an actuator file, by type, that no experiment of the study finds.
+        given: values that it does not find itself; None: none.
     """
 
     def __init__(
@@ -59,14 +75,12 @@ class Analysis:
         source: Source,
         on_fit: Callable[[str], None] = lambda what: None,
         fitted: Callable[[ExperimentResult], None] = lambda outcome: None,
-        repeated: Mapping[type, object] | None = None,
-        known: Mapping[type, object] | None = None,
+        given: Given | None = None,
     ) -> None:
         self.study, self.rig = study, rig
         self.experiments = experiments_of(study)
         self._source, self._on_fit, self._fitted = source, on_fit, fitted
-        self._repeated = {} if repeated is None else repeated
-        self._known = known or {}
+        self._given = given or Given()
         self._seen: dict[str, Observation] = {}
         self._outcomes: dict[str, ExperimentResult | NotPlayedError] = {}
         self._under_way: list[str] = []
@@ -106,8 +120,8 @@ class Analysis:
                 raise NotPlayedError(
                     f"[{experiment.table}] of this study did not find a {kind.__name__}"
                 )
-        if kind in self._known:
-            return cast("Value", self._known[kind])
+        if kind in self._given.known:
+            return cast("Value", self._given.known[kind])
         tables = [name for name, c in EXPERIMENTS.usable().items() if kind in c.gives]
         wanted = f"[{tables[0]}]" if tables else f"an experiment that finds a {kind.__name__}"
         raise NotPlayedError(f"needs {wanted}, which is not in this study")
@@ -120,7 +134,11 @@ class Analysis:
 
     def repeated(self, kind: type[Value]) -> Value | None:
         """Return the value of the run that is repeated; None if there is none."""
-        return cast("Value | None", self._repeated.get(kind))
+        return cast("Value | None", self._given.repeated.get(kind))
+
+    def near(self, kind: type[Value]) -> Value | None:
+        """Return the value of a fit of almost the same observations; None if there is none."""
+        return cast("Value | None", self._given.near.get(kind))
 
     def to_play(self, kind: type[Value]) -> Value:
         """Return the value to play: that of a run that is repeated, else the one found here.

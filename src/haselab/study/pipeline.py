@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 from haselab.base import Estimate
 from haselab.rig import RigDescription
 from haselab.runtime.runner import Runner
-from haselab.study.analysis import Analysis
+from haselab.study.analysis import Analysis, Given
 from haselab.study.definition import Study
 from haselab.study.experiment import Chart, ExperimentResult, NotPlayedError
 from haselab.study.experiments.foreign import foreign, rows_of_experiment
@@ -87,7 +87,8 @@ def investigate(
             runner.rest()  # while the fit is made
         on_fit(what)
 
-    analysis = Analysis(study, rig, source, begin, fitted, repeated, known)
+    given = Given({} if repeated is None else repeated, known or {})
+    analysis = Analysis(study, rig, source, begin, fitted, given)
     left_out: dict[str, str] = {}
     if runner is not None:
         for experiment in analysis.experiments:

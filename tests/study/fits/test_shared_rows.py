@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from haselab.base import DeviceError
+from haselab.base import DeviceError, ResultError
 from haselab.pipelines import model_results
-from haselab.pipelines.model_results import _along
+from haselab.pipelines.model_results import _along, _second_process
 
 pytestmark = pytest.mark.unit
 
@@ -19,9 +19,10 @@ class Problem:
     values: object = None
     known: object = None
     study: object = None
+    near: object = None
 
-    def rows(self, source, change):
-        return {"row": float(change[0])}
+    def fitted(self, source, change):
+        return {"row": float(change[0])}, {}
 
 
 class Helper:
@@ -60,12 +61,21 @@ def test_each_change_is_fitted_once_whatever_the_second_process_does(monkeypatch
     monkeypatch.setattr(model_results, "HelperProcess", helper)
     helper.closed = 0
     changes = np.arange(float(count))[:, None]
-    found = _along(Problem(), lambda name: None, {}, changes)
+    with _second_process() as second:
+        found = _along(Problem(), lambda name: None, {}, changes, second)
     assert sorted(row["row"] for row in found) == list(range(count))
-    assert helper.closed == (helper is not Refused)
+    assert bool(helper.closed) == (helper is not Refused)
 
 
-def test_values_that_cannot_be_sent_are_fitted_here(monkeypatch):
-    monkeypatch.setattr(model_results, "HelperProcess", None)  # would fail if it were called
+def test_the_second_process_ends_with_a_fit_that_fails(monkeypatch):
+    monkeypatch.setattr(model_results, "HelperProcess", Helper)
+    Helper.closed = 0
+    with pytest.raises(ResultError, match="no result"), _second_process():
+        raise ResultError("no result")
+    assert Helper.closed == 1
+
+
+def test_values_that_cannot_be_sent_are_fitted_here():
+    never = Lost([], 0.0)
     problem = Problem(values={"of another package": lambda: None})
-    assert len(_along(problem, lambda name: None, {}, np.zeros((3, 1)))) == 3
+    assert len(_along(problem, lambda name: None, {}, np.zeros((3, 1)), never)) == 3

@@ -7,6 +7,7 @@ All their inputs are files in the run's folder, with which `haselab run` repeats
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import subprocess
 import sys
@@ -264,5 +265,6 @@ def _end_with_the_study() -> None:
 
 if __name__ == "__main__":
     lower_priority()  # the study, which takes longest, goes first
+    gc.freeze()  # the garbage collector need not look at the modules again
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     main(Path(sys.argv[1]), sys.argv[2], sys.argv[3])

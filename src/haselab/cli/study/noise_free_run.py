@@ -7,6 +7,7 @@ It plays the same experiments on the same twin with all noise off. What the stud
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import pickle
 import subprocess
@@ -155,6 +156,7 @@ class SentValues(Mapping[type, object]):
 def main() -> None:
     """Play and fit what standard input brings, and write the results to standard output."""
     lower_priority()  # the study, which takes longest, goes first
+    gc.freeze()  # the garbage collector need not look at the modules again
     source, target = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # nothing that is printed may come between
     config, study, known = pickle.load(source)

@@ -161,7 +161,10 @@ class FreeResponseFit(CurveFit):
 
 @checked
 def fit_free_response(
-    trials: FreeTrial | Sequence[FreeTrial], *, creep: bool | None = None
+    trials: FreeTrial | Sequence[FreeTrial],
+    *,
+    creep: bool | None = None,
+    near: FreeResponseFit | None = None,
 ) -> FreeResponseFit:
     r"""Fit all trials jointly, each with its own amplitude, phase, offset and creep.
 
@@ -189,12 +192,15 @@ def fit_free_response(
     if len(trials) == 0:
         raise InputError("trials is empty. Pass at least one FreeTrial.")
     moving = [trial.moving() for trial in trials]
-    joint = _fit(moving, bool(creep))
+    joint = _fit(moving, bool(creep), near)
     if creep is None and not (joint.succeeded and joint.residual_whiteness_p >= _WHITE):
         joint, creep = _better(joint, _fit(moving, True), moving)
     if len(trials) == 1 or not joint.succeeded:
         return joint
-    alone = tuple(_fit([trial], bool(creep)) for trial in moving)
+    parts = [None] * len(moving) if near is None or not near.trials else near.trials
+    alone = tuple(
+        _fit([trial], bool(creep), part) for trial, part in zip(moving, parts, strict=True)
+    )
     good = [fit for fit in alone if fit.succeeded]
     if len(good) < 2:
         return joint
@@ -263,9 +269,15 @@ def _bounds(trials: Sequence[FreeTrial], creep: bool) -> tuple[Floats, Floats]:
     return np.array(low), np.array(high)
 
 
-def _search(trials: Sequence[FreeTrial], creep: bool) -> tuple[Solution, bool]:
+def _search(
+    trials: Sequence[FreeTrial], creep: bool, near: FreeResponseFit | None
+) -> tuple[Solution, bool]:
     """Grid of frequency and damping on few samples, then all samples."""
     low, high = _bounds(trials, creep)
+    if near is not None and near.search.size == low.size:
+        return minimise(
+            lambda s: [_basis(s, trial) for trial in trials], near.search, (low, high), gain=0.0
+        )
     stride = [max(1, trial.x.size // _THIN) for trial in trials]
     few = [FreeTrial(r.x[::k], r.time_s[::k]) for r, k in zip(trials, stride, strict=True)]
     ceiling = min(math.pi / float(np.median(np.diff(trial.time_s))) for trial in few)
@@ -285,8 +297,10 @@ def _search(trials: Sequence[FreeTrial], creep: bool) -> tuple[Solution, bool]:
     return minimise(lambda s: [_basis(s, trial) for trial in trials], best.search, (low, high))
 
 
-def _fit(trials: Sequence[FreeTrial], creep: bool) -> FreeResponseFit:
-    solution, settled = _search(trials, creep)
+def _fit(
+    trials: Sequence[FreeTrial], creep: bool, near: FreeResponseFit | None = None
+) -> FreeResponseFit:
+    solution, settled = _search(trials, creep, near)
     modelled = tuple(r.x - e for r, e in zip(trials, solution.residuals, strict=True))
     times = tuple(trial.time_s for trial in trials)
     estimates, covariance = _estimates(trials, solution)

@@ -107,9 +107,9 @@ def modelled(
             raise LimitError(f"{record.name}: the motion leaves the limits of the law.")
     scale = unknowns.value(SENSING_SCALE)
     latency_s = unknowns.value(SENSING_LATENCY)
-    drift = record.over_windows(response.drift_f_s)
+    drift = record.over_windows(response.drift_f_s[record.sensed])
     later_s = record.capacitance_later_s - latency_s
-    inside = record.over_windows(response.capacitance_f) + later_s * drift
+    inside = record.over_windows(response.capacitance_f[record.sensed]) + later_s * drift
     shown = unknowns.value(CAMERA_SCALE)
     length_m = shown * response.length_m + unknowns.value(CAMERA_OFFSET)
     if not derivatives:
@@ -122,21 +122,20 @@ def modelled(
         SENSING_LATENCY: (0.0, -scale * drift),
         SENSING_SCALE: (0.0, inside),
     }
+    inside_by = record.over_windows(response.capacitance_by)
     if held_n is not None:
-        columns[START_HYSTERESIS] = (
-            shown * response.length_by[:, -1],
-            scale * record.over_windows(response.capacitance_by[:, -1]),
-        )
+        columns[START_HYSTERESIS] = shown * response.length_by[:, -1], scale * inside_by[:, -1]
     length_by = np.empty((length_m.size, len(unknowns.names)))
     capacitance_by = np.empty((inside.size, len(unknowns.names)))
     count = len(unknowns.law_names)
     length_by[:, :count] = shown * response.length_by[:, :count]
-    capacitance_by[:, :count] = scale * record.over_windows(response.capacitance_by[:, :count])
+    capacitance_by[:, :count] = scale * inside_by[:, :count]
     for k, name in enumerate(unknowns.names[count:], start=count):
         length_by[:, k] = np.asarray(columns[name][0])
         capacitance_by[:, k] = np.asarray(columns[name][1])
-    slopes = unknowns.slopes
-    return Modelled(length_m, scale * inside, length_by * slopes, capacitance_by * slopes)
+    length_by *= unknowns.slopes
+    capacitance_by *= unknowns.slopes
+    return Modelled(length_m, scale * inside, length_by, capacitance_by)
 
 
 def _highest_v(record: MotionRecord) -> float:
@@ -160,9 +159,7 @@ def _respond(
     both_s = np.clip(np.concatenate([middle_s - half_s, middle_s + half_s]), low, high)
     order = np.argsort(both_s, kind="stable")
     start, start_by = _at_rest(sampled, record, held_n, longest_m)
-    sensed = np.zeros(drive.voltage_v.size, np.uint8)
-    sensed[record.window] = 1
-    found = sampled.respond(drive, both_s[order], start, sensed=sensed, start_by=start_by)
+    found = sampled.respond(drive, both_s[order], start, sensed=record.sensed, start_by=start_by)
     first, second = np.split(np.argsort(order), 2)
     return replace(
         found,

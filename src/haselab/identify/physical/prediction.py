@@ -410,7 +410,7 @@ def predict_motion(
     channels = (
         (LENGTH, record.length_experiment, record.length_time_s, record.length_m,
          found.length_m, noise_m, length_std),
-        (CAPACITANCE, record.capacitance_experiment, record.over_windows(middle_s),
+        (CAPACITANCE, record.capacitance_experiment, record.over_windows(middle_s[record.sensed]),
          record.capacitance_f, found.capacitance_f, noise_f, capacitance_std),
     )  # fmt: skip
     parts = []

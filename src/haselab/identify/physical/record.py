@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,21 +66,33 @@ class MotionRecord:
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     window_weight: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def over_windows(self, values: Floats) -> Floats:
-        """Weighted means over the intervals in which each capacitance was sensed.
+    @cached_property
+    def sensed(self) -> NDArray[np.bool_]:
+        """The intervals of the drive in which a capacitance was sensed. Shape `(N,)`."""
+        found = np.zeros(self.drive.voltage_v.size, dtype=np.bool_)
+        found[self.window] = True
+        return found
 
-        Args:
-            values: means over each interval of the drive. Shape `(N,)` or `(N, P)`.
-        Returns:
-            One per capacitance. Shape `(C,)` or `(C, P)`.
-        """
+    @cached_property
+    def _shares(self) -> csr_array:
+        """Share of each sensed interval in each capacitance. Shape `(C, S)`."""
         weight = np.diff(self.drive.edge_s)[self.window]
         if self.window_weight.size:
             weight = weight * self.window_weight
         share = weight / np.bincount(self.window_of, weight)[self.window_of]
-        shape = self.capacitance_f.size, values.shape[0]
-        weights = csr_array((share, (self.window_of, self.window)), shape=shape)
-        return np.asarray(weights @ values)
+        place = np.cumsum(self.sensed) - 1
+        shape = self.capacitance_f.size, int(np.count_nonzero(self.sensed))
+        return csr_array((share, (self.window_of, place[self.window])), shape=shape)
+
+    def over_windows(self, values: Floats) -> Floats:
+        """Weighted means over the intervals in which each capacitance was sensed.
+
+        Args:
+            values: means over each interval of `sensed`. Shape `(S,)` or `(S, P)`.
+        Returns:
+            One per capacitance. Shape `(C,)` or `(C, P)`.
+        """
+        return np.asarray(self._shares @ values)
 
     def __post_init__(self) -> None:
         frames = (self.length_m, self.length_std_m, self.length_experiment)

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,8 +155,10 @@ def richer(misfit: Misfit, found: Found) -> Richer | None:
         That law; None if there is none.
     """
     best: Richer | None = None
-    for more in _candidates(found.unknowns, _duration_s(misfit)):
-        column = _column(misfit, found, more)
+    candidates = _candidates(found.unknowns, _duration_s(misfit))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        columns_of = list(pool.map(lambda more: _column(misfit, found, more), candidates))
+    for more, column in zip(candidates, columns_of, strict=True):
         if column is None or not column.any():
             continue
         columns = np.column_stack([found.jacobian, column])

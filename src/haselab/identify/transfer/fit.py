@@ -30,7 +30,7 @@ from haselab.identify.transfer.parameters import (
     poles_of,
     zeros_of,
 )
-from haselab.identify.transfer.problem import TransferProblem
+from haselab.identify.transfer.problem import LEAST_GAIN, TransferProblem
 from haselab.identify.transfer.profile import profiled
 from haselab.identify.transfer.search import Best, best_fit, has_line
 from haselab.identify.transfer.start import delay_margin_s
@@ -256,6 +256,7 @@ def fit_transfer(
     structure: TransferStructure | None = None,
     *,
     applied: bool = False,
+    near: TransferFit | None = None,
 ) -> TransferFit:
     r"""Fit one transfer function to all records, each with its own initial state and offset.
 
@@ -269,6 +270,9 @@ def fit_transfer(
         structure: model structure. Default: one resonance with a delay.
         applied: whether the inputs are known to have been applied as recorded, by the same clock:
             a clipped or slew-limited input and a drifting clock are then not considered as causes.
+        near: fit of the same structure to almost the same records: the search starts there alone,
+            ends nearer to the minimum, and looks for no other. None, or one without a result: no
+            such fit is known.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -290,7 +294,8 @@ def fit_transfer(
     tones = _too_few_tones(layout_of(structure), records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)
-    fit = _fit(layout_of(structure), records, applied=applied)
+    known = [] if near is None or near.best is None else [near.best.found.search]
+    fit = _fit(layout_of(structure), records, applied=applied, known=known)
     if _doubtful(fit):
         why = _why(structure, records)
         fit = fit if why is None else replace(fit, status=why, ambiguous=False)
@@ -325,13 +330,16 @@ def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
     )
 
 
-def _fit(layout: Layout, records: Sequence[Record], *, applied: bool) -> TransferFit:
-    """Search the parameters, then describe the result."""
+def _fit(
+    layout: Layout, records: Sequence[Record], *, applied: bool, known: Sequence[Floats] = ()
+) -> TransferFit:
+    """Search the parameters, from known ones if there are any, then describe the result."""
     _check_size(layout, records)
     tried: list[Best] = []
     for variant in _variants(records):
-        known = [found.search for best in tried for found in (best.found, *best.others[:2])]
-        search = best_fit(layout, variant, known)
+        found_before = [one.search for best in tried for one in (best.found, *best.others[:2])]
+        starts = [*known, *found_before]
+        search = best_fit(layout, variant, starts, 0.0 if known else LEAST_GAIN)
         tried += [] if search is None else [search]
     if not tried:
         return _no_result(layout, "no stable model found; record longer, or fit fewer poles")

@@ -13,12 +13,12 @@ from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
 from haselab.models.filters import resample_poly
 
-__all__ = ["Columns", "Found", "TransferProblem", "fine_input"]
+__all__ = ["LEAST_GAIN", "Columns", "Found", "TransferProblem", "fine_input"]
 
 Floats = NDArray[np.float64]
 _FINER = 8  # points per sample of the polygon that represents a band-limited input
 _ITERATIONS = 100
-_GAIN = 1e-9  # of the cost: a thousandth of a standard deviation with 1,000 outputs
+LEAST_GAIN = 1e-9  # of the cost: a thousandth of a standard deviation with 1,000 outputs
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,9 @@ class TransferProblem:
         """Factors and cost at `search`."""
         return Found(*self._native.project(search.tolist()))
 
-    def minimise(self, search: Floats, bounds: tuple[Floats, Floats], gain: float = _GAIN) -> Found:
+    def minimise(
+        self, search: Floats, bounds: tuple[Floats, Floats], gain: float = LEAST_GAIN
+    ) -> Found:
         """Levenberg-Marquardt search from `search`, until a step gains less than `gain`."""
         low, high = (bound.tolist() for bound in bounds)
         return Found(*self._native.minimise(search.tolist(), low, high, _ITERATIONS, gain))

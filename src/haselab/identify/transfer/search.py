@@ -14,7 +14,7 @@ from haselab.identify.noise import whiteness_p
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.ambiguity import has_unique_delay
 from haselab.identify.transfer.layout import Layout, layout_of
-from haselab.identify.transfer.problem import Columns, Found, TransferProblem
+from haselab.identify.transfer.problem import LEAST_GAIN, Columns, Found, TransferProblem
 from haselab.identify.transfer.start import (
     SHARES,
     coarse_grid,
@@ -66,13 +66,17 @@ class Best:
 
 
 def best_fit(
-    layout: Layout, records: Sequence[Record], known: Sequence[Floats] = ()
+    layout: Layout,
+    records: Sequence[Record],
+    known: Sequence[Floats] = (),
+    gain: float = LEAST_GAIN,
 ) -> Best | None:
     """Fit from several starts; None when none leads to a finite model.
 
     A likely start ends the search when its residuals are white and no other delay could
     explain as much. Otherwise starts at all delays are ranked and refined on fewer outputs, the
-    likely ones on all.
+    likely ones on all. Known starts are the only ones. A search ends when a step lowers the cost by
+    less than `gain`, relative to it.
     """
     problem = TransferProblem(layout, records, delay_margin_s(records))
     bounds = search_bounds(layout, records)
@@ -80,7 +84,7 @@ def best_fit(
     tried: list[Best] = []
 
     def explains(start: Floats) -> bool:
-        best = settled(problem, records, np.clip(start, *bounds), bounds)
+        best = settled(problem, records, np.clip(start, *bounds), bounds, gain)
         if best is None:
             return False
         tried.append(best)
@@ -163,9 +167,10 @@ def settled(
     records: Sequence[Record],
     start: Floats,
     bounds: tuple[Floats, Floats],
+    gain: float = LEAST_GAIN,
 ) -> Best | None:
     """The solution from one start, its parameters in order; None: no finite one."""
-    found = problem.minimise(start, bounds)
+    found = problem.minimise(start, bounds, gain)
     if not math.isfinite(found.cost):
         return None
     ordered = problem.layout.ordered(found.search)

@@ -78,7 +78,8 @@ class ChirpTest(Experiment[Chirp]):
             found = fit_chirp(seen, maps, analysis.rig, stop_hz)
             return self._alone(*found, "needs the open-loop trials of [steps]")
         opened = [analysis.observe(name) for name in open_names(self.study)]
-        both = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig)
+        near = analysis.near(Dynamics)
+        both = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig, near)
         missing = {key: _NO_SLOW for key in self.rows() if key not in both.quantities}
         return ExperimentResult(
             both.quantities, figures=both.figures, values=(both,), missing=missing

@@ -31,6 +31,7 @@ class FreeResponseTest(Experiment[FreeResponse]):
     table = "free_response"
     title = "Free response"
     settings_type = FreeResponse
+    gives = (Free,)
     report_figures = ("fig5",)
 
     def recordings(self) -> dict[str, str]:
@@ -56,7 +57,7 @@ class FreeResponseTest(Experiment[FreeResponse]):
         """See `Experiment`."""
         trials = [analysis.observe(name) for name in self.recordings()]
         try:
-            found = fit_free(trials)
+            found = fit_free(trials, analysis.near(Free))
         except ResultError as reason:  # as of an actuator that is too damped to oscillate
             return ExperimentResult(missing=dict.fromkeys(self.rows(), str(reason)))
         quantities, notes = found.quantities, found.notes
@@ -68,7 +69,9 @@ class FreeResponseTest(Experiment[FreeResponse]):
             notes = {**notes, _DIFFERENCE: _discussed(quantities, dynamics)}
         except NotPlayedError as reason:
             missing = {_DIFFERENCE: str(reason)}
-        return ExperimentResult(quantities, notes, figures=found.figures, missing=missing)
+        return ExperimentResult(
+            quantities, notes, figures=found.figures, values=(found,), missing=missing
+        )
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

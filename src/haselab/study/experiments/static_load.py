@@ -54,7 +54,7 @@ class StaticLoadTest(Experiment[StaticLoad]):
 
     def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
-        found = fit_static(analysis.observe(_NAME), self.study, analysis.rig)
+        found = fit_static(analysis.observe(_NAME), self.study, analysis.rig, analysis.near(Static))
         reason = (
             "only a planar-hasel has such a shell; this actuator is a "
             f"{analysis.rig.actuator_kind}. 'haselab identify actuator' fits its law"

@@ -38,6 +38,8 @@ class Dynamics:
         figures: section of analysis.json.
         posterior: the plant's parameters with the covariance of both fits.
         residual_std: rms residual of the plant in the chirp, in strain.
+        slow: fit of the slow branch to the steps.
+        joined: fit of the fast mode to the chirp, with that branch.
     """
 
     plant: Plant
@@ -46,6 +48,8 @@ class Dynamics:
     figures: JsonObject
     posterior: PlantPosterior
     residual_std: float
+    slow: TransferFit | None = None
+    joined: TransferFit | None = None
 
 
 def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
@@ -63,7 +67,12 @@ def _held(seen: Observation, u: Floats, length_m: float, rig: RigDescription, fi
 
 
 def fit_chirp_and_steps(
-    chirp: Observation, steps: Sequence[Observation], maps: Maps, study: Study, rig: RigDescription
+    chirp: Observation,
+    steps: Sequence[Observation],
+    maps: Maps,
+    study: Study,
+    rig: RigDescription,
+    near: Dynamics | None = None,
 ) -> Dynamics:
     """Fit the second order to the chirp and the slow branch to the steps; join them to one plant.
 
@@ -75,6 +84,8 @@ def fit_chirp_and_steps(
         maps: zero strain and the voltage map.
         study: time of the step.
         rig: for the output's delay.
+        near: results of almost the same observations, at which the searches start. The new ones
+            then have neither figures nor a covariance.
     Returns:
         Results S20, the plant, data for the Bode plots.
     Raises:
@@ -82,7 +93,7 @@ def fit_chirp_and_steps(
     Source: reference study, row S20, eqs. 8 to 10.
     """
     sweep = _record(chirp, maps, rig, 0.0)
-    printed = _second_order(sweep)
+    printed = _second_order(sweep, None if near is None else near.second_order)
     fast = printed.parameters
     trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
     slow = _checked(
@@ -97,6 +108,7 @@ def fit_chirp_and_steps(
                 },
             ),
             applied=True,
+            near=None if near is None else near.slow,
         ),
         "steps, slow branch",
     )
@@ -111,6 +123,7 @@ def fit_chirp_and_steps(
                 fixed={"slow_gain": slow_gain.value, "slow_time_constant_s": slow_tau.value},
             ),
             applied=True,
+            near=None if near is None else near.joined,
         ),
         "chirp, second order plus slow branch",
     )
@@ -120,6 +133,12 @@ def fit_chirp_and_steps(
         gain.value, wn.value, zeta.value, max(e["delay_s"].value, 0.0),
         (SlowMode(slow_gain.value, slow_tau.value),),
     )  # fmt: skip
+    posterior = _posterior(both, slow)
+    figures: JsonObject = {}
+    if near is None:
+        figures = {"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)}
+    else:
+        posterior = replace(posterior, covariance=np.zeros_like(posterior.covariance))
     return Dynamics(
         plant=plant,
         second_order=printed,
@@ -132,9 +151,11 @@ def fit_chirp_and_steps(
             "S20.slow_tau": slow_tau,
             **_second_order_results(printed),
         },
-        figures={"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)},
-        posterior=_posterior(both, slow),
+        figures=figures,
+        posterior=posterior,
         residual_std=float(np.sqrt(np.mean(both.residuals[0] ** 2))),
+        slow=slow,
+        joined=both,
     )
 
 
@@ -206,8 +227,9 @@ def _fast_alone(printed: TransferFit, sweep: Record, study: Study) -> Dynamics:
     )  # fmt: skip
 
 
-def _second_order(sweep: Record) -> TransferFit:
-    return _checked(fit_transfer([sweep], TransferStructure(), applied=True), "chirp, second order")
+def _second_order(sweep: Record, near: TransferFit | None = None) -> TransferFit:
+    found = fit_transfer([sweep], TransferStructure(), applied=True, near=near)
+    return _checked(found, "chirp, second order")
 
 
 def _second_order_results(printed: TransferFit) -> dict[str, Estimate]:

@@ -91,11 +91,13 @@ class Free:
         quantities: results by id.
         notes: by id, remarks for the reader.
         figures: section of analysis.json.
+        fit: of all trials.
     """
 
     quantities: dict[str, Estimate]
     notes: dict[str, str]
     figures: JsonObject
+    fit: FreeResponseFit
 
 
 def fit_printed(trial: FreeTrial, omega_d: float, decay: float) -> PrintedFit:
@@ -154,7 +156,7 @@ def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float)
     return Envelope(-slope, moved, math.exp(intercept), at_s, moved_m[peaks])
 
 
-def fit_free(trials: Sequence[Observation]) -> Free:
+def fit_free(trials: Sequence[Observation], near: Free | None = None) -> Free:
     """Fit eqs. 6 and 7 and both envelopes, as printed and with a creep term.
 
     Eq. 6 has no creep term. With an actuator that creeps it leaves large residuals, and creep makes
@@ -163,6 +165,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
 
     Args:
         trials: one observation per trial.
+        near: results of almost the same observations, where the search starts.
     Returns:
         Results S19, data for figure 5.
     Raises:
@@ -170,7 +173,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
     Source: reference study, row S19.
     """
     records = [_trial(seen).moving() for seen in trials]
-    fit = fit_free_response(records, creep=True)
+    fit = fit_free_response(records, creep=True, near=None if near is None else near.fit)
     if not fit.succeeded:
         fit = fit_free_response(records, creep=False)
     if not fit.succeeded:
@@ -188,6 +191,7 @@ def fit_free(trials: Sequence[Observation]) -> Free:
         [record.x - part for record, part in zip(records, fit.modelled, strict=True)]
     )
     return Free(
+        fit=fit,
         quantities={
             "S19.omega_d": e["damped_frequency_rad_s"],
             **{name: decay for name, decay in envelopes.items() if decay is not None},

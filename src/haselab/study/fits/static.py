@@ -32,6 +32,7 @@ class Static:
     Args:
         free_length_m: between the clamps without load.
         region: the longest linear region.
+        segments: number of regions.
         quantities: results by id.
         notes: by id, remarks for the reader.
         figures: section of analysis.json.
@@ -39,6 +40,7 @@ class Static:
 
     free_length_m: float
     region: Region
+    segments: int
     quantities: dict[str, Estimate]
     notes: dict[str, str]
     figures: JsonObject
@@ -51,7 +53,9 @@ class Static:
         return Estimate.normal(middle, 0.5 * float(np.hypot(low.std, high.std)), "")
 
 
-def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
+def fit_static(
+    seen: Observation, study: Study, rig: RigDescription, near: Static | None = None
+) -> Static:
     """Fit the load as a function of the elongation of the whole actuator.
 
     Stretch counts from the free length, where the shell itself is stretched by 1/sqrt(lateral).
@@ -62,6 +66,7 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
         seen: the static load test.
         study: number of straight segments; None: chosen by BIC.
         rig: kind of the actuator, cross-section and lateral stretch of the shell.
+        near: results of almost the same observation, whose number of segments is taken.
     Returns:
         Results S16 and S17, data for figure 4.
     Raises:
@@ -85,12 +90,14 @@ def fit_static(seen: Observation, study: Study, rig: RigDescription) -> Static:
             shell = _fit_shell(stretch, load_n, rig)
         except ResultError as error:
             left_out = str(error)
-    regions = find_regions(stretch, load_n, segments=study.static_load.segments)
+    segments = study.static_load.segments if near is None else near.segments
+    regions = find_regions(stretch, load_n, segments=segments)
     chosen = regions.regions[regions.chosen]
     finest = POSITION_PX * rig.scale_m_per_px / free_length_m
     return Static(
         free_length_m=free_length_m,
         region=chosen,
+        segments=len(regions.regions),
         quantities={
             **({} if shell is None else shell.quantities),
             "S17.region_low": with_resolution(chosen.low, finest * chosen.low.value),

@@ -17,7 +17,7 @@ VALUES = np.array([3.0, 3.9, 0.02, -1e-3])
 
 def test_each_parameter_varies_by_its_own_scale() -> None:
     assert SCALES.by_logarithm.tolist() == [True, False, True, False]
-    assert SCALES.inverse_power.tolist() == [0.0, 2.0, 0.0, 0.0]
+    assert SCALES.inverse_exponent.tolist() == [0.0, 2.0, 0.0, 0.0]
 
 
 @given(st.lists(st.floats(-0.01, 0.01), min_size=4, max_size=4))

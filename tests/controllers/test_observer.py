@@ -184,8 +184,8 @@ def test_a_plan_ends_at_rest_at_the_target_within_the_force_of_the_field(
         middle_m = x + half_s * v + 0.5 * half_s**2 * a
         ends_n = [model.pull_n(middle_m, volt) for volt in (0.0, known.highest_drive_v(middle_m))]
         needed_n = model.needed_n(state, middle_m, v + half_s * a, a)
-        # between the times that are checked, by less than the reserve
-        spare_n = max(0.02, reserve * (ends_n[1] - ends_n[0]))
+        # between the times that are checked, by less than a tenth of the range
+        spare_n = 0.1 * (ends_n[1] - ends_n[0])
         assert ends_n[0] - spare_n <= needed_n <= ends_n[1] + spare_n
 
 

@@ -73,7 +73,7 @@ class DeaStack(ActuatorLaw):
         15e3, unit="Pa", low=1.0, high=1e8, description="of the elastomer")
     extension_limit: float = parameter(
         80.0, unit="", low=5.0, high=1e6, description="J_m of Gent's law; a large one is neo-Hooke",
-        inverse_power=1)
+        inverse_exponent=1)
     permittivity: float = parameter(3.0, unit="", low=1.0, high=1e3, description="relative")
     density_kg_m3: float = parameter(
         1000.0, unit="kg/m^3", low=1.0, high=1e5, description="of the elastomer", fitted=False)

@@ -50,7 +50,7 @@ class Parameter:
         high: largest permitted value.
         description: short text for people.
         fitted: whether `identify actuator` estimates it; False: measured otherwise.
-        inverse_power: see `parameter`.
+        inverse_exponent: see `parameter`.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Parameter:
     high: float
     description: str
     fitted: bool = True
-    inverse_power: int = 0
+    inverse_exponent: int = 0
 
 
 def parameter(
@@ -72,7 +72,7 @@ def parameter(
     description: str,
     key: str = "",
     fitted: bool = True,
-    inverse_power: int = 0,
+    inverse_exponent: int = 0,
 ) -> AnyValue:
     """A field of a law with its unit and limits.
 
@@ -85,7 +85,7 @@ def parameter(
         key: in TWIN.toml; empty: the name of the field in the table `actuator`.
         fitted: whether `identify actuator` estimates it; False: measured otherwise, such as a
             width, or without effect on motion and capacitance.
-        inverse_power: power of its inverse in which the forces are nearly linear, such as 2 of a
+        inverse_exponent: power of its inverse in which the forces are nearly linear, such as 2 of a
             locking stretch; 0: it is varied by its logarithm.
     Returns:
         The dataclass field.
@@ -97,7 +97,7 @@ def parameter(
         "high": high,
         "description": description,
         "fitted": fitted,
-        "inverse_power": inverse_power,
+        "inverse_exponent": inverse_exponent,
     }
     field: AnyValue = dataclasses.field(default=default, metadata={_KEY: about})
     return field

@@ -72,7 +72,7 @@ class PlanarHasel(ActuatorLaw):
         description="of the shell", key="shell.shear_modulus_pa")
     locking_stretch: float = parameter(3.92, unit="", low=1.5, high=50.0,
         description="at which the chains are straight", key="shell.locking_stretch",
-        inverse_power=2)
+        inverse_exponent=2)
     length_m: float = parameter(0.0624, unit="m", low=0.01, high=0.2,
         description="between clamps, unstretched", key="shell.length_m")
     shell_width_m: float = parameter(

@@ -26,16 +26,16 @@ class Scales:
 
     Args:
         by_logarithm: Shape `(P,)`.
-        inverse_power: of those that vary by a power of their inverse; 0 of others. Shape `(P,)`.
+        inverse_exponent: of those that vary by a power of their inverse; 0 of others. Shape `(P,)`.
     """
 
     by_logarithm: NDArray[np.bool_]
-    inverse_power: Floats
+    inverse_exponent: Floats
 
     @classmethod
     def of(cls, law: ActuatorLaw, names: Sequence[str]) -> Scales:
         """Those of parameters of a law; other names, such as an added inertia, vary by value."""
-        powers = {about.key: about.inverse_power for about in law.described()}
+        powers = {about.key: about.inverse_exponent for about in law.described()}
         powers |= dict.fromkeys(DRIFT_TIMES, 0)
         inverse = [powers.get(name.partition("[")[0]) for name in names]
         return cls(
@@ -46,7 +46,7 @@ class Scales:
     @property
     def by_inverse(self) -> NDArray[np.bool_]:
         """Which of them vary by a power of their inverse. Shape `(P,)`."""
-        return self.inverse_power > 0.0
+        return self.inverse_exponent > 0.0
 
     def slopes(self, values: Floats) -> Floats:
         """Change of the values per change of what varies.
@@ -57,7 +57,7 @@ class Scales:
             Slopes. Shape `(P,)`.
         """
         found = np.where(self.by_logarithm, values, 1.0)
-        inverse, power = self.by_inverse, self.inverse_power[self.by_inverse]
+        inverse, power = self.by_inverse, self.inverse_exponent[self.by_inverse]
         found[inverse] = -(values[inverse] ** (power + 1.0)) / power
         return found
 
@@ -72,7 +72,7 @@ class Scales:
         found = values.astype(np.float64)
         found[self.by_logarithm] = np.log(values[self.by_logarithm])
         inverse = self.by_inverse
-        found[inverse] = values[inverse] ** -self.inverse_power[inverse]
+        found[inverse] = values[inverse] ** -self.inverse_exponent[inverse]
         return found
 
     def moved(self, values: Floats, step: Floats) -> Floats:
@@ -85,7 +85,7 @@ class Scales:
             The new values; not a number where an inverse became negative. Shape `(P,)`.
         """
         logarithm, inverse = self.by_logarithm, self.by_inverse
-        power = self.inverse_power[inverse]
+        power = self.inverse_exponent[inverse]
         found = values + step
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             found[logarithm] = values[logarithm] * np.exp(np.minimum(step[logarithm], 50.0))

@@ -69,6 +69,7 @@ def static(low: float, high: float) -> Static:
     return Static(
         FREE_M,
         Region(ends[0], ends[1], Estimate.normal(6.0, 0.1, "N"), 1.0),
+        3,
         {"S17.region_low": ends[0], "S17.region_high": ends[1]},
         {},
         {"static": {"stretch": stretch, "load_n": 6.0 * (stretch - 1.0)}},

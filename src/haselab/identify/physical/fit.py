@@ -451,13 +451,13 @@ def _result(
     parameters = {}
     for k, name in enumerate(unknowns.names):
         unit = units[name.partition("[")[0]]
-        if unknowns.by_logarithm[k] or unknowns.inverse_power[k]:
+        if unknowns.by_logarithm[k] or unknowns.inverse_exponent[k]:
             share = np.inf if weak[k] else std[k] * abs(slopes[k]) / unknowns.values[k]
             parameters[name] = (
                 Estimate.inverse(
-                    unknowns.values[k], share, unit, described[name].high, unknowns.inverse_power[k]
+                    unknowns.values[k], share, unit, described[name].high, unknowns.inverse_exponent[k]
                 )
-                if unknowns.inverse_power[k]
+                if unknowns.inverse_exponent[k]
                 else Estimate.lognormal(unknowns.values[k], share, unit)
             )
         else:

@@ -124,7 +124,7 @@ def simpler(found: Found, covariance: Floats) -> list[Rival]:
         if about is None:
             continue
         size, std = unknowns.values[k], math.sqrt(covariance[k, k])
-        if power := about.inverse_power:
+        if power := about.inverse_exponent:
             effect, std = f"{about.key} (infinite)", power * std / size ** (power + 1)
             size = size**-power
         elif about.name == "branch_share":

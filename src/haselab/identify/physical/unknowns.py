@@ -172,7 +172,7 @@ class Unknowns:
     def _scales(self) -> Scales:
         found = Scales.of(self.law, self.names)
         positive = np.array([name in _SCALES for name in self.names])
-        return Scales(found.by_logarithm | positive, found.inverse_power)
+        return Scales(found.by_logarithm | positive, found.inverse_exponent)
 
     @property
     def by_logarithm(self) -> NDArray[np.bool_]:
@@ -180,9 +180,9 @@ class Unknowns:
         return self._scales.by_logarithm
 
     @property
-    def inverse_power(self) -> Floats:
+    def inverse_exponent(self) -> Floats:
         """Power of the inverse by which they vary; 0 of others. Shape `(P,)`."""
-        return self._scales.inverse_power
+        return self._scales.inverse_exponent
 
     @property
     def widths(self) -> Floats:
@@ -191,10 +191,10 @@ class Unknowns:
         about = {one.key: one for one in self.law.described()}
         for name, value in zip(self.names, self.values.tolist(), strict=True):
             known = about.get(name.partition("[")[0])
-            if known is not None and value > 0.0 and not known.inverse_power:
+            if known is not None and value > 0.0 and not known.inverse_exponent:
                 widths[name] = max(_WIDTH * (1.0 - known.low / value), _LEAST_WIDTH)
         found = np.array([widths.get(name, _WIDTH) for name in self.names])
-        power = self.inverse_power
+        power = self.inverse_exponent
         inverse = power > 0.0
         found[inverse] *= power[inverse] / self.values[inverse] ** power[inverse]
         return found
@@ -208,7 +208,7 @@ class Unknowns:
         """
         usual_law, found = type(self.law)(), self.widths
         fields = {about.key: about.name for about in self.law.described()}
-        power = self.inverse_power
+        power = self.inverse_exponent
         for k in np.flatnonzero(power):
             default = float(getattr(usual_law, fields[self.names[k]]))
             found[k] = max(found[k], power[k] * _WIDTH / default ** power[k])

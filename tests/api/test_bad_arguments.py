@@ -240,7 +240,12 @@ CALLS = {
         "period_s": (None, NUMBER_OR_NONE),
         "segment_s": (1.0, NUMBER_OR_NONE),
     },
-    hl.fit_transfer: {"records": RECORDS, "structure": STRUCTURE, "applied": (False, FLAG)},
+    hl.fit_transfer: {
+        "records": RECORDS,
+        "structure": STRUCTURE,
+        "applied": (False, FLAG),
+        "near": (None, without(OBJECT, "nothing")),
+    },
     hl.fit_arx: {
         "records": RECORDS,
         "orders": (None, without(OBJECT, "nothing")),
@@ -264,6 +269,7 @@ CALLS = {
     hl.fit_free_response: {
         "trials": (FreeTrial(U, TIME_S), OBJECT),
         "creep": (None, without(FLAG, "nothing")),
+        "near": (None, without(OBJECT, "nothing")),
     },
     hl.fit_map: {"x": (STRAIN, VECTOR), "y": (STRAIN, VECTOR), "monotone": (True, FLAG)},
     hl.fit_voltage_map: {"strain": (STRAIN, VECTOR), "voltage_v": (STRAIN, VECTOR)},

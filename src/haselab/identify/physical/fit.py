@@ -455,7 +455,11 @@ def _result(
             share = np.inf if weak[k] else std[k] * abs(slopes[k]) / unknowns.values[k]
             parameters[name] = (
                 Estimate.inverse(
-                    unknowns.values[k], share, unit, described[name].high, unknowns.inverse_exponent[k]
+                    unknowns.values[k],
+                    share,
+                    unit,
+                    described[name].high,
+                    unknowns.inverse_exponent[k],
                 )
                 if unknowns.inverse_exponent[k]
                 else Estimate.lognormal(unknowns.values[k], share, unit)

@@ -214,6 +214,17 @@ def test_a_session_can_be_read_while_it_is_written(tmp_path, writer):
     assert seen[-1] > seen[1] and frames > 0  # it did grow under the reader's eyes
 
 
+def test_rows_that_move_to_their_table_between_two_looks_are_found(tmp_path, writer, monkeypatch):
+    began, missed = SessionReader._began, [True]
+    monkeypatch.setattr(
+        SessionReader,
+        "_began",
+        lambda self, group: not (missed and missed.pop()) and began(self, group),
+    )
+    with SessionReader(tmp_path / "s.h5") as session:
+        assert "a" in session.names
+
+
 @pytest.mark.skipif(os.name == "nt", reason="SIGKILL is POSIX's")
 def test_a_killed_writer_loses_no_block_that_it_took(tmp_path, writer):
     os.kill(writer.pid, signal.SIGKILL)

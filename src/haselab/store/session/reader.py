@@ -64,8 +64,15 @@ class SessionReader(Closing):
         self._path, self._unverified = path, unverified
         if not path.is_file():
             raise InputError(f"No session here; run a study first. {path}")
+        self._open()
+        if self._live and len(self.names) < self._planned:
+            # rows may have moved from the tail to their table between the two looks
+            self._file.close()
+            self._open()
+
+    def _open(self) -> None:
         try:
-            opened = open_session(path, unverified=unverified)
+            opened = open_session(self._path, unverified=self._unverified)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
         self._file, self._live, self.doubt = opened.file, opened.live, opened.doubt
@@ -74,10 +81,10 @@ class SessionReader(Closing):
                 raise KeyError("format")
             check_links(self._file)
             self.header: dict[str, Any] = decode_json(self._file.attrs["header"])
-            self._tail = TailReader(self._file, path)
-            self.names: list[str] = [
-                name for name, group in self._file["experiments"].items() if self._began(group)
-            ]
+            self._tail = TailReader(self._file, self._path)
+            groups = self._file["experiments"]
+            self._planned = len(groups)
+            self.names: list[str] = [name for name, group in groups.items() if self._began(group)]
         except HDF5_ERRORS as error:
             self._file.close()
             raise self._damaged(error) from None

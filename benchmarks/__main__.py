@@ -49,6 +49,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         Measurement("identification.random_plants", quick={"plants": 200}),
         Measurement("control.margins", quick={"loops": 200}),
     ),
+    "scoreboard": (Measurement("control.scoreboard", full={"whole": True, "seeds": 5}),),
     "recording": (
         Measurement("rig.recording", quick={"seconds": 20.0, "live": 10.0, "kills": 3}),
         Measurement("rig.wire", quick={"seconds": 5.0}),

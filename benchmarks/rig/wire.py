@@ -47,7 +47,7 @@ class Served:
         command = [sys.executable, "-m", "haselab.cli", "twin", "serve", str(folder / "twin.toml")]
         command += ["--ahead-blocks", str(ahead), "--out", str(self.path)]
         self._process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-        while not self.path.exists():
+        while not (self.path.exists() and self.path.stat().st_size):
             if self._process.poll() is not None:
                 raise SystemExit("the twin is not served")
             time.sleep(0.05)

@@ -28,6 +28,7 @@ UNDERFLOW = -200290  # DAQmx status of an output that ran dry
 TICKS = 20  # samples in one mechanical step
 _BUFFER_S = 10.0
 _RAMP_S, _RAMP_PIECES = 1.0, 50
+_SHORTEST_S = 1e-4  # sleep of a reader
 _IDLE_S = 0.02  # longest sleep of the pace keeper
 _RIGHT = Wiring()
 _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
@@ -257,10 +258,14 @@ class TwinHub(Closing):
                 self._advance(-(-(due - self._acquired) // TICKS) * TICKS)
             deadline_s = time.monotonic() + timeout_s
             while self._acquired < due:
+                self._catch_up()  # samples come within a block too, without an event
                 left_s = deadline_s - time.monotonic()
+                if self._acquired >= due:
+                    break
                 if left_s <= 0.0 or not self._sampling or self._closed.is_set():
                     return None
-                self._lock.wait(left_s)
+                coming_s = (due - self._acquired) / (self.rate_hz * self._pace)
+                self._lock.wait(min(left_s, max(coming_s, _SHORTEST_S)))
             if self._acquired - start > len(self._ring):
                 raise LookupError("overwritten")
             return self._ring[(start + np.arange(samples)) % len(self._ring)]

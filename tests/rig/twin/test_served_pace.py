@@ -16,5 +16,5 @@ def test_samples_within_a_block_come_without_an_event(monkeypatch):
     with TwinHub(twin_of_reading("hz"), 1) as hub:
         hub.start_inputs()
         half = hub.description.block_samples // 2
-        codes = hub.238:        self, start: int, samples: int, timeout_s: float, until: int = 0(0, half, timeout_s=30.0)
+        codes = hub.readings(0, half, timeout_s=30.0)
         assert codes is not None and len(codes) == half

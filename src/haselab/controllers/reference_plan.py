@@ -51,7 +51,7 @@ class ReferencePlan:
         self._curve: tuple[float, ...] = ()
         self._for_s, self._at_s, self._target_m = 0.0, 0.0, length_m
         self._follows, self._last_m = False, length_m
-        self._here = (length_m, 0.0, 0.0)  # at the next drive
+        self._here = (length_m, 0.0)  # length and speed at the next drive
 
     def next(
         self, wanted_m: list[float], acts_s: float, state: list[float]
@@ -74,19 +74,18 @@ class ReferencePlan:
             rests = self._at_s >= self._for_s - _SAME
             if self._follows or (rests and abs(given[0] - here[0]) < _NEAR * self._most_m):
                 self._follows = True
-                after = (*_cubic(samples, place + 1.0, period_s), 0.0)
-                self._here = after
+                after = self._here = _cubic(samples, place + 1.0, period_s)
                 return (*given, 2.0 * (after[0] - given[0] - given[1] * period_s) / period_s**2)
         if self._follows or target_m != self._target_m:
             self._follows = False
-            self._plan((here[0], here[1], 0.0), target_m, state)
+            self._plan(here, target_m, state)
         self._at_s += period_s
         if self._at_s >= self._for_s - _SAME:
-            self._here = self._target_m, 0.0, 0.0
+            self._here = self._target_m, 0.0
         else:  # as a drive that is held can lead it
-            _, speed, pushed = _value(self._curve, self._at_s)
-            self._here = here[0] + 0.5 * period_s * (here[1] + speed), speed, pushed
-        return here[0], here[1], (self._here[1] - here[1]) / period_s
+            speed = _value(self._curve, self._at_s)[1]
+            self._here = here[0] + 0.5 * period_s * (here[1] + speed), speed
+        return (*here, (self._here[1] - here[1]) / period_s)
 
     def _smooth(self, samples: list[float], at: int) -> bool:
         """Whether the samples about one are neither a step nor faster than the force of the field.
@@ -100,7 +99,7 @@ class ReferencePlan:
         )
         return not alone and max(rises) <= self._most_m
 
-    def _plan(self, start: tuple[float, float, float], target_m: float, state: list[float]) -> None:
+    def _plan(self, start: tuple[float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits."""
         self._target_m = target_m
         period_s = self._period_s
@@ -137,14 +136,14 @@ class ReferencePlan:
         return True
 
 
-def _quintic(start: tuple[float, float, float], target_m: float, for_s: float) -> tuple[float, ...]:
-    """Coefficients, lowest power first, of the way to rest at a target."""
-    x, v, a = start
-    t, gap = for_s, target_m - start[0]
-    c3 = (10.0 * gap - 6.0 * v * t - 1.5 * a * t * t) / t**3
-    c4 = (-15.0 * gap + 8.0 * v * t + 1.5 * a * t * t) / t**4
-    c5 = (6.0 * gap - 3.0 * v * t - 0.5 * a * t * t) / t**5
-    return x, v, 0.5 * a, c3, c4, c5
+def _quintic(start: tuple[float, float], target_m: float, for_s: float) -> tuple[float, ...]:
+    """Coefficients, lowest power first, of the way to rest at a target, from no acceleration."""
+    x, v = start
+    t, gap = for_s, target_m - x
+    c3 = (10.0 * gap - 6.0 * v * t) / t**3
+    c4 = (-15.0 * gap + 8.0 * v * t) / t**4
+    c5 = (6.0 * gap - 3.0 * v * t) / t**5
+    return x, v, 0.0, c3, c4, c5
 
 
 def _value(curve: tuple[float, ...], t: float) -> tuple[float, float, float]:

@@ -55,7 +55,7 @@ class LoopSettings:
         drive_limits_v: tuple[float, float],
         sensed_before_s: float | None = None,
     ) -> ControllerSetting:
-        """What the controller is told of the loop.
+        """Timing and limits of the loop, for the controller.
 
         Args:
             period_s: time between two steps, in s.

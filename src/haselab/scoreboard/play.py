@@ -94,7 +94,7 @@ class Trace:
 def setting_for(
     chosen: ChosenController, loop: LoopClass, known: KnownActuator, start_v: float
 ) -> ControllerSetting:
-    """What a controller is told of a loop on the scoreboard.
+    """Timing and limits of a loop on the scoreboard, for a controller.
 
     Args:
         chosen: the controller.

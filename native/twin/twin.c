@@ -366,6 +366,10 @@ static element connected(const twin_parameters *p, const twin_state *s, double s
     return load;
 }
 
+/* A change of the voltage in a step that moves no law. */
+#define STEADY 1e-3
+#define STEADY_V 1.0
+
 /* Samples of one mechanical step, one array for each quantity: most of the work needs no earlier
  * sample and is done on vectors. A voltage and its rate have one value more, at the end. */
 typedef struct {
@@ -375,7 +379,7 @@ typedef struct {
     double plate_v[TWIN_SUB + 1], lag_v[TWIN_SUB];
     double flow_a[TWIN_SUB], amps[TWIN_SUB];
     float noise_v[TWIN_SUB], noise_i[TWIN_SUB];
-    double sine, cosine; /* of the carrier's phase, means over the step */
+    double sine[TWIN_SUB + 1], cosine[TWIN_SUB + 1]; /* of the carrier's phase */
 } samples;
 
 /* The amplifier: linear dynamics, then the slew and the current it can deliver. */
@@ -489,19 +493,19 @@ HS_CLONES static void convert(const double *values, double scale, double offset_
 static void generate(const twin_parameters *p, double gain, const double drive_v[2], int32_t until,
                      const double turn[2], double carrier[2], samples *x)
 {
-    double c = carrier[0], q = carrier[1], sine = 0.0, cosine = 0.0;
+    double c = carrier[0], q = carrier[1];
     int j;
     for (j = 0; j < TWIN_SUB; ++j) {
-        const double now = q, before = c;
+        const double now = q;
+        x->sine[j] = q;
+        x->cosine[j] = c;
         q = now * turn[0] + c * turn[1];
         c = c * turn[0] - now * turn[1];
         x->held_v[j] = gain * (drive_v[j >= until] + p->carrier_v * now);
         x->rise_v[j] = gain * p->carrier_v * (q - now);
-        sine += 0.5 * (now + q);
-        cosine += 0.5 * (before + c);
     }
-    x->sine = sine / TWIN_SUB;
-    x->cosine = cosine / TWIN_SUB;
+    x->sine[TWIN_SUB] = q;
+    x->cosine[TWIN_SUB] = c;
     carrier[0] = c;
     carrier[1] = q;
 }
@@ -517,20 +521,41 @@ static void read_monitors(const twin_parameters *p, twin_state *s, samples *x, i
     convert(x->amps, p->i_monitor, p->i_offset_v, x->noise_i, p->i_noise_v, p->lsb_v, codes + 1);
 }
 
-/* Mean voltage and its ripple over the step, by the trapezoidal rule. */
-static motion_input pull_of(const samples *x, double load_n)
+/* Mean voltage and its ripple over some samples, by the trapezoidal rule. */
+static motion_input pull_of(const double *volt, int samples_used, double load_n)
 {
     motion_input pull = {0.0, 0.0, load_n};
     double sum = 0.0, sum2 = 0.0;
     int j;
-    for (j = 0; j < TWIN_SUB; ++j) {
-        const double v0 = x->plate_v[j], v1 = x->plate_v[j + 1];
+    for (j = 0; j < samples_used; ++j) {
+        const double v0 = volt[j], v1 = volt[j + 1];
         sum += 0.5 * (v0 + v1);
         sum2 += 0.5 * (v0 * v0 + v1 * v1);
     }
-    pull.volt = sum / TWIN_SUB;
-    pull.ripple_v2 = sum2 / TWIN_SUB - pull.volt * pull.volt;
+    pull.volt = sum / samples_used;
+    pull.ripple_v2 = sum2 / samples_used - pull.volt * pull.volt;
     return pull;
+}
+
+/* Moves by a step under a law that does not follow the carrier, whose mean square acts. Its force is
+ * not proportional to the square of the voltage, so that a change is followed sample by sample. */
+static void move_without_carrier(const twin_parameters *p, twin_state *s, const samples *x,
+                                 const carried *rides, double load_n, double time_s)
+{
+    double volt[TWIN_SUB + 1], change = 0.0;
+    int j, at_once = TWIN_SUB;
+    for (j = 0; j <= TWIN_SUB; ++j) {
+        volt[j] = x->plate_v[j] - rides->sine * x->sine[j] - rides->cosine * x->cosine[j];
+        change = fmax(change, fabs(volt[j] - volt[0]));
+    }
+    if (change > STEADY * fabs(volt[0]) + STEADY_V) {
+        at_once = 1;
+    }
+    for (j = 0; j < TWIN_SUB; j += at_once) {
+        motion_input pull = pull_of(volt + j, at_once, load_n);
+        pull.ripple_v2 += rides->square;
+        move_on(p, s, &pull, time_s + p->sample_s * j, p->sample_s * at_once, 0);
+    }
 }
 
 void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, double after_v,
@@ -551,6 +576,7 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
         const double by_current = p->current_limit_a / (load.farad + p->stray_f);
         const double reach =
             p->sample_s * (by_current < p->slew_v_s ? by_current : p->slew_v_s);
+        const double time_s = s->time_s + dt * (double)step;
         motion_input pull = {0.0, 0.0, load_n};
         generate(p, s->broken ? 0.0 : p->gain, drive_v, switch_at - step * TWIN_SUB, turn, carrier,
                  &x);
@@ -560,14 +586,14 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
         add_currents(&load, &x);
         read_monitors(p, s, &x, codes + 2 * TWIN_SUB * step);
         if (!(s->reference_f > 0.0)) { /* a reference moves nothing */
-            pull = pull_of(&x, load_n);
-            if (p->law.voltages > 1) {
-                pull.volt -= rides.sine * x.sine + rides.cosine * x.cosine;
-                pull.ripple_v2 = rides.square;
-            }
             watch_field(p, s, s->plate_v);
+            pull = pull_of(x.plate_v, TWIN_SUB, load_n);
         }
-        move_on(p, s, &pull, s->time_s + dt * (double)step, dt, 0);
+        if (!(s->reference_f > 0.0) && p->law.voltages > 1) {
+            move_without_carrier(p, s, &x, &rides, load_n, time_s);
+        } else {
+            move_on(p, s, &pull, time_s, dt, 0);
+        }
         lengths[step] = s->motion.length_m;
     }
     s->time_s += n_samples * p->sample_s;

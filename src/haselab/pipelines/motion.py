@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from haselab.identify.physical import MotionRecord
 from haselab.pipelines.sensing.series import DEFAULT_REQUEST
 from haselab.pipelines.sensing.source import session_config
 from haselab.runtime.observer import FIDUCIALS
-from haselab.sensing import Lockin
+from haselab.sensing import Lockin, Sensed
 from haselab.store.session.layout import ExperimentRecord
 from haselab.store.session.reader import SessionReader
 from haselab.study.fits.observe import gauge_length
@@ -38,7 +39,8 @@ class _Blocks:
             Shape `(S, 2)`.
         carrier_v: peak of the carrier at the actuator, by the voltage monitor; NaN if it was not
             seen.
-        rise: of the voltage monitor at each switch, see `_rise`. Shape `(4, N)`.
+        rise: of the voltage monitor at each switch.
+        lag_s: of the electrodes' voltage behind the amplifier's, by the series resistance.
         weight: of each of those samples' parts in the capacitances, see `_weights`. Shape `(N, S)`.
         later_s: of each capacitance, see `_weights`.
     """
@@ -50,7 +52,8 @@ class _Blocks:
     std_f: Floats
     used: NDArray[np.bool_]
     carrier_v: float
-    rise: Floats
+    rise: _Rise
+    lag_s: Floats
     weight: Floats
     later_s: Floats
 
@@ -120,12 +123,7 @@ def _joined(
     blocks: Mapping[str, _Blocks],
 ) -> MotionRecord:
     rig = reader.header["rig"]
-    block_s = rig["block_samples"] / rig["rate_hz"]
-    switch_s = rig["switch_sample"] / rig["rate_hz"]
-    drive = _drive(
-        conditions, blocks.values(), _late_s(blocks.values(), rig["rate_hz"]),
-        (block_s, switch_s), float(rig["amplifier_gain"]),
-    )  # fmt: skip
+    drive = _drive(conditions, blocks.values(), rig)
     time_s, length_m, std_m, of_length = lengths
     inside = (time_s >= drive.edge_s[0]) & (time_s <= drive.edge_s[-1])
     order = np.argsort(time_s[inside], kind="stable")
@@ -191,7 +189,7 @@ def _sensed(
 
 
 def _blocks(
-    reader: SessionReader, record: ExperimentRecord, lockin: Lockin, rise: Floats
+    reader: SessionReader, record: ExperimentRecord, lockin: Lockin, rise: _Rise
 ) -> _Blocks:
     rig, config = reader.header["rig"], lockin.config
     block_s = config.block_samples / config.rate_hz
@@ -205,7 +203,7 @@ def _blocks(
     carrier_v = 0.5 * volt_per_code * float(np.median(sensed.v_pp[used])) if used.any() else np.nan
     return _Blocks(
         record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
-        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v, rise,
+        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v, rise, _lag_s(sensed, used),
         *_weights(record.codes[:, :, 0], lockin),
     )  # fmt: skip
 
@@ -236,23 +234,29 @@ def _lengths(
 
 
 def _drive(
-    conditions: NDArray[np.void],
-    blocks: Collection[_Blocks],
-    late_s: Sequence[Floats],
-    timing_s: tuple[float, float],
-    gain: float,
+    conditions: NDArray[np.void], blocks: Collection[_Blocks], rig: Mapping[str, Any]
 ) -> Drive:
     """What acted."""
-    block_s, switch_s = timing_s
+    block_s, switch_s = (rig[name] / rig["rate_hz"] for name in ("block_samples", "switch_sample"))
+    gain = float(rig["amplifier_gain"])
+    drive_v_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"] / gain
+    late_s = _late_s(blocks, rig["rate_hz"])
     changes: list[tuple[float, float]] = [
         (float(row["time_s"]), float(row["drive_v"])) for row in conditions
     ]
     # the run begins at rest under its first row, even if another one has the same time
     edges = [conditions["time_s"][:1] - block_s, conditions["time_s"]]
     for part, late in zip(blocks, late_s, strict=True):
-        acts_s = part.start_s + switch_s + late
-        changes += zip(acts_s.tolist(), part.drive_v.tolist(), strict=True)
-        edges += [part.start_s, acts_s, part.start_s + block_s]
+        middle_s, half_s = part.start_s + switch_s + late, 0.5 * part.rise.duration / rig["rate_hz"]
+        at_once = half_s < _SAME_S
+        first_v = np.where(at_once, part.drive_v, drive_v_per_code * part.rise.middle)
+        for acts_s, volt in (
+            (middle_s - half_s, first_v),
+            ((middle_s + half_s)[~at_once], part.drive_v[~at_once]),
+        ):
+            changes += zip(acts_s.tolist(), volt.tolist(), strict=True)
+            edges.append(acts_s)
+        edges += [part.start_s, part.start_s + block_s]
         edges += [part.start_s + at_s for at_s in part.spans_s.ravel().tolist()]
     ramps = _ramp_edges(conditions)
     edge_s = np.sort(np.concatenate([*edges, ramps]))
@@ -319,49 +323,96 @@ def _weights(codes: NDArray[np.int16], lockin: Lockin) -> tuple[Floats, Floats]:
     return weight, sensed(ramp_s) - weight @ middle_s
 
 
-def _rise(codes: NDArray[np.int16], lockin: Lockin) -> Floats:
-    """Change and area of the voltage monitor at each switch, and the same of its square.
+@dataclass(frozen=True)
+class _Rise:
+    """How the voltage monitor follows each switch, in codes and samples, without the carrier.
 
-    The area is the sum of the samples after the switch, less what they reach. Of the first block,
-    the voltage before the switch is that of its own samples, in whole periods of the carrier.
+    Args:
+        change: of the level. Shape `(N,)`.
+        area: sum of the blanked samples, less the level that they reach. Shape `(N,)`.
+        square_change: of the level's square. Shape `(N,)`.
+        square_area: the same sum of the square. Shape `(N,)`.
+        large: whether both of these are known well for a single switch. Shape `(N,)`.
+        duration: of a step in two equal parts, whose square is on average as far from its ends as
+            that of a large switch; 0 of others. Shape `(N,)`.
+        middle: level between these parts. Shape `(N,)`.
+    """
+
+    change: Floats
+    area: Floats
+    square_change: Floats
+    square_area: Floats
+    large: NDArray[np.bool_]
+    duration: Floats
+    middle: Floats
+
+
+def _rise(codes: NDArray[np.int16], lockin: Lockin) -> _Rise:
+    """Compare the blanked samples with the levels before and after them.
+
+    The carrier is fitted to the samples after them. Of the first block, the voltage before the
+    switch is that of its own samples.
     """
     first, end = lockin.config.blank
-    period = 2.0 * np.pi * lockin.config.rate_hz / lockin.config.omega_rad_s
-    whole = round(int(first / period) * period)
-    found = []
-    for power in (1, 2):
-        level = (codes[:, end:].astype(np.float64) ** power).mean(axis=1)
-        before = codes[:1, first - whole : first].astype(np.float64) ** power
-        start = before.mean(axis=1) if whole else level[:1]
-        after = codes[:, first:end].astype(np.float64) ** power
-        found += [np.diff(level, prepend=start), (after - level[:, None]).sum(axis=1)]
-    change, area = found[:2]
-    small = np.abs(change[1:]) < _LARGE
-    if small.any():  # the carrier's part is the same in all
-        found[1] = area - area[1:][small].mean()
-    return np.stack(found)
+    turn = lockin.config.omega_rad_s / lockin.config.rate_hz * np.arange(codes.shape[1])
+    carrier = np.stack([np.cos(turn), np.sin(turn)])
+    level, size = _without_carrier(codes[:, end:], carrier[:, end:])
+    before = np.append(level[:1], level[:-1])
+    if first * lockin.config.omega_rad_s >= 2.0 * np.pi * lockin.config.rate_hz:
+        before[:1] = _without_carrier(codes[:1, :first], carrier[:, :first])[0]
+    after = codes[:, first:end] - size @ carrier[:, first:end]
+    change, square_change = level - before, level**2 - before**2
+    # a step to the opposite voltage changes no square, hence no force
+    large = (np.abs(change) >= _LARGE) & (np.abs(square_change) >= _LARGE**2)
+    share = (after[large] ** 2 - before[large, None] ** 2) / square_change[large, None]
+    duration = np.zeros(level.size)
+    duration[large] = np.maximum(4.0 * (share * (1.0 - share)).sum(axis=1), 0.0)
+    middle = np.sqrt(0.5 * (level**2 + before**2))
+    return _Rise(
+        change, (after - level[:, None]).sum(axis=1),
+        square_change, (after**2 - level[:, None] ** 2).sum(axis=1),
+        large, duration, np.copysign(middle, level + before),
+    )  # fmt: skip
+
+
+def _lag_s(sensed: Sensed, used: NDArray[np.bool_]) -> Floats:
+    """Resistance times capacitance of each block; of unused blocks, the median of the others."""
+    if not used.any():
+        return np.zeros(used.size)
+    capacitance_f = np.where(used, sensed.capacitance_f, np.median(sensed.capacitance_f[used]))
+    return max(float(np.median(sensed.resistance_ohm[used])), 0.0) * capacitance_f
+
+
+def _without_carrier(codes: NDArray[np.int16], carrier: Floats) -> tuple[Floats, Floats]:
+    """Level of each row, shape `(N,)`, and its parts of a carrier, shape `(N, 2)`."""
+    basis = np.vstack([np.ones(carrier.shape[1]), carrier])
+    fit = np.linalg.pinv(basis).astype(np.float32)
+    found = (codes.astype(np.float32) @ fit).astype(np.float64)
+    return found[:, 0], found[:, 1:]
 
 
 def _late_s(blocks: Collection[_Blocks], rate_hz: float) -> list[Floats]:
-    """By how much later than requested the voltage of each block acts, by the voltage monitor.
+    """By how much later than requested the voltage of each block acts on the electrodes.
 
     A large step takes the amplifier longer, up to its limits of current and slew rate; all others
     are delayed equally.
     """
     rises = [part.rise for part in blocks]
     # the generator starts with the first block
-    small = [rise[:2, 1:][:, np.abs(rise[0, 1:]) < _LARGE] for rise in rises]
-    change, area = np.concatenate([np.zeros((2, 0)), *small], axis=1)
+    small = [np.flatnonzero(np.abs(rise.change[1:]) < _LARGE) + 1 for rise in rises]
+    change, area = (
+        np.concatenate([np.zeros(0), *(part[at] for part, at in zip(parts, small, strict=True))])
+        for parts in ([rise.change for rise in rises], [rise.area for rise in rises])
+    )
     size = float(change @ change)
     usual = -float(change @ area) / size if size > 0.0 else 0.5
     found = []
-    for rise in rises:
-        late = np.full(rise.shape[1], usual)
-        # a step to the opposite voltage changes no square, hence no force
-        large = (np.abs(rise[0]) >= _LARGE) & (np.abs(rise[2]) >= _LARGE**2)
-        late[large] = -rise[3, large] / rise[2, large]
+    for part, rise in zip(blocks, rises, strict=True):
+        late = np.full(rise.change.size, usual)
+        large = rise.large
+        late[large] = -rise.square_area[large] / rise.square_change[large]
         # the first sample still shows the voltage before: half an interval of the sums
-        found.append((late - 0.5) / rate_hz)
+        found.append((late - 0.5) / rate_hz + part.lag_s)
     return found
 
 

@@ -58,12 +58,18 @@ def test_the_first_step_of_an_experiment_is_as_late_as_its_monitor_shows(from_v)
     first = from_v + (4000.0 - from_v) * ramp + carrier
     codes = np.round(np.stack([first, np.full(BLOCK, 4000.0) + carrier])).astype(np.int16)
     found = _rise(codes, lockin)
-    part = SimpleNamespace(rise=found)
+    part = SimpleNamespace(rise=found, lag_s=np.zeros(2))
     late_s = _late_s([part], RATE_HZ)[0]
     # of the square of the voltage, which the force follows; sums of samples
     square = (4000.0**2 - (from_v + (4000.0 - from_v) * ramp[400:560]) ** 2).sum()
     expected = square / (4000.0**2 - from_v**2) - 0.5
-    # the carrier in a part of its period of 100 samples: 2 V c 100 / 2 pi, of the change of V^2
-    within = 2.0 * 4000.0 * 60.0 * 100.0 / (2.0 * np.pi) / (4000.0**2 - from_v**2)
-    assert late_s[0] * RATE_HZ == pytest.approx(expected, abs=2.0 * within)
+    # codes are rounded, and the square of each is uncertain by 2 V / sqrt(12)
+    rounding = 3.0 * 2.0 * 4000.0 * np.sqrt(160.0 / 12.0) / (4000.0**2 - from_v**2)
+    assert late_s[0] * RATE_HZ == pytest.approx(expected, abs=rounding)
     assert expected > 0.3 * slew
+    # a step in two parts has the same area, and the same mean of share (1 - share)
+    share = ((from_v + (4000.0 - from_v) * ramp) ** 2 - from_v**2) / (4000.0**2 - from_v**2)
+    apart = 4.0 * (share * (1.0 - share)).sum()
+    assert found.duration[0] == pytest.approx(apart, abs=4.0 * rounding)
+    assert found.duration[1] == 0.0
+    assert found.middle[0] == pytest.approx(np.sqrt(0.5 * (4000.0**2 + from_v**2)), abs=1.0)

@@ -1,12 +1,20 @@
-"""A session as one motion: when each capacitance was sensed."""
+"""A session as one motion: what acted when, and when each capacitance was sensed."""
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from haselab.pipelines.motion import _late_s, _rise, _weights
+from haselab.actuators import GRAVITY_M_S2, Drive, SampledLaw
+from haselab.pipelines.motion import _drive, _late_s, _rise, _weights
+from haselab.rig.twin.config import Mullins, TwinConfig
+from haselab.rig.twin.twin_bench import native_bench
+from haselab.rig.twin.twin_file import load_twin
 from haselab.sensing import Lockin, LockinConfig
+
+KINDS = Path(__file__).resolve().parents[3] / "examples" / "kinds"
 
 RATE_HZ, CARRIER_HZ, BLOCK = 200e3, 2000.0, 2000
 AMPLITUDE = 2e4  # codes
@@ -73,3 +81,59 @@ def test_the_first_step_of_an_experiment_is_as_late_as_its_monitor_shows(from_v)
     assert found.duration[0] == pytest.approx(apart, abs=4.0 * rounding)
     assert found.duration[1] == 0.0
     assert found.middle[0] == pytest.approx(np.sqrt(0.5 * (4000.0**2 + from_v**2)), abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "bound"),
+    # with the carrier c of the frequency w, a change from V acts c / (V w) earlier: 1 to 3 us; the
+    # ramp of 0.5 ms that charges a stack is followed in two steps: T^2 / 36 of its acceleration
+    [("planar-hasel", 1e-4), ("peano-hasel", 2e-5), ("dea-stack", 1.5e-4)],
+)
+def test_the_drive_of_a_record_moves_the_law_as_the_instruments_moved_the_actuator(kind, bound):
+    """Large steps of an amplifier with a lag and a current limit, within `bound` of the motion."""
+    if kind == "planar-hasel":
+        config = TwinConfig(mullins=Mullins(share=0.0))
+    else:
+        config = load_twin(KINDS / kind / "twin.toml")
+    law, gain = config.law, config.amplifier.gain
+    bench = native_bench(config, 1, noise=False)
+    bench.carrier_rad_s, bench.carrier_v = 2.0 * np.pi * CARRIER_HZ, 0.02
+    load_n = config.load.mass_kg * GRAVITY_M_S2
+    middle_v, half_v = (
+        0.55 * config.acquisition.drive_high_v,
+        0.17 * config.acquisition.drive_high_v,
+    )
+    drive_v = middle_v + half_v * np.sin(2.0 * np.pi * 5.0 * np.arange(100) / 100.0)
+    drive_v[:10] = middle_v
+    bench.move(drive_v[:1], 1, load_n, np.empty(1_200_000))  # creep of two minutes
+    codes = np.empty((drive_v.size, BLOCK, 2), dtype=np.int16)
+    lengths = np.empty((drive_v.size, BLOCK // 20))
+    for k, volt in enumerate(drive_v):
+        bench.acquire(drive_v[max(k - 1, 0)], volt, 400, load_n, codes[k], lengths[k])
+    rig = {"rate_hz": RATE_HZ, "block_samples": BLOCK, "switch_sample": 400, "amplifier_gain": gain,
+           "volt_per_code": 20.0 / 2**16, "v_monitor_v_per_v": 1.0 / gain}  # fmt: skip
+    lockin = Lockin(LockinConfig(RATE_HZ, BLOCK, CARRIER_HZ, 0.0, 1e6, blank=(400, 560)))
+    farad = law.differential_capacitance_f(lengths.mean(axis=1), gain * middle_v)
+    start_s = BLOCK / RATE_HZ * np.arange(drive_v.size)
+    part = SimpleNamespace(
+        start_s=start_s, drive_v=drive_v, spans_s=np.zeros((0, 2)), carrier_v=np.nan,
+        rise=_rise(codes[:, :, 0], lockin), lag_s=law.circuit.series_ohm * farad,
+    )  # fmt: skip
+    names = [("time_s", float), ("drive_v", float), ("carrier_v", float), ("pull_n", float),
+             ("mass_kg", float)]  # fmt: skip
+    conditions = np.array([(0.0, drive_v[0], 0.02, load_n, config.load.mass_kg)], dtype=names)
+
+    def left_m(drive: Drive) -> float:
+        sampled = SampledLaw(law, 12e3, added_inertia_kg=config.load.added_inertia_kg)
+        time_s = (start_s[:, None] + 1e-4 * np.arange(1, 101)).ravel()[:-1]
+        acts = float(drive.voltage_v[0]), float(drive.ripple_v2[0]), load_n
+        found = sampled.respond(drive, time_s, sampled.at_rest(*acts)[0], sensed=np.zeros(
+            drive.voltage_v.size, dtype=bool)).length_m  # fmt: skip
+        return float(np.std(lengths.ravel()[:-1] - found))
+
+    drive = _drive(conditions, [part], rig)
+    motion_m = float(np.std(lengths))
+    assert left_m(drive) < bound * motion_m
+    # a delay of 10 us is seen
+    late = replace(drive, edge_s=drive.edge_s + 1e-5 * (drive.edge_s > 0.0))
+    assert left_m(late) > bound * motion_m

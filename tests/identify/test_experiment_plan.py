@@ -149,10 +149,10 @@ def test_limits_that_leave_no_drive_give_no_result():
 
 def test_bad_plans_are_refused():
     with pytest.raises(
-        InputError, match="goal = colour; must be one of creep, reading, modes, all"
+        InputError, match="goal = colour; it must be one of creep, reading, modes, all"
     ):
         plan_experiment(PLANT, "colour", UNIPOLAR)
-    with pytest.raises(InputError, match=r"baseline_v = 3 V; must be above 0 V and within"):
+    with pytest.raises(InputError, match=r"baseline_v = 3 V; it must be above 0 V and within"):
         plan_experiment(PLANT, "all", UNIPOLAR, baseline_v=3.0)
     with pytest.raises(InputError, match=r"duration_s = 0\.01 s"):
         plan_experiment(PLANT, "all", UNIPOLAR, duration_s=0.01)

@@ -98,9 +98,12 @@ def test_a_plant_survives_its_file():
 @pytest.mark.parametrize(
     ("numbers", "match"),
     [
-        (("thermal", (0.05,), 5.0, 0.1), "creep = thermal; must be one of mechanical, electrical"),
+        (
+            ("thermal", (0.05,), 5.0, 0.1),
+            "creep = thermal; it must be one of mechanical, electrical",
+        ),
         (("mechanical", (), 5.0, 0.1), "gains is empty"),
-        (("mechanical", (0.05,), 5.0, 0.1, 0.0, 1.0), "creep_share = 1; must be 0 to below 1"),
+        (("mechanical", (0.05,), 5.0, 0.1, 0.0, 1.0), "creep_share = 1; it must be 0 to below 1"),
         (("mechanical", (0.05,), -5.0, 0.1), "natural_frequency_rad_s = -5"),
     ],
 )

@@ -52,8 +52,9 @@ def mittag_leffler(order: float, x: ArrayLike) -> Floats:
     values = np.asarray(x, dtype=np.float64)
     if not 0.0 < order <= 1.0 or not (values >= 0.0).all():
         raise InputError(
-            f"Mittag-Leffler of order {order:g} down to {values.min(initial=0.0):g}; the order "
-            "must be above 0 and at most 1, and the argument 0 or more."
+            f"The Mittag-Leffler function got the order {order:g} and arguments down to "
+            f"{values.min(initial=0.0):g}; the order must be above 0 and at most 1, and the "
+            "arguments 0 or more."
         )
     theta = (2.0 * np.arange(_NODES // 2) + 1.0) * math.pi / _NODES
     z = _NODES * (0.1309 - 0.1194 * theta**2 + 0.2500j * theta)

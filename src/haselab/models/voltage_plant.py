@@ -142,9 +142,9 @@ class VoltagePlant:
 
     def __post_init__(self) -> None:
         if self.creep not in CREEPS:
-            raise InputError(f"creep = {self.creep}; must be one of {', '.join(CREEPS)}.")
+            raise InputError(f"creep = {self.creep}; it must be one of {', '.join(CREEPS)}.")
         if not 0.0 <= self.creep_share < 1.0:
-            raise InputError(f"creep_share = {self.creep_share:g}; must be 0 to below 1.")
+            raise InputError(f"creep_share = {self.creep_share:g}; it must be 0 to below 1.")
         if not self.gains:
             raise InputError("gains is empty. Give at least one gain.")
         self._linear()

@@ -206,7 +206,8 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     high_hz = min(request.rate_hz / 3.0, 2.0 * request.bandwidth_hz)
     if not low_hz < high_hz:
         raise InputError(
-            f"No carrier has {_FEWEST_PERIODS:g} periods in {window_s:g} s that count and is "
+            f"No carrier has {_FEWEST_PERIODS:g} periods in the {window_s:g} s that are used "
+            "and is "
             f"below {high_hz:g} Hz. Lengthen the block, blank less, or sample faster."
         )
     grid_hz = 0.25 / request.block_s
@@ -245,11 +246,15 @@ def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
     """
     r = request
     periods = carrier_hz * _window_s(r)
+    if not carrier_hz > 0.0:
+        raise InputError(f"carrier_hz is {carrier_hz:g} Hz; it must be above 0 Hz.")
     if not (periods >= 2.0 and carrier_hz <= r.rate_hz / 3.0):
         raise InputError(
-            f"Carrier = {carrier_hz:g} Hz has {periods:.3g} periods in the samples that count, at "
-            f"{r.rate_hz:g} samples per second; at least 2 periods and 3 samples per period are "
-            "required. Choose another carrier."
+            f"A carrier of {carrier_hz:g} Hz has {periods:.3g} periods in the samples that "
+            "are used and "
+            f"{r.rate_hz / carrier_hz:.3g} samples per period; at least 2 periods and 3 "
+            "samples per "
+            "period are needed. Choose another carrier."
         )
     omega = 2.0 * math.pi * carrier_hz
     impedance = r.series_ohm + 1.0 / (1j * omega * r.capacitance_f)

@@ -149,7 +149,7 @@ def test_no_result_is_a_result_error_with_the_reason_in_the_json(tmp_path):
         (["transfer", "{sweep}", "--delay", "soon", "--rate-hz", "9"], "--delay is soon"),
         (["transfer", "{sweep}", "--fix", "gain", "--rate-hz", "9"], "--fix is gain"),
         (["transfer", "{sweep}", "--rate-hz", "-1"], "--rate-hz is -1 Hz"),
-        (["transfer", "{sweep}", "--poles", "9", "--rate-hz", "9"], "poles = 9; must be"),
+        (["transfer", "{sweep}", "--poles", "9", "--rate-hz", "9"], "poles = 9; it must be"),
         (["hyperelastic", "{sweep}"], "lacks stretch, nominal_stress_pa"),
     ],
 )

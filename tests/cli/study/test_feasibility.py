@@ -183,7 +183,7 @@ frame_rate_hz = 100.0
         ("high_v = 2.0\nfrequency_hz = 0.5", "high_v = 10.0\nfrequency_hz = 1.0",
          "only 6 frames on each edge within 0.3 V of the baseline of 5 V"),
         ("[triangle]", "hold_s = 3\n[triangle]", "has the key hold_s outside its tables"),
-        ("[triangle]", "chirp = 3\n[triangle]", "chirp: Input should be a table, headed [chirp]"),
+        ("[triangle]", "chirp = 3\n[triangle]", "chirp: must be a table, headed [chirp]"),
         ("skipped_cycles = 1", "skipped_cycles = 3",
          "skipped_cycles = 3 must be below cycles = 3"),
         ("high_v = 2.0", "high_v = 0.0", "low_v = 0 must be below high_v = 0"),

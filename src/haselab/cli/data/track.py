@@ -316,7 +316,7 @@ def _request(options: dict[str, Any]) -> _Request:
     help="Read the times of the frames from a CSV file (frame, time_s), or from a session.h5 with "
     "--experiment. Default: from the frame rate.",
 )  # fmt: skip
-@shared_option("--experiment", detail="For a session given with --times. Default: its only one.")
+@shared_option("--experiment", detail="Needed if --times is a session. Default: its only one.")
 @click.option(
     "--subset-px", type=INTEGER,
     help="Set the side of a subset in px, odd. Default: 15 with --points, from the size of the "
@@ -339,7 +339,7 @@ def _request(options: dict[str, Any]) -> _Request:
     "--report", type=click.Path(path_type=Path), metavar="FILE.html",
     help="Write a page about the tracks. Default: none.",
 )  # fmt: skip
-@answer_options(_OUTPUTS, "A CSV file with the tracks.  [required]", plot=True)
+@answer_options(_OUTPUTS, "It is a CSV file with the tracks.  [required]", plot=True)
 @unverified_option
 def command(
     video: Path,

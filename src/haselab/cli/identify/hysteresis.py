@@ -147,7 +147,7 @@ def creep(
 ) -> None:
     """Fit a creep law to the response to a held input.
 
-    The laws are a sum of exponentials, a fractional law and a logarithm. FILE holds the columns of
+    The laws are a sum of exponentials, a fractional law and a logarithm. FILE has the columns of
     input and output.
     """
     table = read_valid(file, [output] if unit_step else [source, output], columns)

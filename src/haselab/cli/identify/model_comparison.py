@@ -44,7 +44,9 @@ _AGREEMENT = "agreement"
     "mechanical or electrical; modes: are there one or two modes; agreement: do the answers in "
     "JSON files agree.",
 )
-@shared_option("--input", "source", default="drive_v", show_default=True, detail="The drive, in V.")
+@shared_option(
+    "--input", "source", default="drive_v", show_default=True, detail="It is the drive, in V."
+)
 @OUTPUT
 @RATE
 @click.option(

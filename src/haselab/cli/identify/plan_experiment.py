@@ -59,7 +59,11 @@ _OF_SIGNAL = (
     "Default: 0.1.",
 )  # fmt: skip
 @shared_option(
-    "--duration-s", type=REAL, default=40.0, show_default=True, detail="Length of the drive signal."
+    "--duration-s",
+    type=REAL,
+    default=40.0,
+    show_default=True,
+    detail="It is the length of the drive signal.",
 )
 @click.option(
     "--baseline-v", type=REAL, default=1.0, show_default=True,
@@ -86,7 +90,7 @@ _OF_SIGNAL = (
 )  # fmt: skip
 @answer_options(
     None,
-    "A CSV file of the drive signal: time_s, drive_v; or, without --rig, a study file. "
+    "It is a CSV file of the drive signal (time_s, drive_v) or, without --rig, a study file. "
     "Default: none.",
     plot=True,
 )

@@ -120,7 +120,7 @@ def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequenc
 
 @click.command("free-response")
 @FILES
-@shared_option("--output", default="x", show_default=True, detail="The motion.")
+@shared_option("--output", default="x", show_default=True, detail="It is the measured motion.")
 @RATE
 @click.option(
     "--creep/--no-creep", default=None,

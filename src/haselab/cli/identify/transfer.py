@@ -106,9 +106,11 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 )  # fmt: skip
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
 @shared_option("--bootstrap", type=click.IntRange(2, 10_000), detail="Default: no bootstrap.")
-@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For --bootstrap.")
+@shared_option(
+    "--seed", type=SEED, default=1, show_default=True, detail="Only --bootstrap uses it."
+)
 @shared_option("--through-voltage-map", is_flag=True)
-@actuator_option("Reads [drive.voltage_map] and writes [model] with its covariance.")
+@actuator_option("The command reads [drive.voltage_map] and writes [model] with its covariance.")
 @column_options
 @answer_options(plot=True)
 def transfer(

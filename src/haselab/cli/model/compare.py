@@ -69,12 +69,16 @@ _NO_BAND = "no uncertainty: the model has no covariance"
 @click.option("--longest-m", type=POSITIVE,
               help="State the longest length of the actuator before the record, in m. Default: its "
               "length at the start of the record.")  # fmt: skip
-@shared_option("--mass-kg", type=REAL, detail="For tables. Default: that of MODEL.")
-@shared_option("--gain-v-per-v", type=POSITIVE, detail="For tables. Default: that of MODEL.")
+@shared_option("--mass-kg", type=REAL, detail="Used for tables only. Default: that of MODEL.")
+@shared_option(
+    "--gain-v-per-v", type=POSITIVE, detail="Used for tables only. Default: that of MODEL."
+)
 @shared_option("--zero-length-m", type=POSITIVE,
-               detail="For tables with strains. Default: that of MODEL.")  # fmt: skip
+               detail="Used for tables with strains only. Default: that of MODEL.")  # fmt: skip
 @unverified_option
-@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For the 95 % band.")
+@shared_option(
+    "--seed", type=SEED, default=1, show_default=True, detail="Only the 95 % band uses it."
+)
 @column_options
 @answer_options(plot=True)
 @click.pass_context

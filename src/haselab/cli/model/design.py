@@ -74,7 +74,7 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @loop_options
 @click.option(
-    "--limits", type=(REAL, REAL), show_default="the actuator file's, else -0.05 0.1",
+    "--limits", type=(REAL, REAL), show_default="those in the actuator file, else -0.05 0.1",
     metavar="LOW HIGH",
     help="Limit the controller's output to this range, in the unit of the model's input.",
 )  # fmt: skip
@@ -92,7 +92,9 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
     "--accept-shortfalls", is_flag=True,
     help="Write the best controller even if it does not meet the demands.",
 )  # fmt: skip
-@answer_options(None, "A new actuator file with model and controller. Default: none.", plot=True)
+@answer_options(
+    None, "It is a new actuator file with model and controller. Default: none.", plot=True
+)
 def command(
     model: Path,
     spec: Path | None,

@@ -88,8 +88,8 @@ def command(
     if any(value is not None for value in given):
         if kp is None or ki is None or kind is not None:
             raise click.UsageError(
-                "Give --kp and --ki, optionally with --kd and --derivative-filter-s, or none of "
-                "them: then --controller names a controller of the actuator file."
+                "Gains and a controller of the file cannot be combined. Give --kp and --ki "
+                "(and --kd and --derivative-filter-s if needed), or none of them."
             )
         gains = PidGains(*(value or 0.0 for value in given))
     elif held is not None:

@@ -66,7 +66,7 @@ def check_ends(session: SessionReader, path: Path) -> None:
 @click.argument("session", type=click.Path(path_type=Path))
 @answer_options(
     OutputRule("folder", own=_own_folder),
-    "A folder for the results. Default: the folder of SESSION.",
+    "It is a folder for the results. Default: the folder of SESSION.",
 )
 @shared_option(
     "--physical-model/--no-physical-model", default=False, show_default=True,

@@ -40,7 +40,9 @@ def _page(found: Feasibility) -> str:
 @click.argument("study", type=click.Path(path_type=Path))
 @shared_option("--rig", required=True, type=click.Path(path_type=Path))
 @shared_option("--quick", is_flag=True, detail="The table [quick] of STUDY describes it.")
-@actuator_option("Uses its voltage of zero strain and its controller, as haselab run does.")
+@actuator_option(
+    "The command uses its voltage of zero strain and its controller, as haselab run does."
+)
 @answer_options(plot=True)
 def command(
     study: Path,

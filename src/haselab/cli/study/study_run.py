@@ -50,7 +50,7 @@ __all__ = [
     "with_date",
 ]
 
-RUN_FOLDER = "A new folder for the recording and the results.  [required]"
+RUN_FOLDER = "It is a new folder for the recording and the results.  [required]"
 keep_video_option = shared_option(
     "--keep-video", type=click.Choice(["none", "sample", "all"]), default="sample",
     show_default=True, detail="sample: the first and the last second of each experiment.",

@@ -198,7 +198,7 @@ class CreepFit(RecordFit[Record]):
         """
         self._present(self.candidates or None)
         if not 0.0 < later_s < math.inf:
-            raise InputError(f"later_s = {later_s:g} s; must be above 0 s.")
+            raise InputError(f"later_s = {later_s:g} s; it must be above 0 s.")
         entries = [_forecast(self.setting, candidate, later_s) for candidate in self.candidates]
         low = min(entry.ci95[0] for entry in entries)
         high = max(entry.ci95[1] for entry in entries)
@@ -257,7 +257,7 @@ def fit_creep(
     record = sampled(records)
     setting, stepped = _setting(record, leave_out_s)
     if model not in _KINDS:
-        raise InputError(f"model = {model}; must be one of {', '.join(_KINDS)}.")
+        raise InputError(f"model = {model}; it must be one of {', '.join(_KINDS)}.")
     drift = _drift_before(setting, rest_known=not stepped)
     if drift is not None:
         return _no_result(setting, drift)
@@ -290,9 +290,7 @@ def _rest(record: Record) -> float:
 def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
     inputs, outputs, rate_hz = record.u, record.y, record.input_rate_hz
     if not 0.0 <= leave_out_s < math.inf:
-        raise InputError(
-            f"leave_out_s is {leave_out_s:g} s, but must be 0 s or more. Correct the time."
-        )
+        raise InputError(f"leave_out_s is {leave_out_s:g} s, but it must be 0 s or more.")
     stepped = bool(np.ptp(inputs) == 0.0)
     rest = _rest(record)
     moved = inputs - rest

@@ -173,7 +173,7 @@ def _status(limits: Sequence[float], outputs: Sequence[Floats]) -> str:
 
 def _check_method(method: str, period_s: float | None, segment_s: float | None) -> None:
     if method not in RESPONSE_METHODS:
-        raise InputError(f"method = {method}; must be one of {', '.join(RESPONSE_METHODS)}.")
+        raise InputError(f"method = {method}; it must be one of {', '.join(RESPONSE_METHODS)}.")
     if (period_s is not None) != (method == "periodic"):
         raise InputError(
             f"period_s = {period_s} with the method {method}; the method periodic requires a "

@@ -188,7 +188,7 @@ def fit_hammerstein(
     records, structure = several(records), structure or TransferStructure()
     layout, kind = layout_of(structure), f"hammerstein-{degree}"
     if degree not in DEGREES:
-        raise InputError(f"degree = {degree}; must be 2 or 3.")
+        raise InputError(f"degree = {degree}; it must be 2 or 3.")
     levels = np.unique(np.concatenate([r.u for r in records]))
     if levels.size <= degree:
         return no_fit(

@@ -308,7 +308,7 @@ def _fit(
             "needs 2, 0 and 0. Fit one resonance."
         )
     if not powers or not set(powers) <= {2, 3}:
-        raise InputError(f"powers = {powers}; must be 2 or 3.")
+        raise InputError(f"powers = {powers}; it must be 2 or 3.")
     model = _Oscillator(structure, powers, spring)
     kind = model.kind
     layout, records = layout_of(structure), several(records)

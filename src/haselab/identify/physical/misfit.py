@@ -90,7 +90,9 @@ def modelled(
     added_kg = unknowns.value(ADDED_INERTIA)
     lightest_kg = float(record.drive.mass_kg.min()) + law.moving_mass_kg + added_kg
     if lightest_kg < _LIGHTEST * unknowns.mass_kg:
-        raise LimitError(f"{record.name}: {lightest_kg:g} kg move, too few to simulate.")
+        raise LimitError(
+            f"{record.name}: the moving mass of {lightest_kg:g} kg is too small to simulate."
+        )
     names = unknowns.law_names if derivatives else ()
     sampled = SampledLaw(
         law,

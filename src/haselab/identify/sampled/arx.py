@@ -52,7 +52,7 @@ class ArxOrders:
         for name, least in (("na", 0), ("nb", 1), ("nk", 0)):
             value, most = getattr(self, name), _MOST[name]
             if not least <= value <= most:
-                raise InputError(f"{name} = {value}; must be {least} to {most}.")
+                raise InputError(f"{name} = {value}; it must be {least} to {most}.")
 
     @property
     def memory(self) -> int:
@@ -249,7 +249,7 @@ def fit_arx(
         True
     """
     if criterion not in _CRITERIA:
-        raise InputError(f"criterion = {criterion}; must be one of {', '.join(_CRITERIA)}.")
+        raise InputError(f"criterion = {criterion}; it must be one of {', '.join(_CRITERIA)}.")
     record = driven(records)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]

@@ -194,12 +194,12 @@ def _check(record: Record, order: int | None, block_rows: int) -> None:
     least = 8 * block_rows
     if block_rows < 2 or record.u.size < least:
         raise InputError(
-            f"block_rows = {block_rows} for {record.u.size} samples; must be 2 or more, and "
+            f"block_rows = {block_rows} for {record.u.size} samples; it must be 2 or more, and "
             f"with {least} samples or more. Lower block_rows, or record longer."
         )
     if order is not None and not 1 <= order < min(block_rows, _MOST_ORDER + 1):
         raise InputError(
-            f"order = {order}; must be 1 to {min(block_rows - 1, _MOST_ORDER)}. "
+            f"order = {order}; it must be 1 to {min(block_rows - 1, _MOST_ORDER)}. "
             "Lower the order, or raise block_rows."
         )
 

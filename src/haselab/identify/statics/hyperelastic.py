@@ -323,7 +323,7 @@ def fit_hyperelastic_tests(
     if not tests:
         raise InputError("No test was given. Pass at least one TensileTest.")
     if model != "auto" and model not in LAWS:
-        raise InputError(f"model = {model}; must be one of auto, {', '.join(LAWS)}.")
+        raise InputError(f"model = {model}; it must be one of auto, {', '.join(LAWS)}.")
     if electrode_stiffening and electrode_natural is None:
         raise InputError(
             "electrode_stiffening needs electrode_natural, the stretch at which the electrodes are "

@@ -171,7 +171,7 @@ def _checked(stretch: ArrayLike, load_n: ArrayLike, segments: int | None) -> tup
     most = x.size // _LEAST_SAMPLES
     if segments is not None and not 1 <= segments <= most:
         raise InputError(
-            f"segments = {segments}; must be 1 to {most}, a third of the {x.size} samples. "
+            f"segments = {segments}; it must be 1 to {most}, a third of the {x.size} samples. "
             "Fit fewer segments, or record more loads."
         )
     order = np.argsort(x, kind="stable")

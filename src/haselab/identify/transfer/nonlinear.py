@@ -55,7 +55,7 @@ def fit_nonlinear(
         InputError: an unknown kind, or a structure that the model does not support.
     """
     if kind not in NONLINEAR:
-        raise InputError(f"nonlinear = {kind}; must be one of {', '.join(NONLINEAR)}.")
+        raise InputError(f"nonlinear = {kind}; it must be one of {', '.join(NONLINEAR)}.")
     family, _, which = kind.partition("-")
     if family == "hammerstein":
         return fit_hammerstein(records, structure, int(which))

@@ -328,5 +328,5 @@ def test_a_number_that_no_computation_can_bear_is_bad_usage(refused: Refused, va
 
 
 def test_no_limit_is_a_limit(refused: Refused) -> None:
-    line = refused("identify", "verdict", "no.csv", "--question", "creep", "--slew", "inf")
+    line = refused("identify", "model-comparison", "no.csv", "--question", "creep", "--slew", "inf")
     assert "There is no such file" in line

@@ -158,5 +158,5 @@ def test_bad_plans_are_refused():
         plan_experiment(PLANT, "all", UNIPOLAR, duration_s=0.01)
     with pytest.raises(InputError, match="samples_per_s = 0"):
         Accuracy(samples_per_s=0.0)
-    with pytest.raises(LimitError, match=r"Window \[2, 1\] V"):
+    with pytest.raises(LimitError, match=r"limits of the bench are 2 to 1 V"):
         BenchLimits(2.0, 1.0)

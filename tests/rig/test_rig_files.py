@@ -104,9 +104,7 @@ def test_a_name_with_a_control_character_is_refused_in_one_line(manual, section,
     tables.pop("exposure", None)
     tables[section][key] = "MARK"
     manual.write_text(toml_text(tables).replace("MARK", f"/dev/tty{character}x"))
-    reported = (
-        rf"{section}\.(aravis\.)?{key}: must have no control characters or line breaks"
-    )
+    reported = rf"{section}\.(aravis\.)?{key}: must have no control characters or line breaks"
     with pytest.raises(InputError, match=reported) as error:
         load_rig(manual)
     assert len(str(error.value).splitlines()) == 1

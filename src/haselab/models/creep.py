@@ -18,8 +18,8 @@ __all__ = [
     "LogarithmicCreep",
     "PowerCreep",
     "PronyCreep",
+    "lagged_response",
     "mittag_leffler",
-    "retarded",
     "superpose",
 ]
 
@@ -169,7 +169,7 @@ class PronyCreep(Creep):
         inputs = _held(u, rate_hz)
         total = self.instant * inputs
         for gain, tau_s in zip(self.gains, self.time_constants_s, strict=True):
-            total = total + gain * retarded(inputs, rate_hz, tau_s)
+            total = total + gain * lagged_response(inputs, rate_hz, tau_s)
         return total
 
     def invert(self, y: ArrayLike, rate_hz: float) -> Floats:
@@ -202,7 +202,7 @@ class PronyCreep(Creep):
         return np.asarray(lfilter(denominator, numerator, outputs))
 
 
-def retarded(inputs: Floats, rate_hz: float, tau_s: float) -> Floats:
+def lagged_response(inputs: Floats, rate_hz: float, tau_s: float) -> Floats:
     """Response of `1 - exp(-t/tau)` to a held input, from rest. Shape `(N,)`."""
     step = math.exp(-1.0 / (rate_hz * tau_s))
     push = -math.expm1(-1.0 / (rate_hz * tau_s))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["CarrierChoice", "CarrierPlan", "CarrierRequest", "judge_carrier", "plan_carrier"]
+__all__ = ["CarrierChoice", "CarrierPlan", "CarrierRequest", "evaluate_carrier", "plan_carrier"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -197,7 +197,7 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
         InputError: no frequency is left between the window and the converter.
     Example:
         >>> plan = plan_carrier(CarrierRequest())
-        >>> paper = judge_carrier(CarrierRequest(), 2000.0)
+        >>> paper = evaluate_carrier(CarrierRequest(), 2000.0)
         >>> plan.chosen.total < paper.total, paper.remarks[0][:50]
         (True, '2000 Hz is harmonic 20 of the 100 Hz staircase of ')
     """
@@ -215,7 +215,7 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     grid_hz *= math.ceil((high_hz - low_hz) / grid_hz / most)
     first = math.ceil(low_hz / grid_hz - 1e-9)
     carriers_hz = grid_hz * np.arange(first, math.floor(high_hz / grid_hz + 1e-9) + 1)
-    candidates = tuple(judge_carrier(request, float(f)) for f in carriers_hz)
+    candidates = tuple(evaluate_carrier(request, float(f)) for f in carriers_hz)
     usable = [c for c in candidates if c.usable]
     if not usable:
         raise InputError(
@@ -233,7 +233,7 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     return CarrierPlan(chosen, _reasons(request, chosen, bool(free)), candidates)
 
 
-def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
+def evaluate_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
     """Errors and remarks for one carrier.
 
     Args:

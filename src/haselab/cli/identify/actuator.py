@@ -16,7 +16,7 @@ from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
 from haselab.cli.common import POSITIVE, REAL, actuator_option, answer_options, unverified_option
-from haselab.cli.identify.common import FILES, RATE, give
+from haselab.cli.identify.common import FILES, RATE, emit_fit
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -111,11 +111,11 @@ def actuator(
     _refuse_twice(inputs)
     fit = fit_actuator(law, records, mass_kg=mass_kg)
     if not fit.succeeded:
-        give(fit, inputs, as_json, out)
+        emit_fit(fit, inputs, as_json, out)
     section = section_of_fit(fit, records, gains_v_per_v[0])
     proposals = _proposals(tables, section, fit, actuator)
     listed = {"experiments": [proposal.answer() for proposal in proposals]}
-    give(fit, inputs, as_json, out, listed)
+    emit_fit(fit, inputs, as_json, out, listed)
     save_plot(plot, fit.chart)
     save_section(actuator, "model.physical", section, inputs, status=fit.status)
 

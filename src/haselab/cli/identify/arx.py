@@ -9,7 +9,7 @@ import click
 from haselab.base import InputError
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, SEED, answer_options
-from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
+from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, emit_fit, rate_hz_of, read_valid
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.record import Record
@@ -89,7 +89,7 @@ def arx(
     rate = rate_hz_of(table, rate_hz, file)
     record = Record.sampled(table[source][used], table[output][used], rate)
     fit = fit_arx(record, orders, criterion=criterion, remove_means=not keep_means)
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     save_plot(plot, lambda: fit.chart((source, output)))
 
 
@@ -137,5 +137,5 @@ def subspace(
         block_rows=options["block_rows"], remove_means=not keep_means,
         bootstrap=options["bootstrap"], seed=options["seed"],
     )  # fmt: skip
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     save_plot(plot, lambda: fit.chart((source, output)))

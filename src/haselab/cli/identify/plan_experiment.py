@@ -111,8 +111,8 @@ def command(
 
     With --rig, the command designs a drive signal within the limits of the bench. The signal
     separates candidate models, or reduces the confidence interval of a parameter, as well as
-    possible. MODEL is a JSON answer of `identify verdict` or `identify transfer`, or the model.json
-    of a run.
+    possible. MODEL is a JSON answer of `identify model-comparison` or `identify transfer`, or the
+    model.json of a run.
 
     Without --rig, it finds the shortest study that determines a parameter of the physical model,
     within the limits of [drive]. MODEL is an actuator file with [model.physical].

@@ -25,7 +25,7 @@ from haselab.cli.identify.common import (
     STRESS,
     STRETCH,
     VOLTAGE,
-    give,
+    emit_fit,
     read_quantities,
 )
 from haselab.cli.options import shared_option
@@ -131,7 +131,7 @@ def hyperelastic(
     fit = fit_hyperelastic_tests(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )
-    give(_WithStress(fit, np.asarray(test["at_stretch"])), files, as_json, out)
+    emit_fit(_WithStress(fit, np.asarray(test["at_stretch"])), files, as_json, out)
     save_plot(plot, fit.chart)
 
 
@@ -228,7 +228,7 @@ def regions(
     stretch, load_n = read_quantities(file, wanted, columns)
     stretch, load_n = _between(stretch, load_n, stretch_min, stretch_max, file)
     fit = find_regions(stretch, load_n, segments)
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     save_plot(plot, fit.chart)
 
 
@@ -260,7 +260,7 @@ def voltage_map(
         file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns, known
     )
     fit = fit_voltage_map(strain, voltage_v)
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     if actuator is not None:
         save_voltage_map(actuator, fit, file)
     save_plot(plot, fit.chart)
@@ -308,5 +308,5 @@ def capacitance_map(
         section = save_strain_map(actuator, pairs, files)
         found = {name: part for name, part in section.items() if part is not None}
         more = {"strain_map": found if as_json or out is not None else _FOR_LOOPS}
-    give(fit, files, as_json, out, more)
+    emit_fit(fit, files, as_json, out, more)
     save_plot(plot, fit.chart)

@@ -19,9 +19,9 @@ from haselab.cli.identify.common import (
     INPUT,
     OUTPUT,
     RATE,
-    about,
-    give,
-    recorded,
+    emit_fit,
+    name_files_in_errors,
+    read_recorded,
     unit_text,
 )
 from haselab.cli.model.sections import MODEL_KEYS, model_section
@@ -151,8 +151,8 @@ def transfer(
     notes: list[str] = []
     units = ("", "")
     for file in files:
-        with about(file):
-            found_records = recorded(
+        with name_files_in_errors(file):
+            found_records = read_recorded(
                 file,
                 (source, output),
                 rate_hz,
@@ -173,7 +173,7 @@ def transfer(
         )
     if options["nonlinear"] and options["bootstrap"] is not None:
         raise InputError("--bootstrap needs a linear model. Leave out --bootstrap or --nonlinear.")
-    with about(*files):
+    with name_files_in_errors(*files):
         if options["nonlinear"]:
             found = fit = fit_nonlinear(records, structure, options["nonlinear"])
         elif options["choose"]:
@@ -193,7 +193,7 @@ def transfer(
                 f"--bootstrap needs a linear model, but {fit.kind} was chosen. Leave it out."
             )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
-    give(found, files, as_json, out, more)
+    emit_fit(found, files, as_json, out, more)
     if actuator is not None:
         _save(actuator, fit, (modelled, output), units, files, options["through_voltage_map"])
     save_plot(plot, lambda: fit.chart((source, output)))

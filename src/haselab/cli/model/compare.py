@@ -19,8 +19,8 @@ from haselab.cli.identify.common import (
     INPUT,
     OUTPUT,
     RATE,
-    about,
-    recorded,
+    name_files_in_errors,
+    read_recorded,
     unit_of_name,
     unit_text,
 )
@@ -143,11 +143,13 @@ def command(
     through = model if through_voltage_map else None
     records = []
     for file in files:
-        with about(file):
-            found = recorded(file, (source, output), rate_hz, held_at_hz, columns, through=through)
+        with name_files_in_errors(file):
+            found = read_recorded(
+                file, (source, output), rate_hz, held_at_hz, columns, through=through
+            )
             _check_units(origin, found.units, (source, output), through_voltage_map)
             records += found.records
-    with about(*files):
+    with name_files_in_errors(*files):
         prediction = predict(
             plant,
             records,

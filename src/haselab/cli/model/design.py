@@ -14,7 +14,7 @@ from haselab.base import Estimate, InputError, ResultError, table_at
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.model.charts import design_chart, loop_chart
-from haselab.cli.model.feedback import feedback_of, held_controller
+from haselab.cli.model.feedback import feedback_of, read_controller
 from haselab.cli.model.margins import margins_answer
 from haselab.cli.model.model_file import (
     loop_of,
@@ -217,7 +217,7 @@ def _judge(
             f"--controller {kind} reads its parameters from [controller] of an actuator file, but "
             f"the model is not an actuator file. Name one: {model}"
         )
-    held = held_controller(model, kind)
+    held = read_controller(model, kind)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
     setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
     plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.identify.record import finite_vector
 
-__all__ = ["paired", "plausible_strain", "plausible_stretch", "plausible_voltage"]
+__all__ = ["check_pair", "plausible_strain", "plausible_stretch", "plausible_voltage"]
 
 Floats = NDArray[np.float64]
 _LONGEST = 30.0  # stretch: above the break of any elastomer
@@ -20,7 +20,7 @@ _HIGHEST_V = 1e5
 _KILOVOLTS_V = 20.0  # span below which volts of an amplifier's output could be kilovolts
 
 
-def paired(
+def check_pair(
     first: str, one: object, second: str, two: object, *, least: int, record: str
 ) -> tuple[Floats, Floats]:
     """Check two columns: finite, equally long, neither constant.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import InputError, JsonObject, LimitError, check_fields, checked
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import CurveFit
-from haselab.identify.statics.columns import paired, plausible_stretch
+from haselab.identify.statics.columns import check_pair, plausible_stretch
 from haselab.identify.statics.hyperelastic_search import (
     ELECTRODE_NAMES,
     Candidate,
@@ -57,7 +57,7 @@ class TensileTest:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        x, y = paired(
+        x, y = check_pair(
             "stretch", self.stretch, "nominal_stress_pa", self.nominal_stress_pa,
             least=_LEAST_SAMPLES, record="record a tensile test",
         )  # fmt: skip

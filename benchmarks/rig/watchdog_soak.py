@@ -24,7 +24,7 @@ from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.loop_watchdog import LoopWatchdog
 from haselab.study.definition import Study, builtin_study
 from haselab.study.fits.maps import Maps
-from haselab.study.pipeline import investigate
+from haselab.study.pipeline import play_and_fit
 from haselab.study.simulated.noise_free import NoiseFreeBench
 
 BLOCKS_PER_S = 100
@@ -74,7 +74,7 @@ def maps_of(config: TwinConfig) -> Maps:
     study = Study.model_validate({key: reference[key] for key in ("name", "sensing", "triangle")})
     quiet = NoiseFreeBench(config, study)
     with Runner(quiet.rig, quiet, quiet, *CARRIER, SilentProgress()) as runner:
-        found = investigate(quiet.observation, study, quiet.rig.description, runner)
+        found = play_and_fit(quiet.observation, study, quiet.rig.description, runner)
     maps = found.find(Maps)
     assert maps is not None
     return maps

@@ -19,7 +19,7 @@ from benchmarks.sensing.calibration import (
 from haselab.report.style import BLUE, GREEN, GREY, PURPLE, RED, SKY
 from haselab.rig import Rig
 from haselab.sensing import LockinConfig
-from haselab.sensing.carrier_plan import CarrierRequest, judge_carrier, plan_carrier
+from haselab.sensing.carrier_plan import CarrierRequest, evaluate_carrier, plan_carrier
 from haselab.sensing.strain import fit_strain_map
 
 SWEEP_S = 10.0
@@ -100,7 +100,7 @@ def draw_strain(rig: Rig, config: LockinConfig) -> Figure:
 def draw_plan() -> Figure:
     """Cost of each carrier on the study's bench, and the place of the study's own."""
     request = CarrierRequest()
-    plan, paper = plan_carrier(request), judge_carrier(request, PAPER_HZ)
+    plan, paper = plan_carrier(request), evaluate_carrier(request, PAPER_HZ)
     carriers_hz = np.array([c.carrier_hz for c in plan.candidates])
     figure = Figure(figsize=(6.8, 3.8), layout="constrained")
     block, second = figure.subplots(1, 2, width_ratios=(3, 2))

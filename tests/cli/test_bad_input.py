@@ -130,7 +130,7 @@ def test_a_file_that_is_not_there_or_not_what_it_should_be_is_one_line(
         (
             "[operating_point]",
             "[operating_point]\nbaseline_v = nan",
-            "operating_point.baseline_v: Input should be a finite number",
+            "operating_point.baseline_v: must be a finite number",
         ),
         ("masses_kg = [0.0,", "masses_kg = [-0.1,", "masses_kg"),
         (
@@ -138,9 +138,9 @@ def test_a_file_that_is_not_there_or_not_what_it_should_be_is_one_line(
             "masses_kg = [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.5]\nold = [",
             "has 6 different masses, but needs at least 7",
         ),
-        ("cycles = 5", "cycles = 1", "triangle.cycles: Input should be greater than or equal to 2"),
-        ("cycles = 5", 'cycles = "many"', "triangle.cycles: Input should be a number, not a text"),
-        ("carrier_hz = 2000.0", "carrier_hz = -1.0", "sensing.carrier_hz: Input should be"),
+        ("cycles = 5", "cycles = 1", "triangle.cycles: must be greater than or equal to 2"),
+        ("cycles = 5", 'cycles = "many"', "triangle.cycles: must be a number, not a text"),
+        ("carrier_hz = 2000.0", "carrier_hz = -1.0", "sensing.carrier_hz: must be"),
         ("carrier_hz = 2000.0", "carrier_hz = 90e3", "carrier frequency is 9e+04 Hz"),
         ("[chirp]", "[chrip]", "has a table [chrip], but no installed experiment"),
         ("[chirp]", "[chirp", "Not a TOML file"),
@@ -160,14 +160,14 @@ def test_a_fault_in_a_study_is_refused_before_anything_moves(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "the file has no key kind: "),
-        ('kind = "robot"', "kind: Input should be 'twin'"),
+        ("", "the file has no key kind ("),
+        ('kind = "robot"', "kind: must be 'twin'"),
         ('kind = "twin"\nsed = 1', "sed: no such key"),
-        ('kind = "twin"\nseed = -1', "seed: Input should be greater than or equal to 0"),
-        ('kind = "twin"\nseed = "one"', "seed: Input should be a number, not a text"),
+        ('kind = "twin"\nseed = -1', "seed: must be greater than or equal to 0"),
+        ('kind = "twin"\nseed = "one"', "seed: must be a number, not a text"),
         ('kind = "twin"\nseed = 99999999999999999999', "seed: "),
-        ('kind = "twin"\nreading = "khz"', "reading: Input should be 'rad' or 'hz'"),
-        ('kind = "twin"\ntwin = 5', "twin: Input should be a valid string"),
+        ('kind = "twin"\nreading = "khz"', "reading: must be 'rad' or 'hz'"),
+        ('kind = "twin"\ntwin = 5', "twin: must be a valid string"),
         ('kind = "twin"\ntwin = "no.toml"', "No such twin file. Give the name of one that exists"),
         ('kind = "twin"\ntwin = "t.toml"\nreading = "hz"', "either twin or reading"),
     ],
@@ -186,22 +186,22 @@ def test_a_fault_in_a_rig_file_is_one_line(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[load]\nmass_kg = -0.2", "load.mass_kg: Input should be greater than 0 (got -0.2)"),
-        ("[load]\nmass_kg = nan", "load.mass_kg: Input should be a finite number (got nan)"),
+        ("[load]\nmass_kg = -0.2", "load.mass_kg: must be greater than 0 (got -0.2)"),
+        ("[load]\nmass_kg = nan", "load.mass_kg: must be a finite number (got nan)"),
         (
             "[load]\nmas_kg = 1",
             "mas_kg: no such key; the keys are added_inertia_kg, mass_kg (got 1)",
         ),
-        ("[acquisition]\ndrive_high_v = 50", "acquisition.drive_high_v: Input should be less"),
+        ("[acquisition]\ndrive_high_v = 50", "acquisition.drive_high_v: must be less"),
         (
             "[acquisition]\ndrive_high_v = 1.5",
             "highest drive voltage is 2 V in triangle (limit 1.5 V)",
         ),
         ("[acquisition]\nblock_samples = 1001", "acquisition.block_samples"),
         ("[viscosity]\nshare = [0.1]", "share and relaxation_s each need one number per branch"),
-        ('reading = "khz"', "reading: Input should be 'rad' or 'hz'"),
-        ("load = 3", "load: Input should be a table, headed [load]"),
-        ('[load]\nmass_kg = -1\n[shell]\nwidth_m = "wide"', "2 error(s): shell.width_m"),
+        ('reading = "khz"', "reading: must be 'rad' or 'hz'"),
+        ("load = 3", "load: must be a table, headed [load]"),
+        ('[load]\nmass_kg = -1\n[shell]\nwidth_m = "wide"', "2 errors: shell.width_m"),
     ],
 )
 def test_a_twin_that_cannot_be_is_one_line_that_names_every_fault(
@@ -328,5 +328,5 @@ def test_a_number_that_no_computation_can_bear_is_bad_usage(refused: Refused, va
 
 
 def test_no_limit_is_a_limit(refused: Refused) -> None:
-    line = refused("identify", "verdict", "no.csv", "--question", "creep", "--slew", "inf")
+    line = refused("identify", "model-comparison", "no.csv", "--question", "creep", "--slew", "inf")
     assert "There is no such file" in line

@@ -351,7 +351,7 @@ MANY_BRANCHES = Plant(0.5, 5.0, 0.1, slow_modes=(SlowMode(0.1, 1.0),) * 4)
             r"measurement_noise has shape \(1,\) or contains an infinity",
         ),
         ({"measurement_noise": [0.0, np.inf]}, r"measurement_noise has shape \(2,\)"),
-        ({"threads": -1}, r"threads = -1; must be 1 or more, or 0 for all of the machine"),
+        ({"threads": -1}, r"threads = -1; it must be 1 or more, or 0 for all of the machine"),
         ({"measurement_noise": WhiteNoise([1.0, 2.0])}, r"noise has 2 standard deviations"),
     ],
 )
@@ -371,5 +371,5 @@ def test_noise_that_cannot_be_is_refused(std):
 
 
 def test_a_seed_below_zero_is_refused():
-    with pytest.raises(InputError, match=r"seed = -1; must be 0 or more"):
+    with pytest.raises(InputError, match=r"seed = -1; it must be 0 or more"):
         WhiteNoise(1.0, seed=-1)

@@ -474,7 +474,7 @@ def test_the_recording_alone_gives_the_same_numbers(played: Path, tmp_path: Path
     ("change", "reported"),
     [
         ("[simulator]", "either port or a table simulator"),
-        (f'run = "{DATA}"', "the file has no key run: folder"),
+        (f'run = "{DATA}"', "the file has no key run (folder"),
     ],
 )
 def test_a_rig_file_without_what_it_needs_is_one_line(

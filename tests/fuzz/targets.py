@@ -58,7 +58,7 @@ _TARGETS: dict[str, tuple[str, dict[str, str]]] = {
     "report": ("report run", _RUN),
     "rig check": ("rig check rig.toml", _BENCH),
     "sense, calibrated": (f"sense monitors.csv {_SENSE} --calibration calibration.toml", {}),
-    "verdict agreement": ("identify verdict estimate.json other.json --question agreement",
+    "verdict agreement": ("identify model-comparison estimate.json other.json --question agreement",
                           {"other.json": "estimate.json"}),
     "arx": (f"identify arx {_RECORD} --na 2 --nb 2 --nk 1", {}),
     "subspace": (f"identify subspace {_RECORD} --order 2 --bootstrap 2", {}),

@@ -123,7 +123,7 @@ def test_bad_records_are_refused():
         fit_arx(Record.sampled(u[:20], y[:20], 10.0), ArxOrders(4, 4, 3))
     with pytest.raises(InputError, match="criterion = hqic"):
         fit_arx(Record.sampled(u, y, 10.0), criterion="hqic")
-    with pytest.raises(InputError, match="na = 13; must be 0 to 12"):
+    with pytest.raises(InputError, match="na = 13; it must be 0 to 12"):
         ArxOrders(13, 1, 1)
     with pytest.raises(InputError, match="rate"):
         fit_arx(Record.sampled(u, y, 0.0))

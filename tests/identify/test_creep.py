@@ -119,7 +119,7 @@ def test_the_callers_arrays_are_left_as_they_are():
 
 def test_a_forecast_asks_for_a_time_after_the_record():
     fit = fit_creep(Record.sampled(HELD, answer(TWO), RATE_HZ), "prony")
-    with pytest.raises(InputError, match="later_s = -1 s"):
+    with pytest.raises(InputError, match="after_s = -1 s"):
         fit.forecast(-1.0)
 
 

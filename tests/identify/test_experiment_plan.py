@@ -149,14 +149,14 @@ def test_limits_that_leave_no_drive_give_no_result():
 
 def test_bad_plans_are_refused():
     with pytest.raises(
-        InputError, match="goal = colour; must be one of creep, reading, modes, all"
+        InputError, match="goal = colour; it must be one of creep, reading, modes, all"
     ):
         plan_experiment(PLANT, "colour", UNIPOLAR)
-    with pytest.raises(InputError, match=r"baseline_v = 3 V; must be above 0 V and within"):
+    with pytest.raises(InputError, match=r"baseline_v = 3 V; it must be above 0 V and within"):
         plan_experiment(PLANT, "all", UNIPOLAR, baseline_v=3.0)
     with pytest.raises(InputError, match=r"duration_s = 0\.01 s"):
         plan_experiment(PLANT, "all", UNIPOLAR, duration_s=0.01)
     with pytest.raises(InputError, match="samples_per_s = 0"):
         Accuracy(samples_per_s=0.0)
-    with pytest.raises(LimitError, match=r"Window \[2, 1\] V"):
+    with pytest.raises(LimitError, match=r"limits of the bench are 2 to 1 V"):
         BenchLimits(2.0, 1.0)

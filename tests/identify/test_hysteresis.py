@@ -194,7 +194,7 @@ GOOD = drive()
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: LoopRecord(GOOD[:10], GOOD[:10], 1.0), "at least 24 values"),
+        (lambda: LoopRecord(GOOD[:10], GOOD[:10], 1.0), "at least 24 are needed"),
         (lambda: LoopRecord(GOOD, GOOD[:-1], 1.0), "must be equally long"),
         (lambda: LoopRecord(GOOD, 0.0 * GOOD, 1.0), "y is 0 throughout"),
         (lambda: LoopRecord(np.full(30, 2.0), GOOD[:30], 1.0), "u is 2 throughout"),

@@ -134,13 +134,13 @@ def test_what_cannot_be_fitted_is_refused():
     rng = np.random.default_rng(7)
     u = levels(rng)
     record = Record.sampled(u, u + 0.1 * rng.normal(size=COUNT), RATE_HZ)
-    with pytest.raises(InputError, match="nonlinear = cubic; must be one of hammerstein-2"):
+    with pytest.raises(InputError, match="nonlinear = cubic; it must be one of hammerstein-2"):
         fit_nonlinear([record], None, "cubic")
-    with pytest.raises(InputError, match="degree = 4; must be 2 or 3"):
+    with pytest.raises(InputError, match="degree = 4; it must be 2 or 3"):
         fit_hammerstein([record], degree=4)
     with pytest.raises(InputError, match="The structure has 3 poles"):
         fit_duffing([record], TransferStructure(poles=3))
-    with pytest.raises(InputError, match=r"powers = \(4,\); must be 2 or 3"):
+    with pytest.raises(InputError, match=r"powers = \(4,\); it must be 2 or 3"):
         fit_duffing([record], powers=(4,))
 
 

@@ -137,7 +137,7 @@ def test_too_many_states_give_no_result_and_bad_records_are_refused():
     assert fit.status.startswith("no result: the data do not support 8 states")
     with pytest.raises(ResultError, match="do not support 8 states"):
         _ = fit.plant
-    with pytest.raises(InputError, match="order = 15; must be 1 to 10"):
+    with pytest.raises(InputError, match="order = 15; it must be 1 to 10"):
         fit_subspace(Record.sampled(u, y, RATE_HZ), 15)
     with pytest.raises(InputError, match="120 samples or more"):
         fit_subspace(Record.sampled(u[:100], y[:100], RATE_HZ))

@@ -81,7 +81,7 @@ def test_the_inverse_of_prony_creep_gives_back_the_input():
         (lambda: PowerCreep(1.0, 0.1, 1.5), "above 0"),
         (lambda: FractionalCreep(1.0, 0.1, 0.5, -1.0), "above 0"),
         (lambda: mittag_leffler(1.2, [0.0]), "order must be above 0 and at most 1"),
-        (lambda: mittag_leffler(0.5, [-1.0]), "the argument 0 or more"),
+        (lambda: mittag_leffler(0.5, [-1.0]), "arguments 0 or more"),
         (lambda: CREEPS[0].simulate([[1.0]], 1.0), "finite vector"),
         (lambda: CREEPS[0].simulate([1.0], 0.0), "above 0 Hz"),
         (lambda: PronyCreep(0.0, (1.0,), (1.0,)).invert([1.0], 1.0), "no stable inverse"),

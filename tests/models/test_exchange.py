@@ -83,11 +83,11 @@ def test_what_cannot_be_taken_is_refused_with_a_reason(monkeypatch):
     with pytest.raises(InputError, match="2 inputs and 1 outputs"):
         from_scipy(signal.StateSpace(-np.eye(2), np.eye(2), np.ones((1, 2)), np.zeros((1, 2))))
     for read in (from_scipy, from_control):
-        with pytest.raises(InputError, match="The model is a str; must be TransferFunction"):
+        with pytest.raises(InputError, match="The model is a str; it must be TransferFunction"):
             read("1/s")
-    with pytest.raises(InputError, match="form = x; must be one of tf, ss, zpk"):
+    with pytest.raises(InputError, match="form = x; it must be one of tf, ss, zpk"):
         to_scipy(MODEL, "x")
-    with pytest.raises(InputError, match="form = zpk; must be one of tf, ss"):
+    with pytest.raises(InputError, match="form = zpk; it must be one of tf, ss"):
         to_control(MODEL, "zpk")
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(InputError, match=r"not installed; .* pip install haselab\[control\]"):

@@ -131,9 +131,9 @@ def test_kinds_of_test_are_what_their_names_say():
     assert Deformation("fixed_lateral", lateral_stretch=3.0).stretches(x)[1].tolist() == [3.0, 3.0]
     length, width = Deformation("prestretched", prestretch=2.0).stretches(x)
     assert (length.tolist(), width.tolist()) == ([2.2, 4.0], [2.0, 2.0])
-    with pytest.raises(InputError, match="deformation = shear; must be one of uniaxial"):
+    with pytest.raises(InputError, match="deformation = shear; it must be one of uniaxial"):
         Deformation("shear")
-    with pytest.raises(InputError, match="prestretch = 0; must be above 0"):
+    with pytest.raises(InputError, match="prestretch = 0; it must be above 0"):
         Deformation("prestretched", prestretch=0.0)
     with pytest.raises(LimitError, match="not strain"):
         Deformation().stretches([0.0])

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from haselab.base import InputError
-from haselab.models.voltage_plant import VoltagePlant, pulling_square
+from haselab.models.voltage_plant import VoltagePlant, delayed_square
 
 RATE_HZ = 100.0
 TIME_S = np.arange(2000) / RATE_HZ
@@ -13,14 +13,14 @@ TIME_S = np.arange(2000) / RATE_HZ
 
 def test_without_relaxation_only_the_square_of_the_voltage_counts():
     drive_v = np.random.default_rng(1).uniform(-2.0, 2.0, 50)
-    np.testing.assert_array_equal(pulling_square(drive_v, RATE_HZ, 0.0, 3.0), drive_v**2)
+    np.testing.assert_array_equal(delayed_square(drive_v, RATE_HZ, 0.0, 3.0), drive_v**2)
 
 
 def test_a_relaxing_voltage_goes_from_the_instant_part_to_all_of_it():
     """A step from 0 to V: ((1 - s) + s (1 - exp(-t/tau)))^2 V^2 at the middle of each update."""
     share, tau_s = 0.4, 3.0
     drive_v = np.concatenate([[0.0], np.full(1999, 1.5)])
-    pull = pulling_square(drive_v, RATE_HZ, share, tau_s)
+    pull = delayed_square(drive_v, RATE_HZ, share, tau_s)
     middle_s = TIME_S[1:] - TIME_S[1] + 0.5 / RATE_HZ
     expected = (1.5 * (1.0 - share * np.exp(-middle_s / tau_s))) ** 2
     np.testing.assert_allclose(pull[1:], expected, rtol=1e-12)
@@ -30,7 +30,7 @@ def test_fast_alternation_takes_the_relaxing_part_away():
     """The relaxed voltage swings by V T / (4 tau) at most about its mean, which is zero."""
     share, tau_s, flips_s = 0.35, 5.0, 0.1
     drive_v = np.where((np.arange(20000) // 10) % 2, -1.5, 1.5)
-    pull = pulling_square(drive_v, RATE_HZ, share, tau_s)[-1000:]
+    pull = delayed_square(drive_v, RATE_HZ, share, tau_s)[-1000:]
     swing_v = 1.5 * flips_s / (2.0 * tau_s)
     slack = 2.0 * (1.0 - share) * 1.5 * share * swing_v + (share * swing_v) ** 2
     assert np.abs(pull - ((1.0 - share) * 1.5) ** 2).max() <= slack
@@ -39,8 +39,8 @@ def test_fast_alternation_takes_the_relaxing_part_away():
 def test_a_limited_slew_loses_the_square_of_the_ramp():
     """From -1 V to 1 V in the whole update the mean square is 1/3; in half of it, 2/3."""
     drive_v = np.array([-1.0, 1.0, 1.0])
-    np.testing.assert_allclose(pulling_square(drive_v, RATE_HZ, 0.0, 1.0, 200.0), [1, 1 / 3, 1])
-    np.testing.assert_allclose(pulling_square(drive_v, RATE_HZ, 0.0, 1.0, 400.0), [1, 2 / 3, 1])
+    np.testing.assert_allclose(delayed_square(drive_v, RATE_HZ, 0.0, 1.0, 200.0), [1, 1 / 3, 1])
+    np.testing.assert_allclose(delayed_square(drive_v, RATE_HZ, 0.0, 1.0, 400.0), [1, 2 / 3, 1])
 
 
 @pytest.mark.parametrize("creep", ["mechanical", "electrical"])
@@ -98,9 +98,12 @@ def test_a_plant_survives_its_file():
 @pytest.mark.parametrize(
     ("numbers", "match"),
     [
-        (("thermal", (0.05,), 5.0, 0.1), "creep = thermal; must be one of mechanical, electrical"),
+        (
+            ("thermal", (0.05,), 5.0, 0.1),
+            "creep = thermal; it must be one of mechanical, electrical",
+        ),
         (("mechanical", (), 5.0, 0.1), "gains is empty"),
-        (("mechanical", (0.05,), 5.0, 0.1, 0.0, 1.0), "creep_share = 1; must be 0 to below 1"),
+        (("mechanical", (0.05,), 5.0, 0.1, 0.0, 1.0), "creep_share = 1; it must be 0 to below 1"),
         (("mechanical", (0.05,), -5.0, 0.1), "natural_frequency_rad_s = -5"),
     ],
 )

@@ -11,7 +11,7 @@ import pytest
 from haselab.base import InputError, LimitError
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import TwinBench, describe
-from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
+from haselab.safety.feasibility import Drive, Feasibility, Rating, check_feasibility
 
 RIG = describe(TwinConfig())
 RATING = Rating(12e-3, 350e6, 6e3, 1.3e-9, 310e-6, 40e6, stretch_high=9.0, stretch=2.7)
@@ -24,7 +24,7 @@ def asked(found: Feasibility) -> dict[str, float]:
 
 def test_the_numbers_are_the_closed_forms() -> None:
     ramp = Drive("ramp", np.array([0.2, 0.4, 0.6, 0.8, 1.0, 1.2]), 0.25)
-    got = asked(judge(RIG, RATING, [REST, ramp], 2000.0, 0.02))
+    got = asked(check_feasibility(RIG, RATING, [REST, ramp], 2000.0, 0.02))
     ripple_a = 2 * math.pi * 2000.0 * 1.3e-9 * 100.0
     assert got["peak current"] == pytest.approx(1e3 * (ripple_a + 1.3e-9 * 1000.0 / 0.01))
     rise_s = 1.3e-9 * 1000.0 / (12e-3 - ripple_a) + 3.0 / (2 * math.pi * 6e3)
@@ -38,7 +38,7 @@ def test_the_carrier_s_current_is_what_the_twin_s_monitor_shows() -> None:
     rating = dataclasses.replace(
         RATING, capacitance_f=twin._native.capacitance(twin._native.length_m)
     )
-    told_a = 1e-3 * asked(judge(RIG, rating, [REST], 2000.0, 0.02))["peak current"]
+    told_a = 1e-3 * asked(check_feasibility(RIG, rating, [REST], 2000.0, 0.02))["peak current"]
     twin.sine(2000.0, 0.02)
     for _ in range(3):
         codes = twin.read()
@@ -72,7 +72,7 @@ def test_the_carrier_s_current_is_what_the_twin_s_monitor_shows() -> None:
     ],
 )
 def test_a_study_beyond_the_bench_is_refused(change, drive, carrier, words) -> None:
-    found = judge(
+    found = check_feasibility(
         RIG, dataclasses.replace(RATING, **change), [REST, Drive("x", np.array(drive))], *carrier
     )
     assert not found.ok
@@ -81,18 +81,18 @@ def test_a_study_beyond_the_bench_is_refused(change, drive, carrier, words) -> N
 
 
 def test_a_signal_that_the_updates_cannot_make_is_refused() -> None:
-    found = judge(RIG, RATING, [Drive("fast", np.zeros(2), 60.0)], 2000.0, 0.02)
+    found = check_feasibility(RIG, RATING, [Drive("fast", np.zeros(2), 60.0)], 2000.0, 0.02)
     with pytest.raises(LimitError, match=r"signal frequency is 60 Hz in fast \(limit 50 Hz"):
         found.require()
 
 
 def test_an_unknown_stretch_passes() -> None:
     rating = dataclasses.replace(RATING, stretch=math.nan)
-    assert judge(RIG, rating, [REST], 2000.0, 0.02).ok
+    assert check_feasibility(RIG, rating, [REST], 2000.0, 0.02).ok
 
 
 def test_ratings_that_are_not_positive_and_missing_drives_are_refused() -> None:
     with pytest.raises(InputError, match=r"rating\.thickness_m is 0, but"):
         dataclasses.replace(RATING, thickness_m=0.0)
     with pytest.raises(InputError, match="no drive to check"):
-        judge(RIG, RATING, [], 2000.0, 0.02)
+        check_feasibility(RIG, RATING, [], 2000.0, 0.02)

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from haselab.base import InputError
-from haselab.sensing.carrier_plan import CarrierRequest, judge_carrier, plan_carrier
+from haselab.sensing.carrier_plan import CarrierRequest, evaluate_carrier, plan_carrier
 
 REQUEST = CarrierRequest()
 
@@ -19,7 +19,7 @@ class Bench:
         self.r, self.omega = request, 2 * np.pi * carrier_hz
         self.time_s = np.arange(round(request.block_s * request.rate_hz)) / request.rate_hz
         self.y = 1 / (request.series_ohm + 1 / (1j * self.omega * request.capacitance_f))
-        choice = judge_carrier(request, carrier_hz)
+        choice = evaluate_carrier(request, carrier_hz)
         self.v_v = choice.v_peak_v * request.volt_per_monitor_volt
 
     def carrier(self, phase_rad: float) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +71,7 @@ def test_the_noise_is_the_scatter_of_simulated_blocks(carrier_hz):
         v + REQUEST.volt_per_monitor_volt * noise[0],
         i + REQUEST.ampere_per_monitor_volt * noise[1],
     )
-    expected = judge_carrier(REQUEST, carrier_hz).noise
+    expected = evaluate_carrier(REQUEST, carrier_hz).noise
     assert error.std() == pytest.approx(expected, rel=5 / np.sqrt(2 * blocks))
 
 
@@ -88,15 +88,15 @@ def test_the_leak_of_a_step_is_that_of_a_simulated_step(carrier_hz, update_s):
         errors.append(relative(bench, v + step_v, i + step_a)[0])
     rms = np.sqrt(np.mean(np.square(errors)))
     # To first order in the leak, which is at most 3 % here; the earlier step has died out.
-    assert judge_carrier(request, carrier_hz).step == pytest.approx(rms, rel=0.06)
+    assert evaluate_carrier(request, carrier_hz).step == pytest.approx(rms, rel=0.06)
 
 
 def test_a_blank_that_covers_the_step_leaves_nothing_of_it():
     request = replace(REQUEST, update_s=0.002, blank_s=1.5e-3)
-    choice = judge_carrier(request, 2000.0)
+    choice = evaluate_carrier(request, 2000.0)
     # The amplifier's exponential: e^-(0.6 * 2 pi 6000 * 1.5 ms) = e^-34 of the step.
     assert choice.step < np.exp(-30)
-    unblanked = judge_carrier(replace(request, blank_s=0.0), 2000.0)
+    unblanked = evaluate_carrier(replace(request, blank_s=0.0), 2000.0)
     assert unblanked.step > 1e-5
     # 300 of 2,000 samples and a level more cost noise: at least their share.
     assert choice.noise > unblanked.noise * np.sqrt(2000 / 1700) * 0.999
@@ -112,7 +112,7 @@ def test_only_off_the_staircase_a_step_averages_out(carrier_hz, averages_out):
     for k in range(100):  # a second of updates of one height; the carrier runs on
         v, i = bench.carrier(bench.omega * REQUEST.block_s * k)
         errors.append(relative(bench, v + step[0], i + step[1])[0])
-    choice = judge_carrier(REQUEST, carrier_hz)
+    choice = evaluate_carrier(REQUEST, carrier_hz)
     rms, mean = np.sqrt(np.mean(np.square(errors))), abs(np.mean(errors))
     if averages_out:
         assert choice.step_average < 1e-3 * choice.step
@@ -142,19 +142,19 @@ def test_the_mains_leak_as_simulated_lines_do(carrier_hz):
     for phase in 2 * np.pi * np.arange(8) / 8:
         v, i = bench.carrier(phase)
         errors.append(relative(bench, v + lines[0], i + lines[1]))
-    expected = judge_carrier(request, carrier_hz).mains
+    expected = evaluate_carrier(request, carrier_hz).mains
     assert np.std(errors) == pytest.approx(expected, rel=5 / np.sqrt(2 * blocks))
 
 
 def test_harmonics_that_fold_back_are_named():
-    choice = judge_carrier(REQUEST, 12.5e3)  # 200 kHz / 16
+    choice = evaluate_carrier(REQUEST, 12.5e3)  # 200 kHz / 16
     assert "Harmonics 15, 17, 31, 33 of the carrier alias onto it" in " ".join(choice.remarks)
     assert choice.alias > 0.0
-    assert judge_carrier(REQUEST, 5575.0).alias == 0.0
+    assert evaluate_carrier(REQUEST, 5575.0).alias == 0.0
 
 
 def test_amplitudes_and_roll_off_are_those_of_the_chain():
-    low, high = judge_carrier(REQUEST, 500.0), judge_carrier(REQUEST, 12e3)
+    low, high = evaluate_carrier(REQUEST, 500.0), evaluate_carrier(REQUEST, 12e3)
     assert low.v_peak_v == pytest.approx(0.02, rel=0.01)
     w = 12e3 / 6e3
     gain = 1 / np.hypot(1 - w**2, 2 * 0.6 * w)
@@ -166,7 +166,7 @@ def test_amplitudes_and_roll_off_are_those_of_the_chain():
 
 @pytest.mark.long
 def test_the_choice_is_off_the_staircase_and_better_than_the_papers():
-    plan, paper = plan_carrier(REQUEST), judge_carrier(REQUEST, 2000.0)
+    plan, paper = plan_carrier(REQUEST), evaluate_carrier(REQUEST, 2000.0)
     assert plan.chosen.total < 0.5 * paper.total
     assert plan.chosen.step_average < 1e-6
     assert (plan.chosen.carrier_hz / 100) % 1 > 0.1
@@ -178,8 +178,8 @@ def test_the_choice_is_off_the_staircase_and_better_than_the_papers():
 
 @pytest.mark.long
 def test_the_unknown_time_of_an_update_is_the_mean_over_its_places():
-    unknown = judge_carrier(replace(REQUEST, update_s=None), 2025.0)
-    places = [judge_carrier(replace(REQUEST, update_s=s), 2025.0).step
+    unknown = evaluate_carrier(replace(REQUEST, update_s=None), 2025.0)
+    places = [evaluate_carrier(replace(REQUEST, update_s=s), 2025.0).step
               for s in (np.arange(16) + 0.5) / 16 * 0.01]  # fmt: skip
     assert unknown.step == pytest.approx(np.sqrt(np.mean(np.square(places))), rel=1e-6)
     reasons = plan_carrier(replace(REQUEST, update_s=None)).reasons
@@ -217,6 +217,6 @@ def test_no_possible_carrier_is_reported():
         plan_carrier(replace(REQUEST, block_s=0.002, update_hz=500.0, bandwidth_hz=200.0))
     for carrier_hz in (100.0, 80e3):
         with pytest.raises(
-            InputError, match="at least 2 periods and 3 samples per period are required"
+            InputError, match="at least 2 periods and 3 samples per period are needed"
         ):
-            judge_carrier(REQUEST, carrier_hz)
+            evaluate_carrier(REQUEST, carrier_hz)

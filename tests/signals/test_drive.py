@@ -108,10 +108,10 @@ def test_a_multisine_has_its_lines_with_their_powers_and_a_low_crest():
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: square(51.0, 1.0, 100.0), r"needs a frequency in \(0, 50\] Hz"),
+        (lambda: square(51.0, 1.0, 100.0), r"must have a frequency in \(0, 50\] Hz"),
         (lambda: prbs(0.001, 1.0, 100.0), "bits must be 0.01 s or longer"),
         (lambda: prbs(0.01, 1.0, 100.0, 0), "from start 0"),
-        (lambda: multisine([60.0], 1.0, 100.0), r"needs lines in \(0, 50\) Hz"),
+        (lambda: multisine([60.0], 1.0, 100.0), r"must have lines in \(0, 50\) Hz"),
         (lambda: multisine([6.0], 1.0, 100.0, [0.0]), "some above 0"),
     ],
 )

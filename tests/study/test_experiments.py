@@ -24,7 +24,7 @@ from haselab.study.feasibility import rating_of_twin, study_drives, study_masses
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.static import Static
 from haselab.study.paper.quantity_table import quantities
-from haselab.study.pipeline import investigate
+from haselab.study.pipeline import play_and_fit
 from haselab.study.registry import EXPERIMENTS
 
 REFERENCE = builtin_study(quick=True)
@@ -196,7 +196,7 @@ def test_the_code_of_another_package_that_fails_is_named(monkeypatch: pytest.Mon
     monkeypatch.setattr("haselab.study.analysis.experiments_of", lambda study: (own,))
     bench: Any = _Bench()
     with pytest.raises(ResultError, match=r"'play' of the experiment \[own\].*KeyError"):
-        investigate(lambda name: None, REFERENCE, describe(TwinConfig()), bench)  # type: ignore[arg-type,return-value]
+        play_and_fit(lambda name: None, REFERENCE, describe(TwinConfig()), bench)  # type: ignore[arg-type,return-value]
 
 
 def test_a_result_without_a_row_is_refused() -> None:

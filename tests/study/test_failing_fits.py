@@ -77,7 +77,7 @@ def test_a_fit_that_refuses_recorded_data_is_a_missing_result(
         monkeypatch.setattr(f"{where}{name}.Cycles.of", lambda *_: _Anything())
     monkeypatch.setattr(where + failing, _refuse)
     with pytest.raises(ResultError, match=rf"{FITS[failing]}.*y has 3 samples.*are kept"):
-        pipeline.investigate(lambda name: _Anything(), builtin_study(quick=True), _Anything())
+        pipeline.play_and_fit(lambda name: _Anything(), builtin_study(quick=True), _Anything())
 
 
 def test_a_missing_experiment_is_still_bad_input() -> None:
@@ -85,7 +85,7 @@ def test_a_missing_experiment_is_still_bad_input() -> None:
         raise InputError(f"The session holds no experiment {name}.")
 
     with pytest.raises(InputError, match="no experiment triangle"):
-        pipeline.investigate(source, builtin_study(quick=True), _Anything())
+        pipeline.play_and_fit(source, builtin_study(quick=True), _Anything())
 
 
 def test_a_run_whose_fit_refuses_its_data_exits_with_3_and_keeps_them(

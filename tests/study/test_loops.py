@@ -9,7 +9,7 @@ import pytest
 from haselab.base import ResultError
 from haselab.control import LoopSetting, PidGains, Saturation, margins, simulate_loop
 from haselab.models.plant import Plant, SlowMode
-from haselab.study.fits.loops import _delay_text, _lowered, _margin_note, playable
+from haselab.study.fits.loops import _delay_text, _lowered, _margin_note, reduce_gains
 
 # What the quick study found on the twin's reading "hz".
 PLANT = Plant(0.9955, 32.58, 0.1185, 0.0, (SlowMode(0.7268, 5.276),))
@@ -33,13 +33,13 @@ def rings(gains: PidGains, delay_s: float) -> float:
 
 def test_the_printed_pi_is_played_where_it_holds() -> None:
     assert least_db(PRINTED, 5.7e-3) > 2.0
-    assert playable(PLANT, PRINTED, setting(5.7e-3)) == PRINTED
+    assert reduce_gains(PLANT, PRINTED, setting(5.7e-3)) == PRINTED
 
 
 @pytest.mark.parametrize("delay_s", [15.7e-3, 25.7e-3, 35.7e-3])
 def test_outputs_that_wait_lower_the_gain_until_the_loop_holds(delay_s: float) -> None:
     assert rings(PRINTED, delay_s) > 1.0  # it oscillates without end
-    played = playable(PLANT, PRINTED, setting(delay_s))
+    played = reduce_gains(PLANT, PRINTED, setting(delay_s))
     assert played.ki == PRINTED.ki
     assert least_db(played, delay_s) >= 6.0
     assert rings(played, delay_s) < 0.1
@@ -50,7 +50,7 @@ def test_outputs_that_wait_lower_the_gain_until_the_loop_holds(delay_s: float) -
 def test_where_no_gain_holds_it_says_what_to_change() -> None:
     still = Plant(1.0, 32.58, 1e-4)
     with pytest.raises(ResultError, match=r"No PI reaches .* 6 dB .* 500 ms\. Queue fewer outputs"):
-        playable(still, PidGains(0.4, 500.0), setting(0.5))
+        reduce_gains(still, PidGains(0.4, 500.0), setting(0.5))
 
 
 def test_the_delay_that_a_note_states_is_the_one_that_its_margin_has() -> None:

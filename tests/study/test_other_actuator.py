@@ -8,7 +8,7 @@ from haselab.base import InputError
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import describe
 from haselab.study.definition import Study
-from haselab.study.feasibility import judge_study, rating_of_twin
+from haselab.study.feasibility import check_study, rating_of_twin
 from haselab.study.simulated.truth import parameters, set_in_twin, twin_of
 
 TRIANGLE = {
@@ -30,7 +30,7 @@ def study() -> Study:
 def test_a_stack_that_withstands_the_study_is_rated_by_its_law(study):
     twin = stack()
     rating = rating_of_twin(twin, study)
-    assert judge_study(study, describe(twin), rating).ok
+    assert check_study(study, describe(twin), rating).ok
     # It contracts: capacitance and field are largest at 10 kV, where the layers are thin.
     law = twin.law
     shortest_m = rating.thickness_m * 50.0
@@ -44,7 +44,7 @@ def test_a_stack_that_collapses_is_refused_before_it_is_energised(study):
     rating = rating_of_twin(twin, study)
     assert math.isinf(rating.stretch)
     with pytest.raises(InputError, match=r"stretch is infinite in triangle.* Lower the voltage"):
-        judge_study(study, describe(twin), rating).require()
+        check_study(study, describe(twin), rating).require()
 
 
 def test_no_result_was_set_in_a_twin_of_another_kind():

@@ -9,7 +9,7 @@ from haselab.base import Estimate
 from haselab.control import step_metrics
 from haselab.study.definition import Steps, builtin_study
 from haselab.study.fits.further import _scatter_note
-from haselab.study.fits.trials import ONE_TRIAL, Trials, compared
+from haselab.study.fits.trials import ONE_TRIAL, Trials, make_comparison
 
 STEPS = builtin_study().steps
 PX = 5e-3  # strain per pixel
@@ -34,7 +34,7 @@ def test_a_figures_table_has_the_intervals_of_the_rows(count: int) -> None:
     group = trials(count, 1.2)
     metrics = group.metrics
     quantities = {"rise": metrics.rise_time_s, "error": metrics.steady_state_error}
-    found = compared({"PI": group}, quantities, STEPS, PX, "PI")
+    found = make_comparison({"PI": group}, quantities, STEPS, PX, "PI")
     table = found.figures["steps"]["metrics"]["PI"]
     assert table["rise_time_s"] == found.quantities["rise"]
     assert table["error"] == found.quantities["error"]
@@ -45,7 +45,7 @@ def test_a_figures_table_has_the_intervals_of_the_rows(count: int) -> None:
 def test_a_number_that_is_missing_has_no_deviation() -> None:
     group = trials(2, 1.2)
     nothing = Estimate(np.nan, np.nan, (np.nan, np.nan), "s")
-    found = compared({"PI": group}, {"settling": nothing}, STEPS, PX, "PI")
+    found = make_comparison({"PI": group}, {"settling": nothing}, STEPS, PX, "PI")
     assert np.isnan(found.quantities["settling"].std)
 
 

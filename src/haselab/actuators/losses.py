@@ -146,8 +146,8 @@ def drift_pairs(values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         pair = values.get(rate, 0.0), values.get(time, 0.0)
         if not 1.0 + pair[0] * pair[1] > _LEAST:
             raise LimitError(
-                f"{rate} = {pair[0]:g} and {time} = {pair[1]:g} leave less than {_LEAST:g} of it. "
-                "Change them."
+                f"{rate} = {pair[0]:g} and {time} = {pair[1]:g} reduce the initial value to "
+                f"less than {_LEAST:g} of it. Make one of them smaller."
             )
         found[field] = pair
     return found

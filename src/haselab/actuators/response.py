@@ -433,7 +433,7 @@ class SampledLaw:
         times = np.ascontiguousarray(times_s, dtype=np.float64)
         if times.size and not (drive.edge_s[0] <= times[0] and times[-1] <= drive.edge_s[-1]):
             raise InputError(
-                f"Lengths are wanted from {times[0]:g} to {times[-1]:g} s, but the drive lasts "
+                f"Lengths were requested from {times[0]:g} to {times[-1]:g} s, but the drive lasts "
                 f"from {drive.edge_s[0]:g} to {drive.edge_s[-1]:g} s. Extend the drive."
             )
         count, intervals = len(self.by), drive.voltage_v.size

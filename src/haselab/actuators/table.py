@@ -85,8 +85,8 @@ def law_table(law: ActuatorLaw, highest_v: float) -> LawTable:
     limits = law.length_limits_m
     if not limits.low < limits.high:
         raise LimitError(
-            f"The {law.kind} is valid from {limits.low:g} to {limits.high:g} m: at no length. "
-            "Change its parameters."
+            f"length_limits_m of the {law.kind} are {limits.low:g} and {limits.high:g} m, but the "
+            "lower limit must come first. Change its parameters."
         )
     lengths_m, step_m = np.linspace(limits.low, limits.high, LENGTHS, retstep=True)
     voltages_v = np.linspace(0.0, highest_v, VOLTAGES)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 else:
     Data = Any  # pandas and xarray need not be there; `_columns` refuses what has no columns
 
-__all__ = ["Data", "Session", "example", "is_uneven", "load", "records", "table", "wanted"]
+__all__ = ["Data", "Session", "example", "is_uneven", "load", "numeric_table", "records", "table"]
 
 Floats = NDArray[np.float64]
 _SESSION = "session.h5"
@@ -129,7 +129,7 @@ def table(data: Data, *, rate_hz: float | None = None) -> Table:
     return _at_rate(found, rate_hz)
 
 
-def wanted(data: Data, names: Sequence[str], rate_hz: float | None) -> Table:
+def numeric_table(data: Data, names: Sequence[str], rate_hz: float | None) -> Table:
     """Columns of any source as a table in which some are numbers.
 
     Args:
@@ -342,7 +342,7 @@ def records(
         return [data]
     if isinstance(data, Sequence) and data and all(isinstance(each, Record) for each in data):
         return list(data)
-    found = wanted(data, (input, output), rate_hz)
+    found = numeric_table(data, (input, output), rate_hz)
     if found.rate_hz is not None and not is_uneven(found):
         return [Record.sampled(found[input], found[output], found.rate_hz, hold=hold)]
     if found.time_s is None or found.time_name is None:

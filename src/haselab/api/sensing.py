@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.api.data import Data, wanted
+from haselab.api.data import Data, numeric_table
 from haselab.base import InputError, checked, real_array, shown
 from haselab.pipelines.sensing.series import DEFAULT_REQUEST
 from haselab.pipelines.sensing.source import at_the_actuator, lockin_config
@@ -59,7 +59,7 @@ def sense(
     Raises:
         InputError: a column that is missing, no rate, or fewer samples than one block.
     """
-    found = wanted(data, [v, i], rate_hz)
+    found = numeric_table(data, [v, i], rate_hz)
     for name in (v, i):
         if not np.isfinite(found[name]).any():
             raise InputError(f"Column {name} has no finite value. Name another column.")

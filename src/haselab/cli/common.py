@@ -84,7 +84,7 @@ SEED = click.IntRange(0, 2**63 - 1)
 
 def answer_options(
     rule: OutputRule | None = None,
-    out_detail: str = "A JSON file. Default: none.",
+    out_detail: str = "It is a JSON file. Default: none.",
     *,
     plot: bool = False,
 ) -> Callable[[F], F]:

@@ -62,6 +62,8 @@ _BAD_PATHS = (
     IsADirectoryError,
     NotADirectoryError,
 )
+# What click raises for a group without a command, since version 8.2; its message is the help.
+_NO_COMMAND = getattr(click.exceptions, "NoArgsIsHelpError", ())
 _CLOSED_PIPE = 141  # 128 + SIGPIPE, the exit status of a program that this signal ended
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 
@@ -184,6 +186,9 @@ def main(
         sys.exit(_broken_pipe(broken.error))
     except click.exceptions.Exit as stop:
         sys.exit(stop.exit_code)
+    except _NO_COMMAND as error:
+        click.echo(error.format_message(), err=True)
+        sys.exit(2)
     except click.UsageError as error:
         usage = error.ctx.command_path if error.ctx else "haselab"
         sys.exit(_fail(f"{error.format_message()} See '{usage} --help'.", 2))

@@ -48,7 +48,7 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--mass-kg": (None, "State the hung mass in kg."),
     "--method": (None, "Choose the method."),
     "--model": (None, "Choose the model."),
-    "--out": (None, "Write the result to this path; missing folders are created."),
+    "--out": (None, "Write the result to this path."),
     "--output": ("COLUMN", "Name the column of the output."),
     "--physical-model/--no-physical-model": (
         None,

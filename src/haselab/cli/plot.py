@@ -28,7 +28,7 @@ def _checked(context: click.Context, parameter: click.Parameter, path: Path | No
 
 PLOT = click.option(
     "--plot", type=click.Path(path_type=Path), metavar="FILE.svg|png|html", callback=_checked,
-    help="Write the figure of the result; missing folders are created. Default: none.",
+    help="Write the figure of the result to this file. Default: none.",
 )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
-from haselab.control.plants.general import AnyPlant, PlantScale, varied
+from haselab.control.plants.general import AnyPlant, PlantScale, frequency_variants
 from haselab.control.plants.general_loops import closed_loop_poles, trace_general
 from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import default_step
@@ -63,7 +63,7 @@ class Task:
 
     def plants(self) -> tuple[AnyPlant, ...]:
         """The nominal plant, and with its natural frequency varied to both sides."""
-        return varied(self.plant, self.spec.frequency_spread)
+        return frequency_variants(self.plant, self.spec.frequency_spread)
 
     @cached_property
     def step(self) -> float:

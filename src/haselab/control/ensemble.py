@@ -236,5 +236,5 @@ def _reference(values: ArrayLike) -> NDArray[np.float32]:
 
 def _threads(threads: int) -> int:
     if threads < 0:
-        raise InputError(f"threads = {threads}; must be 1 or more, or 0 for all of the machine.")
+        raise InputError(f"threads = {threads}; it must be 1 or more, or 0 for all of the machine.")
     return threads

@@ -70,7 +70,7 @@ class PidGains:
         for name in ("kp", "ki", "kd", "derivative_filter_s"):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
-                raise InputError(f"{name} = {value!r}; must be finite, 0 or more.")
+                raise InputError(f"{name} = {value!r}; it must be finite, 0 or more.")
 
     def controller(self) -> ChosenController:
         """The same PID as a registered controller for the runner."""

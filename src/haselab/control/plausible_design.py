@@ -83,7 +83,7 @@ def design_controller(
             )
         return search(model, spec, setting, rng=rng)
     if not _FEWEST <= draws <= _MOST:
-        raise InputError(f"draws = {draws}; must be {_FEWEST} to {_MOST}.")
+        raise InputError(f"draws = {draws}; it must be {_FEWEST} to {_MOST}.")
     most = 1.0 - 1.0 / min(draws, _SEARCHED)
     if probability is not None and not 0.0 < probability <= most:
         raise InputError(

@@ -10,7 +10,7 @@ from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 
-__all__ = ["default_step", "integrates", "reachable"]
+__all__ = ["default_step", "integrates", "reachable_range"]
 
 _STEP = 0.04  # of the reference study
 _OF_REACH = 0.5
@@ -41,7 +41,7 @@ def default_step(plant: AnyPlant, limits: Saturation) -> float:
     return _OF_REACH * gain * max(limits.low, limits.high, key=abs)
 
 
-def reachable(
+def reachable_range(
     wanted: Saturation, to_volt: VoltageMap, low_v: float | None, high_v: float | None
 ) -> Saturation:
     """Limit a range of strain to what the drive can produce through the voltage map.
@@ -58,7 +58,7 @@ def reachable(
         ResultError: the drive does not reach zero strain.
     Example:
         >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
-        >>> round(reachable(Saturation(), eq4, 0.0, 1.6).high, 4)
+        >>> round(reachable_range(Saturation(), eq4, 0.0, 1.6).high, 4)
         0.0692
     """
     low_v = -math.inf if low_v is None else low_v

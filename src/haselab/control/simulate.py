@@ -55,7 +55,7 @@ class LoopSetting:
         )  # fmt: skip
         for name, value, good, allowed in checks:
             if not good:
-                raise InputError(f"{name} = {value:g}; must be {allowed}.")
+                raise InputError(f"{name} = {value:g}; it must be {allowed}.")
 
 
 @dataclass(frozen=True)
@@ -203,5 +203,5 @@ def _vector(name: str, values: ArrayLike, size: int | None = None) -> NDArray[np
             "one value per sample."
         )
     if size is not None and vector.size != size:
-        raise InputError(f"{name} has {vector.size} values; must be {size}.")
+        raise InputError(f"{name} has {vector.size} values; it must be {size}.")
     return vector

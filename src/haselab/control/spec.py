@@ -70,7 +70,7 @@ class DesignSpec:
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise InputError(f"{name} = {value:g}; must be within [{low:g}, {high:g}].")
+                raise InputError(f"{name} = {value:g}; it must be within [{low:g}, {high:g}].")
         if self.step is not None and not _SMALLEST_STEP <= abs(self.step) <= _LARGEST_STEP:
             raise InputError(
                 f"step = {self.step:g}; its magnitude must be within [{_SMALLEST_STEP:g}, "
@@ -90,14 +90,14 @@ class DesignSpec:
         for name, value in data.items():
             if name not in known:
                 raise InputError(
-                    f"The specification has the unknown key {name!r}; must be one of "
+                    f"The specification has the unknown key {name!r}. The keys are "
                     f"{', '.join(sorted(known))}."
                 )
             flag = name == "keep_crossover"
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
             if not (isinstance(value, bool) if flag else number and abs(value) <= _LARGEST):
                 raise InputError(
-                    f"{name} = {value!r}; must be {'true or false' if flag else 'a number'}."
+                    f"{name} = {value!r}; it must be {'true or false' if flag else 'a number'}."
                 )
         values: dict[str, Any] = {
             name: value if isinstance(value, bool) else float(value) for name, value in data.items()

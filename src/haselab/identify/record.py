@@ -23,10 +23,12 @@ _LARGEST_SHARE = 0.05  # of the record
 def finite_vector(name: str, values: object, least: int) -> Floats:
     """`values` as a finite vector of at least `least` numbers, or an `InputError`."""
     vector = real_array(name, values)
-    if vector.ndim != 1 or vector.size < least:
+    if vector.ndim != 1:
+        raise InputError(f"{name} has shape {vector.shape}; it must be a vector.")
+    if vector.size < least:
         raise InputError(
-            f"{name} has shape {vector.shape}; it must be a vector of at least {least} values. "
-            "Record longer, or name the right column."
+            f"{name} has {vector.size} values, but at least {least} are needed. Record longer, or "
+            "name the right column."
         )
     if not np.isfinite(vector).all():
         row = int(np.flatnonzero(~np.isfinite(vector))[0])
@@ -79,11 +81,11 @@ class Record:
         _check_times(self.output_time_s)
         if not 0.0 < self.input_rate_hz < math.inf:
             raise InputError(
-                f"input_rate_hz = {self.input_rate_hz:g} Hz; must be above 0 Hz and finite. "
+                f"input_rate_hz = {self.input_rate_hz:g} Hz; it must be above 0 Hz and finite. "
                 "Give the rate at which the input was updated."
             )
         if self.hold not in HOLDS:
-            raise InputError(f"hold = {self.hold}; must be one of {', '.join(HOLDS)}.")
+            raise InputError(f"hold = {self.hold}; it must be one of {', '.join(HOLDS)}.")
         before = self.u[0] if self.input_before is None else self.input_before
         if np.ptp(self.u) == 0.0 and self.u[0] == before and self.input_before is not None:
             raise InputError(
@@ -131,7 +133,8 @@ class Record:
         """
         if not 0.0 < rate_hz < math.inf:
             raise InputError(
-                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz and finite. Give the sampling rate."
+                f"rate_hz = {rate_hz:g} Hz; it must be above 0 Hz and finite. Give the "
+                "sampling rate."
             )
         source, output = finite_vector("u", u, 8), finite_vector("y", y, 8)
         if source.size != output.size:

@@ -36,7 +36,7 @@ from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 from haselab.models.spline_map import SplineMap
 from haselab.models.state_space import StateSpaceModel
-from haselab.models.voltage_plant import VoltagePlant, pulling_square
+from haselab.models.voltage_plant import VoltagePlant, delayed_square
 
 __all__ = [
     "DEFORMATIONS",
@@ -74,12 +74,12 @@ __all__ = [
     "VoltagePlant",
     "Yeoh",
     "YeohTwoTerms",
+    "delayed_square",
     "from_control",
     "from_scipy",
     "inverse_langevin",
     "law_from_parameters",
     "mittag_leffler",
-    "pulling_square",
     "to_control",
     "to_scipy",
 ]

@@ -18,8 +18,8 @@ __all__ = [
     "LogarithmicCreep",
     "PowerCreep",
     "PronyCreep",
+    "lagged_response",
     "mittag_leffler",
-    "retarded",
     "superpose",
 ]
 
@@ -52,8 +52,9 @@ def mittag_leffler(order: float, x: ArrayLike) -> Floats:
     values = np.asarray(x, dtype=np.float64)
     if not 0.0 < order <= 1.0 or not (values >= 0.0).all():
         raise InputError(
-            f"Mittag-Leffler of order {order:g} down to {values.min(initial=0.0):g}; the order "
-            "must be above 0 and at most 1, and the argument 0 or more."
+            f"The Mittag-Leffler function got the order {order:g} and arguments down to "
+            f"{values.min(initial=0.0):g}; the order must be above 0 and at most 1, and the "
+            "arguments 0 or more."
         )
     theta = (2.0 * np.arange(_NODES // 2) + 1.0) * math.pi / _NODES
     z = _NODES * (0.1309 - 0.1194 * theta**2 + 0.2500j * theta)
@@ -168,7 +169,7 @@ class PronyCreep(Creep):
         inputs = _held(u, rate_hz)
         total = self.instant * inputs
         for gain, tau_s in zip(self.gains, self.time_constants_s, strict=True):
-            total = total + gain * retarded(inputs, rate_hz, tau_s)
+            total = total + gain * lagged_response(inputs, rate_hz, tau_s)
         return total
 
     def invert(self, y: ArrayLike, rate_hz: float) -> Floats:
@@ -201,7 +202,7 @@ class PronyCreep(Creep):
         return np.asarray(lfilter(denominator, numerator, outputs))
 
 
-def retarded(inputs: Floats, rate_hz: float, tau_s: float) -> Floats:
+def lagged_response(inputs: Floats, rate_hz: float, tau_s: float) -> Floats:
     """Response of `1 - exp(-t/tau)` to a held input, from rest. Shape `(N,)`."""
     step = math.exp(-1.0 / (rate_hz * tau_s))
     push = -math.expm1(-1.0 / (rate_hz * tau_s))

@@ -45,13 +45,13 @@ class Deformation:
     def __post_init__(self) -> None:
         if self.kind not in DEFORMATIONS:
             raise InputError(
-                f"deformation = {self.kind}; must be one of {', '.join(DEFORMATIONS)}."
+                f"deformation = {self.kind}; it must be one of {', '.join(DEFORMATIONS)}."
             )
         for name in ("lateral_stretch", "prestretch"):
             value = getattr(self, name)
             if not 0.0 < value < float("inf"):
                 raise InputError(
-                    f"{name} = {value:g}; must be above 0 (1 is the natural length). "
+                    f"{name} = {value:g}; it must be above 0 (1 is the natural length). "
                     "Give a stretch, not a strain."
                 )
 
@@ -68,7 +68,7 @@ class Deformation:
         x = np.asarray(stretch, dtype=np.float64)
         if not (x > 0.0).all():
             raise LimitError(
-                f"stretch = {float(x.min()):g}; must be above 0 (1 is the natural length). "
+                f"stretch = {float(x.min()):g}; it must be above 0 (1 is the natural length). "
                 "Give stretch, not strain."
             )
         if self.kind == "uniaxial":

@@ -37,7 +37,7 @@ def to_scipy(model: RationalModel, form: str = "tf", *, delay_order: int = 0) ->
     """
     rational = _delay_free(model, delay_order, "scipy.signal")
     if form not in _FORMS:
-        raise InputError(f"form = {form}; must be one of {', '.join(_FORMS)}.")
+        raise InputError(f"form = {form}; it must be one of {', '.join(_FORMS)}.")
     from scipy import signal  # the import takes half a second
 
     if form == "ss":
@@ -63,7 +63,7 @@ def from_scipy(system: Any) -> RationalModel:
         return _from_state_space(system.A, system.B, system.C, system.D, system.dt)
     if not isinstance(system, (signal.TransferFunction, signal.ZerosPolesGain)):
         raise InputError(
-            f"The model is a {type(system).__name__}; must be TransferFunction, StateSpace or "
+            f"The model is a {type(system).__name__}; it must be TransferFunction, StateSpace or "
             "ZerosPolesGain of scipy.signal. Convert it."
         )
     _check_continuous(system.dt)
@@ -84,7 +84,7 @@ def to_control(model: RationalModel, form: str = "tf", *, delay_order: int = 0) 
         InputError: python-control is not installed, an unknown form, or a delay and no order.
     """
     if form not in _FORMS[:2]:
-        raise InputError(f"form = {form}; must be one of {', '.join(_FORMS[:2])}.")
+        raise InputError(f"form = {form}; it must be one of {', '.join(_FORMS[:2])}.")
     try:
         control = importlib.import_module("control")
     except ImportError as error:
@@ -114,7 +114,7 @@ def from_control(system: Any) -> RationalModel:
         return _from_state_space(system.A, system.B, system.C, system.D, system.dt, labels)
     if not all(hasattr(system, name) for name in ("num", "den", "dt")):
         raise InputError(
-            f"The model is a {type(system).__name__}; must be TransferFunction or StateSpace "
+            f"The model is a {type(system).__name__}; it must be TransferFunction or StateSpace "
             "of python-control. Convert it."
         )
     _check_continuous(system.dt)

@@ -59,7 +59,7 @@ class HeldInput:
             )
         if not self.rate_hz > 0.0:
             raise InputError(
-                f"input_rate_hz = {self.rate_hz:g} Hz; must be above 0 Hz. "
+                f"input_rate_hz = {self.rate_hz:g} Hz; it must be above 0 Hz. "
                 "Give the rate at which the input was updated."
             )
 

@@ -82,7 +82,7 @@ def _stretches(
     length = np.asarray(stretch, dtype=np.float64)
     if not (length > 0.0).all():
         raise LimitError(
-            f"stretch = {float(length.min()):g}; must be above 0 (1 is the natural length). "
+            f"stretch = {float(length.min()):g}; it must be above 0 (1 is the natural length). "
             "Give stretch, not strain."
         )
     if lateral_stretch is None:
@@ -91,7 +91,7 @@ def _stretches(
     side = np.broadcast_to(np.asarray(lateral_stretch, dtype=np.float64), length.shape)
     if not (side > 0.0).all():
         raise LimitError(
-            f"lateral_stretch = {float(side.min()):g}; must be above 0. "
+            f"lateral_stretch = {float(side.min()):g}; it must be above 0. "
             "Give None for a free width, 1 for pure shear."
         )
     return length, side, 1.0 / (length * side)
@@ -427,7 +427,7 @@ def law_from_parameters(name: str, parameters: Mapping[str, float]) -> Hyperelas
         InputError: an unknown name, or a parameter that the law does not have.
     """
     if name not in LAWS:
-        raise InputError(f"model = {name}; must be one of {', '.join(LAWS)}.")
+        raise InputError(f"model = {name}; it must be one of {', '.join(LAWS)}.")
     try:
         return LAWS[name](**parameters)
     except TypeError as error:

@@ -23,7 +23,7 @@ _CRITICAL_BAND = 1e-9
 def _require(name: str, value: float, unit: str, *, positive: bool) -> None:
     allowed = "above 0" if positive else "0 or above"
     if not (value > 0.0 if positive else value >= 0.0) or value == float("inf"):
-        raise InputError(f"{name} = {value:g} {unit}; must be {allowed} and finite.")
+        raise InputError(f"{name} = {value:g} {unit}; it must be {allowed} and finite.")
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,7 @@ class PlantPosterior:
             InputError: `count` is below 1.
         """
         if count < 1:
-            raise InputError(f"count = {count}; must be 1 or more.")
+            raise InputError(f"count = {count}; it must be 1 or more.")
         std = np.sqrt(np.diag(self.covariance))
         sizes, axes = np.linalg.eigh(self._correlation(std))
         root = std[:, None] * axes * np.sqrt(np.maximum(sizes, 0.0))

@@ -61,7 +61,7 @@ class RationalModel:
                 "most as many zeros as poles."
             )
         if not 0.0 <= self.delay_s < math.inf:
-            raise InputError(f"delay_s = {self.delay_s:g} s; must be 0 s or above.")
+            raise InputError(f"delay_s = {self.delay_s:g} s; it must be 0 s or above.")
         object.__setattr__(self, "numerator", tuple((top / bottom[0]).tolist()))
         object.__setattr__(self, "denominator", tuple((bottom / bottom[0]).tolist()))
 
@@ -129,7 +129,7 @@ class RationalModel:
         Source: Padé's approximant of the exponential function.
         """
         if not 0 <= order <= 10:
-            raise InputError(f"order = {order}; must be 0 to 10.")
+            raise InputError(f"order = {order}; it must be 0 to 10.")
         if self.delay_s == 0.0 or order == 0:
             return replace(self, delay_s=0.0)
         powers = np.arange(order, -1, -1)

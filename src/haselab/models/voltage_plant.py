@@ -15,14 +15,14 @@ from haselab.base import InputError, JsonObject
 from haselab.models.filters import lfilter
 from haselab.models.plant import Plant, SlowMode
 
-__all__ = ["CREEPS", "VoltagePlant", "pulling_square"]
+__all__ = ["CREEPS", "VoltagePlant", "delayed_square"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 CREEPS = ("mechanical", "electrical")
 
 
-def pulling_square(
+def delayed_square(
     drive_v: Floats,
     rate_hz: float,
     share: float,
@@ -47,7 +47,7 @@ def pulling_square(
         Mean square in each update, in V^2. Shape `(N,)`.
     Example:
         >>> drive_v = np.tile([1.0, -1.0], 500)
-        >>> p = pulling_square(drive_v, 100.0, 0.5, 0.5)
+        >>> p = delayed_square(drive_v, 100.0, 0.5, 0.5)
         >>> float(p[0]), round(float(p[-1]), 2)
         (1.0, 0.25)
     """
@@ -108,7 +108,7 @@ class VoltagePlant:
 
     $y = \sum_k g_k\, (x^k - x_0^k),\ x = G(s)\, p$; mechanical creep: $p = V^2$ and
     $G = (1 - c)\,G_0 + c/(\tau s + 1)$; electrical creep: $G = G_0$ and $p$ of
-    `pulling_square`; $G_0$ is the resonance with the delay. The output is relative to that at the
+    `delayed_square`; $G_0$ is the resonance with the delay. The output is relative to that at the
     first value of the drive, at steady state; further gains make the static curve nonlinear.
 
     Args:
@@ -142,9 +142,9 @@ class VoltagePlant:
 
     def __post_init__(self) -> None:
         if self.creep not in CREEPS:
-            raise InputError(f"creep = {self.creep}; must be one of {', '.join(CREEPS)}.")
+            raise InputError(f"creep = {self.creep}; it must be one of {', '.join(CREEPS)}.")
         if not 0.0 <= self.creep_share < 1.0:
-            raise InputError(f"creep_share = {self.creep_share:g}; must be 0 to below 1.")
+            raise InputError(f"creep_share = {self.creep_share:g}; it must be 0 to below 1.")
         if not self.gains:
             raise InputError("gains is empty. Give at least one gain.")
         self._linear()
@@ -168,12 +168,12 @@ class VoltagePlant:
             drive_v: drive, in V. Shape `(N,)`.
             rate_hz: update rate, in Hz.
             time_s: times of the output since the first update, in s. Shape `(M,)`.
-            slew_v_s: as for `pulling_square`.
+            slew_v_s: as for `delayed_square`.
         Returns:
             Responses. Shape `(M, K)`.
         """
         share = self.creep_share if self.creep == "electrical" else 0.0
-        pull = pulling_square(drive_v, rate_hz, share, self.creep_time_constant_s, slew_v_s)
+        pull = delayed_square(drive_v, rate_hz, share, self.creep_time_constant_s, slew_v_s)
         held = _Held(pull - pull[0], rate_hz, time_s - self.delay_s)
         follows = _follows(self._linear(), held)
         if self.second_mode:
@@ -255,5 +255,5 @@ class VoltagePlant:
                 raise
             raise InputError(
                 f"The voltage plant is incomplete or has a wrong value: {error}. It needs the "
-                "keys of to_dict. Write the model again with `haselab identify verdict`."
+                "keys of to_dict. Write the model again with `haselab identify model-comparison`."
             ) from error

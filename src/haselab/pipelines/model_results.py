@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, Estimate, ResultError
 from haselab.identify.physical import ActuatorFit, MotionRecord
-from haselab.identify.physical.misfit import Modelled, modelled
+from haselab.identify.physical.misfit import ModelledRecord, model_record
 from haselab.rig import RigDescription
 from haselab.runtime.helper_process import HelperProcess
 from haselab.study.analysis import Analysis, Given
@@ -67,7 +67,7 @@ def results_of_model(
         raise ResultError(fit.status)
     unknowns = fit.unknowns()
     with _second_process() as helper:  # it loads its modules during the first fit
-        centre = modelled(unknowns, record)
+        centre = model_record(unknowns, record)
         seen: dict[str, Observation] = {}
 
         def recorded(name: str) -> Observation:
@@ -114,7 +114,7 @@ class _Problem:
         near: values that the fits found on almost the same motion, where they start; empty: none.
     """
 
-    centre: Modelled
+    centre: ModelledRecord
     record: MotionRecord
     study: Study
     rig: RigDescription
@@ -213,7 +213,7 @@ class _Motion:
 
     source: Source
     record: MotionRecord
-    modelled: Modelled
+    modelled: ModelledRecord
 
     def __call__(self, name: str) -> Observation:
         seen, record = self.source(name), self.record

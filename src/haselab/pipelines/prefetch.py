@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar, cast
 
-__all__ = ["ahead", "in_order"]
+__all__ = ["map_in_order", "prefetch"]
 
 S = TypeVar("S")
 T = TypeVar("T")
 _END = object()
 
 
-def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
+def prefetch(items: Iterator[T], depth: int = 2) -> Iterator[T]:
     """Produce items ahead of time in a background thread.
 
     Args:
@@ -23,7 +23,7 @@ def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
     Returns:
         The items, in order.
     Example:
-        >>> list(ahead(iter([1, 2, 3])))
+        >>> list(prefetch(iter([1, 2, 3])))
         [1, 2, 3]
     """
     maker = ThreadPoolExecutor(1)
@@ -36,7 +36,7 @@ def ahead(items: Iterator[T], depth: int = 2) -> Iterator[T]:
         maker.shutdown(wait=True, cancel_futures=True)
 
 
-def in_order(work: Callable[[S], T], items: Iterator[S], workers: int) -> Iterator[T]:
+def map_in_order(work: Callable[[S], T], items: Iterator[S], workers: int) -> Iterator[T]:
     """Apply a function to each item in threads, and return the results in order.
 
     Args:
@@ -47,7 +47,7 @@ def in_order(work: Callable[[S], T], items: Iterator[S], workers: int) -> Iterat
     Returns:
         The results in the order of the items.
     Example:
-        >>> list(in_order(abs, iter([-1, 2, -3]), workers=2))
+        >>> list(map_in_order(abs, iter([-1, 2, -3]), workers=2))
         [1, 2, 3]
     """
     pool = ThreadPoolExecutor(workers)

@@ -17,7 +17,7 @@ from haselab.rig.instruments.registry import daq_of, generator_of, reported_faul
 from haselab.rig.operator import BenchStand, OperatorWeights, WeightHandler
 from haselab.rig.twin.client import TwinClient
 
-__all__ = ["Instrument", "RealBench", "UnbrokenCamera", "identify"]
+__all__ = ["GaplessCamera", "Instrument", "RealBench", "identify"]
 
 _CALLS_S = 2.0  # longest call of a driver, not counting the blocks that it waits for
 _CALL_BLOCKS = 50  # `DaqDevice.pass_time` at most, see `stand.BenchStand.wait`
@@ -68,7 +68,7 @@ class _NoCamera:
         """Nothing to stop."""
 
 
-class UnbrokenCamera:
+class GaplessCamera:
     """A camera that makes the acquisition keep every block for as long as it takes frames.
 
     Frames are timed on the acquisition's clock, so no block may be skipped meanwhile.
@@ -101,7 +101,7 @@ class UnbrokenCamera:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """See `haselab.rig.cameras.source.RemarkingCamera`."""
+        """See `haselab.rig.cameras.source.ReportsRemarks`."""
         return self._opened.remarks()
 
     @property
@@ -197,14 +197,14 @@ class RealBench(Closing):
         opened.callback(client.close)
         return client
 
-    def _camera(self, opened: contextlib.ExitStack) -> UnbrokenCamera:
+    def _camera(self, opened: contextlib.ExitStack) -> GaplessCamera:
         found = OpenedCamera(_NoCamera(), "", lambda: None)
         if self.config.camera is not None:
             found = open_camera(
                 self.config.camera, self._clock, self.board.exposures, self.config.exposure_line
             )
         opened.callback(found.close)
-        return UnbrokenCamera(found, self.board)
+        return GaplessCamera(found, self.board)
 
     def _clock(self) -> tuple[float, float]:
         """End of the last block, and the time at which it is read."""

@@ -13,7 +13,7 @@ from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.signals import OrderlyEnd
 from haselab.safety.state_machine import Safety, SafetySettings, Stage
 
-__all__ = ["arm_simulated", "armed", "ends_at_zero"]
+__all__ = ["arm_simulated", "armed", "zero_at_end"]
 
 
 @checked
@@ -44,7 +44,7 @@ def armed(
     return _Armed(rig, settings, acknowledged)
 
 
-def ends_at_zero(guarded: GuardedRig) -> contextlib.AbstractContextManager[object]:
+def zero_at_end(guarded: GuardedRig) -> contextlib.AbstractContextManager[object]:
     """Return a context that always ends at 0 V, read back; arm the bench inside it.
 
     The end of the program ends it too, also for a block in a thread that is still running.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError, LimitError
 from haselab.rig import RigDescription
 
-__all__ = ["Check", "Drive", "Feasibility", "Rating", "judge"]
+__all__ = ["Check", "Drive", "Feasibility", "Rating", "check_feasibility"]
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def _largest(drives: Sequence[Drive], measure: list[float]) -> tuple[float, str]
     return measure[k], drives[k].name
 
 
-def judge(
+def check_feasibility(
     rig: RigDescription,
     rating: Rating,
     drives: Sequence[Drive],
@@ -177,9 +177,9 @@ def judge(
         >>> rig = describe(TwinConfig())
         >>> rating = Rating(12e-3, 350e6, 6e3, 3.3e-9, 314e-6, 40e6)
         >>> ramp = Drive("ramp", np.linspace(0.0, 2.0, 201))
-        >>> judge(rig, rating, [ramp], 2000.0, 0.02).ok
+        >>> check_feasibility(rig, rating, [ramp], 2000.0, 0.02).ok
         True
-        >>> found = judge(rig, rating, [ramp], 2000.0, 0.2)
+        >>> found = check_feasibility(rig, rating, [ramp], 2000.0, 0.2)
         >>> [check.name for check in found.checks if not check.ok]
         ['peak current', 'time of an update']
     """

@@ -58,7 +58,7 @@ class Reference:
         ):
             raise InputError(
                 f"Reference of {self.capacitance_f:g} F, {self.series_ohm:g} ohm, tolerance "
-                f"{self.tolerance:g}; must be in (0, 1) F, 0 ohm or more, and in [0, 1)."
+                f"{self.tolerance:g}; they must be in (0, 1) F, 0 ohm or more, and in [0, 1)."
             )
 
     def admittance_s(self, carrier_hz: float) -> complex:

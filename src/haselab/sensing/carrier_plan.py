@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["CarrierChoice", "CarrierPlan", "CarrierRequest", "judge_carrier", "plan_carrier"]
+__all__ = ["CarrierChoice", "CarrierPlan", "CarrierRequest", "evaluate_carrier", "plan_carrier"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -197,7 +197,7 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
         InputError: no frequency is left between the window and the converter.
     Example:
         >>> plan = plan_carrier(CarrierRequest())
-        >>> paper = judge_carrier(CarrierRequest(), 2000.0)
+        >>> paper = evaluate_carrier(CarrierRequest(), 2000.0)
         >>> plan.chosen.total < paper.total, paper.remarks[0][:50]
         (True, '2000 Hz is harmonic 20 of the 100 Hz staircase of ')
     """
@@ -206,7 +206,8 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     high_hz = min(request.rate_hz / 3.0, 2.0 * request.bandwidth_hz)
     if not low_hz < high_hz:
         raise InputError(
-            f"No carrier has {_FEWEST_PERIODS:g} periods in {window_s:g} s that count and is "
+            f"No carrier has {_FEWEST_PERIODS:g} periods in the {window_s:g} s that are used "
+            "and is "
             f"below {high_hz:g} Hz. Lengthen the block, blank less, or sample faster."
         )
     grid_hz = 0.25 / request.block_s
@@ -214,7 +215,7 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     grid_hz *= math.ceil((high_hz - low_hz) / grid_hz / most)
     first = math.ceil(low_hz / grid_hz - 1e-9)
     carriers_hz = grid_hz * np.arange(first, math.floor(high_hz / grid_hz + 1e-9) + 1)
-    candidates = tuple(judge_carrier(request, float(f)) for f in carriers_hz)
+    candidates = tuple(evaluate_carrier(request, float(f)) for f in carriers_hz)
     usable = [c for c in candidates if c.usable]
     if not usable:
         raise InputError(
@@ -232,7 +233,7 @@ def plan_carrier(request: CarrierRequest) -> CarrierPlan:
     return CarrierPlan(chosen, _reasons(request, chosen, bool(free)), candidates)
 
 
-def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
+def evaluate_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
     """Errors and remarks for one carrier.
 
     Args:
@@ -245,11 +246,15 @@ def judge_carrier(request: CarrierRequest, carrier_hz: float) -> CarrierChoice:
     """
     r = request
     periods = carrier_hz * _window_s(r)
+    if not carrier_hz > 0.0:
+        raise InputError(f"carrier_hz is {carrier_hz:g} Hz; it must be above 0 Hz.")
     if not (periods >= 2.0 and carrier_hz <= r.rate_hz / 3.0):
         raise InputError(
-            f"Carrier = {carrier_hz:g} Hz has {periods:.3g} periods in the samples that count, at "
-            f"{r.rate_hz:g} samples per second; at least 2 periods and 3 samples per period are "
-            "required. Choose another carrier."
+            f"A carrier of {carrier_hz:g} Hz has {periods:.3g} periods in the samples that "
+            "are used and "
+            f"{r.rate_hz / carrier_hz:.3g} samples per period; at least 2 periods and 3 "
+            "samples per "
+            "period are needed. Choose another carrier."
         )
     omega = 2.0 * math.pi * carrier_hz
     impedance = r.series_ohm + 1.0 / (1j * omega * r.capacitance_f)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _sense
-from haselab.sensing.block.deviations import audited
+from haselab.sensing.block.deviations import widen_deviations
 from haselab.sensing.block.explain import DISTURBED, Explained, coarse_text, explain
 from haselab.sensing.block.plan import make_plan
 from haselab.sensing.block.tones import converter_step, rounding_error
@@ -159,7 +159,9 @@ class Lockin:
                 phasors = _unexplained(phasors, suspects)
         if not self._models:
             return sensed_from_phasors(phasors, self.config)
-        return audited(sensed_from_phasors(_without_coarse(phasors, rows, taken), self.config))
+        return widen_deviations(
+            sensed_from_phasors(_without_coarse(phasors, rows, taken), self.config)
+        )
 
     def _suspects(self, rows: NDArray[np.void]) -> NDArray[np.intp]:
         """Blocks that the plain model does not explain and that have no other fault."""

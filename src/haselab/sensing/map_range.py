@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["followed_range"]
+__all__ = ["fitted_range"]
 
 Floats = NDArray[np.float64]
 _CELLS = 24  # of equal capacitance
@@ -17,7 +17,7 @@ _LEFT = 0.05  # of the strain's span, that the curve may be away from the mean o
 _NOISE = 4.0  # standard deviations of that mean
 
 
-def followed_range(
+def fitted_range(
     c: Floats,
     e: Floats,
     branch: NDArray[np.intp],

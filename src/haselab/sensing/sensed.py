@@ -97,7 +97,7 @@ class LockinConfig:
             value = getattr(self, name)
             if not _SMALLEST <= value <= _LARGEST:
                 raise InputError(
-                    f"{name} = {value:g}; must be a number above 0, from {_SMALLEST:g} to "
+                    f"{name} = {value:g}; it must be a number above 0, from {_SMALLEST:g} to "
                     f"{_LARGEST:g}."
                 )
         for name in ("full_scale", "current_limit", "min_amplitude_codes", "skew_s"):

@@ -16,7 +16,7 @@ from scipy.special import stdtrit
 
 from haselab.base import Estimate, InputError, ResultError, checked
 from haselab.models.actuator.strain_map import StrainMap
-from haselab.sensing.map_range import followed_range
+from haselab.sensing.map_range import fitted_range
 
 __all__ = ["DriftCheck", "MapKind", "drift_check", "fit_strain_map"]
 
@@ -68,7 +68,7 @@ def fit_strain_map(
         kind: "line", the study's form; "quadratic"; "cubic"; "auto" is the highest degree for
             which the map rises, or falls, over its whole range. It falls for an actuator that
             contracts. If none of them follows the strain over the whole record, "auto" limits the
-            map to the part that it follows, see `followed_range`.
+            map to the part that it follows, see `fitted_range`.
         coverage: share of the strains that the band should contain.
     Returns:
         The map with its band and the range of the record. With one cycle it has no covariance.
@@ -335,7 +335,7 @@ def _limits_f(c: Floats, e: Floats) -> tuple[float, float] | None:
     """
     ends_f, width_f = (float(c.min()), float(c.max())), float(np.ptp(c))
     branch = _branches(c.size, _turns(c))
-    found = followed_range(c, e, branch, _monotonic)
+    found = fitted_range(c, e, branch, _monotonic)
     inside = np.zeros(c.size, np.bool_) if found is None else (c >= found[0]) & (c <= found[1])
     if found is None or inside.sum() < _FEWEST or np.ptp(e[inside]) < _FOLLOWED * np.ptp(e):
         whole = _Record(c, e, branch, ends_f)

@@ -132,8 +132,8 @@ def square(frequency_hz: float, duration_s: float, rate_hz: float) -> NDArray[np
     """
     if not 0.0 < frequency_hz <= 0.5 * rate_hz:
         raise InputError(
-            f"Square of {frequency_hz:g} Hz needs a frequency in (0, {0.5 * rate_hz:g}] Hz. "
-            "Lower it or raise the update rate."
+            f"A square wave of {frequency_hz:g} Hz must have a frequency in (0, {0.5 * rate_hz:g}] "
+            "Hz. Lower it or raise the update rate."
         )
     halves = np.arange(_count(duration_s, rate_hz)) * (2.0 * frequency_hz / rate_hz)
     return np.where(np.floor(halves + 1e-9) % 2 == 0, 1.0, -1.0)
@@ -221,8 +221,8 @@ def multisine(
     inside = (lines_hz > 0.0) & (lines_hz < 0.5 * rate_hz)
     if not inside.all() or not (share >= 0.0).all() or not share.sum() > 0.0:
         raise InputError(
-            f"Multisine needs lines in (0, {0.5 * rate_hz:g}) Hz and powers of 0 or more, some "
-            "above 0. Lower the lines or raise the update rate."
+            f"A multisine must have lines in (0, {0.5 * rate_hz:g}) Hz and powers of 0 or more, "
+            "some above 0. Lower the lines or raise the update rate."
         )
     share = share / share.sum()
     angle = 2.0 * np.pi * np.outer(np.arange(_count(duration_s, rate_hz)) / rate_hz, lines_hz)

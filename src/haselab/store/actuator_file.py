@@ -90,8 +90,8 @@ def read_actuator(path: Path) -> JsonObject:
     """
     if not path.exists():
         raise InputError(
-            f"There is no such actuator file. Create it with: haselab init NAME --out {path.name}  "
-            f"{path}"
+            f"There is no such actuator file: {path}. Create it with: haselab init NAME --out "
+            f"{path.name}"
         )
     return read_toml(path, "actuator file")
 

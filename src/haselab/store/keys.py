@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import typing
 from dataclasses import dataclass
 from typing import Any
@@ -86,12 +87,15 @@ def _words(annotation: Any) -> tuple[Any, ...]:
 
 def _range(field: FieldInfo) -> str:
     """The limits of a number, and whether it is whole."""
-    limits: dict[str, str] = {}
+    numbers: dict[str, float] = {}
     for each in field.metadata:
         for bound in ("ge", "gt", "le", "lt", "multiple_of"):
             value = getattr(each, bound, None)
             if value is not None and abs(value) < _UNBOUNDED:
-                limits[bound] = _number(value)
+                numbers[bound] = value
+    if numbers.get("ge", -math.inf) > numbers.get("gt", -math.inf):
+        numbers.pop("gt", None)
+    limits = {bound: _number(value) for bound, value in numbers.items()}
     words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
     if {"ge", "le"} <= set(limits) and not {"gt", "lt"} & set(limits):
         between = f"{limits['ge']} to {limits['le']}"

@@ -52,9 +52,7 @@ class Section(BaseModel):
         for number in value if isinstance(value, tuple) else (value,):
             sized = isinstance(number, float) and number != 0.0
             if sized and not _SMALLEST <= abs(number) <= _LARGEST:
-                raise PydanticCustomError(
-                    "size", "Input should be 0 or of a size between 1e-18 and 1e18"
-                )
+                raise PydanticCustomError("size", "must be 0 or of a size between 1e-18 and 1e18")
         return value
 
 
@@ -67,7 +65,7 @@ class PrintableSection(Section):
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str) and _UNPRINTABLE & set(map(unicodedata.category, text)):
                 raise PydanticCustomError(
-                    "printable", "Input should have no control characters and line breaks"
+                    "printable", "must have no control characters or line breaks"
                 )
         return value
 
@@ -147,7 +145,8 @@ def validated(model: type[Model], data: Any, source: object, section: str = "") 
     )
     more = f"; and {count - len(shown)} more" if count > len(shown) else ""
     advice = "" if all(fault["type"] == "missing" for fault in shown) else " Change these values."
-    raise InputError(f"{count} error(s): {faults}{more}.{advice} {source}")
+    errors = "1 error" if count == 1 else f"{count} errors"
+    raise InputError(f"{errors}: {faults}{more}.{advice} {source}")
 
 
 def _path(section: str, parts: Sequence[Any]) -> str:
@@ -175,17 +174,17 @@ def _missing(model: type[BaseModel], fault: Any, data: Any, section: str) -> str
         keys = ", ".join(key for key, each in kind.model_fields.items() if each.is_required())
         what = (kind.__doc__ or "").strip().partition("\n")[0].rstrip(".")
         needs = f"; it needs the keys {keys}" if keys else ""
-        return f"{place} has no table [{_path(path, [name])}]: {what}{needs}"
+        return f"{place} has no table [{_path(path, [name])}] ({what}{needs})"
     advice = describe_key(name, field).advice
-    return f"{place} has no key {name}" + (f": {advice}" if advice else "")
+    return f"{place} has no key {name}" + (f" ({advice})" if advice else "")
 
 
 def _said(model: type[BaseModel], fault: Any, data: Any) -> str:
     """Describe an error, with the valid keys of the table."""
     if fault["type"] == "model_type":
-        return f"Input should be a table, headed [{_path('', fault['loc'])}]"
+        return f"must be a table, headed [{_path('', fault['loc'])}]"
     if fault["type"] != "extra_forbidden":
-        return str(fault["msg"]).removeprefix("Value error, ")
+        return str(fault["msg"]).removeprefix("Value error, ").replace("Input should", "must", 1)
     table = _table_of(model, fault["loc"][:-1], data)
     former = getattr(table, "former_names", {}).get(fault["loc"][-1])
     if former is not None:

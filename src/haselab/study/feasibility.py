@@ -17,7 +17,7 @@ from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile, TwinFile
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import GRAVITY_M_S2, describe, native_bench
-from haselab.safety.feasibility import Drive, Feasibility, Rating, judge
+from haselab.safety.feasibility import Drive, Feasibility, Rating, check_feasibility
 from haselab.safety.rig_limits import rating_section
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study
@@ -26,8 +26,8 @@ from haselab.study.experiments.foreign import declared, foreign
 __all__ = [
     "check_drives",
     "check_settings",
-    "judge_rig",
-    "judge_study",
+    "check_study",
+    "check_study_on_rig",
     "rated_rig",
     "rating_of_twin",
     "study_drives",
@@ -141,7 +141,7 @@ def _largest_f(bench: Bench, lengths_m: NDArray[np.float64], output_v: float) ->
     return max(bench.capacitance(length_m, output_v) for length_m in ends_m)
 
 
-def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:
+def check_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibility:
     """Check a study against a bench; `require` of the answer raises if a check fails.
 
     A drive with its own carrier is checked with it; each check reports the worst case.
@@ -157,7 +157,7 @@ def judge_study(study: Study, rig: RigDescription, rating: Rating) -> Feasibilit
         carrier_v = sensing.carrier_v if drive.carrier_v is None else drive.carrier_v
         by_carrier.setdefault(carrier_v, []).append(drive)
     found = [
-        judge(rig, rating, some, sensing.carrier_hz, carrier_v)
+        check_feasibility(rig, rating, some, sensing.carrier_hz, carrier_v)
         for carrier_v, some in by_carrier.items()
     ]
     together = zip(*(one.checks for one in found), strict=True)
@@ -181,7 +181,7 @@ def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, 
     return file.describe(), Rating(**section.model_dump())
 
 
-def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibility | None:
+def check_study_on_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibility | None:
     """Check a study against the rig of a file.
 
     Args:
@@ -194,4 +194,4 @@ def judge_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibilit
     if isinstance(study, StepStudy):  # for a chip, whose limits are in its firmware
         return None
     rated = rated_rig(file, study, path)
-    return None if rated is None else judge_study(study, *rated)
+    return None if rated is None else check_study(study, *rated)

@@ -12,7 +12,7 @@ from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
 from haselab.study.tables import Control, OperatingPoint
 
-__all__ = ["known_values", "with_known"]
+__all__ = ["known_values", "with_actuator_tables"]
 
 
 def known_values(tables: ActuatorTables) -> dict[type, object]:
@@ -35,7 +35,7 @@ def known_values(tables: ActuatorTables) -> dict[type, object]:
     return found | {Maps: maps}
 
 
-def with_known(study: Study, tables: ActuatorTables) -> Study:
+def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
     """Complete a study with the voltage of zero strain and the controller of an actuator file.
 
     Args:

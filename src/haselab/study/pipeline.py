@@ -16,7 +16,7 @@ from haselab.study.experiments.foreign import foreign, rows_of_experiment
 from haselab.study.fits.observe import Observation, Source
 from haselab.study.player import Player
 
-__all__ = ["Findings", "investigate"]
+__all__ = ["Findings", "play_and_fit"]
 
 Value = TypeVar("Value")
 
@@ -51,7 +51,7 @@ class Findings:
         return cast("Value | None", self.values.get(kind))
 
 
-def investigate(
+def play_and_fit(
     source: Source,
     study: Study,
     rig: RigDescription,

@@ -41,7 +41,7 @@ from haselab.study.experiments.foreign import declared, foreign, refuse_repeated
 from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
 from haselab.study.known import known_values
-from haselab.study.pipeline import Findings, investigate
+from haselab.study.pipeline import Findings, play_and_fit
 from haselab.study.simulated.noise_free import NoiseFreeBench
 
 __all__ = [
@@ -160,7 +160,7 @@ def run_study(
         rig: the bench; it always ends at 0 V.
         options: folder, seed, video.
         progress: in seconds of the rig.
-        fitted: see `investigate`.
+        fitted: see `play_and_fit`.
     Returns:
         All findings.
     Raises:
@@ -190,7 +190,7 @@ def run_study(
         with Runner(
             rig, session, observer, sensing.carrier_hz, sensing.carrier_v, progress
         ) as runner:
-            findings = investigate(
+            findings = play_and_fit(
                 source, study, rig.description, runner,
                 lambda what: progress.advance(0.0, f"fit: {what}"), fitted=fitted,
                 known={} if options.known is None else known_values(options.known),
@@ -256,7 +256,7 @@ def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, 
         def source(name: str) -> Observation:
             return observe(session.experiment(name), events, lockin, study.sensing, rig)
 
-        findings = investigate(source, study, rig, known=known_values(tables))
+        findings = play_and_fit(source, study, rig, known=known_values(tables))
         if "particles" in session.names:
             findings = _with_sheet(findings, session, rig)
         return findings, study, session.header
@@ -287,7 +287,7 @@ def noise_free_results(
     with Runner(
         bench, noise_free, noise_free, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
     ) as runner:
-        found = investigate(
+        found = play_and_fit(
             noise_free.observation, study, noise_free.rig.description, runner,
             repeated=repeated, known={} if known is None else known_values(known),
         )  # fmt: skip

@@ -24,7 +24,7 @@ PLOTTED = {
     "identify transfer", "identify arx", "identify subspace", "identify frequency-response",
     "identify free-response", "identify hyperelastic", "identify regions", "identify voltage-map",
     "identify capacitance-map", "identify map", "identify hysteresis", "identify creep",
-    "identify verdict",
+    "identify model-comparison",
 }  # fmt: skip
 
 
@@ -217,8 +217,8 @@ def test_a_verdict_and_the_next_drive_are_drawn(rig, tmp_path, capsys):
     y += 1e-3 * np.random.default_rng(2).normal(size=y.size)
     table = write(tmp_path / "a.csv", time_s=time_s, drive_v=drive_v, y=y)
     model, odds, drive = tmp_path / "m.json", tmp_path / "v.svg", tmp_path / "d.svg"
-    assert code_of("identify", "verdict", table, "--question", "reading", "--out", model, "--plot",
-                   odds) == 0, capsys.readouterr().err  # fmt: skip
+    assert code_of("identify", "model-comparison", table, "--question", "reading", "--out", model,
+                   "--plot", odds) == 0, capsys.readouterr().err  # fmt: skip
     assert "Probability" in texts_of(odds)
     assert code_of("plan-experiment", model, "--rig", rig, "--goal", "reading", "--duration-s", 10,
                    "--plot", drive) == 0, capsys.readouterr().err  # fmt: skip

@@ -16,7 +16,7 @@ from scipy.io import savemat
 
 from haselab.cli.main import main
 from haselab.pipelines.calibration_file import save_calibration
-from haselab.pipelines.prefetch import ahead, in_order
+from haselab.pipelines.prefetch import map_in_order, prefetch
 from haselab.pipelines.sensing import source as sense_source
 from haselab.pipelines.sensing.table import Summary
 from haselab.rig.twin.config import TwinConfig
@@ -464,8 +464,8 @@ def test_the_median_of_a_short_record_is_that_of_all_blocks():
 
 
 def test_work_in_threads_keeps_its_order_and_its_errors():
-    assert list(ahead(iter(range(50)))) == list(range(50))
-    assert list(in_order(lambda k: k * k, iter(range(50)), 3)) == [k * k for k in range(50)]
+    assert list(prefetch(iter(range(50)))) == list(range(50))
+    assert list(map_in_order(lambda k: k * k, iter(range(50)), 3)) == [k * k for k in range(50)]
 
     def failing():
         yield 1
@@ -473,11 +473,11 @@ def test_work_in_threads_keeps_its_order_and_its_errors():
 
     taken = []
     with pytest.raises(OSError, match="the disk is gone"):
-        for item in in_order(abs, ahead(failing()), 2):
+        for item in map_in_order(abs, prefetch(failing()), 2):
             taken.append(item)
     assert taken == []  # two workers: the first result comes when two more items are there
     with pytest.raises(ZeroDivisionError, match="division"):
-        list(in_order(lambda k: 1 / k, iter([1, 0]), 2))
+        list(map_in_order(lambda k: 1 / k, iter([1, 0]), 2))
 
 
 PEAK = """

@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from haselab.pipelines.tracking.kept import Kept
 from haselab.pipelines.tracking.table import COLUMNS, METRES, Block, TrackRows, reason_name
+from haselab.pipelines.tracking.track_collector import TrackCollector
 from haselab.tracking import LossReason, Tracks
 
 FEW = st.floats(-9e4, 9e4, allow_nan=False)
@@ -68,7 +68,7 @@ def test_every_reason_has_a_word():
 
 def test_of_a_long_clip_all_of_the_few_points_and_some_frames_of_all_are_kept():
     points, frames = 300, 5000
-    kept = Kept(points, np.array([3, 7]))
+    kept = TrackCollector(points, np.array([3, 7]))
     for first in range(0, frames, 50):
         numbers = np.broadcast_to(first + np.arange(50.0)[None, :, None], (5, 50, points)).copy()
         kept.add(block_of(numbers, first=first))

@@ -149,7 +149,7 @@ def test_no_result_is_a_result_error_with_the_reason_in_the_json(tmp_path):
         (["transfer", "{sweep}", "--delay", "soon", "--rate-hz", "9"], "--delay is soon"),
         (["transfer", "{sweep}", "--fix", "gain", "--rate-hz", "9"], "--fix is gain"),
         (["transfer", "{sweep}", "--rate-hz", "-1"], "--rate-hz is -1 Hz"),
-        (["transfer", "{sweep}", "--poles", "9", "--rate-hz", "9"], "poles = 9; must be"),
+        (["transfer", "{sweep}", "--poles", "9", "--rate-hz", "9"], "poles = 9; it must be"),
         (["hyperelastic", "{sweep}"], "lacks stretch, nominal_stress_pa"),
     ],
 )
@@ -280,7 +280,7 @@ def test_creep_answers_with_a_verdict_and_a_forecast(tmp_path):
         (["hysteresis", "{loops}", "--rate-hz", "9", "--input", "volts"], "lacks volts"),
         (["creep", "{loops}", "--rate-hz", "-9"], "--rate-hz is -9 Hz"),
         (["creep", "{loops}", "--rate-hz", "9", "--leave-out-s", "1e9"], "leave_out_s"),
-        (["creep", "{loops}", "--rate-hz", "9", "--forecast-s", "-1"], "later_s = -1 s"),
+        (["creep", "{loops}", "--rate-hz", "9", "--forecast-s", "-1"], "after_s = -1 s"),
     ],
 )
 def test_bad_use_of_hysteresis_and_creep_is_reported_in_one_line(loops, arguments, match):

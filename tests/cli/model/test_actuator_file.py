@@ -349,7 +349,7 @@ def test_a_section_with_a_wrong_value_is_named(files, capsys):
     actuator, first, _ = files
     actuator.write_text(actuator.read_text().replace("low_v = 0.0", 'low_v = "zero"'))
     code, _, error = run(capsys, "identify", "transfer", first, "--actuator", actuator)
-    assert code == 2 and "drive.low_v: Input should be a number, not a text" in error
+    assert code == 2 and "drive.low_v: must be a number, not a text" in error
 
 
 def test_a_design_keeps_the_controllers_of_other_kinds_beside_its_own(known, capsys):
@@ -427,16 +427,17 @@ _CURVE = "[drive.voltage_map]\na1_v = 1.3\nb1 = 3.1\na2_v = -0.3\nb2 = -27.0\n"
     ("text", "said"),
     [
         (f"{_MAP}range_f = [8e-10, 5e-10]", "range_f: [8e-10, 5e-10] must have the"),
-        (f"{_MAP}range_f = [nan, 5e-10]", "range_f.0: Input should be a finite number (got nan)"),
+        (f"{_MAP}range_f = [nan, 5e-10]", "range_f.0: must be a finite number (got nan)"),
         (f"{_MAP}band = [0.01, -0.01]", "band: [0.01, -0.01] must have the lower end"),
-        (f"{_MAP}hysteresis_strain = -0.1", "hysteresis_strain: Input should be greater than or"),
+        (f"{_MAP}hysteresis_strain = -0.1", "hysteresis_strain: must be greater than or"),
         (f"{_CURVE}strain_low = 0.2\nstrain_high = 0.1", "strain_low = 0.2 must be below strain_"),
         ("[drive]\nlow_v = 3\nhigh_v = 1", "drive: low_v = 3 must be below high_v"),
-        ("[drive]\nhighest_field_v_per_m = -1.0", "Input should be greater than 0 (got -1.0)"),
+        ("[drive]\nhighest_field_v_per_m = -1.0", "must be greater than 0 (got -1.0)"),
         ("[controller]\nlimits = {low = 0.1, high = -0.05}", "low = 0.1 must be below high = -0"),
         ('[[controller.alternatives]]\nkind = "x"\nlimits = {low = 0.1, high = 0.1}',
          "alternatives.0.limits: low = 0.1 must be below high = 0.1"),
-        ("[controller.demands]\nphase_margin_deg = -5.0", "phase_margin_deg = -5; must be within"),
+        ("[controller.demands]\nphase_margin_deg = -5.0", "phase_margin_deg = -5; it must be "
+        "within"),
     ],
 )  # fmt: skip
 def test_reversed_and_impossible_ranges_are_refused_when_the_file_is_read(
@@ -488,7 +489,7 @@ def test_a_ragged_covariance_of_a_map_is_one_line(files, tmp_path, capsys, secti
     actuator.write_text(f"{actuator.read_text()}\n[{section}]\n{numbers}covariance = {matrix}\n")
     code, _, error = run(capsys, "report", actuator, "--out", tmp_path / "page.html")
     assert code == 2 and error == (
-        f"haselab: 1 error(s): {section}.covariance: Input should be 4 rows of 4 numbers, not rows "
+        f"haselab: 1 error: {section}.covariance: must be 4 rows of 4 numbers, not rows "
         f"of {rows}. Change these values. {actuator}\n"
     )
 

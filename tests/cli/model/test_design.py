@@ -76,7 +76,7 @@ def test_demands_of_a_file_are_met_or_the_command_exits_with_3(model, tmp_path, 
         ('{"plant": {"natural_frequency_rad_s": 5, "damping_ratio": 0.1}}', "gain"),
         (
             '{"plant": {"gain": 1, "natural_frequency_rad_s": -3, "damping_ratio": 0.1}}',
-            "natural_frequency_rad_s: Input should be greater than 0",
+            "natural_frequency_rad_s: must be greater than 0",
         ),
     ],
 )
@@ -144,7 +144,7 @@ def test_delay_and_rate_are_those_that_the_model_was_measured_with(tmp_path, cap
         model.write_text(json.dumps(stated | {"loop_delay_s": wrong}))
         code, _, error = run(capsys, "design", model)
         assert code == 2
-        assert error.startswith("haselab: 1 error(s): loop_delay_s: Input should be ")
+        assert error.startswith("haselab: 1 error: loop_delay_s: must be ")
 
 
 def test_margins_of_a_designed_controller_are_those_that_the_design_stated(tmp_path, capsys):

@@ -99,7 +99,7 @@ def changed(key, value):
         (changed("values", [1.0, 40.0, 0.12, 0.012]), "belongs to other parameters"),
         (changed("matrix", [[1.0]]), "has rows of [1] numbers, but its 4 names need as many"),
         (changed("matrix", [[1.0] * 4, [1.0]]), "has rows of [4, 1] numbers"),
-        (changed("matrix", "wide"), "matrix: Input should be a number, not a text"),
+        (changed("matrix", "wide"), "matrix: must be a number, not a text"),
         (changed("names", ["gain"] * 4), "all names must differ"),
     ],
 )

@@ -72,7 +72,7 @@ def test_a_fit_with_zeros_keeps_its_poles_and_gain(tmp_path):
     with pytest.raises(InputError, match="a Plant must not have one"):
         export(path, "--to", "plant")
     path.write_text(json.dumps(fit | {"gain": number | {"value": None}}))
-    with pytest.raises(InputError, match="gain: Input should be a valid number \\(got None\\)"):
+    with pytest.raises(InputError, match="gain: must be a valid number \\(got None\\)"):
         export(path, "--to", "json")
 
 

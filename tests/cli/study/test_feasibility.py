@@ -27,7 +27,12 @@ from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import ArmingRequest
 from haselab.study import definition
 from haselab.study.definition import builtin_study, load_study
-from haselab.study.feasibility import check_settings, judge_rig, judge_study, rating_of_twin
+from haselab.study.feasibility import (
+    check_settings,
+    check_study,
+    check_study_on_rig,
+    rating_of_twin,
+)
 
 STUDY = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 
@@ -35,7 +40,7 @@ STUDY = Path(definition.__file__).parent / "studies" / "hasel-iros2018.toml"
 @pytest.mark.parametrize("reading", ["hz", "rad"])
 def test_the_reference_study_is_feasible_on_the_twin(reading: str) -> None:
     config, study = twin_of_reading(reading), builtin_study()
-    printed = judge_study(study, describe(config), rating_of_twin(config, study))
+    printed = check_study(study, describe(config), rating_of_twin(config, study))
     printed.require()
     assert len(printed.checks) >= 5 and all(check.ok for check in printed.checks)
 
@@ -43,7 +48,7 @@ def test_the_reference_study_is_feasible_on_the_twin(reading: str) -> None:
 def test_the_predicted_field_is_the_field_that_breaks_the_twin() -> None:
     # A ramp to the highest output with the twin's own weight; its breakdown set just around.
     study = builtin_study()
-    printed = judge_study(study, describe(TwinConfig()), rating_of_twin(TwinConfig(), study))
+    printed = check_study(study, describe(TwinConfig()), rating_of_twin(TwinConfig(), study))
     field = next(c.requested for c in printed.checks if c.name == "field") * 1e6
     for factor, breaks in ((0.95, True), (1.05, False)):
         breakdown = factor * field / 1.01  # the carrier's 1 % is not in the twin's slow ramp
@@ -183,7 +188,7 @@ frame_rate_hz = 100.0
         ("high_v = 2.0\nfrequency_hz = 0.5", "high_v = 10.0\nfrequency_hz = 1.0",
          "only 6 frames on each edge within 0.3 V of the baseline of 5 V"),
         ("[triangle]", "hold_s = 3\n[triangle]", "has the key hold_s outside its tables"),
-        ("[triangle]", "chirp = 3\n[triangle]", "chirp: Input should be a table, headed [chirp]"),
+        ("[triangle]", "chirp = 3\n[triangle]", "chirp: must be a table, headed [chirp]"),
         ("skipped_cycles = 1", "skipped_cycles = 3",
          "skipped_cycles = 3 must be below cycles = 3"),
         ("high_v = 2.0", "high_v = 0.0", "low_v = 0 must be below high_v = 0"),
@@ -271,7 +276,7 @@ def test_a_fault_names_the_section_of_a_limit_that_two_sections_have(
                 "slew_v_per_s": 1.0, "bandwidth_hz": 1.0, "capacitance_f": 1.0,
                 "thickness_m": 1.0, "breakdown_v_per_m": 1.0,
             })  # fmt: skip
-            judge_rig(bench, builtin_study(quick=True), path)
+            check_study_on_rig(bench, builtin_study(quick=True), path)
 
 
 def test_a_study_that_is_too_much_is_refused_before_arming(tmp_path: Path) -> None:
@@ -293,11 +298,11 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
     """0.2 V are 1 kV and, at the largest capacitance, more than the amplifier's 12 mA."""
     config, study = twin_of_reading("hz"), builtin_study()
     rating = rating_of_twin(config, study)
-    assert judge_study(study, describe(config), rating).ok
+    assert check_study(study, describe(config), rating).ok
     for trials in (1, 0):
         changed = {"paper_chain_carrier_v": 0.2, "paper_chain_trials": trials}
         loud = study.model_copy(update={"steps": study.steps.model_copy(update=changed)})
-        found = judge_study(loud, describe(config), rating)
+        found = check_study(loud, describe(config), rating)
         bad = {check.name: check.where for check in found.checks if not check.ok}
         named = dict.fromkeys(
             ("peak current", "time of an update"), "step trials with the paper's sensing chain"
@@ -322,7 +327,7 @@ def test_the_field_is_that_of_the_study_also_beyond_the_breakdown() -> None:
     study, fields = builtin_study(), []
     for thickness_m in (0.6e-3, 1.0e-3, 1.2e-3, 2.0e-3):
         config = TwinConfig.model_validate({"shell": {"thickness_m": thickness_m}})
-        found = judge_study(study, describe(config), rating_of_twin(config, study))
+        found = check_study(study, describe(config), rating_of_twin(config, study))
         fields.append(next(c.requested for c in found.checks if c.name == "field"))
     assert fields == sorted(fields, reverse=True)
     assert fields[1] > 1.2 * 40.0
@@ -333,7 +338,7 @@ def test_the_numbers_on_the_page_about_safety_are_those_of_the_reference_study()
     if not page.is_file():
         pytest.skip("an installed package has no docs")
     config, study = twin_of_reading("hz"), builtin_study()
-    found = judge_study(study, describe(config), rating_of_twin(config, study)).checks
+    found = check_study(study, describe(config), rating_of_twin(config, study)).checks
     asked = {check.name: check.requested for check in found}
     assert (
         f"a current of {asked['peak current']:.1f} mA (limit 12 mA), "

@@ -11,7 +11,7 @@ from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import describe
 from haselab.study.definition import builtin_study
-from haselab.study.feasibility import judge_study, rating_of_twin
+from haselab.study.feasibility import check_study, rating_of_twin
 from haselab.study.pipeline import Findings
 
 STUDY = builtin_study()
@@ -34,7 +34,7 @@ def accepted(mass_kg: float) -> bool:
     config = TwinConfig.model_validate(
         {**HZ.model_dump(), "load": {**HZ.load.model_dump(), "mass_kg": mass_kg}}
     )
-    return judge_study(STUDY, describe(config), rating_of_twin(config, STUDY)).ok
+    return check_study(STUDY, describe(config), rating_of_twin(config, STUDY)).ok
 
 
 @pytest.mark.long

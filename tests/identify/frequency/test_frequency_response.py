@@ -275,7 +275,7 @@ RAMP = np.arange(100.0)
         ((RAMP[:50], RAMP[:50], 1.0), {}, "A record has 50 samples; it must have 64 or more"),
         ((np.where(RAMP == 3, np.nan, RAMP), RAMP, 1.0), {}, "nan at index 3"),
         ((RAMP, RAMP, 1.0), {"hold": "first"}, "have the hold first; it must be zero for all"),
-        ((RAMP, RAMP, 1.0), {"method": "etfe"}, "method = etfe; must be one of rational"),
+        ((RAMP, RAMP, 1.0), {"method": "etfe"}, "method = etfe; it must be one of rational"),
         ((RAMP, RAMP, 1.0), {"method": "periodic"}, "the method periodic requires a period"),
         ((RAMP, RAMP, 1.0), {"period_s": 2.0}, "and the other methods take none"),
         ((RAMP, RAMP, 1.0), {"segment_s": 2.0}, "only h1, h2 and hv take"),

@@ -113,7 +113,7 @@ def test_bad_input_is_refused_in_one_line():
         fit_voltage_plant([Record(good.u, RATE_HZ, good.y[:12], good.output_time_s[:12])])
     with pytest.raises(InputError, match="The drive is 1 V throughout"):
         fit_voltage_plant([Record(np.ones(1000), RATE_HZ, good.y, good.output_time_s, None)])
-    with pytest.raises(InputError, match="powers = 9; must be 1 to 4"):
+    with pytest.raises(InputError, match="powers = 9; it must be 1 to 4"):
         VoltageStructure(powers=9)
     with pytest.raises(InputError, match="creep = thermal"):
         VoltageStructure("thermal")

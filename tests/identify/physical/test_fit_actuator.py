@@ -20,7 +20,7 @@ from haselab.actuators import (
 from haselab.base import InputError
 from haselab.identify.physical import MotionRecord, fit_actuator
 from haselab.identify.physical.misfit import SESSION_OFFSET_M, SHARED_PX, Misfit, SharedErrors
-from haselab.identify.physical.model_error import excess_energy, hidden_std, widened
+from haselab.identify.physical.model_error import excess_energy, hidden_std, widen_std
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
 MASS_KG = 0.25
@@ -277,7 +277,7 @@ def test_a_hidden_error_of_any_direction_has_the_energy_of_the_visible_one():
 
 def test_covariances_only_grow():
     covariance = np.array([[4.0, 1.0], [1.0, 1.0]])
-    grown = widened(covariance, np.array([1.0, 3.0]))
+    grown = widen_std(covariance, np.array([1.0, 3.0]))
     np.testing.assert_allclose(grown, [[4.0, 3.0], [3.0, 9.0]])
 
 

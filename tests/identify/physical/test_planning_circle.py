@@ -14,7 +14,7 @@ from haselab.identify.physical.outlook import Outlook
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 from haselab.models.actuator.sections import PhysicalRecords
 from haselab.pipelines.planning.catalogue import Range
-from haselab.pipelines.planning.foreseen import foreseen
+from haselab.pipelines.planning.planned_record import planned_record
 from haselab.pipelines.planning.proposal import Planner
 from haselab.pipelines.planning.records import summary_of
 from haselab.study.definition import checked_study
@@ -38,7 +38,7 @@ DROP = {"trials": 1, "settle_s": 2.0, "record_s": 2.0, "frame_rate_hz": 100.0}
 def played(law, tables, seed):
     """What a bench records of a law, with noise."""
     study = checked_study({"name": "played", **tables}, "played")
-    record = foreseen(study, BENCH, MASS_KG)
+    record = planned_record(study, BENCH, MASS_KG)
     drive, rng = record.drive, np.random.default_rng(seed)
     sampled = SampledLaw(law, 12e3)
     start, _ = sampled.at_rest(drive.voltage_v[0], drive.ripple_v2[0], drive.load_n[0])
@@ -148,7 +148,7 @@ def test_a_planned_drop_lasts_as_long_as_it_is_played():
              "frame_rate_hz": 20.0, "open_trials": 1, "pi_trials": 0, "pid_trials": 0}}  # fmt: skip
     study = checked_study({"name": "steps", **steps}, "steps")
     with pytest.raises(InputError, match=r"closed loop cannot be foreseen. Leave out \[steps\]"):
-        foreseen(study, BENCH, MASS_KG)
+        planned_record(study, BENCH, MASS_KG)
 
 
 def test_a_covariance_that_is_none_is_refused():

@@ -15,7 +15,7 @@ from haselab.actuators import (
     SampledLaw,
 )
 from haselab.identify.physical import MotionRecord, fit_actuator
-from haselab.identify.physical.plausible import implausible
+from haselab.identify.physical.plausible import find_implausible
 
 KINDS = {
     "planar-hasel": (PlanarHasel(), 0.25, 8e3),
@@ -59,7 +59,7 @@ def driven(record, factor):
 
 def test_a_plausible_record_has_no_fault(seen):
     law, record = seen
-    assert implausible(law, [record]) == ""
+    assert find_implausible(law, [record]) == ""
 
 
 @pytest.mark.parametrize(
@@ -87,4 +87,4 @@ def test_a_record_without_motion_may_have_a_small_drive(seen):
     small = driven(record, 1.0 / GAIN)
     rng = np.random.default_rng(1)
     still = replace(small, length_m=record.length_m[0] + STD_M * rng.standard_normal(200))
-    assert implausible(law, [still]) == ""
+    assert find_implausible(law, [still]) == ""

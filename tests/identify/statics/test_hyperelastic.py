@@ -170,9 +170,9 @@ def test_bad_data_are_refused():
         fit_hyperelastic(stretch - 1.0, stretch)
     with pytest.raises(InputError, match="must be equally long"):
         fit_hyperelastic(stretch, stretch[:8])
-    with pytest.raises(InputError, match="model = hooke; must be one of auto, neo-hooke"):
+    with pytest.raises(InputError, match="model = hooke; it must be one of auto, neo-hooke"):
         fit_hyperelastic(stretch, stretch, "hooke")
-    with pytest.raises(InputError, match="deformation = biaxial; must be one of uniaxial"):
+    with pytest.raises(InputError, match="deformation = biaxial; it must be one of uniaxial"):
         fit_hyperelastic(stretch, stretch, deformation="biaxial")
 
 

@@ -158,7 +158,7 @@ def test_bad_records_and_structures_are_refused():
         Record(np.arange(9.0), 10.0, np.arange(9.0), np.arange(10.0))
     with pytest.raises(InputError, match="zeros = 3"):
         TransferStructure(zeros=3)
-    with pytest.raises(InputError, match="must be one of natural_frequency_rad_s"):
+    with pytest.raises(InputError, match="must be among natural_frequency_rad_s"):
         fit_transfer(
             [Record.sampled(np.arange(50.0), np.arange(50.0), 1.0)],
             TransferStructure(fixed={"omega": 1.0}),

@@ -141,5 +141,7 @@ def test_a_gap_in_time_and_unequal_columns_are_refused():
         InputError, match="held_at_hz = 90 Hz; it must be 400 Hz divided by a whole"
     ):
         Record.sampled(CHIRP, CHIRP, 400.0, held_at_hz=90.0)
-    with pytest.raises(InputError, match="hold = linear; must be one of zero, first, band-limited"):
+    with pytest.raises(
+        InputError, match="hold = linear; it must be one of zero, first, band-limited"
+    ):
         Record.sampled(CHIRP, CHIRP, 400.0, hold="linear")

@@ -137,14 +137,14 @@ def test_a_camera_that_is_missing_leaves_the_bench_closed_and_at_0_v(served):
     ("camera", "reported"),
     [
         ({"kind": "film"}, r"camera"),
-        ({"kind": "folder"}, r"\[camera\] has no key path: folder of images"),
+        ({"kind": "folder"}, r"\[camera\] has no key path \(folder of images"),
         (
             {"kind": "folder", "path": "x", "address": "y"},
             r"camera\.address: no such key; the keys are kind, path, repeat",
         ),
         ({"kind": "aravis", "exposure_s": -1.0}, r"camera\.exposure_s"),
         ({"kind": "v4l2", "width_px": 640}, r"set both width_px and height_px"),
-        ({"kind": "twin"}, r"\[camera\] has no key address: host:port of the twin"),
+        ({"kind": "twin"}, r"\[camera\] has no key address \(host:port of the twin"),
     ],
 )
 def test_a_fault_in_the_section_is_reported_with_its_place(served, tmp_path, camera, reported):

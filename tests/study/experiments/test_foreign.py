@@ -20,7 +20,7 @@ from haselab.study.definition import builtin_study
 from haselab.study.experiment import Chart, Curve
 from haselab.study.experiments.foreign import refuse_repeated
 from haselab.study.feasibility import check_settings, study_drives, study_masses_kg
-from haselab.study.pipeline import investigate
+from haselab.study.pipeline import play_and_fit
 from haselab.study.results import rows_of
 
 REFERENCE = builtin_study(quick=True)
@@ -149,7 +149,7 @@ def test_a_signal_during_a_fit_still_ends_the_program(ends: BaseException) -> No
 def test_an_experiment_that_exits_while_it_plays_is_named(monkeypatch: Any) -> None:
     monkeypatch.setattr("haselab.study.analysis.experiments_of", lambda study: (own(),))
     with pytest.raises(ResultError, match=r"'play' of the experiment \[own\].*sys\.exit\(0\)"):
-        investigate(lambda name: None, REFERENCE, RIG, Any)  # type: ignore[arg-type,return-value]
+        play_and_fit(lambda name: None, REFERENCE, RIG, Any)  # type: ignore[arg-type,return-value]
 
 
 @pytest.mark.parametrize(

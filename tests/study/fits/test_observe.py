@@ -14,7 +14,7 @@ from haselab.rig.twin.twin_bench import make_twin
 from haselab.store.session.writer import ExperimentRecord, SessionWriter
 from haselab.study.definition import builtin_study
 from haselab.study.fits.observe import observe
-from haselab.study.fits.trials import gather
+from haselab.study.fits.trials import collect_trials
 
 
 def test_a_block_with_a_model_of_its_own_keeps_its_own_middle() -> None:
@@ -49,6 +49,6 @@ def test_a_ringing_keeps_its_height_wherever_the_frames_lie(first_s: float) -> N
         block_start_s=blocks, frame_time_s=100.0 + frames, length_m=0.05 * (1.0 + strain),
         sensed_s=blocks + 0.0064, capacitance_f=np.ones(4000),
     )  # fmt: skip
-    found = gather([trial], 0.05, StrainMap(1.0, 0.0), steps)
+    found = collect_trials([trial], 0.05, StrainMap(1.0, 0.0), steps)
     np.testing.assert_allclose(found.strain[0], strain[: found.time_s.size], rtol=0.0, atol=1e-12)
     assert found.metrics.trials[0].raw_rise_time_s < 0.1

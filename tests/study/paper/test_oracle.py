@@ -34,7 +34,7 @@ from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.runtime.runner import Runner
 from haselab.study.definition import Study, builtin_study
 from haselab.study.fits.maps import Maps as FoundMaps
-from haselab.study.pipeline import investigate
+from haselab.study.pipeline import play_and_fit
 from haselab.study.simulated.noise_free import NoiseFreeBench
 
 Floats = NDArray[np.float64]
@@ -569,7 +569,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
     with Runner(
         quiet.rig, quiet, quiet, sensing.carrier_hz, sensing.carrier_v, SilentProgress()
     ) as runner:
-        found = investigate(quiet.observation, study, quiet.rig.description, runner)
+        found = play_and_fit(quiet.observation, study, quiet.rig.description, runner)
     found_maps = found.find(FoundMaps)
     assert found_maps is not None
     numbers, maps, pole = oracle(config, study)

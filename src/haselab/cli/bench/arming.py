@@ -15,14 +15,14 @@ from haselab.cli.options import shared_option
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import ReplayFile, RigFile, opened_rig
-from haselab.safety.armed import ends_at_zero
+from haselab.safety.armed import zero_at_end
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.guardian.client import Guardians, guardian_command
 from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import ArmingRequest, Safety
 from haselab.study.definition import StepStudy, Study
-from haselab.study.feasibility import judge_rig
+from haselab.study.feasibility import check_study_on_rig
 
 __all__ = ["Operator", "acknowledge_option", "arm", "armed_rig", "arming_options", "gated_rig"]
 
@@ -149,7 +149,7 @@ def armed_rig(
         SafetyError: the reason of the last trip was not acknowledged.
         DeviceError: a guardian does not start, or does not reach the bench.
     """
-    judged = judge_rig(file, study, path)
+    judged = check_study_on_rig(file, study, path)
     if judged is not None:
         judged.require()
     settings = safety_of(file, getattr(file, "safety", {}), path)
@@ -160,7 +160,7 @@ def armed_rig(
             safety.guardians = opened.enter_context(
                 Guardians(guardian_command(path), folder / "guardian.log", safety.gate.interlock)
             )
-        with ends_at_zero(guarded):
+        with zero_at_end(guarded):
             arm(safety, None if isinstance(file, ReplayFile) else operator)
             yield guarded
 

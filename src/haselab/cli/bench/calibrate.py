@@ -215,8 +215,9 @@ def _check_sane(answer: dict[str, Any]) -> None:
     factor = 1.0 + answer["gain_error"]
     if not 1.0 / _WORST_GAIN < factor < _WORST_GAIN:
         raise ResultError(
-            f"The monitors have {factor:.3g} times their nominal gain, but plausible is only "
-            f"{1 / _WORST_GAIN:g} to {_WORST_GAIN:g}. Check that each reference was connected in "
+            f"The monitors have {factor:.3g} times their nominal gain, but the factor should "
+            f"be {1 / _WORST_GAIN:g} to {_WORST_GAIN:g}. Check that each reference was "
+            "connected in "
             "turn, and the monitors' scales in the rig file."
         )
     if abs(answer["phase_rad"]) > _WORST_PHASE_RAD:
@@ -243,10 +244,12 @@ def _check_sane(answer: dict[str, Any]) -> None:
 @shared_option("--carrier-v", type=POSITIVE, default=0.02, show_default=True)
 @shared_option(
     "--duration-s", type=Real(min=0.1, max=600.0), default=1.0, show_default=True,
-    detail="Recording time of each reference.",
+    detail="It is the recording time of each reference.",
 )  # fmt: skip
-@actuator_option("Writes the calibration to [sensing].")
-@answer_options(None, "A calibration file (TOML) for `haselab sense`. Default: none.", plot=True)
+@actuator_option("The command writes the calibration to [sensing].")
+@answer_options(
+    None, "It is a calibration file (TOML) for `haselab sense`. Default: none.", plot=True
+)
 def command(
     rig: str,
     actuator: Path | None,

@@ -21,7 +21,7 @@ from haselab.sensing.carrier_plan import (
     CarrierChoice,
     CarrierPlan,
     CarrierRequest,
-    judge_carrier,
+    evaluate_carrier,
     plan_carrier,
 )
 from haselab.store.folder import write_json
@@ -164,7 +164,7 @@ def _carrier(
     harmonics, and aliased harmonics of the carrier.
     """
     request = CarrierRequest(update_s=None if update_unknown else update_s, **options)
-    given = judge_carrier(request, carrier_hz)
+    given = evaluate_carrier(request, carrier_hz)
     plan = plan_carrier(request)
     answer: dict[str, Any] = {
         "carrier_hz": plan.chosen.carrier_hz,

@@ -94,7 +94,7 @@ command.add_command(new)
     is_flag=True,
     help="Serve every user of this computer instead of only the user who starts the server.",
 )
-@answer_options(OutputRule("late"), "A rig file for this bench. Default: print it.")
+@answer_options(OutputRule("late"), "It is a rig file for this bench. Default: print it.")
 def serve(
     rig: Path,
     pace: float,

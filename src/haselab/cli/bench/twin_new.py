@@ -40,13 +40,13 @@ _ALONG_PX, _ACROSS_PX = 320.0, 400.0  # of the actuator at rest, of 512 rows and
     help="Set one value, for example --set shell.length_m=0.08. Repeat the option for "
     "more. Default: those of the kind.",
 )
-@answer_options(OutputRule("late"), "A TWIN.toml. Default: print it.")
+@answer_options(OutputRule("late"), "It is a TWIN.toml. Default: print it.")
 def new(kind: str, name: str, values: tuple[str, ...], as_json: bool, out: Path | None) -> None:
     """Write a TWIN.toml, which describes a simulated bench.
 
-    The file holds every parameter of the actuator with its unit and limits. The sections amplifier,
-    acquisition and camera are left out where they have the values of the reference study. For
-    another kind than planar-hasel, the camera is scaled to the actuator.
+    The file contains every parameter of the actuator with its unit and limits. The sections
+    amplifier, acquisition and camera are left out where they have the values of the reference
+    study. For another kind than planar-hasel, the camera is scaled to the actuator.
     """
     data = _data(kind, name, values)
     config = validated(TwinConfig, data, "--set")

@@ -16,7 +16,9 @@ __all__ = ["command"]
 
 @click.command("example")
 @click.argument("name", required=False)
-@answer_options(OutputRule("folder"), "A new folder for the data set. Default: list the names.")
+@answer_options(
+    OutputRule("folder"), "It is a new folder for the data set. Default: list the names."
+)
 def command(name: str | None, as_json: bool, out: Path | None) -> None:
     """List the example data sets, or write the one called NAME.
 

@@ -27,13 +27,13 @@ from haselab.cli.common import (
 )
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.pipelines.prefetch import ahead, in_order
+from haselab.pipelines.prefetch import map_in_order, prefetch
 from haselab.pipelines.sensing.source import Request, Source, open_source, too_short
 from haselab.pipelines.sensing.table import (
-    Collected,
+    BlockValidity,
+    CollectedColumns,
     Columns,
     CsvRows,
-    Judged,
     Summary,
     columns_of,
     json_parts,
@@ -129,30 +129,32 @@ def _sense_part(method: _Method, v: NDArray[Any], i: NDArray[Any]) -> Sensed:
     return method.sense_channels(v[:used], i[:used])
 
 
-def _results(source: Source, method: _Method, request: Request) -> Iterator[tuple[Columns, Judged]]:
+def _results(
+    source: Source, method: _Method, request: Request
+) -> Iterator[tuple[Columns, BlockValidity]]:
     """Columns and reasons of the blocks of each part."""
     length = method.config.block_samples
 
     def numbered() -> Iterator[tuple[int, NDArray[Any], NDArray[Any]]]:
         first = 0
-        for v, i in ahead(source.chunks()):
+        for v, i in prefetch(source.chunks()):
             if v.size >= length:
                 yield first, v, i
             first += v.size // length
 
     def work(
         part: tuple[int, NDArray[Any], NDArray[Any]],
-    ) -> tuple[Columns, Judged]:
+    ) -> tuple[Columns, BlockValidity]:
         first, v, i = part
         return _columns(_sense_part(method, v, i), source, request, first)
 
     workers = min(_MOST_WORKERS, os.cpu_count() or 1) if request.method in _PARALLEL else 1
-    return in_order(work, numbered(), workers)
+    return map_in_order(work, numbered(), workers)
 
 
 def _columns(
     sensed: Sensed, source: Source, request: Request, first: int
-) -> tuple[Columns, Judged]:
+) -> tuple[Columns, BlockValidity]:
     """Columns and reasons of the blocks from number `first` on."""
     config, count = source.config, sensed.valid.size
     inside_s = sensed.time_s - config.block_s * np.arange(count)
@@ -165,16 +167,16 @@ def _columns(
         capacitance_scale=request.capacitance_scale,
     )
     reason = np.where(sensed.valid, 0, sensed.reason).astype(np.uint8)
-    return columns, Judged(reason, sensed.seen)
+    return columns, BlockValidity(reason, sensed.seen)
 
 
 def _charge_results(
     source: Source, config: ChargeConfig, request: Request, read: Callable[[], None]
-) -> Iterator[tuple[Columns, Judged]]:
+) -> Iterator[tuple[Columns, BlockValidity]]:
     """Results without a carrier: the whole record is read before its first block is known."""
     charge, length = Charge(config), config.block_samples
     blocks = 0
-    for v, i in ahead(source.chunks()):
+    for v, i in prefetch(source.chunks()):
         used = v.size // length * length
         charge.add(v[:used], i[:used])
         blocks += v.size // length
@@ -261,7 +263,7 @@ def _tones_hz(source: Source) -> list[float]:
 def _sense(
     path: Path, request: Request, out: Path | None, as_json: bool, plot: Path | None
 ) -> None:
-    summary, collected = Summary(), Collected()
+    summary, collected = Summary(), CollectedColumns()
     with ExitStack() as opened:
         source = open_source(path, request, opened)
         if source.session is None:
@@ -320,7 +322,7 @@ def _sense(
             click.echo(f"{summary.blocks} rows, one per block: use --json or --out.")
 
 
-def _chart(collected: Collected, path: Path) -> Chart:
+def _chart(collected: CollectedColumns, path: Path) -> Chart:
     """Capacitance and resistance of all valid blocks."""
     good = collected.column("valid") > 0.0
     time_s = collected.column("time_s")[good]
@@ -388,12 +390,12 @@ class _Out:
 @_option("--current-limit-a", "A block whose current reaches it is not valid. Default: no limit.")
 @shared_option("--v", "v_column", default="v_monitor_v", show_default=True)
 @shared_option("--i", "i_column", default="i_monitor_v", show_default=True)
-@shared_option("--experiment", detail="For a FILE that is a session. Default: its only one.")
+@shared_option("--experiment", detail="Needed if FILE is a session. Default: its only one.")
 @column_options
 @_scale("--reactance-scale", 2.5e6, "Set the scale of eq. 2, for relative_capacitance only.")
 @_scale("--capacitance-scale", 10.0, "Set the scale of eq. 3, for relative_capacitance only.")
-@actuator_option("Reads carrier and calibration from [sensing].")
-@answer_options(None, "A CSV file with one row per block. Default: none.", plot=True)
+@actuator_option("The command reads carrier and calibration from [sensing].")
+@answer_options(None, "It is a CSV file with one row per block. Default: none.", plot=True)
 @unverified_option
 def command(
     file: Path,

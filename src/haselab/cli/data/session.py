@@ -52,11 +52,11 @@ def command() -> None:
 )  # fmt: skip
 @shared_option(
     "--zero-length-m", type=Real(1e-6, 10.0),
-    detail="Adds the column strain to each table of strains. Default: none.",
+    detail="It adds the column strain to each table of strains. Default: none.",
 )  # fmt: skip
 @answer_options(
     OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),
-    "A file, or a folder of tables.  [required]",
+    "It is a file, or a folder of tables.  [required]",
 )
 @unverified_option
 def _export(
@@ -131,7 +131,7 @@ def _export(
 )  # fmt: skip
 @shared_option(
     "--zero-length-m", type=Real(1e-6, 10.0),
-    detail="Gives strains from lengths, and lengths from strains. Required with --displacement. "
+    detail="It converts lengths to strains and strains to lengths. Required with --displacement. "
     "Default: none.",
 )  # fmt: skip
 @shared_option("--experiment", default="imported", show_default=True)
@@ -159,7 +159,7 @@ def _export(
 )  # fmt: skip
 @shared_option("--skew-s", type=Real(-1.0, 1.0), default=0.0, show_default=True)
 @column_options
-@answer_options(OutputRule("folder"), "A new folder for the session.  [required]")
+@answer_options(OutputRule("folder"), "It is a new folder for the session.  [required]")
 def _import(
     file: Path,
     v_column: str,

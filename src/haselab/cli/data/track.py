@@ -28,9 +28,8 @@ from haselab.cli.data.track_pictures import overlay_to
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.plot import save_plot
-from haselab.pipelines.prefetch import in_order
+from haselab.pipelines.prefetch import map_in_order
 from haselab.pipelines.tracking.gauge import gauge_of, strain_answer
-from haselab.pipelines.tracking.kept import Kept
 from haselab.pipelines.tracking.points import (
     PILOT_FRAMES,
     Choice,
@@ -59,6 +58,7 @@ from haselab.pipelines.tracking.stream import (
     read_clock,
 )
 from haselab.pipelines.tracking.table import Block, TrackRows
+from haselab.pipelines.tracking.track_collector import TrackCollector
 from haselab.store.manifest import check_recorded
 from haselab.store.video.opening import VideoReader, open_video
 from haselab.tracking import TrackOptions, frames_at_rest
@@ -126,7 +126,7 @@ def _before_motion(
 
 
 def _with_progress(
-    followed: Iterator[Block], correction: Correction, kept: Kept, frames: int
+    followed: Iterator[Block], correction: Correction, kept: TrackCollector, frames: int
 ) -> Iterator[Block]:
     """Correct and record the blocks, with a progress bar."""
     bar = progress_bar()
@@ -164,7 +164,9 @@ def _track(
         points = without_gauge(points)
     elif request.points is None and choice.together:
         points = name_gauge(points)
-    kept = Kept(len(points.names), np.concatenate([points.group("upper"), points.group("lower")]))
+    kept = TrackCollector(
+        len(points.names), np.concatenate([points.group("upper"), points.group("lower")])
+    )
     overlay = overlay_to(request.overlay, video.frames_expected)
     rows = TrackRows(points.names, None if scale is None else scale.value)
     follow = blocks(opening.all(), choice.tracker, choice.state, overlay.look, video.number)
@@ -172,7 +174,7 @@ def _track(
     with out.open("wb") as file:
         file.write(rows.header())
         watched = _with_progress(iter(followed), correction, kept, video.frames_expected)
-        for _ in in_order(lambda b: file.write(rows.block(b, correction.rest_px)), watched, 1):
+        for _ in map_in_order(lambda b: file.write(rows.block(b, correction.rest_px)), watched, 1):
             pass
     overlay.close()
     if not kept.frames:
@@ -195,7 +197,7 @@ def _track(
     return answer, followed.error
 
 
-def _answer(points: Points, choice: Choice, kept: Kept) -> dict[str, Any]:
+def _answer(points: Points, choice: Choice, kept: TrackCollector) -> dict[str, Any]:
     thin = kept.thinned().tracks
     held = kept.valid / kept.frames
     if 1.0 - held.mean() > _MANY_LOST:
@@ -316,7 +318,7 @@ def _request(options: dict[str, Any]) -> _Request:
     help="Read the times of the frames from a CSV file (frame, time_s), or from a session.h5 with "
     "--experiment. Default: from the frame rate.",
 )  # fmt: skip
-@shared_option("--experiment", detail="For a session given with --times. Default: its only one.")
+@shared_option("--experiment", detail="Needed if --times is a session. Default: its only one.")
 @click.option(
     "--subset-px", type=INTEGER,
     help="Set the side of a subset in px, odd. Default: 15 with --points, from the size of the "
@@ -339,7 +341,7 @@ def _request(options: dict[str, Any]) -> _Request:
     "--report", type=click.Path(path_type=Path), metavar="FILE.html",
     help="Write a page about the tracks. Default: none.",
 )  # fmt: skip
-@answer_options(_OUTPUTS, "A CSV file with the tracks.  [required]", plot=True)
+@answer_options(_OUTPUTS, "It is a CSV file with the tracks.  [required]", plot=True)
 @unverified_option
 def command(
     video: Path,

@@ -45,7 +45,7 @@ def _located(
     finally:
         bar.stop()
     if first is None:
-        raise InputError(f"The video holds no frame. {video.path}")
+        raise InputError(f"The video contains no frame. {video.path}")
     return first, profile, particles, times_s, broken_off
 
 

@@ -51,8 +51,8 @@ def overlay_to(path: Path | None, frame_count: int) -> Overlay:
     if path.suffix.lower() in (".mp4", ".mkv", ".mov"):
         return _Video(path, frame_count)
     raise InputError(
-        f"--overlay ends in {path.suffix!r}; take .mp4, .mkv or .mov for a video, .png for a "
-        f"contact sheet. {path}"
+        f"--overlay ends in {path.suffix!r}. Use .mp4, .mkv or .mov for a video, or .png "
+        f"for a contact sheet. {path}"
     )
 
 

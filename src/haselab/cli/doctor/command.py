@@ -188,7 +188,7 @@ def _examine() -> list[Finding]:
 @click.command("doctor")
 @shared_option(
     "--rig", type=click.Path(path_type=Path),
-    detail="Its instruments are identified too. Default: none.",
+    detail="Its instruments are then identified too. Default: none.",
 )  # fmt: skip
 @answer_options()
 def command(rig: Path | None, as_json: bool, out: Path | None) -> None:

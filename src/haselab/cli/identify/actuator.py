@@ -16,7 +16,7 @@ from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
 from haselab.cli.common import POSITIVE, REAL, actuator_option, answer_options, unverified_option
-from haselab.cli.identify.common import FILES, RATE, give
+from haselab.cli.identify.common import FILES, RATE, emit_fit
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -36,18 +36,24 @@ __all__ = ["actuator", "law_of_section", "section_of_fit"]
 
 @click.command("actuator")
 @FILES
-@actuator_option("Read [actuator], write [model.physical].")
-@shared_option("--input", "source", detail="For tables. Default: u, voltage_v or voltage.")
+@actuator_option("The command reads [actuator] and writes [model.physical].")
+@shared_option(
+    "--input", "source", detail="Used for tables only. Default: u, voltage_v or voltage."
+)
 @shared_option("--output", "outputs", multiple=True,
-               detail="For tables. Give it twice for a length and a capacitance. Default: y, "
+               detail="Used for tables only. Give it twice for a length and a capacitance. "
+               "Default: y, "
                "length_m, strain or capacitance_f.")  # fmt: skip
 @RATE
 @shared_option("--mass-kg", "masses_kg", type=REAL, multiple=True,
-               detail="For tables: once for all, or once for each in their order. Default: that "
+               detail="For tables, give it once for all, or once for each in their order. "
+               "Default: that "
                "of A.toml.")  # fmt: skip
-@shared_option("--gain-v-per-v", type=POSITIVE, detail="For tables. Default: that of A.toml.")
+@shared_option(
+    "--gain-v-per-v", type=POSITIVE, detail="Used for tables only. Default: that of A.toml."
+)
 @shared_option("--zero-length-m", type=POSITIVE,
-               detail="For tables with strains. Default: that of A.toml.")  # fmt: skip
+               detail="Used for tables with strains only. Default: that of A.toml.")  # fmt: skip
 @unverified_option
 @column_options
 @answer_options(plot=True)
@@ -71,10 +77,10 @@ def actuator(
 
     FILES are folders of runs, their session.h5, or tables with a voltage and a length, strain or
     capacitance, all of one actuator. Lengths and capacitances of all experiments are compared with
-    one simulated motion. [actuator] gives the kind, the parameters that were measured otherwise,
-    such as a width, and the starting values.
+    one simulated motion. [actuator] states the kind, the starting values, and the parameters
+    that you measured in another way, such as a width.
 
-    Each table is a motion of its own, which begins at rest under its first voltage.
+    Each table is simulated on its own and is assumed to begin at rest under its first voltage.
     """
     if actuator is None:
         raise InputError(
@@ -105,11 +111,11 @@ def actuator(
     _refuse_twice(inputs)
     fit = fit_actuator(law, records, mass_kg=mass_kg)
     if not fit.succeeded:
-        give(fit, inputs, as_json, out)
+        emit_fit(fit, inputs, as_json, out)
     section = section_of_fit(fit, records, gains_v_per_v[0])
     proposals = _proposals(tables, section, fit, actuator)
     listed = {"experiments": [proposal.answer() for proposal in proposals]}
-    give(fit, inputs, as_json, out, listed)
+    emit_fit(fit, inputs, as_json, out, listed)
     save_plot(plot, fit.chart)
     save_section(actuator, "model.physical", section, inputs, status=fit.status)
 

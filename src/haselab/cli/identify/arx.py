@@ -9,7 +9,7 @@ import click
 from haselab.base import InputError
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, SEED, answer_options
-from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
+from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, emit_fit, rate_hz_of, read_valid
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.record import Record
@@ -69,7 +69,7 @@ def arx(
     """Fit a difference equation (ARX) by least squares.
 
     The poles are also given in continuous time. Use it for sampled plants whose noise passes
-    through the same poles. Sensor noise biases the fit: use `transfer` instead. FILE holds the
+    through the same poles. Sensor noise biases the fit: use `transfer` instead. FILE has the
     columns of input and output.
     """
     given = (na, nb, nk)
@@ -79,7 +79,9 @@ def arx(
         )
     if skip_rows < 0 or (rows is not None and rows < 1):
         raise InputError(
-            f"--skip-rows is {skip_rows}, --rows is {rows}. Use at least 0 and at least 1."
+            f"--skip-rows is {skip_rows} and --rows is {rows}. Use --skip-rows 0 or more, and "
+            "--rows "
+            "1 or more."
         )
     orders = None if na is None or nb is None or nk is None else ArxOrders(na, nb, nk)
     table = read_valid(file, [source, output], columns)
@@ -87,7 +89,7 @@ def arx(
     rate = rate_hz_of(table, rate_hz, file)
     record = Record.sampled(table[source][used], table[output][used], rate)
     fit = fit_arx(record, orders, criterion=criterion, remove_means=not keep_means)
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     save_plot(plot, lambda: fit.chart((source, output)))
 
 
@@ -105,7 +107,9 @@ def arx(
     help="Set the number of past samples, and of future samples, in the data matrices.",
 )  # fmt: skip
 @shared_option("--bootstrap", type=click.IntRange(2, 1000), default=50, show_default=True)
-@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For --bootstrap.")
+@shared_option(
+    "--seed", type=SEED, default=1, show_default=True, detail="Only --bootstrap uses it."
+)
 @shared_option("--keep-means", is_flag=True)
 @column_options
 @answer_options(plot=True)
@@ -124,7 +128,7 @@ def subspace(
     """Fit a state-space model by projections (MOESP).
 
     It is a fast way to see how many modes a record shows; `transfer` gives smaller intervals. FILE
-    holds the columns of input and output.
+    has the columns of input and output.
     """
     table = read_valid(file, [source, output], columns)
     rate = rate_hz_of(table, rate_hz, file)
@@ -133,5 +137,5 @@ def subspace(
         block_rows=options["block_rows"], remove_means=not keep_means,
         bootstrap=options["bootstrap"], seed=options["seed"],
     )  # fmt: skip
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     save_plot(plot, lambda: fit.chart((source, output)))

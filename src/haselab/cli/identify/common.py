@@ -39,14 +39,14 @@ __all__ = [
     "VOLTAGE",
     "Fit",
     "Recorded",
-    "about",
-    "give",
+    "emit_fit",
+    "name_files_in_errors",
     "rate_hz_of",
     "read_columns",
     "read_quantities",
     "read_record",
+    "read_recorded",
     "read_valid",
-    "recorded",
     "unit_of_name",
     "unit_text",
 ]
@@ -87,7 +87,7 @@ class Fit(Protocol):
         """Keys of the public contract."""
 
 
-def give(
+def emit_fit(
     fit: Fit,
     files: Sequence[Path],
     as_json: bool,
@@ -104,7 +104,7 @@ def give(
 
 
 @contextmanager
-def about(*files: Path) -> Iterator[None]:
+def name_files_in_errors(*files: Path) -> Iterator[None]:
     """Append the names of the files to an error about their columns."""
     try:
         yield
@@ -146,7 +146,7 @@ class Recorded:
     units: tuple[str, str]
 
 
-def recorded(
+def read_recorded(
     file: Path,
     names: tuple[str, str],
     rate_hz: float | None,

@@ -18,11 +18,11 @@ _PLACES = {
     "hyperelastic": "haselab.cli.identify.statics:hyperelastic",
     "hysteresis": "haselab.cli.identify.hysteresis:hysteresis",
     "map": "haselab.cli.identify.static_map:spline_map",
+    "model-comparison": "haselab.cli.identify.model_comparison:model_comparison",
     "plan-experiment": "haselab.cli.identify.plan_experiment:command",
     "regions": "haselab.cli.identify.statics:regions",
     "subspace": "haselab.cli.identify.arx:subspace",
     "transfer": "haselab.cli.identify.transfer:transfer",
-    "verdict": "haselab.cli.identify.model_comparison:verdict",
     "voltage-map": "haselab.cli.identify.statics:voltage_map",
 }
 

@@ -18,7 +18,7 @@ from haselab.cli.identify.common import (
     INPUT,
     OUTPUT,
     RATE,
-    give,
+    emit_fit,
     rate_hz_of,
     read_valid,
 )
@@ -74,7 +74,7 @@ def hysteresis(
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate, from_s))
     fit = fit_hysteresis(records, model, operators=operators)
-    give(fit, files, as_json, out)
+    emit_fit(fit, files, as_json, out)
     save_plot(plot, lambda: fit.chart((source, output)))
 
 
@@ -83,7 +83,7 @@ class _Forecast:
     """A creep fit whose answer includes a forecast."""
 
     fit: CreepFit
-    later_s: float | None
+    after_s: float | None
 
     @property
     def status(self) -> str:
@@ -95,9 +95,9 @@ class _Forecast:
 
     def answer(self) -> dict[str, Any]:
         answer: dict[str, Any] = self.fit.answer()
-        if self.later_s is not None and self.succeeded:
-            output: Estimate = self.fit.forecast(self.later_s)
-            answer["forecast"] = {"later_s": self.later_s, "output": output}
+        if self.after_s is not None and self.succeeded:
+            output: Estimate = self.fit.forecast(self.after_s)
+            answer["forecast"] = {"after_s": self.after_s, "output": output}
         return answer
 
 
@@ -147,7 +147,7 @@ def creep(
 ) -> None:
     """Fit a creep law to the response to a held input.
 
-    The laws are a sum of exponentials, a fractional law and a logarithm. FILE holds the columns of
+    The laws are a sum of exponentials, a fractional law and a logarithm. FILE has the columns of
     input and output.
     """
     table = read_valid(file, [output] if unit_step else [source, output], columns)
@@ -155,5 +155,5 @@ def creep(
     u = np.ones(table[output].size) if unit_step else table[source]
     record = Record.sampled(u, table[output], rate, input_before)
     fit = fit_creep(record, model, leave_out_s=leave_out_s)
-    give(_Forecast(fit, forecast_s), [file], as_json, out)
+    emit_fit(_Forecast(fit, forecast_s), [file], as_json, out)
     save_plot(plot, lambda: fit.chart((source, output)))

@@ -1,4 +1,4 @@
-"""`haselab identify verdict`: compare models, and report which one the records support."""
+"""`haselab identify model-comparison`: compare models, and report which one the records support."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ import click
 from haselab.base import Estimate, InputError, ResultError, to_plain
 from haselab.cli.columns import column_options
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
-from haselab.cli.identify.common import FILES, OUTPUT, RATE, about, rate_hz_of, read_record
+from haselab.cli.identify.common import (
+    FILES,
+    OUTPUT,
+    RATE,
+    name_files_in_errors,
+    rate_hz_of,
+    read_record,
+)
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.charts import odds_chart
@@ -29,12 +36,12 @@ from haselab.store.columns.selection import ColumnOptions
 from haselab.store.folder import read_json, write_json
 from haselab.store.toml import validated
 
-__all__ = ["verdict"]
+__all__ = ["model_comparison"]
 
 _AGREEMENT = "agreement"
 
 
-@click.command("verdict")
+@click.command("model-comparison")
 @FILES
 @click.option(
     "--question",
@@ -44,7 +51,9 @@ _AGREEMENT = "agreement"
     "mechanical or electrical; modes: are there one or two modes; agreement: do the answers in "
     "JSON files agree.",
 )
-@shared_option("--input", "source", default="drive_v", show_default=True, detail="The drive, in V.")
+@shared_option(
+    "--input", "source", default="drive_v", show_default=True, detail="It is the drive, in V."
+)
 @OUTPUT
 @RATE
 @click.option(
@@ -65,7 +74,7 @@ _AGREEMENT = "agreement"
 )  # fmt: skip
 @column_options
 @answer_options(plot=True)
-def verdict(
+def model_comparison(
     files: tuple[Path, ...],
     question: str,
     columns: ColumnOptions,
@@ -114,7 +123,7 @@ def verdict(
 
 def _record(file: Path, columns: ColumnOptions, options: dict[str, Any]) -> Record:
     source, output = options["source"], options["output"]
-    with about(file):
+    with name_files_in_errors(file):
         table = read_record(file, [source, output], options["rate_hz"], columns)
         rate_hz = rate_hz_of(table, options["rate_hz"], file)
         return Record.sampled(table[source], table[output], rate_hz)

@@ -59,7 +59,11 @@ _OF_SIGNAL = (
     "Default: 0.1.",
 )  # fmt: skip
 @shared_option(
-    "--duration-s", type=REAL, default=40.0, show_default=True, detail="Length of the drive signal."
+    "--duration-s",
+    type=REAL,
+    default=40.0,
+    show_default=True,
+    detail="It is the length of the drive signal.",
 )
 @click.option(
     "--baseline-v", type=REAL, default=1.0, show_default=True,
@@ -86,7 +90,7 @@ _OF_SIGNAL = (
 )  # fmt: skip
 @answer_options(
     None,
-    "A CSV file of the drive signal: time_s, drive_v; or, without --rig, a study file. "
+    "It is a CSV file of the drive signal (time_s, drive_v) or, without --rig, a study file. "
     "Default: none.",
     plot=True,
 )
@@ -107,8 +111,8 @@ def command(
 
     With --rig, the command designs a drive signal within the limits of the bench. The signal
     separates candidate models, or reduces the confidence interval of a parameter, as well as
-    possible. MODEL is a JSON answer of `identify verdict` or `identify transfer`, or the model.json
-    of a run.
+    possible. MODEL is a JSON answer of `identify model-comparison` or `identify transfer`, or the
+    model.json of a run.
 
     Without --rig, it finds the shortest study that determines a parameter of the physical model,
     within the limits of [drive]. MODEL is an actuator file with [model.physical].

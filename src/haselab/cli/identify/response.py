@@ -13,7 +13,7 @@ import numpy as np
 from haselab.base import InputError, ResultError
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options, emit
-from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, give, rate_hz_of, read_valid
+from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, emit_fit, rate_hz_of, read_valid
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.free.response import FreeTrial, fit_free_response
@@ -120,7 +120,7 @@ def _common_rate_hz(tables: Sequence[Table], given: float | None, files: Sequenc
 
 @click.command("free-response")
 @FILES
-@shared_option("--output", default="x", show_default=True, detail="The motion.")
+@shared_option("--output", default="x", show_default=True, detail="It is the measured motion.")
 @RATE
 @click.option(
     "--creep/--no-creep", default=None,
@@ -151,5 +151,5 @@ def free_response(
         rate = rate_hz_of(table, rate_hz, file)
         trials.append(FreeTrial(table[output], np.arange(table[output].size) / rate))
     fit = fit_free_response(trials, creep=creep)
-    give(fit, files, as_json, out)
+    emit_fit(fit, files, as_json, out)
     save_plot(plot, lambda: fit.chart(("", output)))

@@ -8,7 +8,7 @@ import click
 
 from haselab.cli.columns import column_options
 from haselab.cli.common import answer_options
-from haselab.cli.identify.common import FILE, give, read_valid
+from haselab.cli.identify.common import FILE, emit_fit, read_valid
 from haselab.cli.plot import save_plot
 from haselab.identify.statics.monotone_map import fit_map
 from haselab.store.columns.selection import ColumnOptions
@@ -49,5 +49,5 @@ def spline_map(
     """
     table = read_valid(file, [abscissa, ordinate], columns, ["--x", "--y"])
     fit = fit_map(table[abscissa], table[ordinate], monotone=monotone)
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     save_plot(plot, lambda: fit.chart((abscissa, ordinate)))

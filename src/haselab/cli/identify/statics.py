@@ -25,7 +25,7 @@ from haselab.cli.identify.common import (
     STRESS,
     STRETCH,
     VOLTAGE,
-    give,
+    emit_fit,
     read_quantities,
 )
 from haselab.cli.options import shared_option
@@ -131,7 +131,7 @@ def hyperelastic(
     fit = fit_hyperelastic_tests(
         tests, model, electrode_natural=electrode_natural, electrode_stiffening=electrode_stiffening
     )
-    give(_WithStress(fit, np.asarray(test["at_stretch"])), files, as_json, out)
+    emit_fit(_WithStress(fit, np.asarray(test["at_stretch"])), files, as_json, out)
     save_plot(plot, fit.chart)
 
 
@@ -222,13 +222,13 @@ def regions(
 ) -> None:
     """Find the linear regions of a force-stretch curve.
 
-    The longest region comes first. FILE holds the columns of stretch and force.
+    The longest region comes first. FILE has the columns of stretch and force.
     """
     wanted = {STRETCH: stretch_column, LOAD: load_column}
     stretch, load_n = read_quantities(file, wanted, columns)
     stretch, load_n = _between(stretch, load_n, stretch_min, stretch_max, file)
     fit = find_regions(stretch, load_n, segments)
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     save_plot(plot, fit.chart)
 
 
@@ -237,7 +237,7 @@ def regions(
 @column_option(STRAIN)
 @column_option(VOLTAGE)
 @column_options
-@actuator_option("Writes [drive.voltage_map].")
+@actuator_option("The command writes [drive.voltage_map].")
 @answer_options(plot=True)
 def voltage_map(
     file: Path,
@@ -252,7 +252,7 @@ def voltage_map(
 ) -> None:
     """Fit the voltage as a function of strain.
 
-    The map is eq. 4, a sum of two exponentials. FILE holds the columns of strain and voltage, in
+    The map is eq. 4, a sum of two exponentials. FILE has the columns of strain and voltage, in
     order of time.
     """
     known = None if actuator is None else load_actuator(actuator, to_write=True)
@@ -260,7 +260,7 @@ def voltage_map(
         file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns, known
     )
     fit = fit_voltage_map(strain, voltage_v)
-    give(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out)
     if actuator is not None:
         save_voltage_map(actuator, fit, file)
     save_plot(plot, fit.chart)
@@ -274,9 +274,11 @@ def voltage_map(
     "--strain-file", type=click.Path(path_type=Path),
     help="Read the strain from this file or session, recorded with the same clock. Default: FILE.",
 )  # fmt: skip
-@shared_option("--experiment", detail="For a session as --strain-file. Default: its only one.")
+@shared_option(
+    "--experiment", detail="Needed if --strain-file is a session. Default: its only one."
+)
 @column_options
-@actuator_option("Writes [sensing.strain_map], the map from F with its band.")
+@actuator_option("The command writes [sensing.strain_map]: the map from F, with its band.")
 @answer_options(plot=True)
 def capacitance_map(
     file: Path,
@@ -293,7 +295,7 @@ def capacitance_map(
 ) -> None:
     """Fit the strain as a function of capacitance.
 
-    The map is eq. 5, a straight line. FILE holds the columns of capacitance and strain. The slope
+    The map is eq. 5, a straight line. FILE has the columns of capacitance and strain. The slope
     is per F for a capacitance in F, and per unit of relative capacitance otherwise. For
     --actuator, a polynomial of degree 1 to 3 is fitted too.
     """
@@ -306,5 +308,5 @@ def capacitance_map(
         section = save_strain_map(actuator, pairs, files)
         found = {name: part for name, part in section.items() if part is not None}
         more = {"strain_map": found if as_json or out is not None else _FOR_LOOPS}
-    give(fit, files, as_json, out, more)
+    emit_fit(fit, files, as_json, out, more)
     save_plot(plot, fit.chart)

@@ -19,9 +19,9 @@ from haselab.cli.identify.common import (
     INPUT,
     OUTPUT,
     RATE,
-    about,
-    give,
-    recorded,
+    emit_fit,
+    name_files_in_errors,
+    read_recorded,
     unit_text,
 )
 from haselab.cli.model.sections import MODEL_KEYS, model_section
@@ -106,9 +106,11 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 )  # fmt: skip
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
 @shared_option("--bootstrap", type=click.IntRange(2, 10_000), detail="Default: no bootstrap.")
-@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For --bootstrap.")
+@shared_option(
+    "--seed", type=SEED, default=1, show_default=True, detail="Only --bootstrap uses it."
+)
 @shared_option("--through-voltage-map", is_flag=True)
-@actuator_option("Reads [drive.voltage_map] and writes [model] with its covariance.")
+@actuator_option("The command reads [drive.voltage_map] and writes [model] with its covariance.")
 @column_options
 @answer_options(plot=True)
 def transfer(
@@ -149,8 +151,8 @@ def transfer(
     notes: list[str] = []
     units = ("", "")
     for file in files:
-        with about(file):
-            found_records = recorded(
+        with name_files_in_errors(file):
+            found_records = read_recorded(
                 file,
                 (source, output),
                 rate_hz,
@@ -171,7 +173,7 @@ def transfer(
         )
     if options["nonlinear"] and options["bootstrap"] is not None:
         raise InputError("--bootstrap needs a linear model. Leave out --bootstrap or --nonlinear.")
-    with about(*files):
+    with name_files_in_errors(*files):
         if options["nonlinear"]:
             found = fit = fit_nonlinear(records, structure, options["nonlinear"])
         elif options["choose"]:
@@ -191,7 +193,7 @@ def transfer(
                 f"--bootstrap needs a linear model, but {fit.kind} was chosen. Leave it out."
             )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
-    give(found, files, as_json, out, more)
+    emit_fit(found, files, as_json, out, more)
     if actuator is not None:
         _save(actuator, fit, (modelled, output), units, files, options["through_voltage_map"])
     save_plot(plot, lambda: fit.chart((source, output)))

@@ -19,8 +19,8 @@ from haselab.cli.identify.common import (
     INPUT,
     OUTPUT,
     RATE,
-    about,
-    recorded,
+    name_files_in_errors,
+    read_recorded,
     unit_of_name,
     unit_text,
 )
@@ -69,12 +69,16 @@ _NO_BAND = "no uncertainty: the model has no covariance"
 @click.option("--longest-m", type=POSITIVE,
               help="State the longest length of the actuator before the record, in m. Default: its "
               "length at the start of the record.")  # fmt: skip
-@shared_option("--mass-kg", type=REAL, detail="For tables. Default: that of MODEL.")
-@shared_option("--gain-v-per-v", type=POSITIVE, detail="For tables. Default: that of MODEL.")
+@shared_option("--mass-kg", type=REAL, detail="Used for tables only. Default: that of MODEL.")
+@shared_option(
+    "--gain-v-per-v", type=POSITIVE, detail="Used for tables only. Default: that of MODEL."
+)
 @shared_option("--zero-length-m", type=POSITIVE,
-               detail="For tables with strains. Default: that of MODEL.")  # fmt: skip
+               detail="Used for tables with strains only. Default: that of MODEL.")  # fmt: skip
 @unverified_option
-@shared_option("--seed", type=SEED, default=1, show_default=True, detail="For the 95 % band.")
+@shared_option(
+    "--seed", type=SEED, default=1, show_default=True, detail="Only the 95 % band uses it."
+)
 @column_options
 @answer_options(plot=True)
 @click.pass_context
@@ -139,11 +143,13 @@ def command(
     through = model if through_voltage_map else None
     records = []
     for file in files:
-        with about(file):
-            found = recorded(file, (source, output), rate_hz, held_at_hz, columns, through=through)
+        with name_files_in_errors(file):
+            found = read_recorded(
+                file, (source, output), rate_hz, held_at_hz, columns, through=through
+            )
             _check_units(origin, found.units, (source, output), through_voltage_map)
             records += found.records
-    with about(*files):
+    with name_files_in_errors(*files):
         prediction = predict(
             plant,
             records,

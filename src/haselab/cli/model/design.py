@@ -14,7 +14,7 @@ from haselab.base import Estimate, InputError, ResultError, table_at
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.common import REAL, SEED, answer_options, emit
 from haselab.cli.model.charts import design_chart, loop_chart
-from haselab.cli.model.feedback import feedback_of, held_controller
+from haselab.cli.model.feedback import feedback_of, read_controller
 from haselab.cli.model.margins import margins_answer
 from haselab.cli.model.model_file import (
     loop_of,
@@ -74,7 +74,7 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @loop_options
 @click.option(
-    "--limits", type=(REAL, REAL), show_default="the actuator file's, else -0.05 0.1",
+    "--limits", type=(REAL, REAL), show_default="those in the actuator file, else -0.05 0.1",
     metavar="LOW HIGH",
     help="Limit the controller's output to this range, in the unit of the model's input.",
 )  # fmt: skip
@@ -92,7 +92,9 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
     "--accept-shortfalls", is_flag=True,
     help="Write the best controller even if it does not meet the demands.",
 )  # fmt: skip
-@answer_options(None, "A new actuator file with model and controller. Default: none.", plot=True)
+@answer_options(
+    None, "It is a new actuator file with model and controller. Default: none.", plot=True
+)
 def command(
     model: Path,
     spec: Path | None,
@@ -215,7 +217,7 @@ def _judge(
             f"--controller {kind} reads its parameters from [controller] of an actuator file, but "
             f"the model is not an actuator file. Name one: {model}"
         )
-    held = held_controller(model, kind)
+    held = read_controller(model, kind)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
     setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
     plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)

@@ -28,7 +28,7 @@ __all__ = ["command"]
 @click.option(
     "--output-name", metavar="NAME", help="Set the name of the output. Default: that of the model."
 )
-@answer_options(None, "The converted model; required for mat. Default: none.")
+@answer_options(None, "It is the converted model; required for mat. Default: none.")
 def command(
     model: Path,
     form: str,

@@ -14,10 +14,10 @@ from haselab.control import LinearController, PidGains
 from haselab.controllers import CONTROLLERS, LinearisableController
 from haselab.models.actuator import ControllerSection
 
-__all__ = ["feedback_of", "held_controller"]
+__all__ = ["feedback_of", "read_controller"]
 
 
-def held_controller(path: Path, kind: str | None) -> ControllerSection:
+def read_controller(path: Path, kind: str | None) -> ControllerSection:
     """Read a controller of an actuator file.
 
     Args:

@@ -95,7 +95,7 @@ def _sizes(built: Firmware) -> dict[str, Any]:
 )  # fmt: skip
 @shared_option(
     "--rig", type=click.Path(path_type=Path),
-    detail="It has kind 'chip'; the program gets its [front_end] and limits. Default: none.",
+    detail="It must have kind 'chip'; its [front_end] and limits are compiled in. Default: none.",
 )  # fmt: skip
 @answer_options(OutputRule(built=("folder",)))
 def build(

@@ -68,7 +68,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
 @click.argument("name")
 @shared_option(
     "--kind", default="planar-hasel", show_default=True, metavar="KIND",
-    detail="planar-hasel, peano-hasel, curling-hasel, dea-stack or your own.",
+    detail="It is planar-hasel, peano-hasel, curling-hasel, dea-stack or your own.",
 )  # fmt: skip
 @shared_option("--mass-kg", type=REAL, detail="Default: written as a comment.")
 @shared_option("--zero-length-m", type=POSITIVE, detail="Default: written as a comment.")
@@ -83,7 +83,7 @@ kind = "{kind}"  # planar-hasel, peano-hasel, curling-hasel, dea-stack, ...
               help="Write the highest drive voltage, before the amplifier, in V. Default: written "
               "as a comment.")  # fmt: skip
 @shared_option("--gain-v-per-v", type=POSITIVE, detail="Default: written as a comment.")
-@answer_options(None, "An actuator file, for example leg.toml.  [required]")
+@answer_options(None, "It is an actuator file, for example leg.toml.  [required]")
 def command(
     name: str,
     kind: str,

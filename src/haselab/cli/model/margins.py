@@ -8,7 +8,7 @@ import click
 
 from haselab.cli.common import REAL, answer_options, emit
 from haselab.cli.model.charts import loop_chart
-from haselab.cli.model.feedback import feedback_of, held_controller
+from haselab.cli.model.feedback import feedback_of, read_controller
 from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -80,7 +80,7 @@ def command(
     """
     given, held = (kp, ki, kd, derivative_filter_s), None
     if model.suffix.lower() == ".toml" and all(value is None for value in given):
-        held = held_controller(model, kind)
+        held = read_controller(model, kind)
     loop = None if held is None else held.loop
     usual = (None, None) if loop is None else (loop.rate_hz, loop.measurement_delay_s)
     setting = LoopSetting(*loop_of(model, rate_hz, delay_s, usual))
@@ -88,8 +88,8 @@ def command(
     if any(value is not None for value in given):
         if kp is None or ki is None or kind is not None:
             raise click.UsageError(
-                "Give --kp and --ki, optionally with --kd and --derivative-filter-s, or none of "
-                "them: then --controller names a controller of the actuator file."
+                "Gains and a controller of the file cannot be combined. Give --kp and --ki "
+                "(and --kd and --derivative-filter-s if needed), or none of them."
             )
         gains = PidGains(*(value or 0.0 for value in given))
     elif held is not None:

@@ -12,7 +12,7 @@ from haselab.base import Estimate, InputError, ResultError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.model.model_file import read_origin
 from haselab.control import Design, Saturation
-from haselab.control.reach import reachable
+from haselab.control.reach import reachable_range
 from haselab.control.stability.plausible import PlausibleMargins
 from haselab.identify.transfer.fit import TransferFit
 from haselab.models.actuator import ActuatorTables
@@ -118,7 +118,7 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
         wanted = Saturation(typed.low, typed.high)
     if drive.voltage_map is None or ends_v == (None, None):
         return wanted
-    return reachable(wanted, drive.voltage_map.map(), *ends_v)
+    return reachable_range(wanted, drive.voltage_map.map(), *ends_v)
 
 
 def controller_section(

@@ -13,7 +13,7 @@ from haselab.cli.actuator_file import load_run
 from haselab.cli.model.feedback import feedback_of
 from haselab.cli.model.model_file import loop_of, read_any_plant, read_origin
 from haselab.control import DesignSpec, margins
-from haselab.control.plants.general import varied
+from haselab.control.plants.general import frequency_variants
 from haselab.models.actuator import ControllerSection
 from haselab.store.actuator_file import ACTUATOR
 
@@ -124,7 +124,7 @@ def _margins(held: ControllerSection, file: Path, loop: tuple[float, float]) -> 
     stated = [key for key in _STATED if key.startswith(_WORST) and key in held.margins]
     if not (stated and held.demands):
         return known
-    covered = varied(plant, DesignSpec.from_mapping(held.demands).frequency_spread)
+    covered = frequency_variants(plant, DesignSpec.from_mapping(held.demands).frequency_spread)
     every = [margins(p, feedback, loop_delay_s=delay_s, rate_hz=rate_hz) for p in covered]
     return known | {
         key: min(getattr(one, key.removeprefix(_WORST)) for one in every) for key in stated

@@ -13,7 +13,7 @@ from haselab.cli.common import answer_options, unverified_option, warn_unverifie
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import analyse_on_chip
-from haselab.cli.study.physical_model import identified
+from haselab.cli.study.physical_model import identify_physical_model
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.cli.study.study_run import mark_found, print_results, with_date
 from haselab.store.claim import refuse_linked_folders
@@ -66,7 +66,7 @@ def check_ends(session: SessionReader, path: Path) -> None:
 @click.argument("session", type=click.Path(path_type=Path))
 @answer_options(
     OutputRule("folder", own=_own_folder),
-    "A folder for the results. Default: the folder of SESSION.",
+    "It is a folder for the results. Default: the folder of SESSION.",
 )
 @shared_option(
     "--physical-model/--no-physical-model", default=False, show_default=True,
@@ -102,7 +102,7 @@ def command(
     found, study, header = analyse_session(session, unverified=unverified)
     model = None
     if physical_model:
-        model = identified(path, study, found, unverified=unverified)
+        model = identify_physical_model(path, study, found, unverified=unverified)
         found = model.joined(found)
     if study.is_reference:
         found = with_chip_rows(found, folder)

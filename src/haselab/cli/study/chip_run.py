@@ -10,7 +10,7 @@ from haselab.base import JsonObject
 from haselab.cli.bench.arming import Operator, armed_rig
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
-from haselab.cli.study.study_run import check_folder, kept_in, print_results
+from haselab.cli.study.study_run import check_folder, kept_data_note, print_results
 from haselab.rig.chip import ChipFile, opened_chip
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.safety.gate import Gate
@@ -84,7 +84,7 @@ def record_on_chip(
         try:
             found, header = run_on_chip(study, bench, chip, options, progress)
         except KeyboardInterrupt as stop:
-            stop.add_note(kept_in(folder))
+            stop.add_note(kept_data_note(folder))
             raise
         finally:
             bench.safe()

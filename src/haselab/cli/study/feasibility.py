@@ -16,11 +16,11 @@ from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import actuator_option, answer_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.cli.study.run import planned
+from haselab.cli.study.run import load_study_with_actuator
 from haselab.rig.rig_file import load_rig
 from haselab.safety.feasibility import Feasibility
 from haselab.store.folder import write_json
-from haselab.study.feasibility import judge_study, rated_rig
+from haselab.study.feasibility import check_study, rated_rig
 
 __all__ = ["command"]
 
@@ -40,7 +40,9 @@ def _page(found: Feasibility) -> str:
 @click.argument("study", type=click.Path(path_type=Path))
 @shared_option("--rig", required=True, type=click.Path(path_type=Path))
 @shared_option("--quick", is_flag=True, detail="The table [quick] of STUDY describes it.")
-@actuator_option("Uses its voltage of zero strain and its controller, as haselab run does.")
+@actuator_option(
+    "The command uses its voltage of zero strain and its controller, as haselab run does."
+)
 @answer_options(plot=True)
 def command(
     study: Path,
@@ -57,10 +59,10 @@ def command(
     of the bench. It does not connect to any instrument and applies no voltage. The exit code is 2
     if the bench cannot play the study. STUDY is a TOML file.
     """
-    plan = planned(study, actuator, quick=quick)
+    plan = load_study_with_actuator(study, actuator, quick=quick)
     if not quick:
         try:
-            planned(study, actuator, quick=True)
+            load_study_with_actuator(study, actuator, quick=True)
         except InputError as error:
             raise InputError(f"With the changes of [quick]: {error}") from None
     file = load_rig(rig)
@@ -70,7 +72,7 @@ def command(
             f"The rig file, of kind {file.kind!r}, has no table [rating]. Add one with the limits "
             f"of amplifier and actuator, or use a twin. {rig}"
         )
-    found = judge_study(plan, *rated)
+    found = check_study(plan, *rated)
     answer = {
         "feasible": found.ok,
         "checks": [asdict(check) | {"ok": check.ok} for check in found.checks],

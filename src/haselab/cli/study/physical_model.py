@@ -26,7 +26,7 @@ from haselab.study.known import known_values
 from haselab.study.pipeline import Findings
 from haselab.study.run import described
 
-__all__ = ["PhysicalModel", "identified"]
+__all__ = ["PhysicalModel", "identify_physical_model"]
 
 _DIFFERENCE = "S19.chirp_difference"
 
@@ -83,7 +83,7 @@ class PhysicalModel:
         )  # fmt: skip
 
 
-def identified(
+def identify_physical_model(
     session: Path, study: Study, found: Findings, *, unverified: bool = False
 ) -> PhysicalModel:
     """Identify the physical model of the actuator from the session of a study.

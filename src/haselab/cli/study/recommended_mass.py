@@ -10,7 +10,7 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import describe
 from haselab.safety.feasibility import Feasibility
 from haselab.study.definition import Study
-from haselab.study.feasibility import judge_study, rating_of_twin
+from haselab.study.feasibility import check_study, rating_of_twin
 from haselab.study.pipeline import Findings
 from haselab.study.simulated.truth import twin_of
 
@@ -70,4 +70,4 @@ def _largest(twin: TwinConfig, study: Study, refused_kg: float) -> float | None:
 def _judged(twin: TwinConfig, study: Study, mass_kg: float) -> Feasibility:
     load = twin.load.model_copy(update={"mass_kg": mass_kg})
     heavier = twin.model_copy(update={"load": load})
-    return judge_study(study, describe(heavier), rating_of_twin(heavier, study))
+    return check_study(study, describe(heavier), rating_of_twin(heavier, study))

@@ -35,9 +35,9 @@ from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
 from haselab.study.definition import Study, load_step_study, load_study
 from haselab.study.feasibility import check_settings
-from haselab.study.known import with_known
+from haselab.study.known import with_actuator_tables
 
-__all__ = ["command", "planned", "rig_file"]
+__all__ = ["command", "load_study_with_actuator", "rig_file"]
 
 
 def rig_file(path: Path) -> tuple[TwinConfig, int]:
@@ -113,7 +113,7 @@ def command(
         armed_by = operator if file.port is not None else None
         play_on_chip(trials, file, rig, out, keep_video, armed_by, as_json)
         return
-    plan = planned(study, actuator, quick=quick)
+    plan = load_study_with_actuator(study, actuator, quick=quick)
     if actuator is not None:
         warn_doubts(actuator)
     if isinstance(file, TwinFile):
@@ -156,8 +156,8 @@ def _rig(rig: Path | None, twin: Path | None, draw: int | None) -> tuple[RigFile
     return on_bench_of(file, twin, draw, rig), rig
 
 
-def planned(path: Path, actuator: Path | None, *, quick: bool) -> Study:
-    """Read a study, and add the content of an actuator file to it, see `with_known`.
+def load_study_with_actuator(path: Path, actuator: Path | None, *, quick: bool) -> Study:
+    """Read a study, and add the content of an actuator file to it, see `with_actuator_tables`.
 
     Args:
         path: of the study.
@@ -171,7 +171,7 @@ def planned(path: Path, actuator: Path | None, *, quick: bool) -> Study:
     study = load_study(path, quick=quick)
     if actuator is not None:
         try:
-            study = with_known(study, load_actuator(actuator))
+            study = with_actuator_tables(study, load_actuator(actuator))
         except InputError as error:
             raise InputError(f"{error} {actuator}") from None
     try:

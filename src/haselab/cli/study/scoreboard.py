@@ -59,7 +59,7 @@ _MOST_WORKERS = 256
     help="Use this many processes. Default: one for each processor.",
 )  # fmt: skip
 @answer_options(
-    OutputRule("folder"), "The folder of scoreboard.json and scoreboard.html.  [required]"
+    OutputRule("folder"), "It is a folder for scoreboard.json and scoreboard.html.  [required]"
 )
 def command(
     controllers: tuple[str, ...],

@@ -16,7 +16,7 @@ from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
 from haselab.cli.study.noise_free_run import NoiseFreeRun
-from haselab.cli.study.physical_model import identified
+from haselab.cli.study.physical_model import identify_physical_model
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig
@@ -42,7 +42,7 @@ __all__ = [
     "execute",
     "execute_on",
     "keep_video_option",
-    "kept_in",
+    "kept_data_note",
     "mark_found",
     "physical_model_option",
     "print_results",
@@ -50,7 +50,7 @@ __all__ = [
     "with_date",
 ]
 
-RUN_FOLDER = "A new folder for the recording and the results.  [required]"
+RUN_FOLDER = "It is a new folder for the recording and the results.  [required]"
 keep_video_option = shared_option(
     "--keep-video", type=click.Choice(["none", "sample", "all"]), default="sample",
     show_default=True, detail="sample: the first and the last second of each experiment.",
@@ -79,7 +79,7 @@ def twin_rig(config: TwinConfig, seed: int) -> Rig:
     return make_twin(config, seed)
 
 
-def kept_in(folder: Path) -> str:
+def kept_data_note(folder: Path) -> str:
     """The note of an interrupted run about its recording."""
     return f"The data recorded so far are kept in {folder}."
 
@@ -169,7 +169,7 @@ def _execute(
         model = None
         if physical_model:
             progress.advance(0.0, "physical model")
-            model = identified(folder, study, found)
+            model = identify_physical_model(folder, study, found)
             found = model.joined(found)
         if noise_free_run is not None:
             progress.advance(0.0, "noise-free reference run")
@@ -179,7 +179,7 @@ def _execute(
             for row, why in parallel.finish().items():
                 click.echo(f"haselab: {row} was left out: {why}", err=True)
     except KeyboardInterrupt as stop:
-        stop.add_note(kept_in(folder))
+        stop.add_note(kept_data_note(folder))
         raise
     finally:
         rig.safe()

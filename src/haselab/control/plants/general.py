@@ -16,7 +16,14 @@ from haselab.control.plants.modes import Modes
 from haselab.models.plant import Plant
 from haselab.models.rational import RationalModel
 
-__all__ = ["AnyPlant", "HeldModel", "PlantScale", "corners_of", "sampled_response_of", "varied"]
+__all__ = [
+    "AnyPlant",
+    "HeldModel",
+    "PlantScale",
+    "corners_of",
+    "frequency_variants",
+    "sampled_response_of",
+]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -151,7 +158,7 @@ def _slowed(plant: AnyPlant, factor: float) -> AnyPlant:
     return replace(plant, numerator=tuple(gain * t for t in top), denominator=bottom)
 
 
-def varied(plant: AnyPlant, spread: float) -> tuple[AnyPlant, ...]:
+def frequency_variants(plant: AnyPlant, spread: float) -> tuple[AnyPlant, ...]:
     """A plant, and with its frequencies lowered and raised.
 
     Args:

@@ -48,7 +48,7 @@ class WhiteNoise:
                 f"{std.max(initial=-np.inf):g}]; it must be one value, or one per loop, 0 or more."
             )
         if self.seed < 0:
-            raise InputError(f"seed = {self.seed}; must be 0 or more.")
+            raise InputError(f"seed = {self.seed}; it must be 0 or more.")
 
 
 @dataclass(frozen=True)

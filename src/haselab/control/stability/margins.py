@@ -195,9 +195,9 @@ def margins(
         (12.6039, 7.434)
     """
     if not 0.0 <= loop_delay_s < math.inf:
-        raise LimitError(f"loop delay = {loop_delay_s:g} s; must be 0 s or more.")
+        raise LimitError(f"loop delay = {loop_delay_s:g} s; it must be 0 s or more.")
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
-        raise LimitError(f"rate = {rate_hz:g} Hz; must be above 0 Hz, or none.")
+        raise LimitError(f"rate = {rate_hz:g} Hz; it must be above 0 Hz, or none.")
 
     def response(omega: ArrayLike) -> NDArray[np.complex128]:
         return loop_response(plant, gains, omega, loop_delay_s=loop_delay_s, rate_hz=rate_hz)

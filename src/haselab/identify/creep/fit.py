@@ -25,7 +25,7 @@ from haselab.identify.model_choice import APART, bic, effective_count, is_decisi
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.projection import Basis, Solution, minimise, project
 from haselab.identify.record import Record
-from haselab.identify.sampled.record import sampled
+from haselab.identify.sampled.record import single_record
 from haselab.models.creep import Creep
 
 __all__ = ["CreepFit", "fit_creep"]
@@ -173,7 +173,7 @@ class CreepFit(RecordFit[Record]):
         return self.model.simulate(u, rate_hz or self.setting.span.rate_hz)
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:
-        new = sampled(record)
+        new = single_record(record)
         moved = self.model.simulate(new.u - _rest(new), new.input_rate_hz)
         return new.y, moved + (new.y - moved).mean()
 
@@ -185,11 +185,11 @@ class CreepFit(RecordFit[Record]):
         time_s, output = np.arange(y.size) / span.rate_hz, (names or ("", "Output"))[1]
         return time_chart(f"Creep, {self.kind}", time_s, y, modelled, (output, "model"))
 
-    def forecast(self, later_s: float) -> Estimate:
-        """Output `later_s` after the record's end, the input held at its last value.
+    def forecast(self, after_s: float) -> Estimate:
+        """Output `after_s` after the record's end, the input held at its last value.
 
         Args:
-            later_s: time after the last sample, in s.
+            after_s: time after the last sample, in s.
         Returns:
             Output. Its interval covers the intervals of all laws that the data do not distinguish.
         Raises:
@@ -197,9 +197,9 @@ class CreepFit(RecordFit[Record]):
             InputError: a time that is not above 0 s.
         """
         self._present(self.candidates or None)
-        if not 0.0 < later_s < math.inf:
-            raise InputError(f"later_s = {later_s:g} s; must be above 0 s.")
-        entries = [_forecast(self.setting, candidate, later_s) for candidate in self.candidates]
+        if not 0.0 < after_s < math.inf:
+            raise InputError(f"after_s = {after_s:g} s; it must be above 0 s.")
+        entries = [_forecast(self.setting, candidate, after_s) for candidate in self.candidates]
         low = min(entry.ci95[0] for entry in entries)
         high = max(entry.ci95[1] for entry in entries)
         return Estimate(entries[0].value, entries[0].std, (low, high), "")
@@ -254,10 +254,10 @@ def fit_creep(
         >>> fit.verdict, low < 3.0 < high
         ('prony', True)
     """
-    record = sampled(records)
+    record = single_record(records)
     setting, stepped = _setting(record, leave_out_s)
     if model not in _KINDS:
-        raise InputError(f"model = {model}; must be one of {', '.join(_KINDS)}.")
+        raise InputError(f"model = {model}; it must be one of {', '.join(_KINDS)}.")
     drift = _drift_before(setting, rest_known=not stepped)
     if drift is not None:
         return _no_result(setting, drift)
@@ -290,9 +290,7 @@ def _rest(record: Record) -> float:
 def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
     inputs, outputs, rate_hz = record.u, record.y, record.input_rate_hz
     if not 0.0 <= leave_out_s < math.inf:
-        raise InputError(
-            f"leave_out_s is {leave_out_s:g} s, but must be 0 s or more. Correct the time."
-        )
+        raise InputError(f"leave_out_s is {leave_out_s:g} s, but it must be 0 s or more.")
     stepped = bool(np.ptp(inputs) == 0.0)
     rest = _rest(record)
     moved = inputs - rest
@@ -471,10 +469,10 @@ def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], 
     return ordered, rescaled(inner[np.ix_(at, at)], spread)
 
 
-def _forecast(setting: _Setting, entry: _Fitted, later_s: float) -> Estimate:
+def _forecast(setting: _Setting, entry: _Fitted, after_s: float) -> Estimate:
     """One law's output after the record, with the covariance of its parameters."""
     span = setting.span
-    more = max(1, round(later_s * span.rate_hz))
+    more = max(1, round(after_s * span.rate_hz))
     longer = Span(np.concatenate([span.inputs, np.full(more, span.inputs[-1])]), span.rate_hz)
     kept = np.zeros(longer.inputs.size, dtype=bool)
     kept[-1] = True

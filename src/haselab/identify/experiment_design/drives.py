@@ -52,9 +52,10 @@ class BenchLimits:
         positive = (self.slew_v_s, self.update_hz, self.largest_output)
         if not (self.low_v < self.high_v and min(positive) > 0.0):
             raise LimitError(
-                f"Window [{self.low_v:g}, {self.high_v:g}] V, {self.slew_v_s:g} V/s, "
-                f"{self.update_hz:g} Hz, output to {self.largest_output:g}; the window "
-                "must not be empty and the other limits must be above 0."
+                f"The limits of the bench are {self.low_v:g} to {self.high_v:g} V, "
+                f"{self.slew_v_s:g} V/s, {self.update_hz:g} Hz and an output of "
+                f"{self.largest_output:g}; the lower voltage must come first, and the other "
+                "limits must be above 0."
             )
 
     @classmethod
@@ -123,12 +124,12 @@ def candidate_drives(
     lowest_v = max(limits.low_v, 0.0)
     if not lowest_v <= baseline_v <= limits.high_v or baseline_v == 0.0:
         raise InputError(
-            f"baseline_v = {baseline_v:g} V; must be above 0 V and within "
+            f"baseline_v = {baseline_v:g} V; it must be above 0 V and within "
             f"[{lowest_v:g}, {limits.high_v:g}] V."
         )
     if not 10.0 <= duration_s * limits.update_hz <= 1e6:
         raise InputError(
-            f"duration_s = {duration_s:g} s at {limits.update_hz:g} Hz; must be 10 to a "
+            f"duration_s = {duration_s:g} s at {limits.update_hz:g} Hz; it must be 10 to a "
             "million updates."
         )
     families = _about_baseline(plant, limits, duration_s, baseline_v, goal)

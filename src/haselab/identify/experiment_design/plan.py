@@ -54,7 +54,7 @@ class Accuracy:
         if not (self.noise_std > 0.0 and self.samples_per_s > 0.0 and 0.0 <= self.systematic < 1.0):
             raise InputError(
                 f"noise_std = {self.noise_std:g}, samples_per_s = {self.samples_per_s:g}, "
-                f"systematic = {self.systematic:g}; must be above 0, above 0, and 0 to 1."
+                f"systematic = {self.systematic:g}; they must be above 0, above 0, and 0 to 1."
             )
 
 
@@ -188,7 +188,7 @@ def plan_experiment(
         'alternation'
     """
     if goal not in goals_of(plant):
-        raise InputError(f"goal = {goal}; must be one of {', '.join(goals_of(plant))}.")
+        raise InputError(f"goal = {goal}; it must be one of {', '.join(goals_of(plant))}.")
     accuracy = accuracy or Accuracy()
     drives = candidate_drives(plant, limits, duration_s, baseline_v, goal)
     if not drives:

@@ -54,13 +54,12 @@ class FreeTrial:
             object.__setattr__(self, name, finite_vector(name, getattr(self, name), 16))
         if self.x.size != self.time_s.size or not (np.diff(self.time_s) > 0.0).all():
             raise InputError(
-                f"x has {self.x.size} values and time_s {self.time_s.size}, or the times do not "
-                "rise. They must be equally long and the times must rise."
+                f"x has {self.x.size} values and time_s {self.time_s.size}; they must be equally "
+                "long, and the times must rise."
             )
         if np.ptp(self.x) == 0.0:
             raise InputError(
-                f"The motion is {self.x[0]:g} throughout; it must be one that moves. "
-                "Name the right column."
+                f"The motion is {self.x[0]:g} throughout; it must change. Name the right column."
             )
 
     def moving(self) -> FreeTrial:

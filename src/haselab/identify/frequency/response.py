@@ -19,7 +19,7 @@ from haselab.identify.frequency.local_models import Spectrum, local_response
 from haselab.identify.frequency.periodic import periodic_response
 from haselab.identify.frequency.welch import averaged_response
 from haselab.identify.record import Record
-from haselab.identify.sampled.record import driven
+from haselab.identify.sampled.record import single_driven_record
 from haselab.identify.transfer.layout import TransferStructure
 
 __all__ = ["RESPONSE_METHODS", "FrequencyResponse", "estimate_frequency_response"]
@@ -147,7 +147,7 @@ def estimate_frequency_response(
         True
     """
     _check_method(method, period_s, segment_s)
-    found = [driven(record) for record in several(records)]
+    found = [single_driven_record(record) for record in several(records)]
     rate_hz, held = _rate_hz(found), _is_held(found)
     pairs = [(each.u - each.u.mean(), each.y - each.y.mean()) for each in found]
     if method == "periodic" and period_s is not None:
@@ -173,7 +173,7 @@ def _status(limits: Sequence[float], outputs: Sequence[Floats]) -> str:
 
 def _check_method(method: str, period_s: float | None, segment_s: float | None) -> None:
     if method not in RESPONSE_METHODS:
-        raise InputError(f"method = {method}; must be one of {', '.join(RESPONSE_METHODS)}.")
+        raise InputError(f"method = {method}; it must be one of {', '.join(RESPONSE_METHODS)}.")
     if (period_s is not None) != (method == "periodic"):
         raise InputError(
             f"period_s = {period_s} with the method {method}; the method periodic requires a "

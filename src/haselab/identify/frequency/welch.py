@@ -83,7 +83,7 @@ def _size(pairs: Sequence[Pair], rate_hz: float, segment_s: float | None) -> int
     size = round(segment_s * rate_hz) if np.isfinite(segment_s) else 0
     if not _LEAST <= size <= shortest:
         raise InputError(
-            f"segment_s = {segment_s:g} s is {size} samples; must be {_LEAST} to {shortest}, "
+            f"segment_s = {segment_s:g} s is {size} samples; it must be {_LEAST} to {shortest}, "
             "the length of the shortest record."
         )
     return size

@@ -255,9 +255,9 @@ def _fitted(records: Sequence[LoopRecord], model: str, operators: int | None) ->
 
 def _check(model: str, operators: int | None) -> None:
     if model not in _KINDS:
-        raise InputError(f"model = {model}; must be one of {', '.join(_KINDS)}.")
+        raise InputError(f"model = {model}; it must be one of {', '.join(_KINDS)}.")
     if operators is not None and not 1 <= operators <= _MOST_OPERATORS:
-        raise InputError(f"operators = {operators}; must be 1 to {_MOST_OPERATORS}.")
+        raise InputError(f"operators = {operators}; it must be 1 to {_MOST_OPERATORS}.")
 
 
 def _describe(

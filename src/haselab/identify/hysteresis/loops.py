@@ -60,12 +60,12 @@ class LoopRecord:
             )
         if not 0.0 < self.rate_hz < math.inf:
             raise InputError(
-                f"rate_hz = {self.rate_hz:g} Hz; must be above 0 Hz. Give the sampling rate."
+                f"rate_hz = {self.rate_hz:g} Hz; it must be above 0 Hz. Give the sampling rate."
             )
         longest_s = (self.u.size - _LEAST_SAMPLES) / self.rate_hz
         if not 0.0 <= self.counted_from_s <= longest_s:
             raise InputError(
-                f"counted_from_s = {self.counted_from_s:g} s; must be 0 to {longest_s:g} s, "
+                f"counted_from_s = {self.counted_from_s:g} s; it must be 0 to {longest_s:g} s, "
                 f"which leaves {_LEAST_SAMPLES} samples."
             )
 

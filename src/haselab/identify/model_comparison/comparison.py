@@ -273,9 +273,9 @@ def _check(hypotheses: Sequence[Hypothesis], risk: float, unexplained: float) ->
     if len(hypotheses) < 2:
         raise InputError(f"{len(hypotheses)} hypotheses; at least two are required.")
     if not 0.0 < risk < 0.5:
-        raise InputError(f"risk = {risk:g}; must be above 0 and below 0.5.")
+        raise InputError(f"risk = {risk:g}; it must be above 0 and below 0.5.")
     if not 0.0 < unexplained <= 1.0:
-        raise InputError(f"unexplained = {unexplained:g}; must be above 0 and up to 1.")
+        raise InputError(f"unexplained = {unexplained:g}; it must be above 0 and up to 1.")
 
 
 def _no_result(reason: str, risk: float) -> ModelComparison:

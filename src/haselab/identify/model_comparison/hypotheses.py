@@ -234,4 +234,4 @@ def hypotheses_of(question: str, *, slew_v_s: float = math.inf) -> tuple[Hypothe
         return creep_hypotheses(slew_v_s=slew_v_s)
     if question == "modes":
         return mode_hypotheses(slew_v_s=slew_v_s)
-    raise InputError(f"question = {question}; must be one of {', '.join(QUESTIONS)}.")
+    raise InputError(f"question = {question}; it must be one of {', '.join(QUESTIONS)}.")

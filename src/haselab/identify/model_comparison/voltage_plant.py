@@ -78,9 +78,9 @@ class VoltageStructure:
 
     def __post_init__(self) -> None:
         if not 1 <= self.powers <= 4:
-            raise InputError(f"powers = {self.powers}; must be 1 to 4.")
+            raise InputError(f"powers = {self.powers}; it must be 1 to 4.")
         if not self.slew_v_s > 0.0:
-            raise InputError(f"slew_v_s = {self.slew_v_s:g} V/s; must be above 0 V/s.")
+            raise InputError(f"slew_v_s = {self.slew_v_s:g} V/s; it must be above 0 V/s.")
         low, high = self.lowest_rad_s or 1e-3, self.highest_rad_s or 1e6
         if not 0.0 < low < high:
             raise InputError(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from haselab.base import Estimate, InputError, checked
 from haselab.identify.fit import several
 from haselab.identify.noise import coloured_covariance, fit_percent
-from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
+from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, fitted_part, no_fit, remarks
 from haselab.identify.prediction import fitted_output
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import lags_of, means_before
@@ -126,7 +126,7 @@ class _Hammerstein:
 
     def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
         """Outputs simulated with a fit to the first three quarters."""
-        early = shortened(records)
+        early = fitted_part(records)
         if early is None:
             return None
         at = self.solution
@@ -188,7 +188,7 @@ def fit_hammerstein(
     records, structure = several(records), structure or TransferStructure()
     layout, kind = layout_of(structure), f"hammerstein-{degree}"
     if degree not in DEGREES:
-        raise InputError(f"degree = {degree}; must be 2 or 3.")
+        raise InputError(f"degree = {degree}; it must be 2 or 3.")
     levels = np.unique(np.concatenate([r.u for r in records]))
     if levels.size <= degree:
         return no_fit(

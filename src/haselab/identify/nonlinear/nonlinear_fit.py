@@ -23,7 +23,7 @@ from haselab.models import Plant
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 
-__all__ = ["Nonlinear", "NonlinearFit", "cut", "no_fit", "remarks", "shortened"]
+__all__ = ["Nonlinear", "NonlinearFit", "fitted_count", "fitted_part", "no_fit", "remarks"]
 
 Floats = NDArray[np.float64]
 _COLOURED = 0.05
@@ -87,12 +87,12 @@ class NonlinearFit(TransferFit):
     @cached_property
     def validation_errors(self) -> list[Floats] | None:
         """Errors of the simulation of the last quarter; None where the rest is too short."""
-        if self.model is None or any(cut(r) < 8 for r in self.records):
+        if self.model is None or any(fitted_count(r) < 8 for r in self.records):
             return None
         modelled = self.model.simulated_after(self.records)
         if modelled is None:
             return None
-        return [(r.y - m)[cut(r) :] for r, m in zip(self.records, modelled, strict=True)]
+        return [(r.y - m)[fitted_count(r) :] for r, m in zip(self.records, modelled, strict=True)]
 
     @cached_property
     def input_correlation_p(self) -> float:
@@ -175,16 +175,19 @@ class NonlinearFit(TransferFit):
         }
 
 
-def cut(record: Record) -> int:
+def fitted_count(record: Record) -> int:
     """Number of outputs before the held-out part."""
     return int((1.0 - _HELD_OUT) * record.y.size)
 
 
-def shortened(records: Sequence[Record]) -> list[Record] | None:
+def fitted_part(records: Sequence[Record]) -> list[Record] | None:
     """The records without the held-out part; None where the rest is too short."""
-    if any(cut(r) < 8 or np.ptp(r.y[: cut(r)]) == 0.0 for r in records):
+    if any(fitted_count(r) < 8 or np.ptp(r.y[: fitted_count(r)]) == 0.0 for r in records):
         return None
-    return [replace(r, y=r.y[: cut(r)], output_time_s=r.output_time_s[: cut(r)]) for r in records]
+    return [
+        replace(r, y=r.y[: fitted_count(r)], output_time_s=r.output_time_s[: fitted_count(r)])
+        for r in records
+    ]
 
 
 def remarks(whiteness_p: float, gain: Estimate) -> list[str]:

@@ -13,7 +13,7 @@ from haselab import _identify
 from haselab.base import Estimate, InputError, ResultError, checked
 from haselab.identify.fit import several
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
-from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, no_fit, remarks, shortened
+from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, fitted_part, no_fit, remarks
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import TransferStructure, layout_of
 from haselab.identify.transfer.problem import fine_input
@@ -197,7 +197,7 @@ class _Fitted:
 
     def simulated_after(self, records: Sequence[Record]) -> list[Floats] | None:
         """Outputs simulated with a fit to the first three quarters."""
-        early = shortened(records)
+        early = fitted_part(records)
         if early is None:
             return None
         end = _Search(self.model, early).minimise(self.numbers, self.bounds, _STEPS)
@@ -308,7 +308,7 @@ def _fit(
             "needs 2, 0 and 0. Fit one resonance."
         )
     if not powers or not set(powers) <= {2, 3}:
-        raise InputError(f"powers = {powers}; must be 2 or 3.")
+        raise InputError(f"powers = {powers}; it must be 2 or 3.")
     model = _Oscillator(structure, powers, spring)
     kind = model.kind
     layout, records = layout_of(structure), several(records)

@@ -41,27 +41,27 @@ from haselab.identify.physical.information import (
 )
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
 from haselab.identify.physical.misstated import misstated_std, scale_error
-from haselab.identify.physical.model_error import hidden_std, widened
-from haselab.identify.physical.plausible import implausible
+from haselab.identify.physical.model_error import hidden_std, widen_std
+from haselab.identify.physical.plausible import find_implausible
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
     channel_of,
+    channel_residuals,
     noise_of,
     notes_of,
     rms_of,
-    seen_of,
     status_of,
     typical_of,
     worst_of,
 )
 from haselab.identify.physical.rivals import (
     Rival,
-    other_elastic,
-    richer,
-    simpler,
-    with_every_effect,
+    compare_elastic_laws,
+    find_extended_law,
+    find_simpler_laws,
+    search_with_all_effects,
 )
-from haselab.identify.physical.search import Found, refine, search
+from haselab.identify.physical.search import SearchResult, refine, search
 from haselab.identify.physical.unknowns import (
     CAMERA_OFFSET,
     CAMERA_SCALE,
@@ -256,7 +256,7 @@ def fit_actuator(
     """
     if not records:
         raise InputError("There is no record of the actuator's motion. Give at least one.")
-    if fault := implausible(law, records):
+    if fault := find_implausible(law, records):
         return ActuatorFit(status=fault, kind=law.kind)
     if added_inertia_kg is None:
         added_inertia_kg = _USUAL_INERTIA * mass_kg
@@ -281,7 +281,7 @@ def fit_actuator(
         )
     rejected: list[Rival] = []
     if not found.converged:
-        found, rejected = with_every_effect(plain, start.without((CAMERA_SCALE,)), found)
+        found, rejected = search_with_all_effects(plain, start.without((CAMERA_SCALE,)), found)
     if rejected:
         start = start.with_law(found.unknowns.present_law(), found.unknowns.drifts)
     misfit, found = _weighed(
@@ -292,21 +292,21 @@ def fit_actuator(
         misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
     misfit, found, more = _with_effects(misfit, start, found)
     rejected += more
-    seen = seen_of(misfit, found)
+    seen = channel_residuals(misfit, found)
     if len(records) > 1 and seen.excess[0] > _APART and _each_alone(misfit, start):
         status = "the records contradict each other: the law explains each alone, but not all"
         status += " together. Check that all are of one actuator, and mass, units and gain of each"
         return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
-    others = other_elastic(misfit, found) if seen.explained else []
+    others = compare_elastic_laws(misfit, found) if seen.explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
     return _result(misfit, _ordered(found), rejected, preferred)
 
 
 def _with_effects(
-    misfit: Misfit, start: Unknowns, found: Found
-) -> tuple[Misfit, Found, list[Rival]]:
+    misfit: Misfit, start: Unknowns, found: SearchResult
+) -> tuple[Misfit, SearchResult, list[Rival]]:
     """Add effects that the law lacks, as long as the records prefer one decisively.
 
     Args:
@@ -318,7 +318,7 @@ def _with_effects(
     """
     rejected: list[Rival] = []
     for _ in range(_MOST_ADDED):
-        better = richer(misfit, found)
+        better = find_extended_law(misfit, found)
         if better is None:
             break
         again = refine(misfit, better.start, found.evaluations)
@@ -332,10 +332,10 @@ def _with_effects(
     return misfit, found, rejected
 
 
-def _explains(misfit: Misfit, before: Found, after: Found) -> bool:
+def _explains(misfit: Misfit, before: SearchResult, after: SearchResult) -> bool:
     """Whether an effect explains a part of a model error, and not only imitates a little of it."""
-    seen = seen_of(misfit, before)
-    left = seen_of(misfit, after).excess_energy
+    seen = channel_residuals(misfit, before)
+    left = channel_residuals(misfit, after).excess_energy
     return seen.explained or left < (1.0 - _EXPLAINS) * seen.excess_energy
 
 
@@ -343,10 +343,10 @@ def _each_alone(misfit: Misfit, start: Unknowns) -> bool:
     """Whether the law explains each record alone, with parameters of its own."""
     parts = [replace(misfit, records=[record]) for record in misfit.records]
     alone = [(own, search(own, start)) for own in parts]
-    return all(part is not None and seen_of(own, part).explained for own, part in alone)
+    return all(part is not None and channel_residuals(own, part).explained for own, part in alone)
 
 
-def _ordered(found: Found) -> Found:
+def _ordered(found: SearchResult) -> SearchResult:
     """Viscoelastic branches in the order of their relaxation times."""
     unknowns = found.unknowns
     keys = {about.name: about.key for about in unknowns.law.described()}
@@ -369,8 +369,8 @@ def _ordered(found: Found) -> Found:
 
 
 def _from_start(
-    misfit: Misfit, start: Unknowns, found: Found | None, *, explained: bool = False
-) -> Found | None:
+    misfit: Misfit, start: Unknowns, found: SearchResult | None, *, explained: bool = False
+) -> SearchResult | None:
     """Search again if the search did not converge, and return the better result.
 
     The noise is now that of the first result, so the first stages take smaller steps.
@@ -381,7 +381,7 @@ def _from_start(
         found: before; None: nothing.
         explained: search again also if the result leaves more than noise.
     """
-    left = found is not None and explained and not seen_of(misfit, found).explained
+    left = found is not None and explained and not channel_residuals(misfit, found).explained
     if found is not None and found.converged and not left:
         return found
     anew = search(misfit, start, 0 if found is None else found.evaluations)
@@ -390,7 +390,7 @@ def _from_start(
     return found
 
 
-def _weighed(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Misfit, Found]:
+def _weighed(misfit: Misfit, start: Unknowns, found: SearchResult) -> tuple[Misfit, SearchResult]:
     """Estimate the noise and the parameters in turn."""
     for _ in range(_ROUNDS):
         factors = _factors(misfit, found)
@@ -406,7 +406,7 @@ def _weighed(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Misfit, Fou
     return misfit, found
 
 
-def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
+def _factors(misfit: Misfit, found: SearchResult) -> tuple[float, float]:
     """True over stated standard deviation of both channels, by the residuals."""
     segments = misfit.segments
     share = 1.0 - found.unknowns.values.size / found.residuals.size
@@ -416,11 +416,11 @@ def _factors(misfit: Misfit, found: Found) -> tuple[float, float]:
 
 
 def _result(
-    misfit: Misfit, found: Found, rejected: Sequence[Rival], preferred: Sequence[Rival]
+    misfit: Misfit, found: SearchResult, rejected: Sequence[Rival], preferred: Sequence[Rival]
 ) -> ActuatorFit:
     unknowns = found.unknowns
     segments = misfit.segments
-    seen = seen_of(misfit, found)
+    seen = channel_residuals(misfit, found)
     lengths, capacitances = seen.lengths, seen.capacitances
     length_noise, capacitance_noise = noise_of(lengths), noise_of(capacitances)
     status, usable = status_of(
@@ -434,10 +434,10 @@ def _result(
     white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
     energy = seen.excess_energy if status != "ok" else 0.0
     if status != "ok":
-        covariance = widened(covariance, hidden_std(found.jacobian, energy, prior))
+        covariance = widen_std(covariance, hidden_std(found.jacobian, energy, prior))
     scale_std = float(np.sqrt(np.diag(covariance))[unknowns.names.index(SENSING_SCALE)])
     error = scale_error(unknowns.value(SENSING_SCALE), scale_std)
-    covariance = widened(covariance, misstated_std(misfit, found, error, prior))
+    covariance = widen_std(covariance, misstated_std(misfit, found, error, prior))
     std = np.sqrt(np.diag(covariance))
     widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
     described = {about.key: about for about in unknowns.law.described()}
@@ -502,7 +502,7 @@ def _result(
         },
         excess_variance=_excess_variance(covariance, white, ~weak),
         evaluations=found.evaluations,
-        rejected_laws=_each_once([*rejected, *simpler(found, values)]),
+        rejected_laws=_each_once([*rejected, *find_simpler_laws(found, values)]),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
 
@@ -533,7 +533,7 @@ def _each_once(rivals: Sequence[Rival]) -> tuple[Rival, ...]:
     return tuple(found.values())
 
 
-def _covariance(found: Found, segments: Sequence[Segment], prior: Floats) -> Floats:
+def _covariance(found: SearchResult, segments: Sequence[Segment], prior: Floats) -> Floats:
     """Of what varies."""
     return coloured_covariance(
         [found.jacobian[part.rows] for part in segments],

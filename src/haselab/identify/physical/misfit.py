@@ -32,11 +32,11 @@ __all__ = [
     "SESSION_OFFSET_M",
     "SHARED_PX",
     "Misfit",
-    "Modelled",
+    "ModelledRecord",
     "Segment",
     "SharedErrors",
     "least_explained",
-    "modelled",
+    "model_record",
 ]
 
 Floats = NDArray[np.float64]
@@ -48,7 +48,7 @@ _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the st
 
 
 @dataclass(frozen=True)
-class Modelled:
+class ModelledRecord:
     """What a model says of one record.
 
     Args:
@@ -64,14 +64,14 @@ class Modelled:
     capacitance_by: Floats
 
 
-def modelled(
+def model_record(
     unknowns: Unknowns,
     record: MotionRecord,
     *,
     derivatives: bool = True,
     strict: bool = False,
     longest_m: float = 0.0,
-) -> Modelled:
+) -> ModelledRecord:
     """Simulate a record.
 
     Args:
@@ -90,7 +90,9 @@ def modelled(
     added_kg = unknowns.value(ADDED_INERTIA)
     lightest_kg = float(record.drive.mass_kg.min()) + law.moving_mass_kg + added_kg
     if lightest_kg < _LIGHTEST * unknowns.mass_kg:
-        raise LimitError(f"{record.name}: {lightest_kg:g} kg move, too few to simulate.")
+        raise LimitError(
+            f"{record.name}: the moving mass of {lightest_kg:g} kg is too small to simulate."
+        )
     names = unknowns.law_names if derivatives else ()
     sampled = SampledLaw(
         law,
@@ -114,7 +116,7 @@ def modelled(
     length_m = shown * response.length_m + unknowns.value(CAMERA_OFFSET)
     if not derivatives:
         none = np.zeros((0, 0))
-        return Modelled(length_m, scale * inside, none, none)
+        return ModelledRecord(length_m, scale * inside, none, none)
     columns: dict[str, tuple[ArrayLike, ArrayLike]] = {
         CAMERA_LATENCY: (-shown * response.speed_m_s, 0.0),
         CAMERA_OFFSET: (1.0, 0.0),
@@ -135,7 +137,7 @@ def modelled(
         capacitance_by[:, k] = np.asarray(columns[name][1])
     length_by *= unknowns.slopes
     capacitance_by *= unknowns.slopes
-    return Modelled(length_m, scale * inside, length_by, capacitance_by)
+    return ModelledRecord(length_m, scale * inside, length_by, capacitance_by)
 
 
 def _highest_v(record: MotionRecord) -> float:
@@ -352,9 +354,9 @@ class Misfit:
             by.append(np.where(np.array(unknowns.names) == name, 1.0 / std, 0.0)[None])
         return self._weighed(found, unknowns), np.vstack(by)
 
-    def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[Modelled] | None:
-        def one(record: MotionRecord) -> Modelled:
-            return modelled(unknowns, record, derivatives=derivatives, strict=self.strict)
+    def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[ModelledRecord] | None:
+        def one(record: MotionRecord) -> ModelledRecord:
+            return model_record(unknowns, record, derivatives=derivatives, strict=self.strict)
 
         try:
             if len(self.records) == 1:
@@ -364,7 +366,7 @@ class Misfit:
         except HaselabError:
             return None
 
-    def _weighed(self, found: Sequence[Modelled], unknowns: Unknowns) -> Floats:
+    def _weighed(self, found: Sequence[ModelledRecord], unknowns: Unknowns) -> Floats:
         parts = []
         for part, record, shared in zip(found, self.records, self._shared, strict=True):
             std_m = self.length_factor * record.length_std_m

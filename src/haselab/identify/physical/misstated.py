@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.search import Found
+from haselab.identify.physical.search import SearchResult
 from haselab.identify.physical.unknowns import SENSING_SCALE
 
 __all__ = ["misstated_std", "scale_error"]
@@ -48,7 +48,7 @@ def scale_error(scale: float, std: float) -> float:
     return error if abs(error) > max(_CAREFUL, _SURE * std) else 0.0
 
 
-def misstated_std(misfit: Misfit, found: Found, error: float, prior: Floats) -> Floats:
+def misstated_std(misfit: Misfit, found: SearchResult, error: float, prior: Floats) -> Floats:
     """Standard deviations of what varies, for the error that the capacitances show.
 
     Args:

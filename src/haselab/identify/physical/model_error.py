@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from haselab.identify.physical.information import covariance_of
 
-__all__ = ["excess_energy", "hidden_std", "widened"]
+__all__ = ["excess_energy", "hidden_std", "widen_std"]
 
 Floats = NDArray[np.float64]
 _SINGULAR = 1e-12
@@ -57,7 +57,7 @@ def hidden_std(jacobian: Floats, excess: float, prior: Floats | None = None) -> 
     return std
 
 
-def widened(covariance: Floats, std: Floats) -> Floats:
+def widen_std(covariance: Floats, std: Floats) -> Floats:
     """Raise standard deviations to at least other ones.
 
     Args:

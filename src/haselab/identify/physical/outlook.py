@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from haselab.base import ResultError
 from haselab.identify.physical.information import RELATIVE, covariance_of
-from haselab.identify.physical.misfit import SharedErrors, modelled
+from haselab.identify.physical.misfit import SharedErrors, model_record
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import Unknowns
 
@@ -88,7 +88,7 @@ class Outlook:
         Raises:
             HaselabError: The actuator has no equilibrium, or leaves the limits of its law.
         """
-        found = modelled(self.unknowns, record, strict=True)
+        found = model_record(self.unknowns, record, strict=True)
         seen = replace(record, length_m=found.length_m)
         shared = SharedErrors.of(seen, record.length_std_m)
         rows = np.vstack(

@@ -11,7 +11,7 @@ from haselab.actuators import ActuatorLaw, equilibrium_m
 from haselab.base import LimitError
 from haselab.identify.physical.record import MotionRecord
 
-__all__ = ["implausible"]
+__all__ = ["find_implausible"]
 
 Floats = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ _UNSEEN = 0.01  # motion over the noise of a length
 _STILL = 20.0  # spread of the lengths over their noise, of an actuator that moves
 
 
-def implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
+def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
     """Say which unit or voltage of the records is wrong by orders of magnitude.
 
     Args:

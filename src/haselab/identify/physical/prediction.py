@@ -31,7 +31,7 @@ from haselab.identify.physical.misfit import (
     LENGTH,
     SESSION_OFFSET_M,
     SHARED_PX,
-    modelled,
+    model_record,
 )
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Unknowns
@@ -366,7 +366,7 @@ def predict_motion(
     _check_names(record, experiments)
     unknowns = model.unknowns
     try:
-        found = modelled(unknowns, record, strict=True, longest_m=longest_m)
+        found = model_record(unknowns, record, strict=True, longest_m=longest_m)
     except LimitError as error:
         raise ResultError(
             f"The model predicts no motion under this drive: {str(error).rstrip('.')}. Check "

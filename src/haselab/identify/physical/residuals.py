@@ -13,15 +13,15 @@ from haselab.identify.noise import whiteness_p
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment, least_explained
 from haselab.identify.physical.model_error import excess_energy
 from haselab.identify.physical.rivals import Rival
-from haselab.identify.physical.search import Found
+from haselab.identify.physical.search import SearchResult
 
 __all__ = [
-    "Seen",
+    "ChannelResiduals",
     "channel_of",
+    "channel_residuals",
     "noise_of",
     "notes_of",
     "rms_of",
-    "seen_of",
     "status_of",
     "typical_of",
     "worst_of",
@@ -63,7 +63,7 @@ def typical_of(parts: Sequence[Floats]) -> float:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ChannelResiduals:
     """Residuals of both channels, experiment by experiment."""
 
     lengths: list[Floats]
@@ -97,9 +97,9 @@ class Seen:
         return not (self.excess[0] > _SLIGHT and self.whiteness_p < _WHITE)
 
 
-def seen_of(misfit: Misfit, found: Found) -> Seen:
+def channel_residuals(misfit: Misfit, found: SearchResult) -> ChannelResiduals:
     """Residuals of a search."""
-    return Seen(
+    return ChannelResiduals(
         channel_of(misfit.segments, LENGTH, found.residuals),
         channel_of(misfit.segments, CAPACITANCE, found.residuals),
         least_explained(misfit, found.residuals),
@@ -107,7 +107,7 @@ def seen_of(misfit: Misfit, found: Found) -> Seen:
 
 
 def status_of(
-    seen: Seen,
+    seen: ChannelResiduals,
     scale: float,
     preferred: Sequence[Rival],
     *,

@@ -35,10 +35,18 @@ from haselab.actuators import (
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.physical.information import vague_information
 from haselab.identify.physical.misfit import Misfit
-from haselab.identify.physical.search import Found, refine, search
+from haselab.identify.physical.search import SearchResult, refine, search
 from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Unknowns
 
-__all__ = ["DECISIVE", "Richer", "Rival", "other_elastic", "richer", "simpler", "with_every_effect"]
+__all__ = [
+    "DECISIVE",
+    "ExtendedLaw",
+    "Rival",
+    "compare_elastic_laws",
+    "find_extended_law",
+    "find_simpler_laws",
+    "search_with_all_effects",
+]
 
 Floats = NDArray[np.float64]
 DECISIVE = 5.0  # logarithm of evidence: 150 to 1
@@ -71,7 +79,7 @@ class Rival:
     log_evidence: float
 
 
-def other_elastic(misfit: Misfit, found: Found) -> list[Rival]:
+def compare_elastic_laws(misfit: Misfit, found: SearchResult) -> list[Rival]:
     """Compare laws of another elastic energy, each fitted to the records.
 
     Args:
@@ -93,7 +101,7 @@ def other_elastic(misfit: Misfit, found: Found) -> list[Rival]:
 
 
 @dataclass(frozen=True)
-class Richer:
+class ExtendedLaw:
     """A law with one effect more that the records prefer.
 
     Args:
@@ -107,7 +115,7 @@ class Richer:
     log_evidence: float
 
 
-def simpler(found: Found, covariance: Floats) -> list[Rival]:
+def find_simpler_laws(found: SearchResult, covariance: Floats) -> list[Rival]:
     """Laws without one of the effects that the records show decisively.
 
     Args:
@@ -145,7 +153,7 @@ def _log_evidence(size: float, std: float, parameters: int, count: int) -> float
     return float(0.5 * (size / std) ** 2 - 0.5 * parameters * math.log(count))
 
 
-def richer(misfit: Misfit, found: Found) -> Richer | None:
+def find_extended_law(misfit: Misfit, found: SearchResult) -> ExtendedLaw | None:
     """The law with one effect more that the records prefer most, if any decisively.
 
     Args:
@@ -154,7 +162,7 @@ def richer(misfit: Misfit, found: Found) -> Richer | None:
     Returns:
         That law; None if there is none.
     """
-    best: Richer | None = None
+    best: ExtendedLaw | None = None
     candidates = _candidates(found.unknowns, _duration_s(misfit))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         columns_of = list(pool.map(lambda more: _column(misfit, found, more), candidates))
@@ -175,7 +183,7 @@ def richer(misfit: Misfit, found: Found) -> Richer | None:
         evidence = _log_evidence(size, std, 2, rest.size)
         possible = size > 0.0 or more.name in DRIFTS
         if possible and evidence > (DECISIVE if best is None else best.log_evidence):
-            best = Richer(more.sized(size, found.unknowns), more.effect, evidence)
+            best = ExtendedLaw(more.sized(size, found.unknowns), more.effect, evidence)
     return best
 
 
@@ -183,7 +191,9 @@ def _duration_s(misfit: Misfit) -> float:
     return max(float(np.ptp(record.drive.edge_s)) for record in misfit.records)
 
 
-def with_every_effect(misfit: Misfit, start: Unknowns, found: Found) -> tuple[Found, list[Rival]]:
+def search_with_all_effects(
+    misfit: Misfit, start: Unknowns, found: SearchResult
+) -> tuple[SearchResult, list[Rival]]:
     """Search again with a little of every effect that the law lacks, and keep those that matter.
 
     Without an effect that there is, the search may leave the law's parameters far away, where no
@@ -309,7 +319,7 @@ def _candidates(unknowns: Unknowns, duration_s: float) -> list[_Candidate]:
     return found
 
 
-def _column(misfit: Misfit, found: Found, more: _Candidate) -> Floats | None:
+def _column(misfit: Misfit, found: SearchResult, more: _Candidate) -> Floats | None:
     """Derivative of the modelled, over the standard deviations, by the size of an effect."""
     present = found.unknowns
     beside = [*more.drifts, *INSTRUMENTS, START_HYSTERESIS]

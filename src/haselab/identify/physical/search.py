@@ -14,7 +14,7 @@ from haselab.identify.physical.information import vague_information
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.unknowns import Unknowns
 
-__all__ = ["Found", "refine", "search"]
+__all__ = ["SearchResult", "refine", "search"]
 
 Floats = NDArray[np.float64]
 _STAGES = 4  # before the last one; in each, the noise is assumed a tenth of that before
@@ -36,7 +36,7 @@ _DONE = 1e-2  # the same of the last one, in the mean square of the residuals
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """Result of a search.
 
     Args:
@@ -57,7 +57,7 @@ class Found:
     evaluations: int
 
 
-def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | None:
+def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> SearchResult | None:
     """Minimise the misfit: first smoothly near the start, then by the data alone.
 
     A path of growing confidence in the data: in each stage the noise is assumed ten times smaller,
@@ -86,14 +86,14 @@ def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | Non
         now, used = _descend(misfit, now, start, noise, _STEPS)
         count += used
         if float(np.mean(now.residuals**2)) > noise**2:  # a law that lacks something ends here
-            return Found(
+            return SearchResult(
                 now.unknowns, now.residuals, now.jacobian, 0.0 * now.unknowns.values, False,
                 evaluations + count,
             )  # fmt: skip
     return _last_stage(misfit, now, start, evaluations + count)
 
 
-def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | None:
+def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> SearchResult | None:
     """Minimise the misfit from near its minimum.
 
     Args:
@@ -109,7 +109,7 @@ def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> Found | Non
     return _last_stage(misfit, _State(start, *first), start, evaluations + 1)
 
 
-def _last_stage(misfit: Misfit, now: _State, start: Unknowns, evaluations: int) -> Found:
+def _last_stage(misfit: Misfit, now: _State, start: Unknowns, evaluations: int) -> SearchResult:
     now, used = _descend(misfit, now, start, 1.0, _LAST_STEPS, last=True)
     pull = np.sqrt(vague_information(now.unknowns))
     columns = np.vstack([now.jacobian, np.diag(pull)])
@@ -121,7 +121,7 @@ def _last_stage(misfit: Misfit, now: _State, start: Unknowns, evaluations: int) 
     )
     expected = float(np.sum((columns @ (left / scale)) ** 2))
     usual = float(np.mean(now.residuals**2))
-    return Found(
+    return SearchResult(
         now.unknowns, now.residuals, now.jacobian, left / scale,
         expected < _NEAR * max(1.0, usual), evaluations + used,
     )  # fmt: skip

@@ -16,7 +16,12 @@ from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit
 from haselab.identify.noise import fit_percent, whiteness_p
 from haselab.identify.record import Record, finite_vector
-from haselab.identify.sampled.record import check_same_rate, driven, sampled, sampled_chart
+from haselab.identify.sampled.record import (
+    check_same_rate,
+    sampled_chart,
+    single_driven_record,
+    single_record,
+)
 from haselab.models import ArxModel
 from haselab.models.filters import lfilter
 
@@ -52,7 +57,7 @@ class ArxOrders:
         for name, least in (("na", 0), ("nb", 1), ("nk", 0)):
             value, most = getattr(self, name), _MOST[name]
             if not least <= value <= most:
-                raise InputError(f"{name} = {value}; must be {least} to {most}.")
+                raise InputError(f"{name} = {value}; it must be {least} to {most}.")
 
     @property
     def memory(self) -> int:
@@ -169,7 +174,7 @@ class ArxFit(RecordFit[Record]):
         return model.simulate(inputs - self.operating_point[0]) + self.operating_point[1]
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:
-        model, new = self._fitted(), sampled(record)
+        model, new = self._fitted(), single_record(record)
         check_same_rate(new.input_rate_hz, model.rate_hz)
         if not model.is_stable:
             raise ResultError(f"The equation is unstable and cannot be simulated: {self.notes[0]}")
@@ -249,8 +254,8 @@ def fit_arx(
         True
     """
     if criterion not in _CRITERIA:
-        raise InputError(f"criterion = {criterion}; must be one of {', '.join(_CRITERIA)}.")
-    record = driven(records)
+        raise InputError(f"criterion = {criterion}; it must be one of {', '.join(_CRITERIA)}.")
+    record = single_driven_record(records)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
     if orders is None:

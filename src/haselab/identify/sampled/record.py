@@ -13,13 +13,13 @@ from haselab.identify.charts import time_chart
 from haselab.identify.fit import several
 from haselab.identify.record import Record
 
-__all__ = ["check_same_rate", "driven", "sampled", "sampled_chart"]
+__all__ = ["check_same_rate", "sampled_chart", "single_driven_record", "single_record"]
 
 Floats = NDArray[np.float64]
 _OFF = 1e-3  # of a sample: times as far off count as another clock
 
 
-def sampled(records: Record | Sequence[Record]) -> Record:
+def single_record(records: Record | Sequence[Record]) -> Record:
     """The one record that a sampled model is fitted to or compared with.
 
     Args:
@@ -46,7 +46,7 @@ def sampled(records: Record | Sequence[Record]) -> Record:
     return record
 
 
-def driven(records: Record | Sequence[Record]) -> Record:
+def single_driven_record(records: Record | Sequence[Record]) -> Record:
     """The same, where the input must change within the record.
 
     Args:
@@ -54,9 +54,9 @@ def driven(records: Record | Sequence[Record]) -> Record:
     Returns:
         The record.
     Raises:
-        InputError: as `sampled`, or a constant input.
+        InputError: as `single_record`, or a constant input.
     """
-    record = sampled(records)
+    record = single_record(records)
     if np.ptp(record.u) == 0.0:
         raise InputError(
             f"The input is {record.u[0]:g} throughout, so it excites nothing. It "

@@ -15,7 +15,12 @@ from haselab.base.chart import Chart
 from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
 from haselab.identify.record import Record, finite_vector
-from haselab.identify.sampled.record import check_same_rate, driven, sampled, sampled_chart
+from haselab.identify.sampled.record import (
+    check_same_rate,
+    sampled_chart,
+    single_driven_record,
+    single_record,
+)
 from haselab.models import StateSpaceModel
 from haselab.models.filters import lfilter
 
@@ -78,7 +83,7 @@ class SubspaceFit(RecordFit[Record]):
         return self.plant.simulate(inputs - self.operating_point[0]) + self.operating_point[1]
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:
-        new = sampled(record)
+        new = single_record(record)
         check_same_rate(new.input_rate_hz, self.plant.rate_hz)
         inputs = new.u - self.operating_point[0]
         free = np.column_stack([self.plant.responses(inputs)[1], np.ones(inputs.size)])
@@ -147,7 +152,7 @@ def fit_subspace(
         >>> np.round(np.poly(fit.plant.a), 6).tolist()
         [1.0, -1.2, 0.5]
     """
-    record = driven(records)
+    record = single_driven_record(records)
     _check(record, order, block_rows)
     if bootstrap < 0:
         raise InputError(f"bootstrap is {bootstrap}; it must be 0 or more replicates.")
@@ -194,12 +199,12 @@ def _check(record: Record, order: int | None, block_rows: int) -> None:
     least = 8 * block_rows
     if block_rows < 2 or record.u.size < least:
         raise InputError(
-            f"block_rows = {block_rows} for {record.u.size} samples; must be 2 or more, and "
+            f"block_rows = {block_rows} for {record.u.size} samples; it must be 2 or more, and "
             f"with {least} samples or more. Lower block_rows, or record longer."
         )
     if order is not None and not 1 <= order < min(block_rows, _MOST_ORDER + 1):
         raise InputError(
-            f"order = {order}; must be 1 to {min(block_rows - 1, _MOST_ORDER)}. "
+            f"order = {order}; it must be 1 to {min(block_rows - 1, _MOST_ORDER)}. "
             "Lower the order, or raise block_rows."
         )
 
@@ -231,8 +236,8 @@ def _model(u: Floats, y: Floats, space: Floats, rate_hz: float) -> tuple[StateSp
     a = np.asarray(shift, dtype=np.float64)
     size = a.shape[0]
     frame = StateSpaceModel(a, np.zeros(size), space[0], 0.0, rate_hz)
-    driven, free = frame.responses(u)
-    columns = np.column_stack([driven, u, free])
+    single_driven_record, free = frame.responses(u)
+    columns = np.column_stack([single_driven_record, u, free])
     if not np.isfinite(columns).all():
         return frame, np.zeros(y.size)
     scale = np.sqrt((columns**2).sum(axis=0))

@@ -13,7 +13,7 @@ from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, rescaled
 from haselab.identify.noise import autoregression, coloured_covariance, r_squared
-from haselab.identify.statics.columns import paired, plausible_strain
+from haselab.identify.statics.columns import check_pair, plausible_strain
 from haselab.identify.statics.cycles import loop_cells, rising_edges, trend
 from haselab.models.filters import lfilter
 from haselab.models.maps import LinearMap
@@ -138,7 +138,7 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
 def _checked(
     relative_capacitance: ArrayLike, strain: ArrayLike
 ) -> tuple[Floats, Floats, tuple[str, ...]]:
-    c, e = paired(
+    c, e = check_pair(
         "relative_capacitance", relative_capacitance, "strain", strain, least=8,
         record="record a triangle test",
     )  # fmt: skip

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.identify.record import finite_vector
 
-__all__ = ["paired", "plausible_strain", "plausible_stretch", "plausible_voltage"]
+__all__ = ["check_pair", "plausible_strain", "plausible_stretch", "plausible_voltage"]
 
 Floats = NDArray[np.float64]
 _LONGEST = 30.0  # stretch: above the break of any elastomer
@@ -20,7 +20,7 @@ _HIGHEST_V = 1e5
 _KILOVOLTS_V = 20.0  # span below which volts of an amplifier's output could be kilovolts
 
 
-def paired(
+def check_pair(
     first: str, one: object, second: str, two: object, *, least: int, record: str
 ) -> tuple[Floats, Floats]:
     """Check two columns: finite, equally long, neither constant.
@@ -65,7 +65,7 @@ def plausible_stretch(stretch: Floats, other: str, values: Floats) -> None:
     low, high = float(stretch.min()), float(stretch.max())
     if low > 0.0 and high <= _LONGEST:
         return
-    got = f"stretch lies in [{low:g}, {high:g}]; must be above 0 and at most {_LONGEST:g}"
+    got = f"stretch lies in [{low:g}, {high:g}]; it must be above 0 and at most {_LONGEST:g}"
     beside = float(values.min()) > 0.5 and 1.0 < float(values.max()) <= _LONGEST
     swapped = f"{other} looks like stretch. Are the two columns swapped?"
     if high > _LONGEST:
@@ -96,11 +96,11 @@ def plausible_strain(strain: Floats, other: str, values: Floats) -> tuple[str, .
     hint = f"{other} looks like strain. Are the two columns swapped?"
     if size > _LARGEST_STRAIN:
         raise InputError(
-            f"strain reaches {size:g}; must be at most {_LARGEST_STRAIN:g} (1 is twice the "
+            f"strain reaches {size:g}; it must be at most {_LARGEST_STRAIN:g} (1 is twice the "
             f"length). {hint if fits else 'If it is in per cent, divide it by 100.'}"
         )
     raise InputError(
-        f"strain spans {span:g}; must be at least {_SMALLEST_STRAIN:g}. "
+        f"strain spans {span:g}; it must be at least {_SMALLEST_STRAIN:g}. "
         f"{hint if fits else 'Name the right column.'}"
     )
 
@@ -118,7 +118,7 @@ def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:
     size = float(np.abs(voltage_v).max())
     if size > _HIGHEST_V:
         raise InputError(
-            f"voltage_v reaches {size:g} V; must be at most {_HIGHEST_V:g} V. "
+            f"voltage_v reaches {size:g} V; it must be at most {_HIGHEST_V:g} V. "
             "Give volts, or name the right column."
         )
     if size < _KILOVOLTS_V:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import InputError, JsonObject, LimitError, check_fields, checked
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import CurveFit
-from haselab.identify.statics.columns import paired, plausible_stretch
+from haselab.identify.statics.columns import check_pair, plausible_stretch
 from haselab.identify.statics.hyperelastic_search import (
     ELECTRODE_NAMES,
     Candidate,
@@ -57,7 +57,7 @@ class TensileTest:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        x, y = paired(
+        x, y = check_pair(
             "stretch", self.stretch, "nominal_stress_pa", self.nominal_stress_pa,
             least=_LEAST_SAMPLES, record="record a tensile test",
         )  # fmt: skip
@@ -323,7 +323,7 @@ def fit_hyperelastic_tests(
     if not tests:
         raise InputError("No test was given. Pass at least one TensileTest.")
     if model != "auto" and model not in LAWS:
-        raise InputError(f"model = {model}; must be one of auto, {', '.join(LAWS)}.")
+        raise InputError(f"model = {model}; it must be one of auto, {', '.join(LAWS)}.")
     if electrode_stiffening and electrode_natural is None:
         raise InputError(
             "electrode_stiffening needs electrode_natural, the stretch at which the electrodes are "

@@ -15,7 +15,7 @@ from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit
 from haselab.identify.independent import independent_share
 from haselab.identify.noise import r_squared
-from haselab.identify.statics.columns import paired
+from haselab.identify.statics.columns import check_pair
 from haselab.identify.statics.cycles import loop_width, trend
 from haselab.models import SplineMap
 
@@ -155,7 +155,7 @@ def fit_map(x: ArrayLike, y: ArrayLike, *, monotone: bool = False) -> MapFit:
         >>> bool(abs(fit.map.inverse(np.tanh(1.5)) - 0.5) < 4.0 * fit.inverse_std(np.tanh(1.5)))
         True
     """
-    x, y = paired("x", x, "y", y, least=_LEAST_SAMPLES, record="record a sweep of it")
+    x, y = check_pair("x", x, "y", y, least=_LEAST_SAMPLES, record="record a sweep of it")
     distinct = np.unique(x).size
     pieces = max(_LEAST_PIECES, min(_MOST_PIECES, distinct // _SAMPLES_A_PIECE))
     sign = trend(x, y)

@@ -17,7 +17,7 @@ from haselab.identify.independent import independent_share, spread_of, student_e
 from haselab.identify.noise import r_squared
 from haselab.identify.projection import Basis, Solution, minimise, project
 from haselab.identify.statics.broken_line import BreakGrid, best_breaks
-from haselab.identify.statics.columns import paired, plausible_stretch
+from haselab.identify.statics.columns import check_pair, plausible_stretch
 
 __all__ = ["Region", "RegionsFit", "find_regions"]
 
@@ -164,14 +164,14 @@ def find_regions(stretch: ArrayLike, load_n: ArrayLike, segments: int | None = N
 
 
 def _checked(stretch: ArrayLike, load_n: ArrayLike, segments: int | None) -> tuple[Floats, Floats]:
-    x, y = paired(
+    x, y = check_pair(
         "stretch", stretch, "load_n", load_n, least=2 * _LEAST_SAMPLES, record="record more loads"
     )
     plausible_stretch(x, "load_n", y)
     most = x.size // _LEAST_SAMPLES
     if segments is not None and not 1 <= segments <= most:
         raise InputError(
-            f"segments = {segments}; must be 1 to {most}, a third of the {x.size} samples. "
+            f"segments = {segments}; it must be 1 to {most}, a third of the {x.size} samples. "
             "Fit fewer segments, or record more loads."
         )
     order = np.argsort(x, kind="stable")

@@ -14,7 +14,7 @@ from haselab.identify.charts import curve_chart
 from haselab.identify.fit import CurveFit, propagated
 from haselab.identify.noise import coloured_covariance, r_squared
 from haselab.identify.projection import Solution
-from haselab.identify.statics.columns import paired, plausible_strain, plausible_voltage
+from haselab.identify.statics.columns import check_pair, plausible_strain, plausible_voltage
 from haselab.identify.statics.cycles import loop_width, trend
 from haselab.identify.statics.exponentials import (
     coefficients,
@@ -191,7 +191,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
 
 def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats, tuple[str, ...]]:
     """Check both columns; return a note where the voltage may be in kilovolts."""
-    e, v = paired(
+    e, v = check_pair(
         "strain", strain, "voltage_v", voltage_v, least=8, record="record a triangle test"
     )
     return e, v, (*plausible_strain(e, "voltage_v", v), *plausible_voltage(v))

@@ -58,7 +58,7 @@ def bootstrap_transfer(
     """
     if draws < _LEAST:
         raise InputError(
-            f"draws = {draws}; must be {_LEAST} or more, for the ends of a 95 % interval."
+            f"draws = {draws}; it must be {_LEAST} or more, for the ends of a 95 % interval."
         )
     if fit.best is None:
         raise ResultError(f"The fit has no result: {fit.status}")

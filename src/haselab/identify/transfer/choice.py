@@ -135,7 +135,9 @@ def choose_transfer(
     allowed = (*_VARIED, _NONLINEAR)
     unknown = sorted(set(varied) - set(allowed))
     if unknown:
-        raise InputError(f"varied names {', '.join(unknown)}; must be one of {', '.join(allowed)}.")
+        raise InputError(
+            f"varied names {', '.join(unknown)}; they must be among {', '.join(allowed)}."
+        )
     records = several(records)
     first = start or TransferStructure()
     search = _Search(records, first)

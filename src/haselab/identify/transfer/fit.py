@@ -21,7 +21,7 @@ from haselab.identify.prediction import fitted_output, predict
 from haselab.identify.record import Record, finite_vector
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.checks.ambiguity import OtherMinimum, ambiguity, find_other_minima
-from haselab.identify.transfer.checks.diagnosis import diagnosed
+from haselab.identify.transfer.checks.diagnosis import diagnose
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer.parameters import (
     covariance_table,
@@ -31,7 +31,7 @@ from haselab.identify.transfer.parameters import (
     zeros_of,
 )
 from haselab.identify.transfer.problem import LEAST_GAIN, TransferProblem
-from haselab.identify.transfer.profile import profiled
+from haselab.identify.transfer.profile import profile_std
 from haselab.identify.transfer.search import Best, best_fit, has_line
 from haselab.identify.transfer.start import delay_margin_s
 from haselab.models import Plant, SlowMode
@@ -343,7 +343,7 @@ def _fit(
         tried += [] if search is None else [search]
     if not tried:
         return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
-    found = diagnosed(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
+    found = diagnose(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
     fit = _describe(layout, found.best)
     if found.fault is not None:
         fit = replace(fit, status=found.fault, ambiguous=False)
@@ -432,7 +432,7 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
             layout, "the output does not respond to the input; check the columns and the sensor"
         )
     size = found.search.size
-    factors, better = profiled(layout, best, np.sqrt(np.maximum(np.diag(inner)[:size], 0.0)))
+    factors, better = profile_std(layout, best, np.sqrt(np.maximum(np.diag(inner)[:size], 0.0)))
     if better is not None and rounds and not has_line(layout, better.found.search):
         return _describe(layout, better, rounds - 1)
     if better is not None:  # a nearly undamped pair fits noise as well as a resonance does

@@ -50,19 +50,19 @@ class TransferStructure:
         check_fields(self)
         if not 1 <= self.poles <= _MAX_POLES:
             raise InputError(
-                f"poles = {self.poles}; must be 1 to {_MAX_POLES}. Two form one resonance."
+                f"poles = {self.poles}; it must be 1 to {_MAX_POLES}. Two form one resonance."
             )
         if not 0 <= self.zeros <= self.poles:
             raise InputError(
-                f"zeros = {self.zeros}; must be 0 to {self.poles}, at most as many as poles. "
+                f"zeros = {self.zeros}; it must be 0 to {self.poles}, at most as many as poles. "
                 "Lower the zeros or add a pole."
             )
         if not 0 <= self.slow_modes <= 3:
-            raise InputError(f"slow_modes = {self.slow_modes}; must be 0 to 3.")
+            raise InputError(f"slow_modes = {self.slow_modes}; it must be 0 to 3.")
         known_delay = isinstance(self.delay, (int, float)) and 0.0 <= self.delay < math.inf
         if self.delay != "auto" and not known_delay:
             raise InputError(
-                f"delay = {self.delay}; must be auto or a finite number of seconds, 0 or above. "
+                f"delay = {self.delay}; it must be auto or a finite number of seconds, 0 or above. "
                 "Give auto to estimate it."
             )
 
@@ -168,8 +168,8 @@ def layout_of(structure: TransferStructure) -> Layout:
     unknown = sorted(set(fixed) - set(names) - set(factors))
     if unknown:
         raise InputError(
-            f"fixed names {', '.join(unknown)}; must be one of {', '.join([*names, *factors])}. "
-            "Correct the name."
+            f"fixed names {', '.join(unknown)}; the names must be among "
+            f"{', '.join([*names, *factors])}."
         )
     template = np.array([_inner(name, fixed.get(name)) for name in names])
     factor_template = np.array([fixed.get(name, math.nan) for name in factors])
@@ -185,5 +185,5 @@ def _inner(name: str, value: float | None) -> float:
     if name == "delay_s":
         return float(value)
     if not value > 0.0:
-        raise InputError(f"fixed {name} = {value:g}; must be above 0.")
+        raise InputError(f"fixed {name} = {value:g}; it must be above 0.")
     return math.log(value)

@@ -13,7 +13,7 @@ from haselab.base import InputError, checked
 from haselab.identify.model_choice import APART
 from haselab.identify.noise import fit_percent
 from haselab.identify.nonlinear.hammerstein import DEGREES, fit_hammerstein
-from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, cut, no_fit, shortened
+from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, fitted_count, fitted_part, no_fit
 from haselab.identify.nonlinear.oscillator import fit_duffing, fit_output_curve
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.clipping import richer_fits
@@ -55,7 +55,7 @@ def fit_nonlinear(
         InputError: an unknown kind, or a structure that the model does not support.
     """
     if kind not in NONLINEAR:
-        raise InputError(f"nonlinear = {kind}; must be one of {', '.join(NONLINEAR)}.")
+        raise InputError(f"nonlinear = {kind}; it must be one of {', '.join(NONLINEAR)}.")
     family, _, which = kind.partition("-")
     if family == "hammerstein":
         return fit_hammerstein(records, structure, int(which))
@@ -152,7 +152,7 @@ def _held_out_errors(fit: TransferFit) -> list[Floats] | None:
     if fit.best is None:
         return None
     records = fit.records
-    early = shortened(records)
+    early = fitted_part(records)
     if early is None:
         return None
     layout = layout_of(fit.structure)
@@ -161,4 +161,4 @@ def _held_out_errors(fit: TransferFit) -> list[Floats] | None:
         fit.best.found.search, fit.best.bounds, gain=1e-7
     )
     modelled = TransferProblem(layout, records, margin_s).predict(found)
-    return [(r.y - m)[cut(r) :] for r, m in zip(records, modelled, strict=True)]
+    return [(r.y - m)[fitted_count(r) :] for r, m in zip(records, modelled, strict=True)]

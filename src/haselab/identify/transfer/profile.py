@@ -13,7 +13,7 @@ from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import Best, settled
 from haselab.identify.transfer.start import delay_margin_s
 
-__all__ = ["profiled"]
+__all__ = ["profile_std"]
 
 Floats = NDArray[np.float64]
 _NARROW = 0.01  # relative standard deviation, or phase, below which the parabola is assumed
@@ -24,7 +24,7 @@ _LESS = 1e-5  # relative decrease of the cost that counts as a better solution
 _GAIN = 1e-7
 
 
-def profiled(layout: Layout, best: Best, std: Floats) -> tuple[Floats, Best | None]:
+def profile_std(layout: Layout, best: Best, std: Floats) -> tuple[Floats, Best | None]:
     """Compare the cost with its parabola at 4 standard deviations to both sides of each parameter.
 
     One parameter is fixed there and the others are searched again. Where the cost rises less than

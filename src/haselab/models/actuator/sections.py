@@ -68,7 +68,7 @@ def _four_by_four(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...
     lengths = [len(row) for row in rows]
     if lengths != [4] * 4:
         raise PydanticCustomError(
-            "square", "Input should be 4 rows of 4 numbers, not rows of {lengths}",
+            "square", "must be 4 rows of 4 numbers, not rows of {lengths}",
             {"lengths": str(lengths)},
         )  # fmt: skip
     return rows

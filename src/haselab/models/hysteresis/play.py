@@ -110,7 +110,7 @@ class PrandtlIshlinskii(Hysteresis):
         """
         if not 0.0 < rate_hz < math.inf:
             raise InputError(
-                f"rate_hz = {rate_hz:g} Hz; must be above 0 Hz. Give the sampling rate."
+                f"rate_hz = {rate_hz:g} Hz; it must be above 0 Hz. Give the sampling rate."
             )
         memory = np.full(len(self.thresholds) + 2, float(input_before))
         memory[-2] = 0.0

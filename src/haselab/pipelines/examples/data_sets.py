@@ -72,13 +72,13 @@ def _chirp() -> dict[str, str]:
 
 
 def _release() -> dict[str, str]:
-    time_s, x_m = recordings.released(_SEED)
+    time_s, x_m = recordings.release(_SEED)
     # The first samples after the drop are the fall, not the free oscillation.
     return {"release.csv": _plain("Time (ms),Displacement (mm)", [1e3 * time_s, 1e3 * x_m])}
 
 
 def _tensile() -> dict[str, str]:
-    stretch, load_n = recordings.pulled(_SEED)
+    stretch, load_n = recordings.tensile(_SEED)
     return {"tensile.csv": _german("Streckung;Kraft [mN]", [stretch, 1e3 * load_n])}
 
 

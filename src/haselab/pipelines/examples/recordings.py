@@ -12,7 +12,7 @@ from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.lockin import lockin_of
 from haselab.signals import linear_chirp, triangle
 
-__all__ = ["CARRIER_HZ", "Cycles", "chirp", "cycles", "monitors", "pulled", "released"]
+__all__ = ["CARRIER_HZ", "Cycles", "chirp", "cycles", "monitors", "release", "tensile"]
 
 Floats = NDArray[np.float64]
 CARRIER_HZ = 2000.0
@@ -121,7 +121,7 @@ def chirp(seed: int) -> tuple[Floats, Floats, Floats]:
     return time_s, change_v, length_m - length_m[0]
 
 
-def released(seed: int) -> tuple[Floats, Floats]:
+def release(seed: int) -> tuple[Floats, Floats]:
     """Record the free response after the hung mass is lifted and dropped.
 
     Args:
@@ -139,7 +139,7 @@ def released(seed: int) -> tuple[Floats, Floats]:
     return time_s, length_m - rest_m
 
 
-def pulled(seed: int) -> tuple[Floats, Floats]:
+def tensile(seed: int) -> tuple[Floats, Floats]:
     """Record a slow tensile test.
 
     Args:

@@ -10,7 +10,7 @@ from haselab.base import Json
 from haselab.study.definition import Study, checked_study
 from haselab.study.tables import LEAST_LOADS
 
-__all__ = ["Candidate", "Range", "both", "candidates"]
+__all__ = ["Candidate", "Range", "candidates", "combine"]
 
 Tables = Mapping[str, Mapping[str, Json]]
 _SWINGS = (1.0, 0.7)  # of the highest drive
@@ -80,7 +80,7 @@ def candidates(within: Range) -> list[Candidate]:
     ]
 
 
-def both(first: Candidate, second: Candidate) -> Candidate | None:
+def combine(first: Candidate, second: Candidate) -> Candidate | None:
     """One study of two experiments; None if it needs two baselines or repeats a table."""
     shared = set(first.tables) & set(second.tables)
     if shared - {"operating_point"} or any(

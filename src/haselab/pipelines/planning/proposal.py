@@ -12,8 +12,8 @@ from haselab.base import HaselabError, InputError, JsonObject
 from haselab.identify.physical.outlook import Outlook
 from haselab.identify.physical.record import MotionRecord
 from haselab.models.actuator.sections import PhysicalRecords
-from haselab.pipelines.planning.catalogue import Candidate, Range, both, candidates
-from haselab.pipelines.planning.foreseen import foreseen
+from haselab.pipelines.planning.catalogue import Candidate, Range, candidates, combine
+from haselab.pipelines.planning.planned_record import planned_record
 from haselab.study.feasibility import check_settings
 
 __all__ = ["DETERMINED", "Planner", "Proposal"]
@@ -182,7 +182,7 @@ class Planner:
         found = []
         for k, first in enumerate(some):
             for second in some[k + 1 :]:
-                pair = both(first, second)
+                pair = combine(first, second)
                 written = None if pair is None else self._written(pair)
                 if written is None:
                     continue
@@ -197,7 +197,7 @@ class Planner:
         try:
             study = candidate.study()
             check_settings(study)
-            record = foreseen(study, self.records, self.within.mass_kg)
+            record = planned_record(study, self.records, self.within.mass_kg)
         except InputError:
             return None
         return float(np.ptp(record.drive.edge_s)), candidate, record

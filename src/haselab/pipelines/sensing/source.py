@@ -419,7 +419,8 @@ def _blank(session: SessionReader, request: Request, rate_hz: float) -> tuple[in
 
 def too_short(samples: int, block_samples: int, rate_hz: float, path: Path) -> InputError:
     """Make the error for a record that is shorter than one block."""
+    shorter = f", or shorten --block-s to {samples / rate_hz:g} s or less"
     return InputError(
-        f"The record has {samples} samples, but a block has {block_samples}. Shorten "
-        f"--block-s to {samples / rate_hz:g} s or less. {path}"
+        f"The record has {samples} samples, but a block has {block_samples}. Record longer"
+        f"{shorter if samples >= _SHORTEST else ''}. {path}"
     )

@@ -18,10 +18,10 @@ from haselab.sensing import Sensed, reason_text, relative_capacitance
 
 __all__ = [
     "COLUMNS",
-    "Collected",
+    "BlockValidity",
+    "CollectedColumns",
     "Columns",
     "CsvRows",
-    "Judged",
     "Summary",
     "columns_of",
     "json_parts",
@@ -46,7 +46,7 @@ _SEEN_NUMBERS = re.compile(
 
 
 @dataclass(frozen=True)
-class Judged:
+class BlockValidity:
     """Validity of some blocks, and the reasons.
 
     Args:
@@ -118,7 +118,7 @@ class CsvRows:
         self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
     ) -> None:
         """Write the rows of some blocks."""
-        rows = Judged(reason, seen).texts()
+        rows = BlockValidity(reason, seen).texts()
         for row in set(rows) - set(self._forms):
             self._forms[row] = _row_form(*row)
         numbers = np.stack(list(columns.values()), axis=1)
@@ -139,19 +139,19 @@ def _quoted(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if "," in text or '"' in text else text
 
 
-class Collected:
+class CollectedColumns:
     """Keeps all columns in memory."""
 
     def __init__(self) -> None:
         self._columns: list[Columns] = []
-        self._judged: list[Judged] = []
+        self._judged: list[BlockValidity] = []
 
     def write(
         self, columns: Columns, reason: NDArray[np.uint8], seen: Mapping[int, str] = _NOTHING
     ) -> None:
         """Keep the columns of some blocks."""
         self._columns.append(columns)
-        self._judged.append(Judged(reason, seen))
+        self._judged.append(BlockValidity(reason, seen))
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Return one whole column; `valid` as 0 and 1."""
@@ -173,7 +173,7 @@ class Collected:
                     yield to_plain(columns[name][part])
 
 
-def json_parts(answer: Mapping[str, Any], collected: Collected) -> Iterator[str]:
+def json_parts(answer: Mapping[str, Any], collected: CollectedColumns) -> Iterator[str]:
     """Yield one JSON document in parts: the answer, then every column as an array."""
     yield json.dumps(to_plain(answer), indent=2)[:-2]
     for name in COLUMNS:

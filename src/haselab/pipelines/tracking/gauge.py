@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from haselab.base import JsonObject
-from haselab.pipelines.tracking.kept import Kept
 from haselab.pipelines.tracking.points import Points
+from haselab.pipelines.tracking.track_collector import TrackCollector
 from haselab.tracking import GaugeStrain, Tracks, gauge_strain
 from haselab.tracking.options import Floats
 
 __all__ = ["gauge_of", "strain_answer"]
 
 
-def gauge_of(points: Points, rest_px: Floats, kept: Kept) -> GaugeStrain | None:
+def gauge_of(points: Points, rest_px: Floats, kept: TrackCollector) -> GaugeStrain | None:
     """Strain between the points upper* and lower*; NaN if a group is lost."""
     upper, lower = points.group("upper"), points.group("lower")
     if not upper.size or not lower.size:
@@ -34,7 +34,7 @@ def gauge_of(points: Points, rest_px: Floats, kept: Kept) -> GaugeStrain | None:
     return GaugeStrain(full[0], full[1], full[2], found.rest_length_px, *marks)
 
 
-def strain_answer(gauge: GaugeStrain | None, kept: Kept, out: Path) -> JsonObject | None:
+def strain_answer(gauge: GaugeStrain | None, kept: TrackCollector, out: Path) -> JsonObject | None:
     """Summarise the strain for the answer; write that of all frames to a table beside `out`."""
     if gauge is None:
         return None

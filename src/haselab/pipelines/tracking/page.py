@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from haselab.base import Estimate
-from haselab.pipelines.tracking.kept import Kept
 from haselab.pipelines.tracking.points import Points
+from haselab.pipelines.tracking.track_collector import TrackCollector
 from haselab.report.track_page import TrackReport, TrackStrain, track_page
 from haselab.store.folder import write_text
 from haselab.tracking import GaugeStrain
@@ -48,7 +48,7 @@ def write_report(
     path: Path,
     answer: Mapping[str, Any],
     clip: tuple[Frame, Points, Floats],
-    kept: Kept,
+    kept: TrackCollector,
     gauge: GaugeStrain | None,
     warnings: Sequence[str],
 ) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from haselab.base import HaselabError, InputError
-from haselab.pipelines.prefetch import ahead
+from haselab.pipelines.prefetch import prefetch
 from haselab.pipelines.tracking.points import State, Tracker
 from haselab.pipelines.tracking.table import Block
 from haselab.store.session.writer import SessionReader
@@ -148,7 +148,7 @@ def read_ahead(video: VideoReader, clock: Clock) -> Iterator[list[Timed]]:
     Raises:
         HaselabError: the video breaks off; raised after its last whole frame.
     """
-    for batch in ahead(_batches(video, clock), _BATCHES_AHEAD):
+    for batch in prefetch(_batches(video, clock), _BATCHES_AHEAD):
         if isinstance(batch, HaselabError):
             raise batch
         yield batch

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 __all__ = [
     "BlockClock",
+    "ExplainsLosses",
     "ExposureLine",
     "FrameSource",
     "KnownCamera",
-    "KnowsCauses",
-    "RemarkingCamera",
+    "ReportsRemarks",
     "Shot",
 ]
 
@@ -73,7 +73,7 @@ class KnownCamera(Protocol):
 
 
 @runtime_checkable
-class RemarkingCamera(Protocol):
+class ReportsRemarks(Protocol):
     """A camera that reports possible problems with its frames."""
 
     @property
@@ -82,12 +82,12 @@ class RemarkingCamera(Protocol):
 
 
 @runtime_checkable
-class KnowsCauses(Protocol):
+class ExplainsLosses(Protocol):
     """A driver that can explain late or lost frames."""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """See `RemarkingCamera`."""
+        """See `ReportsRemarks`."""
 
     def why_slow(self, rate_hz: float) -> str:
         """What to change to reach this frame rate, in sentences."""

@@ -16,7 +16,7 @@ from haselab.rig import Frames
 from haselab.rig.cameras.clocks import ClockOffset, SlowOffset
 from haselab.rig.cameras.frame_rate import FrameRateMeter
 from haselab.rig.cameras.pairing import ExposureLog, FramePairing
-from haselab.rig.cameras.source import BlockClock, FrameSource, KnowsCauses, Shot
+from haselab.rig.cameras.source import BlockClock, ExplainsLosses, FrameSource, Shot
 
 __all__ = ["TimedCamera", "Timing"]
 
@@ -105,7 +105,7 @@ class TimedCamera:
     def remarks(self) -> tuple[str, ...]:
         """See `RemarkingCamera`."""
         with self._lock:
-            return self._source.remarks if isinstance(self._source, KnowsCauses) else ()
+            return self._source.remarks if isinstance(self._source, ExplainsLosses) else ()
 
     @property
     def lag_s(self) -> float:
@@ -200,7 +200,7 @@ class TimedCamera:
         if got_hz == 0.0 or abs(got_hz / self._rate_hz - 1.0) <= _RATE_SHARE:
             return
         advice = "Shorten the exposure, or request another rate."
-        if isinstance(self._source, KnowsCauses):
+        if isinstance(self._source, ExplainsLosses):
             advice = self._source.why_slow(self._rate_hz)
         raise DeviceError(
             f"Camera {self.identity}: frames arrive at {got_hz:.4g} Hz instead of the requested "
@@ -225,7 +225,7 @@ class TimedCamera:
         timing = self._timing
         lost, all_ = self.dropped, self._count + self.dropped
         if lost > timing.most_dropped * max(all_, _FEW):
-            why = self._source.why_lost() if isinstance(self._source, KnowsCauses) else ""
+            why = self._source.why_lost() if isinstance(self._source, ExplainsLosses) else ""
             advice = why or (
                 "Lower the frame rate or the image size, or raise camera.most_dropped."
             )

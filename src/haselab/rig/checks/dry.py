@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from haselab.base import DeviceError, LimitError
 from haselab.rig import ReportsOutput, ReportsOutputState, Rig
-from haselab.rig.cameras.source import KnownCamera, RemarkingCamera
+from haselab.rig.cameras.source import KnownCamera, ReportsRemarks
 from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.board import lateness_check
 from haselab.rig.checks.signals import (
@@ -228,7 +228,7 @@ def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[CheckResult]:
         good = good and known.dropped == 0
     lost = known is not None and known.dropped > 0
     yield CheckResult("dry", "frames", reported, good, _LINK if lost else _SLOW)
-    if isinstance(rig.camera, RemarkingCamera):
+    if isinstance(rig.camera, ReportsRemarks):
         yield from (CheckResult("dry", "camera", remark, True) for remark in rig.camera.remarks)
 
 

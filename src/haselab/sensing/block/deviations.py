@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 
 from haselab.sensing.sensed import Sensed
 
-__all__ = ["audited"]
+__all__ = ["widen_deviations"]
 
 Floats = NDArray[np.float64]
 _WINDOW = 301  # blocks over which the scatter is evaluated
@@ -22,7 +22,7 @@ _NORMAL = 1.4826  # standard deviation over the median of a normal variable's si
 _TEXT = "scatter of the blocks beyond their noise"
 
 
-def audited(sensed: Sensed) -> Sensed:
+def widen_deviations(sensed: Sensed) -> Sensed:
     """Widen standard deviations that are smaller than the scatter of the blocks.
 
     Noise and tones near the carrier can be constant within a block and differ from block to block.

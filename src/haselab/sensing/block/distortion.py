@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from haselab.sensing.block.segments import HARMONICS
 
-__all__ = ["distorted"]
+__all__ = ["find_distortion"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -16,7 +16,7 @@ _CLEAR = 4.5  # standard deviations of a harmonic's quadrature
 _IN_PHASE = 0.06  # of a harmonic: tolerance for noise and skew of the phase of a saturation
 
 
-def distorted(
+def find_distortion(
     harmonic: Complexes, std: Floats, voltage: Complexes, current: Complexes
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Find blocks in which a monitor saturates, and blocks with harmonics of the carrier.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.sensing.block.distortion import distorted
+from haselab.sensing.block.distortion import find_distortion
 from haselab.sensing.block.drive import UNEXPLAINED, DriveLibrary
 from haselab.sensing.block.dropouts import Breaks, find_breaks
 from haselab.sensing.block.ratio import Ratio, ratio_of_segments
@@ -336,7 +336,9 @@ def _judge(
 ) -> NDArray[np.uint8]:
     """Determine the reason of each block, and complete the texts."""
     reason = np.zeros(len(texts), dtype=np.uint8)
-    flat, harmonic = distorted(found.harmonic, found.harmonic_std, ratio.voltage, ratio.current)
+    flat, harmonic = find_distortion(
+        found.harmonic, found.harmonic_std, ratio.voltage, ratio.current
+    )
     coarse, step = _coarse(readings, found.variance, ratio)
     far = np.abs(ratio.turn) > _MOST_OFF * segments.turn
     off = far & ratio.turns

@@ -26,7 +26,7 @@ from haselab.store.session.writer import (
 from haselab.study.definition import StepStudy
 from haselab.study.experiments.steps import step_reference
 from haselab.study.fits.observe import Observation, gauge_length, point_spread
-from haselab.study.fits.trials import Comparison, compared, gather
+from haselab.study.fits.trials import Comparison, collect_trials, make_comparison
 from haselab.study.folder import marked_unverified
 from haselab.study.player import UPDATE_HZ
 from haselab.study.results import VERDICT_RULE, quantity_rows
@@ -145,7 +145,7 @@ def _compare(
     row: str,
 ) -> Comparison:
     trials = [_observed(session.experiment(name), chip, rig) for name in chip_names(study)]
-    group = gather(
+    group = collect_trials(
         trials, chip.zero_length_m, StrainMap(*chip.settings.strain_map), study.step_trials
     )
     quantities = {
@@ -155,7 +155,7 @@ def _compare(
         f"{row}.error": group.metrics.steady_state_error,
     }
     per_px = rig.scale_m_per_px / chip.zero_length_m
-    return compared({_GROUP: group}, quantities, study.step_trials, per_px, _GROUP)
+    return make_comparison({_GROUP: group}, quantities, study.step_trials, per_px, _GROUP)
 
 
 def run_on_chip(

@@ -15,7 +15,7 @@ from haselab.study.definition import Study
 from haselab.study.fits.loops import Loops
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
-from haselab.study.fits.trials import ONE_TRIAL, Trials, gather, with_camera_resolution
+from haselab.study.fits.trials import ONE_TRIAL, Trials, collect_trials, with_camera_resolution
 from haselab.study.tables import Steps
 
 __all__ = ["further_trials", "saturating_reference"]
@@ -64,7 +64,7 @@ def further_trials(
     for group, (row, name) in _ROWS.items():
         if not observed.get(group):
             continue
-        trials = gather(observed[group], maps.length_m, maps.strain_map, steps)
+        trials = collect_trials(observed[group], maps.length_m, maps.strain_map, steps)
         known = trials if pi is None else pi
         rise, error = (
             _like(trials.metrics.trials, known.metrics.trials, which)

@@ -19,7 +19,7 @@ from haselab.control import (
     margins,
 )
 from haselab.control.plants.general import AnyPlant
-from haselab.control.reach import reachable
+from haselab.control.reach import reachable_range
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 from haselab.rig import RigDescription
@@ -36,8 +36,8 @@ __all__ = [
     "loop_setting",
     "margin_estimates",
     "measured_latency",
-    "playable",
     "printed_gains",
+    "reduce_gains",
 ]
 
 _UNITS = {"phase_margin": "deg", "gain_margin": "dB", "delay_margin": "s", "crossover": "rad/s"}
@@ -104,7 +104,7 @@ def loop_saturation(study: Study, rig: RigDescription, to_volt: VoltageMap) -> S
         The range that is left.
     """
     wanted = Saturation(study.control.saturation_low, study.control.saturation_high)
-    return reachable(wanted, to_volt, rig.drive_limits.low, rig.drive_limits.high)
+    return reachable_range(wanted, to_volt, rig.drive_limits.low, rig.drive_limits.high)
 
 
 def _nominal_s(rig: RigDescription) -> float:
@@ -141,7 +141,7 @@ def _holds(plant: Plant, gains: PidGains, setting: LoopSetting, least_db: float)
     return found.stable and found.gain_margin_db >= least_db
 
 
-def playable(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
+def reduce_gains(plant: Plant, gains: PidGains, setting: LoopSetting) -> PidGains:
     """Reduce the gains of the PI if the delay of the loop requires it.
 
     Each output that waits in a device adds one block of delay. If this leaves less than 2 dB of
@@ -238,8 +238,8 @@ def design_loops(
     held_back_s = study.steps.extra_delay_blocks * rig.block_s
     late = replace(setting, measurement_delay_s=setting.measurement_delay_s + held_back_s)
     scaled = printed_gains(study, found.plant)
-    pi = given.pi if given else playable(found.plant, scaled, setting)
-    delayed_pi = given.delayed_pi if given else playable(found.plant, scaled, late)
+    pi = given.pi if given else reduce_gains(found.plant, scaled, setting)
+    delayed_pi = given.delayed_pi if given else reduce_gains(found.plant, scaled, late)
     demands = replace(_PID, step=study.steps.step or None)
     pid = given.pid if given else design_pid(found.plant, demands, setting, rng=rng).gains
     as_printed = PidGains(study.control.kp, study.control.ki)

@@ -25,9 +25,9 @@ __all__ = [
     "ONE_TRIAL",
     "Comparison",
     "Trials",
+    "collect_trials",
     "compare_trials",
-    "compared",
-    "gather",
+    "make_comparison",
     "normal_equivalent",
     "with_camera_resolution",
 ]
@@ -63,7 +63,7 @@ def normal_equivalent(estimate: Estimate) -> Estimate:
     return Estimate(estimate.value, (high - low) / (2.0 * Z95), estimate.ci95, estimate.unit)
 
 
-def gather(
+def collect_trials(
     trials: Sequence[Observation],
     zero_length_m: float,
     to_strain: StrainMap,
@@ -134,7 +134,7 @@ def compare_trials(
     Source: reference study, rows S24 and S25.
     """
     groups = {
-        name: gather(trials, maps.length_m, maps.strain_map, study.steps)
+        name: collect_trials(trials, maps.length_m, maps.strain_map, study.steps)
         for name, trials in observed.items()
     }
     opened = groups["open loop"].metrics
@@ -169,7 +169,7 @@ def compare_trials(
         notes[key] = f"{note}; {notes[key]}" if key in notes else note
     named = {str(study.control.kind) if name == OWN else name: g for name, g in groups.items()}
     shown = "PI" if "PI" in named else list(named)[-1]
-    found = compared(named, quantities, study.steps, scale_m_per_px / maps.length_m, shown)
+    found = make_comparison(named, quantities, study.steps, scale_m_per_px / maps.length_m, shown)
     return replace(found, notes=notes)
 
 
@@ -199,7 +199,7 @@ def with_camera_resolution(
     return with_resolution(estimate, POSITION_PX * strain_per_px / abs(steps.step))
 
 
-def compared(
+def make_comparison(
     groups: dict[str, Trials],
     quantities: dict[str, Estimate],
     steps: Steps | StepTrials,

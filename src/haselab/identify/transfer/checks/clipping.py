@@ -20,7 +20,7 @@ from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import delay_margin_s, richer_start
 
-__all__ = ["clipped_input", "kept", "richer_fits", "without_clipped"]
+__all__ = ["clipped_input", "keep_outputs", "richer_fits", "without_clipped"]
 
 Floats = NDArray[np.float64]
 _BETTER = 50.0  # twice the gain of logarithmic likelihood that names a cause
@@ -89,7 +89,7 @@ def without_clipped(layout: Layout, best: Best) -> tuple[Best | None, list[str]]
     ]
 
 
-def kept(record: Record, keep: NDArray[np.bool_]) -> Record:
+def keep_outputs(record: Record, keep: NDArray[np.bool_]) -> Record:
     """The record with the marked outputs only.
 
     Raises:
@@ -148,7 +148,8 @@ def _fit_between(layout: Layout, best: Best, keep: NDArray[np.bool_]) -> Best | 
     ends = np.cumsum([r.y.size for r in best.records])[:-1]
     try:
         records = [
-            kept(r, part) for r, part in zip(best.records, np.split(keep, ends), strict=True)
+            keep_outputs(r, part)
+            for r, part in zip(best.records, np.split(keep, ends), strict=True)
         ]
     except InputError:
         return None

@@ -11,12 +11,12 @@ from scipy.special import ndtri
 
 from haselab.base import InputError
 from haselab.identify.record import Record
-from haselab.identify.transfer.checks.clipping import clipped_input, kept, without_clipped
+from haselab.identify.transfer.checks.clipping import clipped_input, keep_outputs, without_clipped
 from haselab.identify.transfer.checks.timing import timing_cause
 from haselab.identify.transfer.layout import Layout
 from haselab.identify.transfer.search import Best, best_fit
 
-__all__ = ["Diagnosis", "diagnosed"]
+__all__ = ["Diagnosis", "diagnose"]
 
 Floats = NDArray[np.float64]
 _FALSE_ALARM = 1e-3  # probability that white noise alone has a spike
@@ -47,7 +47,7 @@ class Diagnosis:
     fault: str | None = None
 
 
-def diagnosed(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
+def diagnose(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
     """The fit without spikes and clipped outputs, where these explain the records better.
 
     Args:
@@ -155,7 +155,7 @@ def _without_spikes(layout: Layout, best: Best) -> tuple[Best, list[str]]:
                 "how the motion begins. An additional mode may explain them."
             ]
         try:
-            records = [kept(r, ~mark) for r, mark in zip(best.records, marks, strict=True)]
+            records = [keep_outputs(r, ~mark) for r, mark in zip(best.records, marks, strict=True)]
         except InputError:
             break
         found = best_fit(layout, records)

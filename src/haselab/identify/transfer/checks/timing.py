@@ -15,7 +15,7 @@ from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.checks.ambiguity import whitened_energy
-from haselab.identify.transfer.checks.clipping import kept, richer_fits
+from haselab.identify.transfer.checks.clipping import keep_outputs, richer_fits
 from haselab.identify.transfer.layout import Layout
 from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import Best, best_fit
@@ -320,7 +320,7 @@ def _part_fit(
 ) -> Best | None:
     """The fit to some outputs; all delays are searched where the residuals are not white."""
     try:
-        part = [kept(record, keep)]
+        part = [keep_outputs(record, keep)]
     except InputError:
         return None
     fit = best_fit(layout, part, starts)
@@ -404,7 +404,7 @@ def _parted(layout: Layout, best: Best, record: Record, at: int) -> list[Record]
     if late.sum() < _EDGE or edge >= record.u.size - 1:
         return None
     try:
-        before = kept(record, np.arange(record.y.size) < at)
+        before = keep_outputs(record, np.arange(record.y.size) < at)
         after = replace(
             record,
             u=record.u[edge:],

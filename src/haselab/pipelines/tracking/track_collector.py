@@ -12,7 +12,7 @@ from haselab.tracking import Tracks
 from haselab.tracking.audit import expected_wrong, wrong_share
 from haselab.tracking.options import Floats
 
-__all__ = ["WRONG_PX", "Kept", "KeptTracks"]
+__all__ = ["WRONG_PX", "ThinnedTracks", "TrackCollector"]
 
 WRONG_PX = 0.5  # error of a position that counts as wrong
 
@@ -21,7 +21,7 @@ _FEWEST_FRAMES = 16
 
 
 @dataclass(frozen=True)
-class KeptTracks:
+class ThinnedTracks:
     """All points in every n-th frame.
 
     Args:
@@ -35,7 +35,7 @@ class KeptTracks:
     tracks: Tracks
 
 
-class Kept:
+class TrackCollector:
     """Collects blocks in bounded memory, except for a few points that are always kept.
 
     Args:
@@ -91,10 +91,10 @@ class Kept:
         """The points that are always kept, in all frames."""
         return _joined(self._full)
 
-    def thinned(self) -> KeptTracks:
+    def thinned(self) -> ThinnedTracks:
         """All points in every n-th frame."""
         frames, times_s, tracks = zip(*self._thin, strict=True)
-        return KeptTracks(np.array(frames, np.intp), np.array(times_s), _joined(list(tracks)))
+        return ThinnedTracks(np.array(frames, np.intp), np.array(times_s), _joined(list(tracks)))
 
 
 _FIELDS = ("x_px", "y_px", "std_x_px", "std_y_px", "quality", "valid")

@@ -200,11 +200,13 @@ def test_bad_questions_are_refused():
     seen = noisy(np.arange(50.0), 0.1)
     with pytest.raises(InputError, match="1 hypotheses; at least two are required"):
         compare(hypotheses[:1], [seen])
-    with pytest.raises(InputError, match=r"risk = 0\.7; must be above 0 and below 0\.5"):
+    with pytest.raises(InputError, match=r"risk = 0\.7; it must be above 0 and below 0\.5"):
         compare(hypotheses, [seen], risk=0.7)
     with pytest.raises(InputError, match="unexplained = 2"):
         compare(hypotheses, [seen], unexplained=2.0)
-    with pytest.raises(InputError, match="question = colour; must be one of reading, creep, modes"):
+    with pytest.raises(
+        InputError, match="question = colour; it must be one of reading, creep, modes"
+    ):
         hypotheses_of("colour")
     with pytest.raises(InputError, match="spread = 3"):
         reading_hypotheses(spread=3.0)

@@ -14,7 +14,7 @@ from haselab.models.actuator.sections import PhysicalRecords
 from haselab.signals import constant, linear_chirp, triangle
 from haselab.study.definition import Study
 
-__all__ = ["foreseen"]
+__all__ = ["planned_record"]
 
 Floats = NDArray[np.float64]
 _UPDATE_HZ = 100.0  # one output and one capacitance a block
@@ -108,7 +108,7 @@ class _Bench:
         )  # fmt: skip
 
 
-def foreseen(study: Study, records: PhysicalRecords, mass_kg: float) -> MotionRecord:
+def planned_record(study: Study, records: PhysicalRecords, mass_kg: float) -> MotionRecord:
     """Write down what a study would do, in the order in which it is played.
 
     Args:

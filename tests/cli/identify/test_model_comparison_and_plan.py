@@ -1,4 +1,4 @@
-"""`haselab identify verdict` and `haselab plan-experiment` on files."""
+"""`haselab identify model-comparison` and `haselab plan-experiment` on files."""
 
 import json
 
@@ -55,7 +55,14 @@ def test_the_verdict_comes_with_its_evidence_and_a_model_for_the_plan(alternatio
     out = tmp_path / "verdict.json"
     answer = json.loads(
         printed(
-            identify, "verdict", alternation, "--question", "creep", "--json", "--out", str(out)
+            identify,
+            "model-comparison",
+            alternation,
+            "--question",
+            "creep",
+            "--json",
+            "--out",
+            str(out),
         )
     )
     assert answer["verdict"] == "supports mechanical"
@@ -66,7 +73,7 @@ def test_the_verdict_comes_with_its_evidence_and_a_model_for_the_plan(alternatio
     )
     assert VoltagePlant.from_dict(answer["voltage_plant"]).creep == "mechanical"
     assert json.loads(out.read_text()) == answer
-    page = printed(identify, "verdict", alternation, "--question", "creep")
+    page = printed(identify, "model-comparison", alternation, "--question", "creep")
     assert page.splitlines()[0] == "supports mechanical"
     assert "excluded" in page
 
@@ -111,7 +118,7 @@ def test_answers_that_agree_and_answers_that_do_not(tmp_path):
         estimate = Estimate.normal(value, 0.1, "rad/s").to_dict()
         path.write_text(json.dumps({"natural_frequency_rad_s": estimate}))
         files[name] = str(path)
-    ask = ("verdict", "--question", "agreement")
+    ask = ("model-comparison", "--question", "agreement")
     assert printed(identify, *ask, files["a"], files["b"]).splitlines()[0] == "agree"
     answer = json.loads(printed(identify, *ask, *files.values(), "--json"))
     assert answer["verdict"] == "disagree: a and c; b and c"
@@ -126,21 +133,21 @@ def test_modes_of_a_proportional_input(tmp_path):
     y = Plant(0.5, 5.11, 0.09, 0.01).simulate(u, 100.0, time_s)
     y = y + 0.01 * np.random.default_rng(4).normal(size=1000)
     np.savetxt(tmp_path / "u.csv", np.column_stack([u, y]), "%.7g", ",", header="u,y", comments="")
-    page = printed(identify, "verdict", str(tmp_path / "u.csv"), "--question", "modes", "--linear",
-                "--input", "u", "--rate-hz", "100")  # fmt: skip
+    page = printed(identify, "model-comparison", str(tmp_path / "u.csv"), "--question", "modes",
+                "--linear", "--input", "u", "--rate-hz", "100")  # fmt: skip
     assert page.splitlines()[0] == "supports one"
 
 
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        (["verdict", "{file}", "--question", "creep", "--output", "z"], "lacks z"),
-        (["verdict", "{file}", "--question", "creep", "--risk", "0.9"], r"risk = 0\.9"),
+        (["model-comparison", "{file}", "--question", "creep", "--output", "z"], "lacks z"),
+        (["model-comparison", "{file}", "--question", "creep", "--risk", "0.9"], r"risk = 0\.9"),
         (
-            ["verdict", "{file}", "--question", "creep", "--linear"],
+            ["model-comparison", "{file}", "--question", "creep", "--linear"],
             "not supported with --question creep",
         ),
-        (["verdict", "{model}", "--question", "agreement"], "has no estimate"),
+        (["model-comparison", "{model}", "--question", "agreement"], "has no estimate"),
     ],
 )
 def test_bad_use_of_a_model_comparison_is_reported_in_one_line(
@@ -178,5 +185,5 @@ def test_a_plan_without_a_drive_has_no_result(model, rig):
 def test_a_chirp_decides_the_frequency_axis_on_the_command_line(tmp_path):
     drive_v = 1.0 + 0.4 * linear_chirp(0.1, 8.0, 10.0, 100.0)
     file = write(tmp_path / "chirp.csv", drive_v)
-    page = printed(identify, "verdict", file, "--question", "reading")
+    page = printed(identify, "model-comparison", file, "--question", "reading")
     assert page.splitlines()[0] == "supports rad"

@@ -1,9 +1,12 @@
 // Python face of native/twin/camera.c: one immutable scene, rendered with the GIL released.
 #include <nanobind/nanobind.h>    // module, class
 #include <nanobind/ndarray.h>     // numpy arrays without a copy
+#include <nanobind/stl/pair.h>
 
 #include <cstdint>
+#include <memory>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "bindings/records.h"
@@ -60,18 +63,24 @@ public:
         std::vector<float> scratch(camera_scratch_size(&scene_, lengths_px.shape(1)));
         for (std::size_t f = 0; f < lengths_px.shape(0); f++)
             camera_expect(&scene_, lengths_px.data() + f * lengths_px.shape(1), lengths_px.shape(1),
-                          scratch.data(), out.data() + f * pixels());
+                          {0, scene_.height}, scratch.data(), out.data() + f * pixels());
     }
 
-    void render(Table lengths_px, std::uint64_t first_index, Frames out) const {
+    void render(Table lengths_px, std::uint64_t first_index, Frames out,
+                std::pair<int, int> rows) const {
         check(lengths_px, out.shape(0), out.shape(1), out.shape(2));
+        if (rows.first < 0 || rows.first > rows.second || rows.second > scene_.height)
+            throw std::invalid_argument("rows: first to stop, inside the frame");
+        const int even = rows.first - rows.first % 2;  // a pixel of an odd number would be first
+        const std::size_t width = light_x_.size();
         const nb::gil_scoped_release release;
         std::vector<float> scratch(camera_scratch_size(&scene_, lengths_px.shape(1)));
-        std::vector<float> level(pixels());
+        const std::unique_ptr<float[]> level(new float[pixels()]);  // most of it may stay untouched
         for (std::size_t f = 0; f < lengths_px.shape(0); f++) {
             camera_expect(&scene_, lengths_px.data() + f * lengths_px.shape(1), lengths_px.shape(1),
-                          scratch.data(), level.data());
-            camera_expose(level.data(), pixels(), &noise_, first_index + f, out.data() + f * pixels());
+                          {even, rows.second}, scratch.data(), level.get());
+            camera_expose(level.get(), width * even, width * rows.second, &noise_, first_index + f,
+                          out.data() + f * pixels());
         }
     }
 
@@ -121,6 +130,7 @@ NB_MODULE(_camera, m) {
         .def("expect", &Scene::expect, nb::arg("lengths_px"), nb::arg("out").noconvert(),
              "Expected levels of each row of lengths, into out (frames, height, width) float32.")
         .def("render", &Scene::render, nb::arg("lengths_px"), nb::arg("first_index"),
-             nb::arg("out").noconvert(),
-             "Noisy 8-bit frames of each row of lengths, into out (frames, height, width) uint8.");
+             nb::arg("out").noconvert(), nb::arg("rows"),
+             "Some rows of noisy 8-bit frames, one for each row of lengths, into out (frames, height, "
+             "width) uint8. The row before an odd first one is drawn, too; the others stay.");
 }

@@ -232,6 +232,7 @@ NB_MODULE(_track, m) {
         .def_ro("most_surprise_px", &track_summary::most_surprise_px)
         .def_ro("unevenness", &track_summary::unevenness)
         .def_ro("largest_std_px", &track_summary::largest_std_px)
+        .def_ro("reach_px", &track_summary::reach_px)
         .def_prop_ro("audit", [](const track_summary &s) {
             return std::pair<float, int>{s.audit.ratio, s.audit.numbers};
         });

@@ -197,6 +197,14 @@ static void load_patch(const struct track_kernels *kernels, const struct track_f
     patch->values = out;
 }
 
+/* Distance from a row of the frame to the farthest one that the patch was filtered from, px. */
+static float reach_of(const struct track_patch *patch, double y)
+{
+    const double above = y - (patch->top - TRACK_REACH);
+    const double below = patch->top + patch->rows - 1 + TRACK_REACH - y;
+    return (float)(above > below ? above : below);
+}
+
 /* Does the patch hold all that the pose needs? */
 static int patch_covers(const struct track_patch *patch, int side, const struct track_pose *pose)
 {
@@ -332,6 +340,8 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
     struct track_patch local = {0};
     struct track_sums sums;
     enum track_status status = TRACK_SLOW;
+    const double start_y = pose->y;
+    float reach = whole ? (float)frame->height : 0.0f;
     int iteration = 0;
     *result = (struct track_result){0};
     while (status == TRACK_SLOW && iteration < settings->max_iterations) {
@@ -342,6 +352,8 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
         }
         if (!whole && (iteration == 0 || !patch_covers(&local, t->side, pose))) {
             load_patch(kernels, frame, t->side, pose, &local, buffers);
+            const float farthest = reach_of(&local, start_y);
+            reach = farthest > reach ? farthest : reach;
         }
         const struct track_grid grid = lay_grid(whole ? whole : &local, t, frame, pose);
         kernels->sample(&grid, w);
@@ -359,6 +371,7 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
     }
     result->iterations = (float)iteration;
     result->status = (float)status;
+    result->reach = reach;
 }
 
 int track_sample(const struct track_kernels *kernels, const struct track_frame *frame,

@@ -25,7 +25,7 @@
 #include <stddef.h> /* size_t, ptrdiff_t */
 #include <stdint.h> /* int16_t */
 
-enum { TRACK_MAX_SIDE = 101, TRACK_RESULTS = 6 };
+enum { TRACK_MAX_SIDE = 101 };
 
 /* How one refinement ended. */
 enum track_status {
@@ -63,6 +63,7 @@ struct track_result {
     float residual;  /* mean square of r, weighted with the gradient's energy, grey^2 */
     float iterations;
     float status;
+    float reach; /* farthest row of pixels that was read, from the subset's centre at the start, px */
 };
 
 struct track_settings {

@@ -247,6 +247,15 @@ static struct track_summary summarise(const struct track_work *w, const struct t
     return s;
 }
 
+static float farthest(const struct track_work *w)
+{
+    float most = 0.0f;
+    for (int i = 0; i < w->points->count; ++i) {
+        most = w->results[i].reach > most ? w->results[i].reach : most;
+    }
+    return most;
+}
+
 static void *take(char **at, size_t bytes)
 {
     void *here = *at;
@@ -290,13 +299,15 @@ struct track_summary track_step(const struct track_kernels *kernels,
         track_refine_point(&w, i);
     }
     double gain, excess;
+    const float reach = farthest(&w);
     int agreed = find_common(&w, &w.common_excess, &gain);
     w.common_gain = *before->gain > 0.0 && !agreed ? *before->gain : gain;
     if (points->neighbours) {
         track_mark_covered(&w);
         track_mark_strays(&w);
     }
-    if (track_any_lost(&w)) {
+    const int searched = track_any_lost(&w);
+    if (searched) {
         track_rescue(&w, before);
         if (!track_lost_hold(&w, before)) {
             track_settle(&w, before);
@@ -306,6 +317,7 @@ struct track_summary track_step(const struct track_kernels *kernels,
     *after->gain = gain_after(*before->gain, gain, agreed);
     remember(&w, before, after);
     struct track_summary summary = summarise(&w, before);
+    summary.reach_px = searched ? (float)frame->height : reach;
     summary.due = report(&w, found);
     summary.audit = track_audit_frame(points, found, w.expected); /* no longer needed */
     return summary;

@@ -38,14 +38,14 @@ size_t camera_scratch_size(const camera_scene *scene, size_t samples)
 }
 
 /* Profiles along y: sheet[k][y] between the clamps, clamps[y] averaged over the samples. */
-static void fill_windows(const camera_scene *s, const double *lengths_px, size_t samples, float *sheet,
-                         float *clamps)
+static void fill_windows(const camera_scene *s, const double *lengths_px, size_t samples,
+                         camera_rows rows, float *sheet, float *clamps)
 {
     const double edge = s->edge_px;
     const double upper_in = s->top_px + s->clamp_inside_px;
     const double upper_out = s->top_px - s->clamp_outside_px;
     const float weight = 1.0f / (float)samples;
-    for (int y = 0; y < s->height; y++) {
+    for (int y = rows.first; y < rows.stop; y++) {
         const float above = logistic(upper_in - y, edge);
         float lower_sum = 0.0f;
         for (size_t k = 0; k < samples; k++) {
@@ -115,8 +115,8 @@ static inline void add_spans(float *cover, int width, const span *spans, size_t 
 }
 
 HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths_px, size_t samples,
-                                    const float *sheet, const float *clamps, float *cover,
-                                    float *level)
+                                    camera_rows rows, const float *sheet, const float *clamps,
+                                    float *cover, float *level)
 {
     float falloff[FALLOFF_SIZE];
     span spans[CAMERA_SAMPLES_MAX];
@@ -125,7 +125,7 @@ HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths
     }
     const float weight = (s->sheet_grey - s->background_grey) / (float)samples;
     const size_t row_bytes = (size_t)s->width * sizeof(float);
-    for (int y = 0; y < s->height; y++) {
+    for (int y = rows.first; y < rows.stop; y++) {
         size_t spanned = 0;
         memset(cover, 0, row_bytes);
         for (size_t k = 0; k < samples; k++) {
@@ -194,10 +194,11 @@ typedef struct {
 } images;
 
 /* Subtracts the images from the level, each in its turn. */
-HS_CLONES static void subtract_images(const camera_scene *s, const images *b, float *level)
+HS_CLONES static void subtract_images(const camera_scene *s, camera_rows rows, const images *b,
+                                      float *level)
 {
-    const int y_from = b->upper > 0 ? b->upper : 0;
-    const int y_stop = b->upper + b->size < s->height ? b->upper + b->size : s->height;
+    const int y_from = b->upper > rows.first ? b->upper : rows.first;
+    const int y_stop = b->upper + b->size < rows.stop ? b->upper + b->size : rows.stop;
     for (int y = y_from; y < y_stop; y++) {
         float *row = level + (size_t)y * (size_t)s->width;
         for (int x = 0; x < b->size; x += LANES) { /* beyond its size a profile is 0 */
@@ -225,7 +226,7 @@ HS_CLONES static void subtract_images(const camera_scene *s, const images *b, fl
 
 /* Subtracts a blob at all samples of the exposure. */
 static void subtract_blob(const camera_scene *s, const camera_blob *blob, const double *lengths_px,
-                          size_t samples, const float *sheet, float *level)
+                          size_t samples, camera_rows rows, const float *sheet, float *level)
 {
     const float depth = (float)(blob->depth_grey / (double)samples);
     const int on_sheet = blob->along > 0.0 && blob->along < 1.0;
@@ -242,8 +243,11 @@ static void subtract_blob(const camera_scene *s, const camera_blob *blob, const 
         if (!(x > -reach && x < s->width - 1 + reach && y > -reach && y < s->height - 1 + reach)) {
             continue;
         }
+        if (line + reach < rows.first || line - reach >= rows.stop) {
+            continue;
+        }
         if (batch.count && (batch.left != (int)column - reach || batch.upper != (int)line - reach)) {
-            subtract_images(s, &batch, level);
+            subtract_images(s, rows, &batch, level);
             batch.count = 0;
         }
         batch.left = (int)column - reach;
@@ -254,26 +258,26 @@ static void subtract_blob(const camera_scene *s, const camera_blob *blob, const 
         fill_profile(y - line, &form, py);
         for (int i = 0; i < batch.size; i++) {
             const int at = batch.upper + i;
-            const int visible = at >= 0 && at < s->height;
+            const int visible = at >= rows.first && at < rows.stop;
             const float window = on_sheet && visible ? sheet[k * (size_t)s->height + (size_t)at] : 1.0f;
             py[i] = depth * py[i] * window;
         }
         batch.count++;
     }
     if (batch.count) {
-        subtract_images(s, &batch, level);
+        subtract_images(s, rows, &batch, level);
     }
 }
 
-void camera_expect(const camera_scene *s, const double *lengths_px, size_t samples, float *scratch,
-                   float *level)
+void camera_expect(const camera_scene *s, const double *lengths_px, size_t samples, camera_rows rows,
+                   float *scratch, float *level)
 {
     float *sheet = scratch, *clamps = sheet + samples * (size_t)s->height;
     float *cover = clamps + s->height;
-    fill_windows(s, lengths_px, samples, sheet, clamps);
-    fill_surfaces(s, lengths_px, samples, sheet, clamps, cover, level);
+    fill_windows(s, lengths_px, samples, rows, sheet, clamps);
+    fill_surfaces(s, lengths_px, samples, rows, sheet, clamps, cover, level);
     for (size_t i = 0; i < s->blob_count; i++) {
-        subtract_blob(s, s->blobs + i, lengths_px, samples, sheet, level);
+        subtract_blob(s, s->blobs + i, lengths_px, samples, rows, sheet, level);
     }
 }
 
@@ -286,16 +290,17 @@ static uint64_t scramble(uint64_t z)
 }
 
 HS_CLONES
-void camera_expose(const float *level, size_t count, const camera_noise *noise, uint64_t frame,
-                   uint8_t *out)
+void camera_expose(const float *level, size_t first, size_t stop, const camera_noise *noise,
+                   uint64_t frame, uint8_t *out)
 {
     const uint64_t golden = 0x9e3779b97f4a7c15u;
     const float *table = noise->table;
     const float read_variance = noise->read_noise_grey * noise->read_noise_grey;
     uint64_t counter = scramble(scramble(noise->seed + golden) + golden * (frame + 1u));
+    counter += golden * (first / 2u); /* one for two pixels */
     float normal[NOISE_BLOCK];
-    for (size_t start = 0; start < count; start += NOISE_BLOCK) {
-        const size_t n = count - start < NOISE_BLOCK ? count - start : NOISE_BLOCK;
+    for (size_t start = first; start < stop; start += NOISE_BLOCK) {
+        const size_t n = stop - start < NOISE_BLOCK ? stop - start : NOISE_BLOCK;
         for (size_t i = 0; i < NOISE_BLOCK; i += 2) {
             counter += golden;
             const uint64_t bits = scramble(counter);

@@ -52,6 +52,10 @@ typedef struct {
 } camera_scene;
 
 typedef struct {
+    int first, stop; /* 0 to the height */
+} camera_rows;
+
+typedef struct {
     float shot_gain_grey;  /* variance = shot_gain * level + read_noise^2, in grey^2 */
     float read_noise_grey;
     uint64_t seed;
@@ -61,13 +65,15 @@ typedef struct {
 /* Floats of scratch memory that camera_expect needs. */
 size_t camera_scratch_size(const camera_scene *scene, size_t samples);
 
-/* Mean of the images at `samples` lengths, at most CAMERA_SAMPLES_MAX, in grey levels; level holds width * height floats. */
-void camera_expect(const camera_scene *scene, const double *lengths_px, size_t samples, float *scratch,
-                   float *level);
+/* Some rows of the mean of the images at `samples` lengths, at most CAMERA_SAMPLES_MAX, in grey levels;
+ * `level` holds width * height floats, of which those of other rows stay as they are. */
+void camera_expect(const camera_scene *scene, const double *lengths_px, size_t samples, camera_rows rows,
+                   float *scratch, float *level);
 
-/* One noisy 8-bit exposure of `count` levels, rounded to nearest, saturated at 0 and 255.
- * The noise depends on (seed, frame, pixel) alone, so frames may be made in any order. */
-void camera_expose(const float *level, size_t count, const camera_noise *noise, uint64_t frame,
-                   uint8_t *out);
+/* Pixels from `first`, an even number, to `stop` of one noisy 8-bit exposure of the levels, rounded to
+ * nearest, saturated at 0 and 255. The noise depends on (seed, frame, pixel) alone, so frames and
+ * their parts may be made in any order. */
+void camera_expose(const float *level, size_t first, size_t stop, const camera_noise *noise,
+                   uint64_t frame, uint8_t *out);
 
 #endif

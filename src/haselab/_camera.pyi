@@ -36,5 +36,9 @@ class Scene:
     ) -> None: ...
     def expect(self, lengths_px: NDArray[np.float64], out: NDArray[np.float32]) -> None: ...
     def render(
-        self, lengths_px: NDArray[np.float64], first_index: int, out: NDArray[np.uint8]
+        self,
+        lengths_px: NDArray[np.float64],
+        first_index: int,
+        out: NDArray[np.uint8],
+        rows: tuple[int, int],
     ) -> None: ...

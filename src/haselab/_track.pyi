@@ -38,6 +38,7 @@ class Summary:
     most_surprise_px: float
     unevenness: float
     largest_std_px: float
+    reach_px: float
     audit: tuple[float, int]
 
 class Points:

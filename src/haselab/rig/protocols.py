@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -23,6 +23,7 @@ __all__ = [
     "HighVoltageSupply",
     "LoadStand",
     "MonitorCalibration",
+    "PartialImage",
     "PreloadsOutputs",
     "ReferenceFixture",
     "ReportsOutput",
@@ -118,7 +119,6 @@ class RigDescription:
         return self.switch_sample % self.block_samples
 
 
-@dataclass(frozen=True)
 class Frames:
     """Images with the middle of each exposure on the acquisition's clock.
 
@@ -127,8 +127,32 @@ class Frames:
         time_s: shape `(frames,)`.
     """
 
-    images: NDArray[np.uint8]
-    time_s: NDArray[np.float64]
+    def __init__(self, images: NDArray[np.uint8], time_s: NDArray[np.float64]) -> None:
+        self._images = images
+        self.time_s = time_s
+
+    @property
+    def images(self) -> NDArray[np.uint8]:
+        """Grey levels, shape `(frames, height, width)`."""
+        return self._images
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """One image, shape `(height, width)`."""
+        return np.asarray(self.images[index])
+
+    def view(self, index: int) -> NDArray[np.uint8] | PartialImage:
+        """One image for somebody who may need only some of its rows."""
+        return self.image(index)
+
+
+class PartialImage(Protocol):
+    """An image of a simulated camera, of which only the rows that are needed are drawn."""
+
+    def whole(self) -> NDArray[np.uint8]:
+        """Draw all of it."""
+
+    def rows(self, spans: Sequence[tuple[int, int]]) -> NDArray[np.uint8]:
+        """Draw rows, each span from its first one to before its end; others may hold anything."""
 
 
 class VoltageSource(Protocol):

@@ -45,6 +45,11 @@ def _in_doubt(found: FrameTracks) -> bool:
     return found.reason is not None and bool((found.reason & LossReason.AMBIGUOUS).any())
 
 
+def _time_s(shown: tuple[Frames, int]) -> float:
+    frames, k = shown
+    return float(frames.time_s[k])
+
+
 _Search = Callable[[NDArray[np.uint8]], NDArray[np.float64]]
 _Call = Callable[[_Search, NDArray[np.uint8]], NDArray[np.float64]]
 
@@ -94,14 +99,14 @@ class _Particles:
 
     def follow(self, frames: Frames, mass_kg: float) -> None:
         """Track the particles in every n-th frame and record them; lost points are not valid."""
-        first = -self._seen % self._stride
-        self._seen += len(frames.images)
-        chosen = range(first, len(frames.images), self._stride)
+        first, count = -self._seen % self._stride, len(frames.time_s)
+        self._seen += count
+        chosen = range(first, count, self._stride)
         if self._tracker is None or self._state is None or not chosen:
             return
         rows = np.zeros((len(chosen), PARTICLES), dtype=SessionWriter.track_dtype())
         for row, k in zip(rows, chosen, strict=True):
-            self._state, found = self._tracker.step(self._state, frames.images[k])
+            self._state, found = self._tracker.step(self._state, frames.image(k))
             for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
                 row[field][: self._count] = getattr(found, field)
         self._session.append_frames(self._name, frames.time_s[list(chosen)], rows, mass_kg)
@@ -151,7 +156,7 @@ class CameraRecorder:
         self._first_s: float | None = None
         self._last_s = 0.0
         self._particles: _Particles | None = None
-        self._tail: deque[tuple[NDArray[np.uint8], float]] = deque()
+        self._tail: deque[tuple[Frames, int]] = deque()
 
     def start(
         self, name: str, rate_hz: float, mass_kg: float, part: str = "", particles: str = ""
@@ -219,14 +224,14 @@ class CameraRecorder:
 
     def _track(self, frames: Frames) -> Seen:
         assert self._tracker is not None and self._state is not None
-        rows = np.empty((len(frames.images), FIDUCIALS), dtype=SessionWriter.track_dtype())
+        rows = np.empty((len(frames.time_s), FIDUCIALS), dtype=SessionWriter.track_dtype())
         searches = len(rows) if self._helper is None else 1  # a loop must not wait longer
-        for row, image in zip(rows, frames.images, strict=True):
+        for k, row in enumerate(rows):
             before = self._state
-            self._state, found = self._tracker.step(before, image)
+            self._state, found = self._tracker.step(before, frames.view(k))
             if searches and _in_doubt(found):
                 searches -= 1
-                self._state, found = self._named(before, self._state, found, image)
+                self._state, found = self._named(before, self._state, found, frames.image(k))
             for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
                 row[field] = getattr(found, field)
         if found.valid.all():
@@ -262,10 +267,10 @@ class CameraRecorder:
         early = frames.time_s < self._first_s + _SAMPLE_S
         if self._keep == "all":
             early[:] = True
-        self._video.append(frames.images[early], frames.time_s[early])
-        late = ~early
-        self._tail.extend(zip(frames.images[late], frames.time_s[late], strict=True))
-        while self._tail and self._tail[-1][1] - self._tail[0][1] > _SAMPLE_S:
+        if early.any():
+            self._video.append(frames.images[early], frames.time_s[early])
+        self._tail.extend((frames, k) for k in np.flatnonzero(~early).tolist())
+        while self._tail and frames.time_s[-1] - _time_s(self._tail[0]) > _SAMPLE_S:
             self._tail.popleft()
 
     def _end_video(self) -> None:
@@ -274,8 +279,8 @@ class CameraRecorder:
             return
         try:
             if self._tail:
-                images, times_s = zip(*self._tail, strict=True)
-                video.append(np.stack(images), np.array(times_s))
+                images = [frames.image(k) for frames, k in self._tail]
+                video.append(np.stack(images), np.array([_time_s(shown) for shown in self._tail]))
         finally:
             try:
                 video.close()

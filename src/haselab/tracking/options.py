@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["Floats", "Frame", "Model", "Poses", "TrackOptions"]
+__all__ = ["Floats", "Frame", "Model", "PartialFrame", "Poses", "TrackOptions"]
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
 Poses = NDArray[np.void]  # centre_px and deformation of each subset; native/tracking/track.h
 Model = Literal["translation", "neighbours", "affine"]
+
+
+class PartialFrame(Protocol):
+    """A frame of which only the rows that are needed are made."""
+
+    def whole(self) -> NDArray[np.uint8]:
+        """Make all of it."""
+
+    def rows(self, spans: Sequence[tuple[int, int]]) -> NDArray[np.uint8]:
+        """Make rows, each span from its first one to before its end; others may hold anything."""
+
 
 _LARGEST_SUBSET_PX = 101
 _SMALLEST_SUBSET_PX = 7

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain, islice
-from math import sqrt
+from math import ceil, floor, sqrt
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_
 from haselab.tracking.audit import may_be_uncertain, uncertain_points
 from haselab.tracking.camera.fixed_pattern import FixedPattern, find_pattern, stays_with_pixels
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.options import Floats, Frame, Model, Poses, TrackOptions
+from haselab.tracking.options import Floats, Frame, Model, PartialFrame, Poses, TrackOptions
 from haselab.tracking.reference import (
     JUMP_PX,
     Reference,
@@ -40,6 +40,7 @@ _SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed
 _LEAST_LEFT = 0.05  # of a template's power; below, the pattern may be the texture
 _DOTS_IN_SUBSET = 6.0  # distance, in sides of a subset, at which a dot's gradients differ
 _MOVED_PX = 1.5  # along x or y, after which an offset is outside its pixel
+_NEAR_PX = 28.0  # of the rows of a frame around the expected points that are made first
 _DUE = 0.1  # share of strongly deformed points at which the reference is renewed
 
 
@@ -160,12 +161,15 @@ class PointTracker:
         centres = state.reference.centres_px + shift
         return self._at_rest(state.reference, centres, state.pattern, state.textured)
 
-    def step(self, state: TrackState, frame: Frame) -> tuple[TrackState, FrameTracks]:
+    def step(
+        self, state: TrackState, frame: Frame | PartialFrame
+    ) -> tuple[TrackState, FrameTracks]:
         """Find all points in the next frame.
 
         Args:
             state: from `init` or the previous `step`.
-            frame: the frame, uint8 or uint16, of the reference's shape.
+            frame: the frame, uint8 or uint16, of the reference's shape. A frame that is made on
+                demand gives the same result.
 
         Returns:
             The next state, and the points in this frame.
@@ -173,12 +177,39 @@ class PointTracker:
         Raises:
             InputError: the frame does not fit the reference.
         """
+        if not isinstance(frame, np.ndarray):
+            rows = self._rows(state)
+            if rows:
+                part = frame.rows(rows)
+                _check_frame(part, state.reference.shape)
+                attempt = self._attempt(state, part)
+                if attempt.summary.reach_px <= _NEAR_PX:  # it has read nothing but these rows
+                    return self._judged(state, part, attempt)
+            frame = frame.whole()
         _check_frame(frame, state.reference.shape)
-        after, found = self._step(state, state.cleaned(frame))
+        clean = state.cleaned(frame)
+        after, found = self._judged(state, clean, self._attempt(state, clean))
         return (after if after.textured is None else self._decided(after, frame)), found
 
-    def _step(self, state: TrackState, frame: Frame) -> tuple[TrackState, FrameTracks]:
-        attempt = self._attempt(state, frame)
+    def _rows(self, state: TrackState) -> list[tuple[int, int]]:
+        """Rows around the expected points, merged; none if more than these may be looked at."""
+        if self._together or state.pattern is not None or state.textured is not None:
+            return []
+        expected_px = state.poses["centre_px"][:, 1] + state.velocity_px[:, 1]
+        spans: list[tuple[int, int]] = []
+        for y_px in sorted(expected_px.tolist()):
+            if not 0.0 <= y_px < state.reference.shape[0]:
+                return []
+            first = max(floor(y_px - _NEAR_PX), 0)
+            stop = min(ceil(y_px + _NEAR_PX) + 1, state.reference.shape[0])
+            if spans and first <= spans[-1][1]:
+                first = spans.pop()[0]
+            spans.append((first, stop))
+        return spans
+
+    def _judged(
+        self, state: TrackState, frame: Frame, attempt: Attempt
+    ) -> tuple[TrackState, FrameTracks]:
         if not self._together:
             self._stay_certain(state, attempt)
         elif self._options.search_px:

@@ -120,7 +120,7 @@ def test_a_branch_that_the_law_lacks_is_found():
     assert "viscosity.share[3]" in far and max(map(abs, far.values())) < 4.0, far
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_softening_that_the_law_lacks_is_found():
     fit = fit_actuator(replace(START, softening_share=0.0), [record(TRUE, 3)], mass_kg=MASS_KG)
     assert fit.status == "ok"

@@ -62,7 +62,7 @@ def test_the_fit_reaches_the_cramer_rao_bound_with_correct_intervals():
 def test_coloured_noise_keeps_the_intervals_correct():
     u = chirp(100)
     clean = PAPER.simulate(u, 100.0, TIME_S)
-    inside, runs = 0, 60
+    inside, runs = 0, 40
     for run in range(runs):
         rng = np.random.default_rng([99, run])
         noise = lfilter([np.sqrt(1 - 0.99**2)], [1, -0.99], rng.normal(size=8000))[4000:]

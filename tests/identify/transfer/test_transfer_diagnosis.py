@@ -123,8 +123,7 @@ def test_an_input_that_was_clipped_unseen_is_named(level):
     assert "input seems to have been clipped" in fit.status
 
 
-@pytest.mark.parametrize("noise", [0.002, 0.05])
-@pytest.mark.parametrize("delay_s", [0.0, 0.02])
+@pytest.mark.parametrize(("noise", "delay_s"), [(0.002, 0.0), (0.05, 0.02)])
 def test_swapped_columns_have_no_result(noise, delay_s):
     rng = np.random.default_rng(5)
     t = np.arange(4000) / RATE_HZ

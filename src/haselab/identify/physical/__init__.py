@@ -1,6 +1,6 @@
 """One physical model of an actuator, identified jointly from all its experiments."""
 
-from haselab.identify.physical.fit import ActuatorFit, fit_actuator
+from haselab.identify.physical.fit import fit_actuator
 from haselab.identify.physical.prediction import (
     ChannelNoise,
     IdentifiedModel,
@@ -9,6 +9,7 @@ from haselab.identify.physical.prediction import (
     predict_motion,
 )
 from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.result import ActuatorFit
 
 __all__ = [
     "ActuatorFit",

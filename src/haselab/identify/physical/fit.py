@@ -13,12 +13,13 @@ residuals and a model error (`model_error`) make it larger.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+<<<<<<< HEAD
 from haselab.actuators import (
     ADDED_INERTIA,
     DRIFT_UNITS,
@@ -70,8 +71,20 @@ from haselab.identify.physical.unknowns import (
     Unknowns,
     shares_of,
 )
+=======
+from haselab.actuators import ActuatorLaw
+from haselab.base import InputError
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit
+from haselab.identify.physical.plausible import implausible
+from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.residuals import channel_of, rms_of, seen_of
+from haselab.identify.physical.result import ActuatorFit, result_of
+from haselab.identify.physical.rivals import Rival, other_elastic, richer, with_every_effect
+from haselab.identify.physical.search import Found, refine, search
+from haselab.identify.physical.unknowns import CAMERA_OFFSET, CAMERA_SCALE, Unknowns
+>>>>>>> speed
 
-__all__ = ["ActuatorFit", "fit_actuator"]
+__all__ = ["fit_actuator"]
 
 Floats = NDArray[np.float64]
 _MOST_ADDED = 2  # effects that the given law lacks
@@ -81,152 +94,6 @@ _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _APART = 2.0  # rms over noise from which records are compared alone
 _LEAST_VALUES = 2  # for each unknown, without which nobody sees the noise
-_POINTS = 5  # voltages of the linear models
-_UNSETTLED = 0.3  # standard deviations that the search would still have to move a value
-_SEEN = 3.0  # standard deviations from 0: an effect that is seen
-
-
-@dataclass(frozen=True, kw_only=True)
-class ActuatorFit(Fit):
-    """One physical model of an actuator.
-
-    Args:
-        status: "ok"; what the model does not explain; or why there is no result.
-        parameters: by the names of TWIN.toml, and of the instruments; the standard deviation of one
-            that is not identifiable is infinite.
-        covariance: of `parameters`, in their order. It grows by what the model does not explain.
-            It is finite: before the records, each is assumed to be within ten widths of its start.
-        residuals: over their standard deviations, one array for each of `channels`.
-        notes: remarks for the user, one sentence each.
-        law: with the estimated parameters.
-        kind: of the actuator.
-        not_identifiable: names of parameters that these records do not determine, or whose values
-            the search had not settled.
-        length_rms_m: of the residuals of the lengths.
-        capacitance_rms_f: of those of the capacitances.
-        length_noise_m: from differences of neighbours, which a slow misfit does not change.
-        capacitance_noise_f: likewise.
-        length_factor: true over stated standard deviation of the noise of the lengths.
-        capacitance_factor: the same of the capacitances.
-        length_worst_m: rms of the residuals in the experiment that the model explains least.
-        capacitance_worst_f: the same of the capacitances.
-        widening: of the standard deviations, by which a model error, or a misstated gain or mass,
-            raised those of `covariance`.
-        hidden_variance: of the parameters by a model error of no particular direction, over that
-            by the noise; see `model_error`.
-        evaluations: of the model, until it was found.
-        chi_squared_ratio: mean square of the residuals over their standard deviations.
-        residual_whiteness_p: probability of the less probable channel under white noise.
-        channels: experiment and channel of each array of residuals.
-        linear_models: at the hung mass and some voltages up to the highest that acted.
-        mass_kg: that hangs.
-        rejected_laws: those that the records contradict decisively.
-        determined_by: by parameter, the segments that determine it; none if it is not identifiable.
-        excess_variance: typical variance of the parameters over that with white residuals.
-    """
-
-    law: ActuatorLaw | None = None
-    kind: str = ""
-    added_inertia_kg: float = 0.0
-    not_identifiable: tuple[str, ...] = ()
-    length_rms_m: float = float("nan")
-    capacitance_rms_f: float = float("nan")
-    length_noise_m: float = float("nan")
-    capacitance_noise_f: float = float("nan")
-    length_factor: float = float("nan")
-    capacitance_factor: float = float("nan")
-    length_worst_m: float = float("nan")
-    capacitance_worst_f: float = float("nan")
-    widening: Floats = field(default_factory=lambda: np.ones(0), repr=False)
-    hidden_variance: float = 0.0
-    evaluations: int = 0
-    chi_squared_ratio: float = float("nan")
-    residual_whiteness_p: float = float("nan")
-    channels: tuple[tuple[str, str], ...] = ()
-    linear_models: tuple[OperatingPoint, ...] = ()
-    mass_kg: float = float("nan")
-    rejected_laws: tuple[Rival, ...] = ()
-    determined_by: Mapping[str, tuple[Source, ...]] = field(default_factory=dict)
-    excess_variance: float = 1.0
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether there are parameters, with or without a model error."""
-        return bool(self.parameters)
-
-    def unknowns(self) -> Unknowns:
-        """What was estimated, at the estimates.
-
-        Raises:
-            ResultError: the fit has no result.
-        """
-        self._require()
-        assert self.law is not None
-        drifts = {name: found.value for name, found in self.parameters.items() if name in DRIFTS}
-        start = Unknowns.of(
-            self.law, added_inertia_kg=self.added_inertia_kg, mass_kg=self.mass_kg, drifts=drifts
-        )
-        values = np.array([self.parameters[name].value for name in start.names])
-        return replace(start, values=values)
-
-    def answer(self) -> JsonObject:
-        """See `Fit`."""
-        return {
-            "kind": self.kind,
-            "parameters": self.parameters,
-            "not_identifiable": list(self.not_identifiable),
-            "determined_by": {
-                name: [source.answer() for source in sources]
-                for name, sources in self.determined_by.items()
-            },
-            "linear_models": [
-                {
-                    "voltage_v": point.voltage_v,
-                    "mass_kg": self.mass_kg,
-                    "gain": point.gain_m_per_v,
-                    "poles": _pairs(point.poles),
-                    "zeros": _pairs(point.zeros),
-                }
-                for point in self.linear_models
-            ],
-            "residual_rms": {
-                "length_m": self.length_rms_m,
-                "capacitance_f": self.capacitance_rms_f,
-            },
-            "noise_rms": {
-                "length_m": self.length_noise_m,
-                "capacitance_f": self.capacitance_noise_f,
-            },
-            "residual_whiteness_p": self.residual_whiteness_p,
-            "rejected_laws": [
-                {"law": rival.law, "log_evidence": rival.log_evidence}
-                for rival in self.rejected_laws
-            ],
-            "evaluations": self.evaluations,
-            "notes": list(self.notes),
-            "status": self.status,
-        }
-
-    def chart(self, names: tuple[str, str] | None = None) -> Chart:
-        """Root mean square of the residuals over the noise, experiment by experiment.
-
-        Args:
-            names: not used; the axes are the experiments.
-        Returns:
-            Bars of lengths and of capacitances.
-        Raises:
-            ResultError: the fit has no result.
-        """
-        self._require()
-        experiments = list(dict.fromkeys(name for name, _ in self.channels))
-        curves = []
-        for channel in (LENGTH, CAPACITANCE):
-            found = {name: rms_of([part]) for (name, of), part in zip(
-                self.channels, self.residuals, strict=True) if of == channel}  # fmt: skip
-            x = np.array([experiments.index(name) for name in found], dtype=np.float64)
-            curves.append(Curve(x, np.array(list(found.values())), channel, "bars"))
-        panel = Panel("", "residual / noise (rms)", curves, ticks=experiments)
-        return Chart(f"Residuals of the {self.kind}", [panel])
 
 
 def fit_actuator(
@@ -301,7 +168,7 @@ def fit_actuator(
     others = compare_elastic_laws(misfit, found) if seen.explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
-    return _result(misfit, _ordered(found), rejected, preferred)
+    return result_of(misfit, _ordered(found), rejected, preferred)
 
 
 def _with_effects(
@@ -413,6 +280,7 @@ def _factors(misfit: Misfit, found: SearchResult) -> tuple[float, float]:
     rms = [rms_of(channel_of(segments, name, found.residuals)) / math.sqrt(share)
            for name in (LENGTH, CAPACITANCE)]  # fmt: skip
     return misfit.length_factor * rms[0], misfit.capacitance_factor * rms[1]
+<<<<<<< HEAD
 
 
 def _result(
@@ -580,3 +448,5 @@ def _linear_models(
         except LimitError:
             break
     return tuple(found)
+=======
+>>>>>>> speed

@@ -25,7 +25,6 @@ from haselab.actuators import ActuatorLaw, with_parameters
 from haselab.base import InputError, LimitError, ResultError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.base.estimate import Z95
-from haselab.identify.physical.fit import ActuatorFit
 from haselab.identify.physical.misfit import (
     CAPACITANCE,
     LENGTH,
@@ -34,6 +33,7 @@ from haselab.identify.physical.misfit import (
     model_record,
 )
 from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.result import ActuatorFit
 from haselab.identify.physical.unknowns import INSTRUMENTS, START_HYSTERESIS, Unknowns
 
 __all__ = ["ChannelNoise", "IdentifiedModel", "MotionPrediction", "PredictedPart", "predict_motion"]

@@ -16,6 +16,7 @@ from haselab.base import LimitError, Limits, SafetyError
 from haselab.rig import Frames, Rig, RigDescription
 from haselab.rig.twin.camera import TwinCamera
 from haselab.rig.twin.config import SETTLE_S, TwinConfig
+from haselab.rig.twin.frames import DrawnFrames
 
 __all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench", "rig_of"]
 
@@ -326,7 +327,10 @@ class TwinBench:
         if exposed is None:
             return None
         time_s, positions = exposed
-        return Frames(self.render(positions), time_s)
+        self._camera.lengths_m.check(positions)
+        frames = DrawnFrames(self._camera, self._draw, positions, self._frames_taken, time_s)
+        self._frames_taken += len(positions)
+        return frames
 
     def exposures(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """True lengths behind the coming frames: middles `(F,)` in s, lengths `(F, sub)` in m.
@@ -357,7 +361,12 @@ class TwinBench:
 
         The result does not depend on their number.
         """
-        first, parts = self._frames_taken, min(_THREADS, len(positions))
+        taken = self._draw(positions, self._frames_taken)
+        self._frames_taken += len(taken)
+        return taken
+
+    def _draw(self, positions: NDArray[np.float64], first: int) -> NDArray[np.uint8]:
+        parts = min(_THREADS, len(positions))
         if parts == 1:  # starting a thread takes longer
             taken = self._camera.render(positions, first)
         else:
@@ -377,7 +386,6 @@ class TwinBench:
                 renderers.shutdown()  # ... would never end, and the process would wait for it
                 raise
             self._renderers = renderers
-        self._frames_taken += len(taken)
         return taken
 
     def _remember(self, lengths: NDArray[np.float64]) -> None:

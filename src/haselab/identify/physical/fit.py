@@ -19,70 +19,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-<<<<<<< HEAD
-from haselab.actuators import (
-    ADDED_INERTIA,
-    DRIFT_UNITS,
-    DRIFTS,
-    GRAVITY_M_S2,
-    ActuatorLaw,
-    OperatingPoint,
-    linearise,
-)
-from haselab.base import Estimate, InputError, JsonObject, LimitError
-from haselab.base.chart import Chart, Curve, Panel
-from haselab.identify.fit import Fit
-from haselab.identify.noise import coloured_covariance
-from haselab.identify.physical.information import (
-    Source,
-    covariance_of,
-    determined_by,
-    largest_std,
-    vague_information,
-)
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
-from haselab.identify.physical.misstated import misstated_std, scale_error
-from haselab.identify.physical.model_error import hidden_std, widen_std
+from haselab.actuators import ActuatorLaw
+from haselab.base import InputError
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit
 from haselab.identify.physical.plausible import find_implausible
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.residuals import (
-    channel_of,
-    channel_residuals,
-    noise_of,
-    notes_of,
-    rms_of,
-    status_of,
-    typical_of,
-    worst_of,
-)
+from haselab.identify.physical.residuals import channel_of, channel_residuals, rms_of
+from haselab.identify.physical.result import ActuatorFit, result_of
 from haselab.identify.physical.rivals import (
     Rival,
     compare_elastic_laws,
     find_extended_law,
-    find_simpler_laws,
     search_with_all_effects,
 )
 from haselab.identify.physical.search import SearchResult, refine, search
-from haselab.identify.physical.unknowns import (
-    CAMERA_OFFSET,
-    CAMERA_SCALE,
-    SENSING_SCALE,
-    START_HYSTERESIS,
-    Unknowns,
-    shares_of,
-)
-=======
-from haselab.actuators import ActuatorLaw
-from haselab.base import InputError
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit
-from haselab.identify.physical.plausible import implausible
-from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.residuals import channel_of, rms_of, seen_of
-from haselab.identify.physical.result import ActuatorFit, result_of
-from haselab.identify.physical.rivals import Rival, other_elastic, richer, with_every_effect
-from haselab.identify.physical.search import Found, refine, search
 from haselab.identify.physical.unknowns import CAMERA_OFFSET, CAMERA_SCALE, Unknowns
->>>>>>> speed
 
 __all__ = ["fit_actuator"]
 
@@ -280,173 +231,3 @@ def _factors(misfit: Misfit, found: SearchResult) -> tuple[float, float]:
     rms = [rms_of(channel_of(segments, name, found.residuals)) / math.sqrt(share)
            for name in (LENGTH, CAPACITANCE)]  # fmt: skip
     return misfit.length_factor * rms[0], misfit.capacitance_factor * rms[1]
-<<<<<<< HEAD
-
-
-def _result(
-    misfit: Misfit, found: SearchResult, rejected: Sequence[Rival], preferred: Sequence[Rival]
-) -> ActuatorFit:
-    unknowns = found.unknowns
-    segments = misfit.segments
-    seen = channel_residuals(misfit, found)
-    lengths, capacitances = seen.lengths, seen.capacitances
-    length_noise, capacitance_noise = noise_of(lengths), noise_of(capacitances)
-    status, usable = status_of(
-        seen, unknowns.value(SENSING_SCALE), preferred, converged=found.converged
-    )
-    if not usable:
-        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
-    prior = vague_information(unknowns)
-    covariance = _covariance(found, segments, prior)
-    own_std = np.sqrt(np.diag(covariance))
-    white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
-    energy = seen.excess_energy if status != "ok" else 0.0
-    if status != "ok":
-        covariance = widen_std(covariance, hidden_std(found.jacobian, energy, prior))
-    scale_std = float(np.sqrt(np.diag(covariance))[unknowns.names.index(SENSING_SCALE)])
-    error = scale_error(unknowns.value(SENSING_SCALE), scale_std)
-    covariance = widen_std(covariance, misstated_std(misfit, found, error, prior))
-    std = np.sqrt(np.diag(covariance))
-    widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
-    described = {about.key: about for about in unknowns.law.described()}
-    units = {key: about.unit for key, about in described.items()}
-    units |= {ADDED_INERTIA: "kg", "camera.latency_s": "s", "camera.offset_m": "m",
-              "camera.scale": "", "sensing.latency_s": "s", "sensing.scale": "",
-              START_HYSTERESIS: "N", **DRIFT_UNITS}  # fmt: skip
-    slopes = unknowns.slopes
-    weak = (std > largest_std(unknowns)) | (np.abs(found.left) > _UNSETTLED * std)
-    weak |= _unseen(unknowns, std)
-    parameters = {}
-    for k, name in enumerate(unknowns.names):
-        unit = units[name.partition("[")[0]]
-        if unknowns.by_logarithm[k] or unknowns.inverse_exponent[k]:
-            share = np.inf if weak[k] else std[k] * abs(slopes[k]) / unknowns.values[k]
-            parameters[name] = (
-                Estimate.inverse(
-                    unknowns.values[k],
-                    share,
-                    unit,
-                    described[name].high,
-                    unknowns.inverse_exponent[k],
-                )
-                if unknowns.inverse_exponent[k]
-                else Estimate.lognormal(unknowns.values[k], share, unit)
-            )
-        else:
-            known_std = np.inf if weak[k] else std[k]
-            parameters[name] = Estimate.normal(unknowns.values[k], known_std, unit)
-    sources = determined_by(unknowns, _by_segment(segments, found.jacobian))
-    names = np.array(unknowns.names)
-    std_m = misfit.length_factor * typical_of([r.length_std_m for r in misfit.records])
-    std_f = misfit.capacitance_factor * typical_of([r.capacitance_std_f for r in misfit.records])
-    law = unknowns.present_law()
-    values = covariance * np.outer(slopes, slopes)
-    return ActuatorFit(
-        status=status,
-        notes=notes_of(error),
-        parameters=parameters,
-        covariance=values,
-        residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),
-        channels=tuple((part.experiment, part.channel) for part in segments if part.experiment),
-        length_rms_m=std_m * rms_of(lengths),
-        length_noise_m=std_m * length_noise,
-        capacitance_rms_f=std_f * rms_of(capacitances),
-        capacitance_noise_f=std_f * capacitance_noise,
-        length_factor=misfit.length_factor * length_noise,
-        capacitance_factor=misfit.capacitance_factor * capacitance_noise,
-        length_worst_m=std_m * worst_of(lengths),
-        capacitance_worst_f=std_f * worst_of(capacitances),
-        widening=widening,
-        hidden_variance=energy / std.size,
-        residual_whiteness_p=seen.whiteness_p,
-        law=law,
-        kind=law.kind,
-        mass_kg=unknowns.mass_kg,
-        added_inertia_kg=unknowns.value(ADDED_INERTIA),
-        linear_models=_linear_models(law, unknowns, misfit.records),
-        not_identifiable=tuple(names[weak].tolist()),
-        determined_by={
-            name: () if weak[k] else sources[name] for k, name in enumerate(unknowns.names)
-        },
-        excess_variance=_excess_variance(covariance, white, ~weak),
-        evaluations=found.evaluations,
-        rejected_laws=_each_once([*rejected, *find_simpler_laws(found, values)]),
-        chi_squared_ratio=float(np.mean(found.residuals**2)),
-    )
-
-
-def _unseen(unknowns: Unknowns, std: Floats) -> NDArray[np.bool_]:
-    """Which parameters are those of an effect that may be absent, such as softening.
-
-    A small effect may be the end of a larger one at another stretch or time, which no standard
-    deviation about its estimate covers.
-    """
-    names = list(unknowns.names)
-    unseen = np.zeros(len(names), dtype=bool)
-    for k, name in enumerate(names):
-        for share in set(shares_of(name)) - {name}:
-            if share in names:
-                at = names.index(share)
-                spread = std[at] * abs(unknowns.slopes[at])
-                if not abs(unknowns.values[at]) > _SEEN * spread:
-                    unseen[[k, at]] = True
-    return unseen
-
-
-def _each_once(rivals: Sequence[Rival]) -> tuple[Rival, ...]:
-    """The first of those with the same law: of an added effect, the evidence at its addition."""
-    found: dict[str, Rival] = {}
-    for rival in rivals:
-        found.setdefault(rival.law, rival)
-    return tuple(found.values())
-
-
-def _covariance(found: SearchResult, segments: Sequence[Segment], prior: Floats) -> Floats:
-    """Of what varies."""
-    return coloured_covariance(
-        [found.jacobian[part.rows] for part in segments],
-        [found.residuals[part.rows] for part in segments],
-        found.unknowns.values.size,
-        prior=prior,
-    )
-
-
-def _excess_variance(covariance: Floats, white: Floats, known: NDArray[np.bool_]) -> float:
-    """Typical ratio of the variances of what is identifiable; at least 1."""
-    ratio = (np.diag(covariance) / np.diag(white))[known]
-    return max(1.0, float(np.median(ratio))) if ratio.size else 1.0
-
-
-def _by_segment(segments: Sequence[Segment], values: Floats) -> dict[tuple[str, str], Floats]:
-    """Rows of each experiment and channel; those of experiments of one name together."""
-    found: dict[tuple[str, str], list[Floats]] = {}
-    for part in segments:
-        found.setdefault((part.experiment, part.channel), []).append(values[part.rows])
-    return {name: np.vstack(parts) for name, parts in found.items()}
-
-
-def _pairs(values: NDArray[np.complex128]) -> list[list[float]]:
-    return [[float(value.real), float(value.imag)] for value in values]
-
-
-def _linear_models(
-    law: ActuatorLaw, unknowns: Unknowns, records: Sequence[MotionRecord]
-) -> tuple[OperatingPoint, ...]:
-    """At the hung mass, for motion within the lengths that were reached."""
-    highest_v = max(float(np.abs(record.drive.voltage_v).max()) for record in records)
-    longest_m = max((float(r.length_m.max()) for r in records if r.length_m.size), default=None)
-    inertia_kg = unknowns.mass_kg + unknowns.value(ADDED_INERTIA)
-    found = []
-    for voltage_v in np.linspace(0.0, highest_v, _POINTS).tolist():
-        try:
-            found.append(
-                linearise(
-                    law, voltage_v, unknowns.mass_kg * GRAVITY_M_S2, inertia_kg,
-                    longest_m=longest_m,
-                )
-            )  # fmt: skip
-        except LimitError:
-            break
-    return tuple(found)
-=======
->>>>>>> speed

@@ -30,19 +30,19 @@ from haselab.identify.physical.information import (
 )
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
 from haselab.identify.physical.misstated import misstated_std, scale_error
-from haselab.identify.physical.model_error import hidden_std, widened
+from haselab.identify.physical.model_error import hidden_std, widen_std
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
+    channel_residuals,
     noise_of,
     notes_of,
     rms_of,
-    seen_of,
     status_of,
     typical_of,
     worst_of,
 )
-from haselab.identify.physical.rivals import Rival, simpler
-from haselab.identify.physical.search import Found
+from haselab.identify.physical.rivals import Rival, find_simpler_laws
+from haselab.identify.physical.search import SearchResult
 from haselab.identify.physical.unknowns import (
     SENSING_SCALE,
     START_HYSTERESIS,
@@ -202,7 +202,7 @@ class ActuatorFit(Fit):
 
 
 def result_of(
-    misfit: Misfit, found: Found, rejected: Sequence[Rival], preferred: Sequence[Rival]
+    misfit: Misfit, found: SearchResult, rejected: Sequence[Rival], preferred: Sequence[Rival]
 ) -> ActuatorFit:
     """The fit of a minimum.
 
@@ -216,7 +216,7 @@ def result_of(
     """
     unknowns = found.unknowns
     segments = misfit.segments
-    seen = seen_of(misfit, found)
+    seen = channel_residuals(misfit, found)
     lengths, capacitances = seen.lengths, seen.capacitances
     length_noise, capacitance_noise = noise_of(lengths), noise_of(capacitances)
     status, usable = status_of(
@@ -230,10 +230,10 @@ def result_of(
     white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
     energy = seen.excess_energy if status != "ok" else 0.0
     if status != "ok":
-        covariance = widened(covariance, hidden_std(found.jacobian, energy, prior))
+        covariance = widen_std(covariance, hidden_std(found.jacobian, energy, prior))
     scale_std = float(np.sqrt(np.diag(covariance))[unknowns.names.index(SENSING_SCALE)])
     error = scale_error(unknowns.value(SENSING_SCALE), scale_std)
-    covariance = widened(covariance, misstated_std(misfit, found, error, prior))
+    covariance = widen_std(covariance, misstated_std(misfit, found, error, prior))
     std = np.sqrt(np.diag(covariance))
     widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
     described = {about.key: about for about in unknowns.law.described()}
@@ -298,7 +298,7 @@ def result_of(
         },
         excess_variance=_excess_variance(covariance, white, ~weak),
         evaluations=found.evaluations,
-        rejected_laws=_each_once([*rejected, *simpler(found, values)]),
+        rejected_laws=_each_once([*rejected, *find_simpler_laws(found, values)]),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
 
@@ -329,7 +329,7 @@ def _each_once(rivals: Sequence[Rival]) -> tuple[Rival, ...]:
     return tuple(found.values())
 
 
-def _covariance(found: Found, segments: Sequence[Segment], prior: Floats) -> Floats:
+def _covariance(found: SearchResult, segments: Sequence[Segment], prior: Floats) -> Floats:
     """Of what varies."""
     return coloured_covariance(
         [found.jacobian[part.rows] for part in segments],

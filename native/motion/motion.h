@@ -17,7 +17,7 @@
 
 #define MOTION_BRANCHES 4
 #define MOTION_LENGTHS 1024
-#define MOTION_VOLTAGES 65
+#define MOTION_VOLTAGES 129
 
 /* An actuator law as numbers on a grid of lengths and voltages, with cubics between the knots. */
 typedef struct {

@@ -26,7 +26,7 @@ from haselab import _motion
 from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.losses import DRIFTS, drift_pairs
 from haselab.actuators.operating_point import equilibrium_m
-from haselab.actuators.table import law_table
+from haselab.actuators.table import at_all_voltages, law_table, solved_voltages
 from haselab.base import InputError, LimitError
 
 __all__ = [
@@ -322,15 +322,21 @@ class SampledLaw:
         knots = np.arange(self.table.elastic_n.size, dtype=np.float64)
         lengths_m = np.asarray(self.table.low_m + self.table.step_m * knots)
         rows = self.table.capacitance_f.shape[0]
-        voltages_v = np.asarray(self.table.step_v * np.arange(rows, dtype=np.float64))
-        near = self.table.values if rows > 1 else None  # otherwise of more voltages
-        elastic, pull, capacitance, free, losses = [], [], [], [], []
+        follows = rows > 1
+        voltages_v = solved_voltages(highest_v) if follows else np.zeros(1)
+        near = self.table.values if follows else None  # otherwise of more voltages
+        elastic, free, losses = [], [], []
+        pull: list[Floats] = []
+        capacitance: list[Floats] = []
         for name in self.by:
             low, high, width = _beside(law, name)
             first, last = (part.on_grid(lengths_m, voltages_v, near) for part in (low, high))
             elastic.append((last.elastic_n - first.elastic_n) / width)
-            capacitance.append((last.capacitance_f - first.capacitance_f) / width)
-            pull.append((last.pull_n_v2 - first.pull_n_v2) / width)
+            for found, change in (
+                (capacitance, last.capacitance_f - first.capacitance_f),
+                (pull, last.pull_n_v2 - first.pull_n_v2),
+            ):
+                found.append((at_all_voltages(change) if follows else change) / width)
             free.append(self._free_moved_m(low, high) / width)
             changed = _losses_of(_parameters(high)) - _losses_of(_parameters(low))
             if name in _BESIDE_THE_LAW:

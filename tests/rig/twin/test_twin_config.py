@@ -43,7 +43,7 @@ def test_all_faults_are_reported_at_once_each_with_its_path(tmp_path: Path) -> N
         "[load]\nmass_kg = -0.25\n[shell]\nlenght_m = 0.06\n"
         '[acquisition]\nbits = 24\n[amplifier]\ngain = "high"\n',
     )
-    with pytest.raises(InputError, match=r"^4 error\(s\)") as fault:
+    with pytest.raises(InputError, match=r"^4 errors") as fault:
         load_twin(path)
     message = str(fault.value)
     for where, what in (

@@ -25,7 +25,7 @@ inline void fill_law(motion_law &law, double low_m, double step_m, double step_v
     if (n < 4 || n > MOTION_LENGTHS || gap_m.size() != n || capacitance_f.shape(1) != n ||
         pull_n_v2.shape(1) != n || pull_n_v2.shape(0) != rows || rows > MOTION_VOLTAGES ||
         (rows != 1 && rows < 4) || !(step_m > 0.0) || !(step_v > 0.0)) {
-        throw std::invalid_argument("4 to 1024 lengths, 1 or 4 to 65 voltages, one grid");
+        throw std::invalid_argument("4 to 1024 lengths, 1 or 4 to 129 voltages, one grid");
     }
     law.lengths = static_cast<int32_t>(n);
     law.voltages = static_cast<int32_t>(rows);

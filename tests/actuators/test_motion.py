@@ -94,7 +94,7 @@ def test_a_capacitance_that_depends_on_the_voltage_goes_into_the_table_too(monke
     )
     config = TwinConfig(kind="saturating")
     law = config.law
-    assert law_table(law, 15e3).pull_n_v2.shape == (65, 1024)
+    assert law_table(law, 15e3).pull_n_v2.shape == (129, 1024)
     bench = native_bench(config, 0)
     assert bench.capacitance(0.03, 7e3) == pytest.approx(
         float(law.differential_capacitance_f(0.03, 7e3)), rel=1e-5

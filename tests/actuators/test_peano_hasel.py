@@ -176,7 +176,7 @@ def test_a_film_that_nothing_straightens_is_refused():
 
 def test_a_law_too_sharp_for_the_table_is_refused():
     sharp = PeanoHasel(half_zipped_v=500.0)
-    with pytest.raises(InputError, match=r"interpolation between 65 voltages has a relative err"):
+    with pytest.raises(InputError, match=r"interpolation between 129 voltages has a relative err"):
         law_table(sharp, 1.5e4)
     stiff = dataclasses.replace(PeanoHasel(), rounding_m=5e-6)
     with pytest.raises(InputError, match=r"interpolation between 1024 lengths has a relative er"):

@@ -6,7 +6,7 @@
 
 #define HS_KEPT 4 /* of them are added last */
 
-/* cosine, sine, level, ramp, square: the lanes of one piece, four of each. */
+/* cosine, sine, level, ramp, square: the lanes of one segment, four of each. */
 typedef float hs_kept[5][HS_KEPT];
 
 static void fold_lanes(const float *lane, float *kept)
@@ -21,7 +21,7 @@ static void fold_lanes(const float *lane, float *kept)
     }
 }
 
-static void sum_piece(const float *x, const float *cosine, const float *sine, uint16_t n,
+static void sum_segment(const float *x, const float *cosine, const float *sine, uint16_t n,
                          hs_kept kept)
 {
     float c[HS_LANES] = {0}, s[HS_LANES] = {0}, l[HS_LANES] = {0}, q[HS_LANES] = {0};
@@ -64,14 +64,14 @@ static float add_kept(const float *x)
     return (x[0] + x[2]) + (x[1] + x[3]);
 }
 
-void hs_sum_pieces(const float *x, uint32_t n, const float *cosine, const float *sine,
-                   uint16_t piece, hs_sums *out)
+void hs_sum_segments(const float *x, uint32_t n, const float *cosine, const float *sine,
+                   uint16_t segment, hs_sums *out)
 {
     uint32_t from;
-    for (from = 0; from < n; from += piece) {
+    for (from = 0; from < n; from += segment) {
         const uint32_t left = n - from;
         hs_kept kept;
-        sum_piece(x + from, cosine, sine, left < piece ? (uint16_t)left : piece, kept);
+        sum_segment(x + from, cosine, sine, left < segment ? (uint16_t)left : segment, kept);
         out->first = x[from];
         out->cosine = add_kept(kept[0]);
         out->sine = add_kept(kept[1]);
@@ -82,7 +82,7 @@ void hs_sum_pieces(const float *x, uint32_t n, const float *cosine, const float 
     }
 }
 
-hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums)
+hs_phasor hs_phasor_of_segment(const float inverse[8], const hs_sums *sums)
 {
     const float b[4] = {sums->cosine, sums->sine, sums->level, sums->ramp};
     hs_phasor p = {0.0f, 0.0f};

@@ -28,8 +28,8 @@ extern "C" {
 #define HS_LARGEST 3.0e38f
 #define HS_LEAD 0.25f /* tangent of the phase lead beyond 90 degrees due to a monitor's lag */
 
-/* Sums for least squares over one channel in one piece of a block, of its samples minus the first:
- * with the carrier's table, with 1 and with the sample number. Pieces can be added, skipped or
+/* Sums for least squares over one channel in one segment of a block, of its samples minus the first:
+ * with the carrier's table, with 1 and with the sample number. Segments can be added, skipped or
  * weighted later without reading the samples again. */
 typedef struct {
     float first;  /* reading that was subtracted */
@@ -40,22 +40,22 @@ typedef struct {
     float square; /* sum of d^2 */
 } hs_sums;
 
-/* Sums of every piece of a block, the last of which may be shorter.
+/* Sums of every segment of a block, the last of which may be shorter.
  * x:            n readings of one channel, in any unit; n is at least 1.
- * cosine, sine: `piece` values each of the carrier, from phase 0 at a piece's first sample.
- * out:          n / piece sums, rounded up.
+ * cosine, sine: `segment` values each of the carrier, from phase 0 at a segment's first sample.
+ * out:          n / segment sums, rounded up.
  */
-void hs_sum_pieces(const float *x, uint32_t n, const float *cosine, const float *sine,
-                   uint16_t piece, hs_sums *out);
+void hs_sum_segments(const float *x, uint32_t n, const float *cosine, const float *sine,
+                   uint16_t segment, hs_sums *out);
 
 /* Peak amplitude of the carrier, x = re cos - im sin. */
 typedef struct {
     float re, im;
 } hs_phasor;
 
-/* Phasor of a single piece.
- * inverse: first two rows of (B'B)^-1, B the columns cos, sin, 1, k over the piece's samples. */
-hs_phasor hs_phasor_of_piece(const float inverse[8], const hs_sums *sums);
+/* Phasor of a single segment.
+ * inverse: first two rows of (B'B)^-1, B the columns cos, sin, 1, k over the segment's samples. */
+hs_phasor hs_phasor_of_segment(const float inverse[8], const hs_sums *sums);
 
 /* Series capacitance and resistance from the phasors, without trigonometry:
  *     Y = scale I / V - stray,   1 / Y = R + 1 / (j omega C) */

@@ -97,18 +97,18 @@ class Plan {
           sine_(sine.data(), sine.data() + sine.size())
     {
         const Records<const sense_choice> given(choices);
-        plan_.sum = sum_pieces_by(vectors);
+        plan_.sum = sum_segments_by(vectors);
         plan_.samples = samples;
-        plan_.piece = cosine_.size();
-        if (samples == 0 || plan_.piece < 8 || plan_.piece > 65535 || plan_.piece > samples ||
-            sine_.size() != plan_.piece || given.size() == 0) {
+        plan_.segment = cosine_.size();
+        if (samples == 0 || plan_.segment < 8 || plan_.segment > 65535 || plan_.segment > samples ||
+            sine_.size() != plan_.segment || given.size() == 0) {
             throw std::invalid_argument("tables do not fit the block");
         }
-        plan_.pieces = samples / plan_.piece;
-        if (plan_.pieces > SENSE_PIECES) {
-            throw std::invalid_argument("too many pieces in a block");
+        plan_.segments = samples / plan_.segment;
+        if (plan_.segments > SENSE_SEGMENTS) {
+            throw std::invalid_argument("too many segments in a block");
         }
-        plan_.padded = (plan_.pieces + 8) / 8 * 8;
+        plan_.padded = (plan_.segments + 8) / 8 * 8;
         plan_.cosine = cosine_.data();
         plan_.sine = sine_.data();
         for (size_t k = 0; k < cosine_.size(); ++k) { // of three times the angle
@@ -134,7 +134,7 @@ class Plan {
         plan_.choices = choices_.data();
         plan_.choice_count = choices_.size();
         plan_.start = 0;
-        while (plan_.start + 1 < plan_.pieces && choices_[0].used[plan_.start] == 0.0) {
+        while (plan_.start + 1 < plan_.segments && choices_[0].used[plan_.start] == 0.0) {
             ++plan_.start;
         }
     }
@@ -272,27 +272,27 @@ class Paper {
     bool started_ = false;
 };
 
-// Cuts of many blocks. y: (blocks, 2, 2 pieces); each table: 2 rows a piece for runs of 1, 2 ...
-// pieces; limits: least and most columns of each table, then gap and spare; prices: of a parameter,
-// of a cut, of a piece left out. parts: PART (blocks, pieces), results: PARTS_RESULT (blocks,).
+// Cuts of many blocks. y: (blocks, 2, 2 segments); each table: 2 rows a segment for runs of 1, 2 ...
+// segments; limits: least and most columns of each table, then gap and spare; prices: of a parameter,
+// of a cut, of a segment left out. parts: PART (blocks, segments), results: PARTS_RESULT (blocks,).
 void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<size_t> &limits,
                const std::vector<double> &prices, nb::object parts_out, nb::object results)
 {
     const Records<parts_part> parts(parts_out);
     const Records<parts_result> result(results);
-    const size_t blocks = y.shape(0), pieces = y.shape(2) / 2, kinds = tables.size();
-    if (pieces == 0 || pieces > PARTS_PIECES || y.shape(2) != 2 * pieces || kinds == 0 ||
+    const size_t blocks = y.shape(0), segments = y.shape(2) / 2, kinds = tables.size();
+    if (segments == 0 || segments > PARTS_SEGMENTS || y.shape(2) != 2 * segments || kinds == 0 ||
         kinds > PARTS_KINDS || limits.size() != 2 * kinds + 2 || prices.size() != 3 ||
-        parts.shape(0) != blocks || parts.shape(1) != pieces || result.size() != blocks) {
+        parts.shape(0) != blocks || parts.shape(1) != segments || result.size() != blocks) {
         throw std::invalid_argument("the tables or the output do not fit the blocks");
     }
     parts_plan plan{};
-    plan.pieces = pieces;
+    plan.segments = segments;
     plan.kinds = kinds;
     for (size_t k = 0; k < kinds; ++k) {
-        if (tables[k].shape(0) != pieces * (pieces + 1) || limits[2 * k] == 0 ||
+        if (tables[k].shape(0) != segments * (segments + 1) || limits[2 * k] == 0 ||
             limits[2 * k + 1] > PARTS_SIZE) {
-            throw std::invalid_argument("a table does not fit the pieces");
+            throw std::invalid_argument("a table does not fit the segments");
         }
         plan.tables[k] = {tables[k].data(), limits[2 * k], limits[2 * k + 1]};
     }
@@ -303,7 +303,7 @@ void run_parts(Drives y, const std::vector<Tables> &tables, const std::vector<si
     plan.left_out = prices[2];
     nb::gil_scoped_release free_gil;
     for (size_t b = 0; b < blocks; ++b) {
-        parts_cut(&plan, y.data() + 4 * pieces * b, parts.data() + pieces * b, result.data() + b);
+        parts_cut(&plan, y.data() + 4 * segments * b, parts.data() + segments * b, result.data() + b);
     }
 }
 
@@ -313,7 +313,7 @@ NB_MODULE(_sense, m)
 {
     nb::set_leak_warnings(false); // objects that exist until the interpreter ends are not leaks
     m.doc() = "Sensing on the desktop: the core's sums, what follows from them, and the paper's chain";
-    m.attr("PIECES") = SENSE_PIECES;
+    m.attr("SEGMENTS") = SENSE_SEGMENTS;
     m.attr("ROOM") = SENSE_ALL;
     m.attr("RESULT") = dtype_of<sense_result>(
         {FIELD(sense_result, v_re), FIELD(sense_result, v_im), FIELD(sense_result, i_re),
@@ -338,15 +338,15 @@ NB_MODULE(_sense, m)
     m.attr("PAPER_RESULT") = dtype_of<paper_result>(
         {FIELD(paper_result, peak_to_peak), FIELD(paper_result, re), FIELD(paper_result, im),
          FIELD(paper_result, scatter), FIELD(paper_result, most)});
-    // Sums of every piece: which vectors add them changes no bit.
-    m.def("sum_pieces", [](Floats x, Floats cosine, Floats sine, int bits, nb::object sums) {
+    // Sums of every segment: which vectors add them changes no bit.
+    m.def("sum_segments", [](Floats x, Floats cosine, Floats sine, int bits, nb::object sums) {
         const Records<hs_sums> out(sums);
-        const size_t piece = cosine.size();
-        if (x.size() == 0 || piece == 0 || piece > 65535 || sine.size() != piece ||
-            out.size() != (x.size() + piece - 1) / piece) {
-            throw std::invalid_argument("the output does not fit the pieces");
+        const size_t segment = cosine.size();
+        if (x.size() == 0 || segment == 0 || segment > 65535 || sine.size() != segment ||
+            out.size() != (x.size() + segment - 1) / segment) {
+            throw std::invalid_argument("the output does not fit the segments");
         }
-        sum_pieces_by(bits)(x.data(), x.size(), cosine.data(), sine.data(), piece, 0,
+        sum_segments_by(bits)(x.data(), x.size(), cosine.data(), sine.data(), segment, 0,
                             out.data());
     });
     nb::class_<Plan>(m, "Plan").def(
@@ -356,7 +356,7 @@ NB_MODULE(_sense, m)
         nb::arg("turn"), nb::arg("local"), nb::arg("whitening"), nb::arg("choices"),
         nb::arg("period_s"), nb::arg("omega_rad_s"), nb::arg("full_scale"),
         nb::arg("current_limit"), nb::arg("vectors") = 512);
-    m.def("vectors", [] { return sum_pieces_bits(512); });
+    m.def("vectors", [] { return sum_segments_bits(512); });
     m.def(
         "blocks",
         [](const Plan &plan, Any x, nb::object out, size_t threads) {

@@ -1,4 +1,4 @@
-/* Takes: level and slope of a block's pieces. Gives: the best cut into parts, each with a model. */
+/* Takes: level and slope of a block's segments. Gives: the best cut into parts, each with a model. */
 #include "sensing/parts.h"
 
 #include <math.h>
@@ -14,17 +14,17 @@ typedef struct {
     int32_t size, kind;
 } run;
 
-/* Squares that the columns of one table take of runs of `count` pieces, from each first piece on.
+/* Squares that the columns of one table take of runs of `count` segments, from each first segment on.
  * Levels and slopes lie apart in y, so that neighbouring runs go through one vector instruction. */
-HS_CLONES static void take(const double *columns, size_t most, size_t count, size_t pieces,
-                           const double y[4][PARTS_PIECES], double taken[][PARTS_PIECES])
+HS_CLONES static void take(const double *columns, size_t most, size_t count, size_t segments,
+                           const double y[4][PARTS_SEGMENTS], double taken[][PARTS_SEGMENTS])
 {
-    const size_t runs = pieces - count + 1;
+    const size_t runs = segments - count + 1;
     size_t first, j, k, c;
     for (k = 0; k < most; ++k) {
         double *restrict to = taken[k];
         for (c = 0; c < 4; c += 2) {
-            double sum[PARTS_PIECES] = {0};
+            double sum[PARTS_SEGMENTS] = {0};
             for (j = 0; j < count; ++j) {
                 const double a = columns[PARTS_SIZE * 2 * j + k];
                 const double b = columns[PARTS_SIZE * (2 * j + 1) + k];
@@ -41,34 +41,34 @@ HS_CLONES static void take(const double *columns, size_t most, size_t count, siz
 }
 
 /* Best model of every run: runs[first][count - 1]. */
-static void judge_runs(const parts_plan *plan, const double *y, run runs[][PARTS_PIECES])
+static void judge_runs(const parts_plan *plan, const double *y, run runs[][PARTS_SEGMENTS])
 {
-    const size_t pieces = plan->pieces;
-    double energy[PARTS_PIECES + 1], taken[PARTS_SIZE][PARTS_PIECES], apart[4][PARTS_PIECES];
+    const size_t segments = plan->segments;
+    double energy[PARTS_SEGMENTS + 1], taken[PARTS_SIZE][PARTS_SEGMENTS], apart[4][PARTS_SEGMENTS];
     size_t p, count, first, kind, k;
     energy[0] = 0.0;
-    for (p = 0; p < pieces; ++p) {
-        const double *v = y + 2 * p, *i = v + 2 * pieces;
+    for (p = 0; p < segments; ++p) {
+        const double *v = y + 2 * p, *i = v + 2 * segments;
         apart[0][p] = v[0];
         apart[1][p] = v[1];
         apart[2][p] = i[0];
         apart[3][p] = i[1];
         energy[p + 1] = energy[p] + v[0] * v[0] + v[1] * v[1] + i[0] * i[0] + i[1] * i[1];
-        for (count = 0; count < pieces; ++count) {
+        for (count = 0; count < segments; ++count) {
             runs[p][count].cost = HUGE_VAL;
         }
     }
     for (kind = 0; kind < plan->kinds; ++kind) {
         const parts_table *table = &plan->tables[kind];
         const double *columns = table->columns;
-        for (count = 1; count <= pieces; columns += 2 * PARTS_SIZE * count, ++count) {
+        for (count = 1; count <= segments; columns += 2 * PARTS_SIZE * count, ++count) {
             const size_t room = 2 * count > plan->spare ? 2 * count - plan->spare : 0;
             const size_t most = table->most < room ? table->most : room;
             if (most < table->least) {
                 continue;
             }
-            take(columns, most, count, pieces, (const double(*)[PARTS_PIECES])apart, taken);
-            for (first = 0; first + count <= pieces; ++first) {
+            take(columns, most, count, segments, (const double(*)[PARTS_SEGMENTS])apart, taken);
+            for (first = 0; first + count <= segments; ++first) {
                 run *best = &runs[first][count - 1];
                 double cost = energy[first + count] - energy[first];
                 for (k = 0; k < most; ++k) {
@@ -86,11 +86,11 @@ static void judge_runs(const parts_plan *plan, const double *y, run runs[][PARTS
 
 void parts_cut(const parts_plan *plan, const double *y, parts_part *parts, parts_result *out)
 {
-    const size_t pieces = plan->pieces;
-    run runs[PARTS_PIECES][PARTS_PIECES];
-    /* Least cost of all pieces before a place: where a part ends there, or a gap. */
-    double part_ends[PARTS_PIECES + 1], gap_ends[PARTS_PIECES + 1];
-    size_t begins[PARTS_PIECES + 1], gaps[PARTS_PIECES + 1]; /* pieces of the part, of the gap */
+    const size_t segments = plan->segments;
+    run runs[PARTS_SEGMENTS][PARTS_SEGMENTS];
+    /* Least cost of all segments before a place: where a part ends there, or a gap. */
+    double part_ends[PARTS_SEGMENTS + 1], gap_ends[PARTS_SEGMENTS + 1];
+    size_t begins[PARTS_SEGMENTS + 1], gaps[PARTS_SEGMENTS + 1]; /* segments of the part, of the gap */
     size_t end, first, found = 0;
     int in_part;
 
@@ -98,9 +98,9 @@ void parts_cut(const parts_plan *plan, const double *y, parts_part *parts, parts
     part_ends[0] = 0.0;
     gap_ends[0] = HUGE_VAL;
     gaps[0] = begins[0] = 0;
-    for (end = 1; end <= pieces; ++end) {
+    for (end = 1; end <= segments; ++end) {
         /* At both ends of a block a gap may be shorter: its other half lies outside. */
-        const size_t short_gap = end == pieces ? 1 : plan->gap;
+        const size_t short_gap = end == segments ? 1 : plan->gap;
         const size_t least = end >= short_gap ? short_gap : end;
         const double opened = part_ends[end - least] + plan->cut_price +
                               (double)least * plan->left_out;
@@ -121,10 +121,10 @@ void parts_cut(const parts_plan *plan, const double *y, parts_part *parts, parts
             }
         }
     }
-    in_part = part_ends[pieces] <= gap_ends[pieces];
-    out->score = in_part ? part_ends[pieces] : gap_ends[pieces];
+    in_part = part_ends[segments] <= gap_ends[segments];
+    out->score = in_part ? part_ends[segments] : gap_ends[segments];
     out->misfit = 0.0;
-    for (end = pieces; end > 0;) {
+    for (end = segments; end > 0;) {
         if (in_part) {
             const run *taken = &runs[begins[end]][end - begins[end] - 1];
             const parts_part one = {(int32_t)begins[end], (int32_t)(end - begins[end]), taken->size,

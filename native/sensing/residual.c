@@ -110,12 +110,12 @@ HS_CLONES static float sum_products(const float *v, const float *i, size_t n, fl
     return sum;
 }
 
-/* The carrier's table for piece p, and the model's constants at its sample `from`. */
+/* The carrier's table for segment p, and the model's constants at its sample `from`. */
 static void leave_strip(const sense_plan *plan, const sense_model *model, size_t p, size_t from,
                         double after, const float *x, size_t n, float *rest, strip_sums *out)
 {
-    const double size = (double)plan->samples, start = (double)(p * plan->piece + from);
-    const double ahead = model->turn * ((double)p - 0.5 * (double)(plan->pieces - 1));
+    const double size = (double)plan->samples, start = (double)(p * plan->segment + from);
+    const double ahead = model->turn * ((double)p - 0.5 * (double)(plan->segments - 1));
     const double c = model->turn == 0.0 ? 1.0 : cos(ahead), s = model->turn == 0.0 ? 0.0 : sin(ahead);
     const double turn_cos = plan->turn_cos[p] * c - plan->turn_sin[p] * s;
     const double turn_sin = plan->turn_sin[p] * c + plan->turn_cos[p] * s;
@@ -138,16 +138,16 @@ void sense_sum_residual(const sense_plan *plan, sense_type type, const void *v, 
     size_t p, j, from;
 
     memset(out, 0, sizeof *out);
-    for (p = 0; p < plan->pieces; ++p) {
-        /* cos and sin of three times the angle at which the piece begins */
+    for (p = 0; p < plan->segments; ++p) {
+        /* cos and sin of three times the angle at which the segment begins */
         const double c = plan->turn_cos[p], s = plan->turn_sin[p];
         const double c3 = (4.0 * c * c - 3.0) * c, s3 = (3.0 - 4.0 * s * s) * s;
         if (choice->used[p] == 0.0) {
             continue;
         }
-        for (from = 0; from < plan->piece; from += STRIP) {
-            const size_t left = plan->piece - from, n = left < STRIP ? left : STRIP;
-            const size_t at = p * plan->piece + from;
+        for (from = 0; from < plan->segment; from += STRIP) {
+            const size_t left = plan->segment - from, n = left < STRIP ? left : STRIP;
+            const size_t at = p * plan->segment + from;
             sense_load(type, v, i, stride, at, n, readings[0], readings[1]);
             for (j = 0; j < 2; ++j) {
                 leave_strip(plan, &model[j], p, from, choice->after[p], readings[j], n, rest[j],

@@ -2,14 +2,14 @@
 #ifndef HASELAB_RESIDUAL_H
 #define HASELAB_RESIDUAL_H
 
-#include "sensing/pieces.h"
+#include "sensing/segments.h"
 
-/* The plain model of one channel: carrier, level, slope, and a step at skipped pieces. */
+/* The plain model of one channel: carrier, level, slope, and a step at skipped segments. */
 typedef struct {
     double a, b;          /* carrier, from the block's first sample */
     double level, slope;  /* in the block's middle, unit of the readings; per block */
-    double step;          /* of the pieces after an update */
-    double turn;          /* phase advance of the carrier from its nominal frequency, rad per piece */
+    double step;          /* of the segments after an update */
+    double turn;          /* phase advance of the carrier from its nominal frequency, rad per segment */
 } sense_model;
 
 /* Sums over the residual r of the samples that are used. */
@@ -23,7 +23,7 @@ typedef struct {
     double samples;
 } sense_residual;
 
-/* One more pass over the readings of the pieces that are used. */
+/* One more pass over the readings of the segments that are used. */
 void sense_sum_residual(const sense_plan *plan, sense_type type, const void *v, const void *i,
                         size_t stride, const sense_choice *choice, const sense_model model[2],
                         sense_residual *out);

@@ -4,14 +4,14 @@
 #include <math.h>
 #include <string.h>
 
-#include "sensing/pieces.h"
+#include "sensing/segments.h"
 #include "sensing/residual.h"
 
-/* ---- least squares over the pieces of a choice -------------------------------------------- */
+/* ---- least squares over the segments of a choice -------------------------------------------- */
 
 typedef struct {
     double x[SENSE_BASIS];
-    double noise;          /* variance of a reading, from the pieces on their own */
+    double noise;          /* variance of a reading, from the segments on their own */
     double explained;      /* sum of squares that the fit takes */
 } fit;
 
@@ -41,14 +41,14 @@ static double noise_of(const sense_plan *plan, const sense_channel *ch, const se
 {
     double rest = 0.0;
     size_t p;
-    for (p = 0; p < plan->pieces; ++p) {
+    for (p = 0; p < plan->segments; ++p) {
         rest += choice->used[p] * ch->rest[p];
     }
-    rest /= choice->full * ((double)plan->piece - 4.0);
+    rest /= choice->full * ((double)plan->segment - 4.0);
     return rest > 0.0 ? rest : 0.0;
 }
 
-/* Squared residual over the pieces of a choice. */
+/* Squared residual over the segments of a choice. */
 static double left_over(const sense_plan *plan, const sense_channel *ch, const sense_choice *choice,
                         const fit *f)
 {
@@ -67,16 +67,16 @@ static double left_over(const sense_plan *plan, const sense_channel *ch, const s
 
 #define ROUNDED_LEVEL 1e-14 /* of the level's square: what readings in single precision add */
 
-/* Scatter of the pieces' phasors about a straight line through them; of the voltage alone, for the
+/* Scatter of the segments' phasors about a straight line through them; of the voltage alone, for the
  * current's carrier bends within a block where the actuator swings. */
 typedef struct {
     double chi2;        /* in variances of the noise */
     double freedom;     /* of chi2 */
-    double turn;        /* rad a piece that the phasor runs ahead of the nominal carrier */
+    double turn;        /* rad a segment that the phasor runs ahead of the nominal carrier */
     double turn_weight; /* 1 / its variance; 0 where there is none */
 } scatter;
 
-/* turn: rad a piece, taken out before. */
+/* turn: rad a segment, taken out before. */
 HS_CLONES static void scatter_of(const sense_plan *plan, const sense_channel *ch,
                                  const sense_choice *choice, double noise, double turn,
                                  scatter *out)
@@ -92,14 +92,14 @@ HS_CLONES static void scatter_of(const sense_plan *plan, const sense_channel *ch
         return;
     }
     for (p = 0; p < plan->padded; ++p) { /* a cos + b sin = Re (a - jb) e^jwt, turned back */
-        counts[p] = p < plan->pieces ? choice->used[p] : 0.0;
+        counts[p] = p < plan->segments ? choice->used[p] : 0.0;
         re[p] = ch->a[p] * plan->turn_cos[p] - ch->b[p] * plan->turn_sin[p];
         im[p] = -ch->b[p] * plan->turn_cos[p] - ch->a[p] * plan->turn_sin[p];
         middle += counts[p] * (double)p;
     }
     middle /= size;
     if (turn != 0.0) {
-        for (p = 0; p < plan->pieces; ++p) {
+        for (p = 0; p < plan->segments; ++p) {
             const double angle = turn * ((double)p - middle), c = cos(angle), s = sin(angle);
             const double x = re[p];
             re[p] = x * c + im[p] * s;
@@ -135,7 +135,7 @@ HS_CLONES static void scatter_of(const sense_plan *plan, const sense_channel *ch
 }
 
 /* Turned with the carrier where it is clearly off its nominal frequency: that turns both monitors
- * alike and leaves their ratio. Returns the turn in rad a piece. */
+ * alike and leaves their ratio. Returns the turn in rad a segment. */
 static double follow_carrier(const sense_plan *plan, const sense_channel *ch,
                              const sense_choice *choice, double noise, scatter *s)
 {
@@ -153,17 +153,17 @@ static double follow_carrier(const sense_plan *plan, const sense_channel *ch,
     return turn;
 }
 
-/* Levels of the pieces about the fit's straight line, in variances of the noise. */
+/* Levels of the segments about the fit's straight line, in variances of the noise. */
 static double level_misfit(const sense_plan *plan, const sense_channel *ch,
                            const sense_choice *choice, const fit *f, double noise)
 {
-    const double m = (double)plan->piece, n = (double)plan->samples;
+    const double m = (double)plan->segment, n = (double)plan->samples;
     double sum = 0.0;
     size_t p;
     if (!(noise > 0.0)) {
         return 0.0;
     }
-    for (p = 0; p < plan->pieces; ++p) {
+    for (p = 0; p < plan->segments; ++p) {
         const double at = (m * (double)p + 0.5 * (m - 1.0) - 0.5 * (n - 1.0)) / n;
         const double off = ch->height[p] - f->x[SENSE_LEVEL] - f->x[SENSE_RAMP] * at -
                            choice->after[p] * f->x[SENSE_STEP];
@@ -175,13 +175,13 @@ static double level_misfit(const sense_plan *plan, const sense_channel *ch,
 /* Noise that one disturbed place cannot raise: the smaller of both halves of the block. */
 static double calm_noise(const sense_plan *plan, const sense_channel *ch)
 {
-    const size_t half = plan->pieces / 2;
-    const double freedom = (double)half * ((double)plan->piece - 4.0);
+    const size_t half = plan->segments / 2;
+    const double freedom = (double)half * ((double)plan->segment - 4.0);
     double early = 0.0, late = 0.0;
     size_t p;
     for (p = 0; p < half; ++p) {
         early += ch->rest[p];
-        late += ch->rest[plan->pieces - 1 - p];
+        late += ch->rest[plan->segments - 1 - p];
     }
     early = early < late ? early : late;
     return early > 0.0 ? early / freedom : 0.0;
@@ -191,7 +191,7 @@ static double calm_noise(const sense_plan *plan, const sense_channel *ch)
 static size_t find_update(const sense_plan *plan, const sense_channel ch[2])
 {
     const sense_choice *planned = plan->choices;
-    const double expected = (double)plan->pieces;
+    const double expected = (double)plan->segments;
     double noise[2], best = -30.0; /* an update must explain more than chance */
     scatter s;
     size_t at = 0, k, j;
@@ -240,7 +240,7 @@ static unsigned judge(const sense_plan *plan, const scatter *s, double turn, sen
     unsigned reason = 0;
 
     out->excess = 1.0;
-    out->offset_rad_s = turn / ((double)plan->piece * plan->period_s);
+    out->offset_rad_s = turn / ((double)plan->segment * plan->period_s);
     if (excess > 1.0 + 6.0 * sqrt(2.0 / freedom)) {
         out->excess = excess;
         reason |= excess > BIASED ? HS_UPDATE : 0u;
@@ -341,7 +341,7 @@ static int drowned(const sense_plan *plan, const sense_channel *ch)
 {
     double square = 0.0, rest = 0.0;
     size_t p;
-    for (p = 0; p < plan->pieces; ++p) {
+    for (p = 0; p < plan->segments; ++p) {
         square += plan->choices->used[p] * ch->square[p];
         rest += plan->choices->used[p] * ch->rest[p];
     }
@@ -362,18 +362,18 @@ static void sum_again(const sense_plan *plan, sense_type type, const void *v, co
     }
     sense_sum_block(plan, type, v, i, stride, 0, known, room, all);
     for (j = 0; j < 2; ++j) {
-        sense_fit_pieces(plan, &all[j], &ch[j]);
-        sense_turn_pieces(plan, &all[j], &ch[j]);
+        sense_fit_segments(plan, &all[j], &ch[j]);
+        sense_turn_segments(plan, &all[j], &ch[j]);
         ch[j].known_a = known[j].a;
         ch[j].known_b = known[j].b;
-        for (p = 0; p < plan->pieces; ++p) {
+        for (p = 0; p < plan->segments; ++p) {
             ch[j].a[p] += known[j].a * plan->turn_cos[p] + known[j].b * plan->turn_sin[p];
             ch[j].b[p] += known[j].b * plan->turn_cos[p] - known[j].a * plan->turn_sin[p];
         }
     }
 }
 
-size_t sense_room(const sense_plan *plan) { return 2 * plan->piece; }
+size_t sense_room(const sense_plan *plan) { return 2 * plan->segment; }
 
 void sense_block(const sense_plan *plan, sense_type type, const void *v, const void *i,
                  size_t stride, size_t ahead, int tested, float *room, sense_result *out)
@@ -390,8 +390,8 @@ void sense_block(const sense_plan *plan, sense_type type, const void *v, const v
     memset(out, 0, sizeof *out);
     reason = sense_sum_block(plan, type, v, i, stride, ahead, NULL, room, all);
     for (j = 0; j < 2; ++j) {
-        sense_fit_pieces(plan, &all[j], &ch[j]);
-        sense_turn_pieces(plan, &all[j], &ch[j]);
+        sense_fit_segments(plan, &all[j], &ch[j]);
+        sense_turn_segments(plan, &all[j], &ch[j]);
     }
     if (drowned(plan, &ch[0]) || drowned(plan, &ch[1])) {
         sum_again(plan, type, v, i, stride, room, all, ch);

@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-PIECES: int
+SEGMENTS: int
 ROOM: int
 PART_COLUMNS: int
 
@@ -35,7 +35,7 @@ class Plan:
     ) -> None: ...
 
 def vectors() -> int: ...
-def sum_pieces(
+def sum_segments(
     x: NDArray[np.float32],
     cosine: NDArray[np.float32],
     sine: NDArray[np.float32],

@@ -41,13 +41,13 @@ static void demodulation(uint32_t *seed)
     for (k = 0; k < 8; ++k) {
         inverse[k] = check_uniform(seed, -1.0f, 1.0f);
     }
-    hs_sum_pieces(x, SAMPLES, cosine, sine, 112, sums);
+    hs_sum_segments(x, SAMPLES, cosine, sine, 112, sums);
     for (k = 0; k < 4; ++k) {
         mix(sums[k].first), mix(sums[k].cosine), mix(sums[k].sine);
         mix(sums[k].level), mix(sums[k].ramp), mix(sums[k].square);
     }
-    v = hs_phasor_of_piece(inverse, &sums[0]);
-    i = hs_phasor_of_piece(inverse, &sums[1]);
+    v = hs_phasor_of_segment(inverse, &sums[0]);
+    i = hs_phasor_of_segment(inverse, &sums[1]);
     z = hs_impedance_of(&c, &v, &i);
     mix(v.re), mix(v.im), mix(i.re), mix(i.im);
     for (k = 0; k < HS_QUADRATURE_SAMPLES; ++k) {

@@ -54,7 +54,7 @@ static void random_readings_agree_with_sums_in_double(void)
         for (k = 0; k < n; ++k) {
             self[k] = x[k] - x[0];
         }
-        hs_sum_pieces(x, (uint32_t)n, cosine, sine, MOST, &s);
+        hs_sum_segments(x, (uint32_t)n, cosine, sine, MOST, &s);
         CHECK(s.first == x[0], "%g", (double)s.first);
         check_sum("cosine", (double)s.cosine, x, cosine, n);
         check_sum("sine", (double)s.sine, x, sine, n);
@@ -72,7 +72,7 @@ static void random_readings_agree_with_sums_in_double(void)
     }
 }
 
-static void a_block_falls_into_pieces_the_last_of_which_is_shorter(void)
+static void a_block_falls_into_segments_the_last_of_which_is_shorter(void)
 {
     static float x[250], cosine[100], sine[100];
     hs_sums all[3], one;
@@ -82,10 +82,10 @@ static void a_block_falls_into_pieces_the_last_of_which_is_shorter(void)
     for (k = 0; k < 250; ++k) {
         x[k] = check_uniform(&seed, -10.0f, 10.0f);
     }
-    hs_sum_pieces(x, 250, cosine, sine, 100, all);
+    hs_sum_segments(x, 250, cosine, sine, 100, all);
     for (k = 0; k < 3; ++k) {
-        hs_sum_pieces(x + 100 * k, k < 2 ? 100 : 50, cosine, sine, 100, &one);
-        CHECK(memcmp(&one, &all[k], sizeof one) == 0, "piece %d", k);
+        hs_sum_segments(x + 100 * k, k < 2 ? 100 : 50, cosine, sine, 100, &one);
+        CHECK(memcmp(&one, &all[k], sizeof one) == 0, "segment %d", k);
     }
 }
 
@@ -95,7 +95,7 @@ static void nothing_beyond_the_block_is_read(void)
     float *x = calloc(37, sizeof *x), *wave = calloc(37, sizeof *wave);
     hs_sums s;
     if (x != NULL && wave != NULL) {
-        hs_sum_pieces(x, 37, wave, wave, 37, &s);
+        hs_sum_segments(x, 37, wave, wave, 37, &s);
         CHECK(s.cosine == 0.0f && s.square == 0.0f, "%g %g", (double)s.cosine, (double)s.square);
     }
     free(x);
@@ -108,7 +108,7 @@ static void what_is_no_number_reaches_the_sums(void)
     hs_sums s;
     fill_table(cosine, sine, 64, 32.0);
     x[5] = NAN;
-    hs_sum_pieces(x, 64, cosine, sine, 64, &s);
+    hs_sum_segments(x, 64, cosine, sine, 64, &s);
     CHECK(!(s.square <= HS_LARGEST), "%g", (double)s.square);
 }
 
@@ -149,8 +149,8 @@ static void a_sine_gives_its_phasor(void)
     for (j = 0; j < 8; ++j) {
         inverse[j] = (float)m[j / 4][4 + j % 4];
     }
-    hs_sum_pieces(x, 64, cosine, sine, 64, &s);
-    p = hs_phasor_of_piece(inverse, &s);
+    hs_sum_segments(x, 64, cosine, sine, 64, &s);
+    p = hs_phasor_of_segment(inverse, &s);
     /* Sums as large as 64 readings of 1,750 against 1,000, rounded some 30 times. */
     CHECK(cabs(v - ((double)p.re + (double)p.im * I)) < 30.0 * ROUNDOFF * 4.0 * 1750.0, "%g %g",
           (double)p.re, (double)p.im);
@@ -328,7 +328,7 @@ int main(void)
     one_division_gives_what_five_give();
     quadrature_knows_what_hides_the_capacitance();
     random_readings_agree_with_sums_in_double();
-    a_block_falls_into_pieces_the_last_of_which_is_shorter();
+    a_block_falls_into_segments_the_last_of_which_is_shorter();
     nothing_beyond_the_block_is_read();
     what_is_no_number_reaches_the_sums();
     a_sine_gives_its_phasor();

@@ -58,7 +58,7 @@ def test_noise_and_a_smooth_swing_are_no_break(rng, depth):
 
 
 @pytest.mark.parametrize(("still", "refused"), [(3, False), (12, True)])
-def test_stuck_pieces_are_left_out_with_their_neighbours(rng, still, refused):
+def test_stuck_segments_are_left_out_with_their_neighbours(rng, still, refused):
     stuck = np.zeros((1, 2, 20), dtype=bool)
     stuck[0, 1, 4 : 4 + still] = True
     found = searched(rng, np.ones(20), stuck=stuck)

@@ -27,7 +27,7 @@ def stepped(scene, rng, at: int, height_v: float = 0.02, blocks: int = 200):
 
 
 @pytest.mark.parametrize("at", [0, 1, 313, 600, 601, 1000, 1400, 1990])
-def test_an_update_at_an_unknown_time_costs_no_more_than_the_pieces_it_hits(scene, rng, rms, at):
+def test_an_update_at_an_unknown_time_costs_no_more_than_the_segments_it_hits(scene, rng, rms, at):
     case = scene.but(carrier_hz=1913.0)  # no whole number of periods: the worst for leaks
     lockin = Lockin(case.config(search_updates=True))
     sensed = lockin.sense(stepped(case, rng, at))

@@ -10,14 +10,14 @@ from haselab.sensing import Lockin, LockinConfig
 from haselab.sensing.block.drive import DriveLibrary
 from haselab.sensing.block.segments import Segments
 
-PIECES, PRICE, CUT, LEFT_OUT = 7, 8.0, 6.0, 10.0
+SEGMENTS, PRICE, CUT, LEFT_OUT = 7, 8.0, 6.0, 10.0
 WIDE = _sense.PART_COLUMNS
 
 
 def tables(rng):
     """Orthonormal columns for runs of each length, two at the most."""
     found = []
-    for count in range(1, PIECES + 1):
+    for count in range(1, SEGMENTS + 1):
         q, _ = np.linalg.qr(rng.standard_normal((2 * count, 2)))
         found.append(np.pad(q, ((0, 0), (0, WIDE - 2))))
     return found
@@ -26,11 +26,11 @@ def tables(rng):
 def exhaustive(y, columns):
     """Least score over every choice of segments left out; runs between them are parts."""
     best = np.inf
-    for used in product((0, 1), repeat=PIECES):
-        score, at = LEFT_OUT * (PIECES - sum(used)), 0
-        while at < PIECES:
+    for used in product((0, 1), repeat=SEGMENTS):
+        score, at = LEFT_OUT * (SEGMENTS - sum(used)), 0
+        while at < SEGMENTS:
             end = at
-            while end < PIECES and used[end] == used[at]:
+            while end < SEGMENTS and used[end] == used[at]:
                 end += 1
             if used[at]:
                 values = y[:, 2 * at : 2 * end]
@@ -46,27 +46,27 @@ def exhaustive(y, columns):
 
 def test_the_cut_is_the_best_of_all(rng):
     columns = tables(rng)
-    y = rng.standard_normal((40, 2, 2 * PIECES)) * rng.uniform(1, 4, (40, 1, 1))
+    y = rng.standard_normal((40, 2, 2 * SEGMENTS)) * rng.uniform(1, 4, (40, 1, 1))
     y[::2, :, 6:8] += 30.0
-    parts, result = np.zeros((40, PIECES), _sense.PART), np.empty(40, _sense.PARTS_RESULT)
+    parts, result = np.zeros((40, SEGMENTS), _sense.PART), np.empty(40, _sense.PARTS_RESULT)
     _sense.parts(y, [np.concatenate(columns)], [2, 2, 1, 2], [PRICE, CUT, LEFT_OUT], parts, result)
     assert result["score"] == pytest.approx([exhaustive(one, columns) for one in y], rel=1e-12)
-    assert (parts["count"].sum(axis=1) < PIECES)[::2].all()  # segment 3 is left out
+    assert (parts["count"].sum(axis=1) < SEGMENTS)[::2].all()  # segment 3 is left out
     assert (result["parts"] == (parts["count"] > 0).sum(axis=1)).all()
 
 
 def test_tables_that_do_not_fit_are_refused(rng):
-    parts, result = np.zeros((1, PIECES), _sense.PART), np.empty(1, _sense.PARTS_RESULT)
-    with pytest.raises(ValueError, match="a table does not fit the pieces"):
+    parts, result = np.zeros((1, SEGMENTS), _sense.PART), np.empty(1, _sense.PARTS_RESULT)
+    with pytest.raises(ValueError, match="a table does not fit the segments"):
         _sense.parts(
-            np.zeros((1, 2, 2 * PIECES)), [np.zeros((5, WIDE))], [2, 2, 1, 2],
+            np.zeros((1, 2, 2 * SEGMENTS)), [np.zeros((5, WIDE))], [2, 2, 1, 2],
             [PRICE, CUT, LEFT_OUT], parts, result,
         )  # fmt: skip
 
 
 def test_rows_of_another_dtype_are_refused(rng):
-    y, columns = np.zeros((1, 2, 2 * PIECES)), [np.concatenate(tables(rng))]
-    parts, plain = np.zeros((1, PIECES), _sense.PART), np.empty((1, 3))
+    y, columns = np.zeros((1, 2, 2 * SEGMENTS)), [np.concatenate(tables(rng))]
+    parts, plain = np.zeros((1, SEGMENTS), _sense.PART), np.empty((1, 3))
     with pytest.raises(ValueError, match="the array has the wrong dtype"):
         _sense.parts(y, columns, [2, 2, 1, 2], [PRICE, CUT, LEFT_OUT], parts, plain)
 

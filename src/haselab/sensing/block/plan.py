@@ -74,7 +74,7 @@ def _segment_length(config: LockinConfig) -> int:
     """
     period = config.rate_hz / config.carrier_hz
     whole = config.blank[0] == config.blank[1] and not config.search_updates
-    segments = _FEW if whole else _sense.PIECES
+    segments = _FEW if whole else _sense.SEGMENTS
     least = max(period, _SHORTEST, config.block_samples / segments)
     return min(_LANES * int(np.ceil(least / _LANES - 1e-9)), config.block_samples)
 
@@ -150,7 +150,8 @@ def _check(config: LockinConfig, segment: int, least: float) -> None:
         )
     if segment > _LONGEST:
         raise InputError(
-            f"A block of {n} samples is longer than {_LONGEST * _sense.PIECES}. Shorten the block."
+            f"A block of {n} samples is longer than {_LONGEST * _sense.SEGMENTS}. Shorten the "
+            "block."
         )
 
 

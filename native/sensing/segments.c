@@ -1,5 +1,5 @@
-/* Takes: readings of both monitors. Gives: sums of their pieces, and a fit of each piece. */
-#include "sensing/pieces.h"
+/* Takes: readings of both monitors. Gives: sums of their segments, and a fit of each segment. */
+#include "sensing/segments.h"
 
 #include <string.h>
 
@@ -112,10 +112,10 @@ static void keep_all(const sense_plan *plan, const hs_sums *sums, sense_columns 
                      unsigned *reason)
 {
     static const hs_sums none = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-    const size_t pieces = (plan->samples + plan->piece - 1) / plan->piece;
+    const size_t segments = (plan->samples + plan->segment - 1) / plan->segment;
     size_t p;
     for (p = 0; p < plan->padded; ++p) {
-        const hs_sums *one = p < pieces ? &sums[p] : &none;
+        const hs_sums *one = p < segments ? &sums[p] : &none;
         all->first[p] = (double)one->first;
         all->cosine[p] = (double)one->cosine;
         all->sine[p] = (double)one->sine;
@@ -143,15 +143,15 @@ unsigned sense_sum_block(const sense_plan *plan, sense_type type, const void *v,
 {
     const int limited = plan->full_scale <= HS_LARGEST || plan->current_limit <= HS_LARGEST;
     const int as_they_are = type == SENSE_FLOAT && stride == 1 && known == NULL;
-    float *rooms[2] = {room, room + plan->piece};
+    float *rooms[2] = {room, room + plan->segment};
     hs_sums sums[2][SENSE_ALL];
     int32_t bits[2] = {0, 0};
     float most[2];
     unsigned reason = 0;
     size_t j, p, from;
 
-    for (p = 0, from = 0; from < plan->samples; ++p, from += plan->piece) {
-        const size_t left = plan->samples - from, n = left < plan->piece ? left : plan->piece;
+    for (p = 0, from = 0; from < plan->samples; ++p, from += plan->segment) {
+        const size_t left = plan->samples - from, n = left < plan->segment ? left : plan->segment;
         const void *at[2] = {later(type, v, stride * from), later(type, i, stride * from)};
         const float *x[2] = {rooms[0], rooms[1]};
         if (as_they_are) {
@@ -165,7 +165,7 @@ unsigned sense_sum_block(const sense_plan *plan, sense_type type, const void *v,
             if (known != NULL) {
                 take_off(plan, &known[j], p, rooms[j], n);
             }
-            plan->sum(x[j], n, plan->cosine, plan->sine, plan->piece, as_they_are ? ahead : 0,
+            plan->sum(x[j], n, plan->cosine, plan->sine, plan->segment, as_they_are ? ahead : 0,
                       &sums[j][p]);
         }
     }
@@ -181,11 +181,11 @@ unsigned sense_sum_block(const sense_plan *plan, sense_type type, const void *v,
     return reason;
 }
 
-/* ---- each piece ---------------------------------------------------------------------------- */
+/* ---- each segment ---------------------------------------------------------------------------- */
 
-HS_CLONES void sense_fit_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out)
+HS_CLONES void sense_fit_segments(const sense_plan *plan, const sense_columns *x, sense_channel *out)
 {
-    const double m = (double)plan->piece, middle = 0.5 * (m - 1.0), first = x->first[plan->start];
+    const double m = (double)plan->segment, middle = 0.5 * (m - 1.0), first = x->first[plan->start];
     const double(*w)[4] = plan->local_inverse;
     size_t p;
     for (p = 0; p < plan->padded; ++p) {
@@ -202,14 +202,14 @@ HS_CLONES void sense_fit_pieces(const sense_plan *plan, const sense_columns *x, 
     }
 }
 
-HS_CLONES void sense_turn_pieces(const sense_plan *plan, const sense_columns *x, sense_channel *out)
+HS_CLONES void sense_turn_segments(const sense_plan *plan, const sense_columns *x, sense_channel *out)
 {
-    const double m = (double)plan->piece, n = (double)plan->samples, first = x->first[plan->start];
-    const size_t rest = plan->samples - plan->pieces * plan->piece;
+    const double m = (double)plan->segment, n = (double)plan->samples, first = x->first[plan->start];
+    const size_t rest = plan->samples - plan->segments * plan->segment;
     size_t p;
     for (p = 0; p < plan->padded; ++p) {
-        const double size = p < plan->pieces ? m : (double)rest;
-        const double *table = plan->table[p < plan->pieces ? 0 : 1];
+        const double size = p < plan->segments ? m : (double)rest;
+        const double *table = plan->table[p < plan->segments ? 0 : 1];
         const double shift = x->first[p] - first;
         const double c = x->cosine[p] + shift * table[0], s = x->sine[p] + shift * table[1];
         const double l = x->level[p] + shift * size;

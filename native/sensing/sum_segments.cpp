@@ -1,8 +1,8 @@
-// Takes: what hs_sum_pieces takes. Gives: the same bits, by the vector unit of this machine.
+// Takes: what hs_sum_segments takes. Gives: the same bits, by the vector unit of this machine.
 //
 // core/hs_lockin.c is the reference, for the microcontroller and for every compiler; here its
 // sixteen lanes are vectors (an extension of gcc and clang), which keeps them in registers.
-#include "sensing/sum_pieces.h"
+#include "sensing/sum_segments.h"
 
 #include <cstring>
 
@@ -52,7 +52,7 @@ INLINE __m128 fold(const Lanes<16> &x)
 }
 
 template <size_t W>
-INLINE void sum_piece(const float *x, const float *cosine, const float *sine, size_t n,
+INLINE void sum_segment(const float *x, const float *cosine, const float *sine, size_t n,
                       size_t ahead, __m128 kept[rows])
 {
     using L = Lanes<W>;
@@ -105,13 +105,13 @@ INLINE void sum_piece(const float *x, const float *cosine, const float *sine, si
 }
 
 template <size_t W>
-INLINE void sum_all(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
+INLINE void sum_all(const float *x, size_t n, const float *cosine, const float *sine, size_t segment,
                     size_t ahead, hs_sums *out)
 {
-    for (size_t from = 0; from < n; from += piece, ++out) {
+    for (size_t from = 0; from < n; from += segment, ++out) {
         __m128 kept[rows];
         float fifth[4];
-        sum_piece<W>(x + from, cosine, sine, n - from < piece ? n - from : piece, ahead,
+        sum_segment<W>(x + from, cosine, sine, n - from < segment ? n - from : segment, ahead,
                      kept);
         _MM_TRANSPOSE4_PS(kept[0], kept[1], kept[2], kept[3]);
         const __m128 four = (kept[0] + kept[2]) + (kept[1] + kept[3]);
@@ -126,34 +126,34 @@ INLINE void sum_all(const float *x, size_t n, const float *cosine, const float *
 }
 
 __attribute__((target("avx512f"))) void by_512(const float *x, size_t n, const float *cosine,
-                                               const float *sine, size_t piece, size_t ahead,
+                                               const float *sine, size_t segment, size_t ahead,
                                                hs_sums *out)
 {
-    sum_all<16>(x, n, cosine, sine, piece, ahead, out);
+    sum_all<16>(x, n, cosine, sine, segment, ahead, out);
 }
 
 __attribute__((target("avx2"))) void by_256(const float *x, size_t n, const float *cosine,
-                                            const float *sine, size_t piece, size_t ahead,
+                                            const float *sine, size_t segment, size_t ahead,
                                             hs_sums *out)
 {
-    sum_all<8>(x, n, cosine, sine, piece, ahead, out);
+    sum_all<8>(x, n, cosine, sine, segment, ahead, out);
 }
 
-void by_128(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
+void by_128(const float *x, size_t n, const float *cosine, const float *sine, size_t segment,
             size_t ahead, hs_sums *out)
 {
-    sum_all<4>(x, n, cosine, sine, piece, ahead, out);
+    sum_all<4>(x, n, cosine, sine, segment, ahead, out);
 }
 
-void by_core(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
+void by_core(const float *x, size_t n, const float *cosine, const float *sine, size_t segment,
              size_t, hs_sums *out)
 {
-    hs_sum_pieces(x, static_cast<uint32_t>(n), cosine, sine, static_cast<uint16_t>(piece), out);
+    hs_sum_segments(x, static_cast<uint32_t>(n), cosine, sine, static_cast<uint16_t>(segment), out);
 }
 
 } // namespace
 
-extern "C" int sum_pieces_bits(int bits)
+extern "C" int sum_segments_bits(int bits)
 {
     __builtin_cpu_init();
     if (bits >= 512 && __builtin_cpu_supports("avx512f")) {
@@ -165,9 +165,9 @@ extern "C" int sum_pieces_bits(int bits)
     return bits >= 128 ? 128 : 0;
 }
 
-extern "C" sum_pieces_fn sum_pieces_by(int bits)
+extern "C" sum_segments_fn sum_segments_by(int bits)
 {
-    switch (sum_pieces_bits(bits)) {
+    switch (sum_segments_bits(bits)) {
     case 512:
         return by_512;
     case 256:
@@ -181,14 +181,14 @@ extern "C" sum_pieces_fn sum_pieces_by(int bits)
 
 #else
 
-static void by_core(const float *x, size_t n, const float *cosine, const float *sine, size_t piece,
+static void by_core(const float *x, size_t n, const float *cosine, const float *sine, size_t segment,
                     size_t ahead, hs_sums *out)
 {
-    hs_sum_pieces(x, static_cast<uint32_t>(n), cosine, sine, static_cast<uint16_t>(piece), out);
+    hs_sum_segments(x, static_cast<uint32_t>(n), cosine, sine, static_cast<uint16_t>(segment), out);
 }
 
-extern "C" int sum_pieces_bits(int) { return 0; }
+extern "C" int sum_segments_bits(int) { return 0; }
 
-extern "C" sum_pieces_fn sum_pieces_by(int) { return by_core; }
+extern "C" sum_segments_fn sum_segments_by(int) { return by_core; }
 
 #endif

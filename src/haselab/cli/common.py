@@ -45,7 +45,7 @@ class Real(click.FloatRange):
     `nan` passes every comparison of `click.FloatRange`, and powers of larger numbers overflow.
     """
 
-    name = "float"
+    name = "number"
     unbounded = False  # inf is no limit
 
     def convert(

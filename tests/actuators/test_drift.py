@@ -79,7 +79,7 @@ def test_derivatives_are_those_of_the_simulated_numbers(law):
 
 
 def test_a_drift_that_leaves_nothing_is_refused():
-    with pytest.raises(LimitError, match=r"leave less than 0\.1 of it\. Change them\."):
+    with pytest.raises(LimitError, match=r"to less than 0\.1 of it\. Make one of them smaller\."):
         SampledLaw(PlanarHasel(), 8e3, drifts={"drift.stiffness_per_s": -0.01,
                                                "drift.stiffness_s": 100.0})  # fmt: skip
 

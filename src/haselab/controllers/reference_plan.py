@@ -20,6 +20,7 @@ _SOON_S = 0.01
 _ALONE = 3.0  # times its neighbours: a rise that is a step
 _NEAR = 0.3
 _SAME = 1e-9
+_SMALL = 0.03  # of the way in a period: a rise that is followed, whatever its neighbours are
 
 
 class ReferencePlan:
@@ -94,7 +95,7 @@ class ReferencePlan:
         """
         rises = [abs(b - a) for a, b in pairwise(samples[max(at - 2, 0) : at + 5])]
         alone = any(
-            rise > _ALONE * max(before, after) + _SAME
+            rise > _ALONE * max(before, after) + _SMALL * self._most_m
             for before, rise, after in zip(rises, rises[1:], rises[2:], strict=False)
         )
         return not alone and max(rises) <= self._most_m

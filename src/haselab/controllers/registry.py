@@ -32,6 +32,7 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "pid": "haselab.controllers.builtin:PID",
         "force": "haselab.controllers.force:FORCE",
         "observer": "haselab.controllers.observer_design:OBSERVER",
+        "learning": "haselab.controllers.adaptive.learning:LEARNING",
     },
     _fault,
 )

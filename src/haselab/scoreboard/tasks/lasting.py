@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.controllers import KnownActuator
-from haselab.scoreboard.devices import find_device
+from haselab.scoreboard.devices import drawn, find_device
 from haselab.scoreboard.loop_class import LoopClass
 from haselab.scoreboard.measures import smoothed, tracking_error
 from haselab.scoreboard.play import Scenario, Trace
@@ -54,6 +54,11 @@ def _periodic(known: KnownActuator, rng: np.random.Generator) -> Scenario:
     return Scenario(find_device("hz"), known.zero_length_m, float(_PERIODS), _gait)
 
 
+def _periodic_drawn(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+    device = drawn(rng, senses_alike=True)
+    return Scenario(device, known.zero_length_m, float(_PERIODS), _gait)
+
+
 def _score_periodic(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
     wanted = scenario.reference(trace.time_s)
     errors = [tracking_error(trace, wanted, float(k), k + 1.0) for k in range(_PERIODS)]
@@ -71,20 +76,20 @@ def _no_bounds(known: KnownActuator, loop: LoopClass) -> Mapping[str, float]:
 
 _FIELD = Metric("peak_field_v_per_m", "V/m", "largest field")
 _HELD = (Metric("error", "", "largest error of a mean of 1 s, from 10 s on, in strain"), _FIELD)
+_REPEATED = (
+    Metric("error_first", "", "rms error over peak-to-peak, first period"),
+    Metric("error_after_ten", "", "the same after ten periods"),
+    Metric("left", "", "the second over the first"),
+    _FIELD,
+)
 
 LASTING_TASKS = (
     Task("T6", "hold for 10 min after a step of 0.10", "hz", _HELD, _hold("hz"), _score_hold,
          _no_bounds, classes=("host-100hz",)),
     Task("T6-retention", "the same with a fifth of the voltage acting late", "hz", _HELD,
          _hold("retention"), _score_hold, _no_bounds, classes=("host-100hz",)),
-    Task(
-        "T7", "a trapezoid gait at 1 Hz, eleven times", "hz",
-        (
-            Metric("error_first", "", "rms error over peak-to-peak, first period"),
-            Metric("error_after_ten", "", "the same after ten periods"),
-            Metric("left", "", "the second over the first"),
-            _FIELD,
-        ),
-        _periodic, _score_periodic, _no_bounds,
-    ),
+    Task("T7", "a trapezoid gait at 1 Hz, eleven times", "hz", _REPEATED, _periodic,
+         _score_periodic, _no_bounds),
+    Task("T7-drawn", "the same on devices drawn about hz that sense alike", "hz", _REPEATED,
+         _periodic_drawn, _score_periodic, _no_bounds, drawn=True),
 )  # fmt: skip

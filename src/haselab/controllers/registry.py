@@ -33,6 +33,7 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "force": "haselab.controllers.force:FORCE",
         "observer": "haselab.controllers.observer_design:OBSERVER",
         "learning": "haselab.controllers.adaptive.learning:LEARNING",
+        "hybrid": "haselab.controllers.adaptive.hybrid:HYBRID",
         "scheduled-pid": "haselab.controllers.adaptive.scheduled:SCHEDULED",
     },
     _fault,

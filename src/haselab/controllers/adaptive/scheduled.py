@@ -145,6 +145,7 @@ class ScheduledController:
         self._known, self._period_s = setting.actuator, setting.period_s
         self._low_v, self._high_v = max(setting.drive_low, 0.0), setting.drive_high
         self._most_v = setting.highest_rate_per_s * setting.period_s
+        self._ahead_s = (setting.delay_s or 0.0) + setting.period_s
         grid = grid_of(self._known)
         self._loads_kg = [row[0].known.mass_kg for row in grid]
         self._rows = [
@@ -186,7 +187,8 @@ class ScheduledController:
         kp, ki, kd = self._gains()
         error_m = known.length_m(self._coming) - length_m
         wanted_v = self._forward_v() + kp * error_m - kd * self._rate + self._integral_v
-        high_v = min(self._high_v, known.highest_drive_v(length_m), self._drive_v + self._most_v)
+        longest_m = length_m + max(self._rate, 0.0) * self._ahead_s
+        high_v = min(self._high_v, known.highest_drive_v(longest_m), self._drive_v + self._most_v)
         low_v = min(max(self._low_v, self._drive_v - self._most_v), high_v)
         self._drive_v = min(max(wanted_v, low_v), high_v)
         push_v = ki * period_s * error_m

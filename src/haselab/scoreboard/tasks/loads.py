@@ -10,6 +10,7 @@ import numpy as np
 from haselab.controllers import KnownActuator
 from haselab.scoreboard.bounds import least_peak
 from haselab.scoreboard.devices import find_device
+from haselab.scoreboard.knowledge import true_actuator
 from haselab.scoreboard.loop_class import LoopClass
 from haselab.scoreboard.measures import (
     load_response,
@@ -110,6 +111,55 @@ def _no_bounds(known: KnownActuator, loop: LoopClass) -> Mapping[str, float]:
     return {}
 
 
+# ---- weights over the whole range ----------------------------------------------------------------
+
+_WIDE_S = 3.0  # of each set-point
+_NEAR = 2e-3  # strain
+_REST = 0.2  # of the time at a set-point, at its end
+_LIGHT, _HEAVY = (0.5, 0.7), (1.6, 2.0)  # of the known mass
+_WIDE = (  # part of the weights, desired strain: some of them out of reach
+    ("known", 0.03), ("light", 0.0), ("light", 0.2), ("known", 0.1), ("heavy", 0.1),
+    ("heavy", 0.25), ("heavy", 0.55), ("known", 0.03),
+)  # fmt: skip
+
+
+def _wide(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+    mass = known.mass_kg
+    weights = {"known": mass, "light": mass * float(rng.uniform(*_LIGHT)),
+               "heavy": mass * float(rng.uniform(*_HEAVY))}  # fmt: skip
+    steps = [(k * _WIDE_S, weights[name], strain) for k, (name, strain) in enumerate(_WIDE)]
+    points = ((-math.inf, 0.03), *((at_s, strain) for at_s, _, strain in steps))
+    loads = tuple((at_s, mass_kg) for at_s, mass_kg, _ in steps)
+    events = tuple((at_s, math.nan, strain) for at_s, _, strain in steps)
+    return Scenario(find_device("hz"), known.zero_length_m, _WIDE_S * len(steps),
+                    staircase(points), loads=loads, events=events)  # fmt: skip
+
+
+def _score_wide(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
+    """Of the set-points that the true device can hold with the weight."""
+    true = true_actuator(scenario.device)
+    errors, times_s, beyond = [], [], []
+    for (at_s, mass_kg), (_, _, wanted) in zip(scenario.loads, scenario.events, strict=True):
+        low, high = true.reachable(mass_kg)
+        _, strain = trace.between(at_s, at_s + _WIDE_S)
+        if strain.size < round(0.9 * _WIDE_S / 1e-3):
+            return {}
+        if low < wanted < high:
+            strain = smoothed(strain)
+            away, start = np.abs(strain - wanted), float(strain[0])
+            errors.append(float(away[-round(_REST * away.size) :].mean()))
+            outside = np.flatnonzero(away > _NEAR)
+            times_s.append((int(outside[-1]) + 1 if outside.size else 0) * 1e-3)
+            beyond.append(float(strain.max()) - max(start, wanted))
+            beyond.append(min(start, wanted) - float(strain.min()))
+    return {
+        "error_at_rest": max(errors),
+        "slowest_s": max(times_s) if max(times_s) < 0.9 * _WIDE_S else math.nan,
+        "beyond": max(beyond),
+        "peak_field_v_per_m": trace.peak_field_v_per_m,
+    }
+
+
 LOAD_TASKS = (
     Task(
         "T5", "an unknown weight, then a step", "hz",
@@ -122,6 +172,16 @@ LOAD_TASKS = (
             Metric("peak_field_v_per_m", "V/m", "largest field"),
         ),
         _weights, _score_weights, _no_bounds,
+    ),
+    Task(
+        "T5-wide", "half to twice the weight, set-points out of reach", "hz",
+        (
+            Metric("error_at_rest", "", "largest error at the end of a reachable set-point"),
+            Metric("slowest_s", "s", "longest time until 0.2 % strain from it"),
+            Metric("beyond", "", "largest strain beyond the way to it"),
+            Metric("peak_field_v_per_m", "V/m", "largest field"),
+        ),
+        _wide, _score_wide, _no_bounds,
     ),
     Task(
         "T4", "changes of the load", "hz",

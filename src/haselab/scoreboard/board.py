@@ -216,7 +216,7 @@ def _play(job: _PlayJob) -> Played:
 def _bounds(task: Task, scenario: Scenario, loop: LoopClass) -> Mapping[str, float]:
     true = replace(true_actuator(scenario.device), zero_length_m=scenario.zero_m)
     try:
-        return task.bounds(true, loop)
+        return task.bounds(true, scenario, loop)
     except HaselabError:  # of a drawn device that does not reach the strain
         return {}
 

@@ -90,6 +90,16 @@ def test_over_all_weights_it_overshoots_less_than_the_observer_alone(known):
     assert scores[0]["peak_field_v_per_m"] < 1.02 * HZ.field_v_per_m
 
 
+@pytest.mark.long
+def test_with_an_unknown_weight_a_step_is_as_good_as_with_the_known_one(known):
+    """The goal is 1.3 times the rise of 36 ms with the known weight; `observer` overshoots."""
+    task, rng = TASKS["T5"], np.random.default_rng(21)
+    scenario = task.scenario(known, rng)
+    assert scenario.loads[1][1] > 1.3 * known.mass_kg
+    score = task.score(play(scenario, HYBRID, HOST, known, rng), scenario)
+    assert score["rise_s"] < 1.3 * 0.036 and score["overshoot"] < 0.05
+
+
 def test_with_a_weight_that_no_drive_can_hold_the_drive_goes_to_0_v(known):
     """A length that only 0.9 kg explain, and a desired strain that is longer still."""
     drives = []

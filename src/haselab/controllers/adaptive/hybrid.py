@@ -2,8 +2,8 @@
 
 An inner `observer` estimates the hung mass. From it follow
 
-- the model: of a bank for some masses, the one whose mass is nearest, with its inertia, the gains
-  of its Kalman filter and the forces that its plans may use;
+- the model: its weight and inertia, the forces that its plans may use, and the gains of the Kalman
+  filter, which are those of the nearest mass of a bank;
 - the reachable set-points: a desired strain is limited to what drive and field can hold with this
   mass, short of the strain at which the field pulls the actuator in;
 - whether there is a feedback at all: with a mass for which no strain can be held, the drive goes to
@@ -31,7 +31,7 @@ from haselab.controllers.protocol import ControllerSetting, Measurement
 __all__ = ["HYBRID", "HybridController", "design_hybrid", "reach_of"]
 
 _MODELS = (0.5, 0.7, 1.0, 1.4, 2.0)  # of the known mass
-_HYSTERESIS = 0.65  # of the way to the next model, at which it is taken
+_OTHER, _PAUSE_S = 0.03, 0.1  # change of the mass that changes the model, and how soon again
 _LIGHTEST, _HEAVIEST, _MASSES = 0.2, 3.0, 57  # of the known mass, of the table of set-points
 _SAME = 0.01  # change of the mass that does not change the set-points
 _WEIGHED_S = 0.1  # time constant of the mass
@@ -72,13 +72,14 @@ class HybridController:
         """See `Controller`."""
         known = setting.actuator
         assert known is not None, "the kind needs it"
-        self._bank = [
-            (loaded, ObserverLaw(replace(setting, actuator=loaded), *self._values))
+        self._known, self._period_s = known, setting.period_s
+        self._laws = [
+            (loaded.mass_kg, ObserverLaw(replace(setting, actuator=loaded), *self._values))
             for loaded in (replace(known, mass_kg=share * known.mass_kg) for share in _MODELS)
             if _holds(loaded, loaded.mass_kg)
         ]
         self._inner.start(setting)
-        self._model = int(np.argmin([abs(one.mass_kg - known.mass_kg) for one, _ in self._bank]))
+        self._model_kg, self._pause_s = known.mass_kg, 0.0
         masses = known.mass_kg * np.linspace(_LIGHTEST, _HEAVIEST, _MASSES)
         held = [float(mass) for mass in masses if _holds(known, float(mass))]
         self._masses_kg = np.array(held)
@@ -102,7 +103,7 @@ class HybridController:
         wanted = [min(max(value, low), high) for value in (reference, *measurement.preview)]
         drive_v = self._inner.step(wanted[0], replace(measurement, preview=tuple(wanted[1:])))
         self._weigh()
-        if not self._masses_kg[0] <= self._set_kg <= self._masses_kg[-1]:
+        if not self._holds_now():
             drive_v = max(self._low_v, measurement.voltage_v - self._most_v)
             self._inner.put_out(drive_v)
         return drive_v
@@ -114,15 +115,17 @@ class HybridController:
         if abs(self._mass_kg - self._set_kg) > _SAME * self._set_kg:
             self._set_kg = self._mass_kg
             self._reach = self._reach_with(self._mass_kg)
-        here_kg = self._bank[self._model][0].mass_kg
-        for next_one in (self._model - 1, self._model + 1):
-            if 0 <= next_one < len(self._bank):
-                there_kg = self._bank[next_one][0].mass_kg
-                if (self._mass_kg - here_kg) / (there_kg - here_kg) > _HYSTERESIS:
-                    known, law = self._bank[next_one]
-                    self._model = next_one
-                    self._inner.exchange(known, law)
-                    return
+        self._pause_s -= self._period_s
+        other = abs(self._mass_kg - self._model_kg) > _OTHER * self._model_kg
+        if other and self._pause_s <= 0.0 and self._holds_now():
+            self._model_kg, self._pause_s = self._mass_kg, _PAUSE_S
+            law = min(self._laws, key=lambda one: abs(math.log(one[0] / self._mass_kg)))[1]
+            known = replace(self._known, mass_kg=self._mass_kg)
+            self._inner.exchange(known, law.hung(known))
+
+    def _holds_now(self) -> bool:
+        """Whether any strain can be held with the present weight."""
+        return bool(self._masses_kg[0] <= self._set_kg <= self._masses_kg[-1])
 
     def _reach_with(self, mass_kg: float) -> tuple[float, float]:
         low, high = (float(np.interp(mass_kg, self._masses_kg, ends)) for ends in self._ends.T)
@@ -140,7 +143,7 @@ def _holds(known: KnownActuator, mass_kg: float) -> bool:
 def design_hybrid(setting: ControllerSetting) -> Mapping[str, float]:
     """Take the design of `observer`, which `design --controller observer` describes.
 
-    The inverse dynamics of the model with the nearest mass keep the error's decay the same with
+    The inverse dynamics with the sensed mass keep the error's decay the same with
     all masses, so the demands of `observer` on the peak sensitivity are those with the known mass.
 
     Args:

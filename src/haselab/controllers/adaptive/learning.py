@@ -46,7 +46,7 @@ _WORSE = 2.0  # times the least error: the correction of that period is restored
 _USABLE = 0.6  # of a period: with less, nothing is learned
 _AT_LIMIT = 1e-3  # of the range of the drive
 _QUIETER = 8.0  # of the expected load: changes that repeat are learned
-_SHRINKS = 0.95  # highest |1 - T| of a harmonic that is learned
+_SHRINKS = 1.0  # |1 - T| of a harmonic that is learned is below
 _POINTS = (0.1, 0.5, 0.9)  # of the reachable range
 _SPREAD = ((1.0, 0.0), (1.1, 0.0), (0.9, 0.2), (1.0, 0.5))  # stiffness; longer delay, of it
 _TRIED_S, _PERIODS, _WAVE, _HIGHEST = 0.5, 3, 3e-5, 0.4  # strain; of the rate of the updates
@@ -204,10 +204,10 @@ def design_learning(setting: ControllerSetting) -> Mapping[str, float]:
     """Take the design of `observer`, make it quieter, and learn the harmonics that surely shrink.
 
     The expected load is an eighth of that of `observer`: what repeats is learned, and noise moves
-    the actuator less. A harmonic is learned if it shrinks in each period by at least 5 % of the
-    learning gain, at three strains of the reachable range: with the identified stiffness, with 10 %
-    more, with 10 % less and a delay that is longer by a fifth, and with a delay that is longer by
-    half; and so do all lower ones.
+    the actuator less. A harmonic is learned if its error shrinks in each period (|1 - T| < 1), and
+    so do those of all lower ones: at three strains of the reachable range, with the identified
+    stiffness, with 10 % more, with 10 % less and a delay that is longer by a fifth, and with a
+    delay that is longer by half.
 
     Args:
         setting: timing and limits of the loop, and the actuator.
@@ -229,7 +229,7 @@ def design_learning(setting: ControllerSetting) -> Mapping[str, float]:
                 inner, setting, low + share * (high - low), (stiffness, longer * delay_s)
             )
             worst = np.maximum(worst, np.abs(1.0 - answer))
-    last = int(np.argmax(worst > _SHRINKS)) if (worst > _SHRINKS).any() else worst.size
+    last = int(np.argmax(worst >= _SHRINKS)) if (worst >= _SHRINKS).any() else worst.size
     if not last:
         raise ResultError("No harmonic of the reference surely shrinks. Shorten the delay.")
     return {**inner, "cutoff_hz": float(f"{hertz[last - 1]:.4g}")}

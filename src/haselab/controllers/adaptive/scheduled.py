@@ -277,8 +277,9 @@ def design_scheduled(setting: ControllerSetting) -> Mapping[str, float]:
         start = best.x
     if best.fun > UNSTABLE:
         raise ResultError(
-            f"No poles of the scheduled PID are stable with a delay of {setting.delay_s or 0.0:g} "
-            "s. Shorten the delay."
+            "No poles of the scheduled PID are stable at all voltages and loads of its grid with a "
+            f"delay of {setting.delay_s or 0.0:g} s. Use the controller observer, or shorten the "
+            "delay."
         )
     names = [parameter.name for parameter in SCHEDULED.parameters]
     return {name: float(f"{v:.4g}") for name, v in zip(names, values(best.x), strict=True)}

@@ -17,6 +17,7 @@ from haselab.base import SilentProgress
 from haselab.scoreboard import Plan, board_rows, play_board
 
 CONTROLLER = "observer"
+OF_TASK = {"T5": "hybrid", "T7": "learning"}  # in place of it
 HOST = "host-100hz"
 # metric: goal; a step of 0.04, one of 0.14 from 0 V, sines of 3 %, and changes of the load by 10 %
 GOALS = {
@@ -34,6 +35,8 @@ GOALS = {
     ("T5", "change_error_0p2s_kg"): 2.5e-3,
     ("T5", "change_error_1s_kg"): 1e-3,
     ("T5", "mass_error"): 0.02,
+    ("T5", "rise_s"): 0.047,  # 1.3 times that with the known load
+    ("T5", "overshoot"): 0.05,
     ("T7", "error_after_ten"): 3e-3,
     ("T8-rad", "rise_s"): 0.24,
 }
@@ -48,7 +51,8 @@ def rows(seeds: int = 1, whole: bool = False) -> Iterator[Row]:
         whole: play all tasks that have a goal, not T1 to T4 alone.
     """
     tasks = tuple(dict.fromkeys(task for task, _ in GOALS)) if whole else QUICK
-    controllers = ("pid", "force", CONTROLLER)
+    own = tuple(OF_TASK.values()) if whole else ()
+    controllers = ("pid", "force", CONTROLLER, *own)
     plan = Plan(controllers, tasks, (HOST,), seed=1, seeds=seeds, workers=2)
     start_s = time.perf_counter()
     game = play_board(plan, SilentProgress())
@@ -56,12 +60,21 @@ def rows(seeds: int = 1, whole: bool = False) -> Iterator[Row]:
     found = {(row.controller, row.task, row.metric): row for row in board_rows(game)}
     for (task, metric), goal in GOALS.items():
         if task in tasks:
-            row = found[CONTROLLER, task, metric]
+            chosen = OF_TASK.get(task, CONTROLLER)
+            row = found[chosen, task, metric]
             others = ", ".join(
-                f"{name} {_text(found[name, task, metric].median)}" for name in controllers[:-1]
-            )
+                f"{name} {_text(found[name, task, metric].median)}"
+                for name in controllers if name != chosen
+            )  # fmt: skip
             value = math.inf if row.median is None else row.median
-            yield Row(f"{task} {metric}", value, row.unit, goal, more_is_better=False, note=others)
+            yield Row(
+                f"{task} {metric}, {chosen}",
+                value,
+                row.unit,
+                goal,
+                more_is_better=False,
+                note=others,
+            )
     yield Row("controllers, tasks and seeds together", took_s, "s")
 
 

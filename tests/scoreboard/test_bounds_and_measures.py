@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike
 from haselab.actuators import ActuatorLaw, Losses, parameter
 from haselab.base import Limits, ResultError
 from haselab.controllers import KnownActuator
-from haselab.scoreboard.bounds import fastest_step, least_peak
+from haselab.scoreboard.bounds import (
+    fastest_step,
+    least_peak,
+    least_tracking_error,
+    mean_error,
+    weight_error_kg,
+)
 from haselab.scoreboard.measures import (
     load_response,
     smoothed,
@@ -92,6 +98,49 @@ def test_the_least_peak_of_a_double_integrator_is_that_of_its_closed_form():
     expected = 0.5 * force_n / mass_kg * dead_s**2 + speed**2 / (2.0 * brake)
     assert least_peak(known, 0.0, added_kg, dead_s) == pytest.approx(expected, rel=5e-3)
     assert least_peak(known, 0.0, added_kg, 0.04) > 3.9 * expected  # as the dead time squared
+
+
+def test_the_limit_by_noise_is_the_median_error_of_a_mean():
+    """5,000 draws: the median is known to 1.25/sqrt(5000) of a standard deviation, here 2 %."""
+    rng = np.random.default_rng(8)
+    means = np.abs(rng.standard_normal((5000, 6, 25)).mean(axis=2))
+    assert mean_error(1.0, 25.0) == pytest.approx(float(np.median(means[:, 0])), rel=0.06)
+    largest = float(np.median(means.max(axis=1)))
+    assert mean_error(1.0, 25.0, 6) == pytest.approx(largest, rel=0.03)
+
+
+def test_the_limit_of_a_weight_is_that_of_a_double_integrator():
+    """x = g t^2 / 2m per kg, as long as the spring is weak: it turns back 5 % at 0.2 s."""
+    at_s = 0.01 * np.arange(1.0, 21.0)
+    slope = 0.5 * GRAVITY * at_s**2 / MASS_KG
+    expected = 0.6745 * 1e-4 / math.sqrt(float(slope @ slope))
+    assert weight_error_kg(slider(), 0.0, 1e-4, at_s) == pytest.approx(expected, rel=0.06)
+
+
+WAVE_S = 1e-3 * np.arange(1000)
+
+
+def test_a_reference_that_a_held_force_can_follow_has_no_tracking_error():
+    """Arcs of a constant acceleration, which changes its sign 0.25 s and 0.75 s into the period."""
+    phase = WAVE_S % 0.5
+    arcs = 5.0 * (0.25 * phase - 0.5 * phase**2) * np.where(WAVE_S < 0.5, 1.0, -1.0)
+    found = least_tracking_error(slider(0.0), arcs, 1e-3, 0.01, 0.0)
+    assert found < 1e-9
+    shifted = np.roll(arcs, 2)  # with the changes of the force
+    assert least_tracking_error(slider(0.0), shifted, 1e-3, 0.01, 2e-3) < 1e-9
+
+
+def test_a_wave_beyond_the_force_is_followed_no_better_than_by_full_force():
+    """Of a sine that asks for twice the force, a square wave of the force follows the most."""
+    most = 0.5 * PULL_N / MASS_KG  # m/s^2, on a length of 1 m
+    amplitude = 2.0 * most / (2.0 * np.pi) ** 2
+    wave = amplitude * np.sin(2.0 * np.pi * WAVE_S)
+    found = least_tracking_error(slider(0.0), wave, 1e-3, 0.01, 0.0)
+    phase = WAVE_S % 0.5
+    arcs = most * (0.25 * phase - 0.5 * phase**2) * np.where(WAVE_S < 0.5, 1.0, -1.0)
+    expected = float(np.sqrt(np.mean((wave - arcs) ** 2))) / np.ptp(wave)
+    assert found == pytest.approx(expected, rel=1e-3)
+    assert least_tracking_error(slider(0.0), 0.4 * wave, 1e-3, 0.01, 0.0) < 1e-4
 
 
 TIME_S = 1e-3 * np.arange(1, 6001) - 2.0

@@ -28,7 +28,7 @@ from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penal
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.sampled_point import SampledPoint, sampled_point
 
-__all__ = ["FORCE", "ForceController", "design_force"]
+__all__ = ["FORCE", "ForceController", "design_force", "force_loop"]
 
 Floats = NDArray[np.float64]
 _POINTS = (0.1, 0.5, 0.9)  # of the reachable range
@@ -245,10 +245,17 @@ def _points(setting: ControllerSetting, known: KnownActuator) -> list[SampledPoi
     return found
 
 
-def _loop(
+def force_loop(
     point: SampledPoint, setting: ControllerSetting, gains: tuple[float, ...], known: KnownActuator
 ) -> LinearLoop:
-    """Closed loop with filtered rate and integral; the drive is the square of the voltage."""
+    """Closed loop with filtered rate and integral; the drive is the square of the voltage.
+
+    Args:
+        point: actuator.
+        setting: of the loop.
+        gains: `kp`, `ki`, `kd` and `filter_s` of `ForceController`.
+        known: scale of the length.
+    """
     per_m, per_m_s, per_m_filter = (gain / known.zero_length_m for gain in gains[:3])
     keep, period_s = math.exp(-setting.period_s / gains[3]), setting.period_s
     size = point.b.size
@@ -287,7 +294,7 @@ def _cost(
         _NOISE,
     )  # fmt: skip
     missed = max(gains[0] * _ERROR / spare_n - 1.0, 0.0)
-    loop = _loop(point, setting, gains, known)
+    loop = force_loop(point, setting, gains, known)
     factor = penalty(loop, setting.period_s, demands, missed)
     return factor if factor > UNSTABLE else factor * squared_error(loop, setting.period_s)
 

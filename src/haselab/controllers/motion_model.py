@@ -62,6 +62,13 @@ class MotionModel:
         found._elastic = [rest_n + factor * (force - rest_n) for force in self._elastic]
         return found
 
+    def hung(self, mass_kg: float) -> MotionModel:
+        """The same motion with another hung mass."""
+        found, weight_n = copy(self), GRAVITY_M_S2 * mass_kg
+        found.inertia_kg += (weight_n - self.weight_n) / GRAVITY_M_S2
+        found.weight_n = weight_n
+        return found
+
     def _at(self, length_m: float) -> tuple[int, float]:
         place = (length_m - self._low_m) / self._step_m
         column = min(max(int(place), 0), self._last)

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 
 from haselab.actuators import GRAVITY_M_S2
+from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.observer_law import ObserverLaw
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.reference_plan import ReferencePlan
@@ -89,6 +90,24 @@ class ObserverController:
         past_v.insert(0, drive_v)
         past_v.pop()
         return drive_v
+
+    def exchange(self, known: KnownActuator, law: ObserverLaw) -> None:
+        """Go on with the model of another hung mass; the weight, the motion and the plan stay.
+
+        Args:
+            known: the actuator with that mass.
+            law: of it.
+        """
+        change_n = GRAVITY_M_S2 * (self._known.mass_kg - known.mass_kg)
+        if self._state is not None:
+            self._state = [*self._state[:-1], self._state[-1] + change_n]
+        self._load_mean_n += change_n
+        self._known, self._law = known, law
+        self._plan.exchange(law.model, known)
+
+    def put_out(self, drive_v: float) -> None:
+        """Tell the observer that another drive than its last one was put out."""
+        self._past_v[0] = drive_v
 
     def _sensed_m(self, measurement: Measurement) -> float:
         known = self._known

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
+from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.motion_model import MotionModel
 from haselab.controllers.protocol import ControllerSetting
 
@@ -108,6 +110,16 @@ class ObserverLaw:
             missed = speed + period_s * pushed - model.moved(state, drive_v, period_s)[1]
             pull_n += model.inertia_kg * missed / period_s
         return max(min(self._known.drive_v(middle_m, pull_n), high_v), low_v)
+
+    def hung(self, known: KnownActuator) -> ObserverLaw:
+        """The same gains with the motion of another hung mass.
+
+        Args:
+            known: the actuator with that mass.
+        """
+        found = copy(self)
+        found._known, found.model = known, self.model.hung(known.mass_kg)
+        return found
 
     def _steady_gains(self) -> list[list[float]]:
         """Gains of Kalman's filter at rest, at each strain."""

@@ -20,6 +20,7 @@ _SOON_S = 0.01
 _ALONE = 3.0  # times its neighbours: a rise that is a step
 _NEAR = 0.3
 _SAME = 1e-9
+_SMALL = 0.03  # of the way in a period: a rise that is followed, whatever its neighbours are
 
 
 class ReferencePlan:
@@ -37,14 +38,24 @@ class ReferencePlan:
         self, model: MotionModel, known: KnownActuator, period_s: float, reserve: float,
         rate_v_per_s: float,
     ) -> None:  # fmt: skip
-        self._model, self._known, self._period_s = model, known, period_s
-        self._reserve, self._rate = reserve, rate_v_per_s
+        self._period_s, self._reserve, self._rate = period_s, reserve, rate_v_per_s
+        self.exchange(model, known)
+
+    def exchange(self, model: MotionModel, known: KnownActuator) -> None:
+        """Plan with another model from now on.
+
+        Args:
+            model: of the motion.
+            known: limits of drive and field.
+        """
+        self._model, self._known = model, known
         lengths_m = [known.length_m(strain) for strain in np.linspace(*known.reachable(), 9)]
         most_n = max(
             abs(model.pull_n(length_m, known.highest_drive_v(length_m))) for length_m in lengths_m
         )
         # the way in a period at a speed that the largest force gives soon
-        self._most_m = most_n / model.inertia_kg * max(period_s, _SOON_S) * period_s
+        soon_s = max(self._period_s, _SOON_S)
+        self._most_m = most_n / model.inertia_kg * soon_s * self._period_s
 
     def begin(self, length_m: float) -> None:
         """Rest at a length."""
@@ -94,27 +105,28 @@ class ReferencePlan:
         """
         rises = [abs(b - a) for a, b in pairwise(samples[max(at - 2, 0) : at + 5])]
         alone = any(
-            rise > _ALONE * max(before, after) + _SAME
+            rise > _ALONE * max(before, after) + _SMALL * self._most_m
             for before, rise, after in zip(rises, rises[1:], rises[2:], strict=False)
         )
         return not alone and max(rises) <= self._most_m
 
     def _plan(self, start: tuple[float, float], target_m: float, state: list[float]) -> None:
-        """Plan the fastest polynomial within the limits."""
-        self._target_m = target_m
-        period_s = self._period_s
+        """Plan the fastest polynomial within the limits, else the one that exceeds them least."""
+        self._target_m, self._at_s = target_m, 0.0
+        period_s, least_n = self._period_s, math.inf
         for_s = _LEAST * period_s
-        while for_s < _LONGEST_S:
+        while for_s < _LONGEST_S and least_n > 0.0:
             curve = _quintic(start, target_m, for_s)
-            if self._possible(curve, for_s, target_m, state):
-                break
+            excess_n = self._excess_n(curve, for_s, target_m, state)
+            if excess_n < least_n:
+                least_n, self._curve, self._for_s = excess_n, curve, for_s
             for_s = period_s * math.ceil(_LONGER * for_s / period_s)
-        self._curve, self._for_s, self._at_s = _quintic(start, target_m, for_s), for_s, 0.0
 
-    def _possible(
+    def _excess_n(
         self, curve: tuple[float, ...], for_s: float, target_m: float, state: list[float]
-    ) -> bool:
-        model, known = self._model, self._known
+    ) -> float:
+        """Force by which a polynomial exceeds the limits; 0: it keeps them."""
+        model, known, excess_n = self._model, self._known, 0.0
         rest_n = [model.needed_n(state, length_m, 0.0, 0.0) for length_m in (curve[0], target_m)]
         before_v = math.nan
         for k in range(_CHECKED + 1):
@@ -126,14 +138,15 @@ class ReferencePlan:
             )
             spare_n = self._reserve * (ends_n[1] - ends_n[0])
             low_n = min(ends_n[0] + spare_n, *rest_n)
-            if not low_n - _SAME <= needed_n <= max(ends_n[1] - spare_n, *rest_n) + _SAME:
-                return False
+            high_n = max(ends_n[1] - spare_n, *rest_n)
+            excess_n = max(excess_n, low_n - _SAME - needed_n, needed_n - high_n - _SAME)
             if math.isfinite(self._rate):
                 drive_v = known.drive_v(length_m, needed_n)
-                if abs(drive_v - before_v) > self._rate * for_s / _CHECKED:
-                    return False
+                faster = abs(drive_v - before_v) * _CHECKED / (self._rate * for_s) - 1.0
+                if faster > 0.0:
+                    excess_n = max(excess_n, faster * (ends_n[1] - ends_n[0]))
                 before_v = drive_v
-        return True
+        return excess_n
 
 
 def _quintic(start: tuple[float, float], target_m: float, for_s: float) -> tuple[float, ...]:

@@ -32,6 +32,9 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "pid": "haselab.controllers.builtin:PID",
         "force": "haselab.controllers.force:FORCE",
         "observer": "haselab.controllers.observer_design:OBSERVER",
+        "learning": "haselab.controllers.adaptive.learning:LEARNING",
+        "hybrid": "haselab.controllers.adaptive.hybrid:HYBRID",
+        "scheduled-pid": "haselab.controllers.adaptive.scheduled:SCHEDULED",
     },
     _fault,
 )

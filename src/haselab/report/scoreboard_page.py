@@ -12,7 +12,7 @@ from haselab.base.chart import Chart, Curve, Panel
 from haselab.report.chart_file import draw_chart
 from haselab.report.numbers import number_text
 from haselab.report.style import figure_style, inline_svg, to_svg
-from haselab.scoreboard import TASKS, Entry, Game, Played, Row, board_rows
+from haselab.scoreboard import TASKS, Entry, Game, Played, Row, board_rows, limits_of
 
 __all__ = ["scoreboard_page"]
 
@@ -51,6 +51,7 @@ class _Part:
     svg: str
     shown: str
     rows: tuple[_Shown, ...]
+    limits: tuple[str, ...]
 
 
 def scoreboard_page(game: Game) -> str:
@@ -127,7 +128,9 @@ def _part(game: Game, name: str, rows: Sequence[Row]) -> _Part:
         chart = _chart(f"{name}: {task.title}", traces)
         with figure_style():
             svg = inline_svg(to_svg(draw_chart(chart), name.lower(), chart.title))
-    return _Part(name, task.title, svg, f"Class {loop}." if svg else "", shown)
+    limits = tuple(f"{', '.join(titles[one] for one in names)}: {limit}."
+                   for _, limit, names in limits_of([name]))  # fmt: skip
+    return _Part(name, task.title, svg, f"Class {loop}." if svg else "", shown, limits)
 
 
 def _number(value: float | None) -> str:

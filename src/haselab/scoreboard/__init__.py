@@ -3,7 +3,7 @@
 from haselab.scoreboard.board import Entry, Game, Plan, Played, play_board
 from haselab.scoreboard.entrants import entering_kinds
 from haselab.scoreboard.loop_class import CLASSES, LoopClass
-from haselab.scoreboard.rows import Row, board_rows
+from haselab.scoreboard.rows import Row, board_rows, limits_of
 from haselab.scoreboard.tasks import TASKS, Metric, Task
 
 __all__ = [
@@ -19,5 +19,6 @@ __all__ = [
     "Task",
     "board_rows",
     "entering_kinds",
+    "limits_of",
     "play_board",
 ]

@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _SHOWN_S = 4e-3  # between two points of a trace that is kept
-_SLOWEST = 1.0  # times the duration of a task: a controller that takes longer is too slow
+_SLOWEST = 10.0  # times the duration of a task: a controller that takes longer does not return
 _LEAST_S = 20.0
 _EXCESS = 1.02  # of the permitted field: what a sensed length may miss
 
@@ -201,8 +201,11 @@ def _play(job: _PlayJob) -> Played:
         known = known_in_class(known, scenario.device, loop)
         known = replace(known, zero_length_m=scenario.zero_m)
     longest_s = max(_SLOWEST * (scenario.duration_s + scenario.lead_s), _LEAST_S)
-    with _deadline(longest_s, "the controller is slower than real time"):
-        trace = play(scenario, chosen, loop, known, rng)
+    try:
+        with _deadline(longest_s, f"the controller takes longer than {_SLOWEST:g} times the task"):
+            trace = play(scenario, chosen, loop, known, rng)
+    except TimeoutError as error:
+        return Played(*about, nothing, bounds, str(error), violates=True)
     numbers = nothing if trace.failure else {**nothing, **task.score(trace, scenario)}
     too_high = trace.peak_field_v_per_m > _EXCESS * scenario.device.field_v_per_m
     kept = None
@@ -216,7 +219,7 @@ def _play(job: _PlayJob) -> Played:
 def _bounds(task: Task, scenario: Scenario, loop: LoopClass) -> Mapping[str, float]:
     true = replace(true_actuator(scenario.device), zero_length_m=scenario.zero_m)
     try:
-        return task.bounds(true, loop)
+        return task.bounds(true, scenario, loop)
     except HaselabError:  # of a drawn device that does not reach the strain
         return {}
 

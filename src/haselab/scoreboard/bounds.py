@@ -1,8 +1,8 @@
 """What no controller can do better: limits of the device, computed from its true law.
 
-Assumptions that all of them share: the voltage may jump between 0 and its highest value at once,
-the highest value is that of the drive or of the permitted field, and the law and its state are
-known exactly.
+Limits of the motion assume that the voltage may jump between 0 and its highest value at once, that
+the highest value is that of the drive or of the permitted field, and that law and state are known
+exactly. Limits of the knowledge come from the noise of the sensed length alone.
 """
 
 from __future__ import annotations
@@ -17,12 +17,16 @@ from haselab.actuators import GRAVITY_M_S2, Drive, SampledLaw
 from haselab.base import ResultError
 from haselab.controllers import KnownActuator
 
-__all__ = ["FastestStep", "fastest_step", "least_peak"]
+__all__ = ["FastestStep", "fastest_step", "least_peak", "least_tracking_error", "mean_error",
+           "weight_error_kg"]  # fmt: skip
 
 Floats = NDArray[np.float64]
 _STEP_S = 1e-4
 _ROUNDS = 40
 _SHORTEST_S, _LONGEST_S = 0.05, 30.0
+_MEDIAN = 0.6745  # of the absolute value of a normal error, over its standard deviation
+_SMALL_KG = 1e-3
+_HEAVY = 1e3  # weight of the equations that close a period
 
 
 @dataclass(frozen=True)
@@ -155,3 +159,112 @@ def least_peak(known: KnownActuator, strain: float, added_kg: float, dead_s: flo
     away = sign * (moved - moved[0])
     falls = np.flatnonzero(np.diff(away) < 0.0)
     return float(away[: falls[0] + 1].max()) if falls.size else float(away.max())
+
+
+# ---- limits by noise -----------------------------------------------------------------------------
+
+
+def mean_error(noise: float, count: float, largest_of: int = 1) -> float:
+    r"""Median error of the best estimate of a constant from measurements with white noise.
+
+    With several errors the median of the largest: $\Phi(q)$ is the probability of each below it.
+
+    Args:
+        noise: standard deviation of one measurement.
+        count: of the measurements.
+        largest_of: number of independent errors of which the largest counts.
+    Example:
+        >>> round(mean_error(1.0, 100.0), 4)
+        0.0674
+    """
+    from scipy.stats import halfnorm  # slow to import
+
+    return noise / math.sqrt(count) * float(halfnorm.ppf(0.5 ** (1.0 / largest_of)))
+
+
+def weight_error_kg(
+    known: KnownActuator, strain: float, noise: float, at_s: NDArray[np.float64]
+) -> float:
+    r"""Cramer-Rao bound of a change of the hung mass, as the median of the absolute error.
+
+    $\sigma_m = \sigma / \sqrt{\sum_k (\partial x(t_k)/\partial m)^2}$ with the length after the
+    change, of which all else is known.
+
+    Args:
+        known: true device.
+        strain: held before.
+        noise: standard deviation of one measured strain.
+        at_s: times of the measurements after the change. Shape `(N,)`.
+    Returns:
+        Error, in kg.
+    """
+    motion, mass_kg = _Motion(known, strain), known.mass_kg
+    volt = known.gain_v_per_v * known.static_drive_v(strain)
+    part = [(float(at_s[-1]) + 2.0 * _STEP_S, volt)]
+    time_s, heavier, _ = motion.under(
+        part, GRAVITY_M_S2 * (mass_kg + _SMALL_KG), mass_kg + _SMALL_KG
+    )
+    _, same, _ = motion.under(part)
+    slope = np.interp(at_s, time_s, heavier - same) / _SMALL_KG
+    return _MEDIAN * noise / math.sqrt(float(slope @ slope))
+
+
+def least_tracking_error(
+    known: KnownActuator, wanted: Floats, step_s: float, update_s: float, first_s: float
+) -> float:
+    """Least rms error of a periodic reference with a force that is constant between updates.
+
+    The mass is a double integrator for the force beyond that of the reference: within an update the
+    spring changes by little. Its force stays within the limits of the drive along the reference.
+
+    Args:
+        known: true device.
+        wanted: desired strains of one period. Shape `(N,)`.
+        step_s: between them.
+        update_s: between two changes of the force.
+        first_s: the first change in the period.
+    Returns:
+        The error, over the peak-to-peak value of the reference.
+    """
+    from scipy.optimize import lsq_linear  # slow to import
+
+    last_s = step_s * wanted.size
+    starts_s = first_s + update_s * np.arange(round(last_s / update_s))
+    time_s = step_s * np.arange(wanted.size + 1)
+
+    def moved(order: int) -> Floats:
+        """What a unit of each force has moved, and then the speed; those before act at the end."""
+        since = np.maximum(time_s[:, None] - starts_s, 0.0) ** order
+        until = np.maximum(time_s[:, None] - starts_s - update_s, 0.0) ** order
+        return np.asarray((since - until) / order)
+
+    # the last force also acts before the first change
+    way, speed = moved(2), moved(1)
+    early = np.minimum(time_s, first_s)
+    way[:, -1] += early**2 / 2.0 + early * np.maximum(time_s - first_s, 0.0)
+    speed[:, -1] += early
+    rows = np.column_stack([np.ones(time_s.size), time_s, way])
+    closed = np.r_[0.0, time_s[-1], way[-1]], np.r_[0.0, 0.0, speed[-1]]
+    a = np.vstack([rows[:-1], _HEAVY * closed[0], _HEAVY * update_s * closed[1]])
+    b = np.r_[wanted, 0.0, 0.0]
+    low, high = _accelerations(known, np.interp(starts_s % last_s, time_s[:-1], wanted))
+    found = np.linalg.lstsq(a, b, rcond=None)[0]
+    if not (np.all(found[2:] >= low) and np.all(found[2:] <= high)):
+        free = np.full(2, np.inf)
+        found = lsq_linear(a, b, (np.r_[-free, low], np.r_[free, high])).x
+    error = rows[:-1] @ found - wanted
+    return float(np.sqrt(np.mean(error**2)) / np.ptp(wanted))
+
+
+def _accelerations(known: KnownActuator, strains: Floats) -> tuple[Floats, Floats]:
+    """Lowest and highest acceleration that the drive gives at strains, per s^2."""
+    inertia_kg = known.mass_kg + known.added_inertia_kg + known.law.moving_mass_kg
+    ends = []
+    for strain in strains.tolist():
+        length_m = known.length_m(strain)
+        rest_n = known.static_pull_n(strain)
+        pulls_n = [known.pull_n(length_m, v) for v in (0.0, known.highest_drive_v(length_m))]
+        ends.append(sorted((pull_n - rest_n) / inertia_kg / known.zero_length_m
+                           for pull_n in pulls_n))  # fmt: skip
+    low, high = np.array(ends).T
+    return low, high

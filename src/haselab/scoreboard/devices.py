@@ -105,7 +105,7 @@ def find_device(name: str) -> Device:
     return DEVICES[name]
 
 
-def drawn(rng: np.random.Generator) -> Device:
+def drawn(rng: np.random.Generator, *, senses_alike: bool = False) -> Device:
     """Draw a planar HASEL that differs from `hz` in all that a controller does not know.
 
     The ranges: stiffness 10 %, relaxing shares 20 %, exponent of the capacitance 2 to 4, delay
@@ -115,6 +115,7 @@ def drawn(rng: np.random.Generator) -> Device:
 
     Args:
         rng: random generator.
+        senses_alike: keep what is not mechanical, so that the sensed length is the true one.
     Returns:
         The device.
     """
@@ -124,14 +125,16 @@ def drawn(rng: np.random.Generator) -> Device:
     for section, key in (("shell", "shear_modulus_pa"), ("electrodes", "stiffness_n_per_m")):
         config[section][key] *= stiffer
     config["viscosity"]["share"] = [creepier * g for g in config["viscosity"]["share"]]
-    dielectric = config["dielectric"]
-    zero = _ZERO_M / _HZ.free_length_m
-    dielectric["permittivity"] *= zero ** (dielectric["capacitance_exponent"] - exponent)
-    dielectric["capacitance_exponent"] = exponent
-    dielectric["relaxation_share"] = float(rng.uniform(0.0, 0.1))
-    config["hysteresis"]["force_n"] = float(rng.uniform(0.0, 0.06))
-    config["unmodelled"]["capacitance_rise"] = float(rng.uniform(-0.005, 0.005))
+    share, hysteresis_n, rise, late_s = rng.uniform(
+        [0.0, 0.0, -0.005, 0.0], [0.1, 0.06, 0.005, _LATE_S]
+    ).tolist()
+    config["hysteresis"]["force_n"] = hysteresis_n
+    if not senses_alike:
+        dielectric, zero = config["dielectric"], _ZERO_M / _HZ.free_length_m
+        dielectric["permittivity"] *= zero ** (dielectric["capacitance_exponent"] - exponent)
+        dielectric["capacitance_exponent"] = exponent
+        dielectric["relaxation_share"] = share
+        config["unmodelled"]["capacitance_rise"] = rise
     config.pop("origin")
-    late_s = float(rng.uniform(0.0, _LATE_S))
     return Device("drawn", "drawn about hz", validated(TwinConfig, config, "drawn"), 2.0, 1.04,
                   late_s)  # fmt: skip

@@ -187,7 +187,10 @@ def play(
     period_s = loop.period_s
     lead, count = round(scenario.lead_s / period_s), round(scenario.duration_s / period_s)
     update_s = period_s * np.arange(-lead, count, dtype=np.float64)
-    reference = np.asarray(scenario.reference(update_s), dtype=np.float64)
+    ahead = chosen.kind.preview_steps(period_s)
+    coming_s = period_s * np.arange(count, count + ahead, dtype=np.float64)
+    wanted = scenario.reference(np.concatenate([update_s, coming_s])).tolist()
+    reference = np.array(wanted[: update_s.size])
     plant = FastPlant(scenario.device, loop, rng, lead + count)
     plant.train()
     start_v = min(known.static_drive_v(float(reference[0])), known.high_v)
@@ -199,9 +202,6 @@ def play(
     except InputError as error:
         failure, count, lead = str(error), 0, 0
     done = 0
-    wanted = reference.tolist()
-    ahead = chosen.kind.preview_steps(period_s)
-    wanted += wanted[-1:] * ahead
     loads = list(scenario.loads)
     for k in range(lead + count):
         while loads and loads[0][0] <= update_s[k] + 1e-9:

@@ -11,7 +11,7 @@ import numpy as np
 from haselab.scoreboard.board import Game, Played
 from haselab.scoreboard.tasks import TASKS
 
-__all__ = ["Row", "board_rows"]
+__all__ = ["Row", "board_rows", "limits_of"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,22 @@ def board_rows(game: Game) -> list[Row]:
         for (_, _, task), group in groups.items()
         for metric in TASKS[task].metrics
     ]
+
+
+def limits_of(tasks: Sequence[str]) -> list[tuple[str, str, tuple[str, ...]]]:
+    """What the physical limits of some tasks are and assume.
+
+    Args:
+        tasks: names.
+    Returns:
+        Task, limit, and the names of the metrics that have it.
+    """
+    found: dict[tuple[str, str], list[str]] = {}
+    for name in tasks:
+        for metric in TASKS[name].metrics:
+            if metric.limit:
+                found.setdefault((name, metric.limit), []).append(metric.name)
+    return [(task, limit, tuple(names)) for (task, limit), names in found.items()]
 
 
 def _row(group: Sequence[Played], metric: str, unit: str) -> Row:

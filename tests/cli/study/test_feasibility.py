@@ -268,7 +268,7 @@ def test_a_fault_names_the_section_of_a_limit_that_two_sections_have(
     path = tmp_path / "rig.toml"
     path.write_text('kind = "twin"\n')
     file = load_rig(path)
-    with pytest.raises(InputError, match=rf"1 error\(s\): {section}\.current_limit_a: "):
+    with pytest.raises(InputError, match=rf"1 error: {section}\.current_limit_a: "):
         if section == "safety":
             safety_of(file, {"current_limit_a": 0.0}, path)
         else:

@@ -22,6 +22,7 @@ from haselab.scoreboard import (
     Row,
     board_rows,
     entering_kinds,
+    limits_of,
     play_board,
 )
 from haselab.store.folder import write_text
@@ -96,7 +97,9 @@ def command(
     text = json.dumps(to_plain(_answer(game, rows)), indent=2)
     write_text(out / "scoreboard.json", text + "\n")
     write_text(out / "scoreboard.html", scoreboard_page(game))
-    click.echo(text if as_json else "\n".join([*_table(rows), f"written to {out}"]))
+    lines = [*_table(rows), *(f"bound of {task} {', '.join(names)}: {limit}."
+                              for task, limit, names in limits_of(plan.tasks))]  # fmt: skip
+    click.echo(text if as_json else "\n".join([*lines, f"written to {out}"]))
 
 
 def _answer(game: Game, rows: list[Row]) -> JsonObject:
@@ -112,6 +115,10 @@ def _answer(game: Game, rows: list[Row]) -> JsonObject:
             {"controller": one.controller, "class": one.loop, "device": one.device,
              "parameters": dict(one.values), "reason": one.reason}
             for one in game.entries
+        ],
+        "bounds": [
+            {"task": task, "metrics": list(names), "assumptions": limit}
+            for task, limit, names in limits_of(plan.tasks)
         ],
         "identification": dict(game.identification),
         "seed": plan.seed,

@@ -9,12 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.controllers import KnownActuator
-from haselab.scoreboard.devices import find_device
+from haselab.scoreboard.bounds import mean_error
+from haselab.scoreboard.devices import drawn, find_device
 from haselab.scoreboard.loop_class import LoopClass
 from haselab.scoreboard.measures import smoothed, tracking_error
 from haselab.scoreboard.play import Scenario, Trace
-from haselab.scoreboard.tasks.task import Metric, Task, staircase
-from haselab.scoreboard.tasks.tracking import trapezoid
+from haselab.scoreboard.tasks.task import (
+    Metric,
+    Task,
+    sensed_noise,
+    staircase,
+    tracking_limit,
+)
+from haselab.scoreboard.tasks.tracking import TRACKING_LIMIT, trapezoid
 
 __all__ = ["LASTING_TASKS"]
 
@@ -54,6 +61,11 @@ def _periodic(known: KnownActuator, rng: np.random.Generator) -> Scenario:
     return Scenario(find_device("hz"), known.zero_length_m, float(_PERIODS), _gait)
 
 
+def _periodic_drawn(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+    device = drawn(rng, senses_alike=True)
+    return Scenario(device, known.zero_length_m, float(_PERIODS), _gait)
+
+
 def _score_periodic(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
     wanted = scenario.reference(trace.time_s)
     errors = [tracking_error(trace, wanted, float(k), k + 1.0) for k in range(_PERIODS)]
@@ -65,26 +77,38 @@ def _score_periodic(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
     }
 
 
-def _no_bounds(known: KnownActuator, loop: LoopClass) -> Mapping[str, float]:
-    return {}
+def _bounds_hold(known: KnownActuator, scenario: Scenario, loop: LoopClass) -> Mapping[str, float]:
+    noise = sensed_noise(known, scenario, loop, _SIZE)
+    return {"error": mean_error(noise, _AFTER_S / loop.period_s)} if noise > 0.0 else {}
+
+
+def _bounds_periodic(
+    known: KnownActuator, scenario: Scenario, loop: LoopClass
+) -> Mapping[str, float]:
+    limit = tracking_limit(known, scenario, loop, 1.0)
+    return {} if limit is None else {"error_first": limit, "error_after_ten": limit}
 
 
 _FIELD = Metric("peak_field_v_per_m", "V/m", "largest field")
-_HELD = (Metric("error", "", "largest error of a mean of 1 s, from 10 s on, in strain"), _FIELD)
+_HELD = (
+    Metric("error", "", "largest error of a mean of 1 s, from 10 s on, in strain",
+           "noise alone: the mean of all measurements before, one constant unknown"),
+    _FIELD,
+)  # fmt: skip
+_REPEATED = (
+    Metric("error_first", "", "rms error over peak-to-peak, first period", TRACKING_LIMIT),
+    Metric("error_after_ten", "", "the same after ten periods", TRACKING_LIMIT),
+    Metric("left", "", "the second over the first"),
+    _FIELD,
+)
 
 LASTING_TASKS = (
     Task("T6", "hold for 10 min after a step of 0.10", "hz", _HELD, _hold("hz"), _score_hold,
-         _no_bounds, classes=("host-100hz",)),
+         _bounds_hold, classes=("host-100hz",)),
     Task("T6-retention", "the same with a fifth of the voltage acting late", "hz", _HELD,
-         _hold("retention"), _score_hold, _no_bounds, classes=("host-100hz",)),
-    Task(
-        "T7", "a trapezoid gait at 1 Hz, eleven times", "hz",
-        (
-            Metric("error_first", "", "rms error over peak-to-peak, first period"),
-            Metric("error_after_ten", "", "the same after ten periods"),
-            Metric("left", "", "the second over the first"),
-            _FIELD,
-        ),
-        _periodic, _score_periodic, _no_bounds,
-    ),
+         _hold("retention"), _score_hold, _bounds_hold, classes=("host-100hz",)),
+    Task("T7", "a trapezoid gait at 1 Hz, eleven times", "hz", _REPEATED, _periodic,
+         _score_periodic, _bounds_periodic),
+    Task("T7-drawn", "the same on devices drawn about hz that sense alike", "hz", _REPEATED,
+         _periodic_drawn, _score_periodic, _bounds_periodic, drawn=True),
 )  # fmt: skip

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.controllers import KnownActuator
-from haselab.scoreboard.loop_class import LoopClass
-from haselab.scoreboard.play import Scenario, Trace
+from haselab.scoreboard.bounds import least_tracking_error
+from haselab.scoreboard.loop_class import STEP_S, LoopClass, noise_of
+from haselab.scoreboard.play import TRACE_S, Scenario, Trace
 
-__all__ = ["Metric", "Task", "staircase"]
+__all__ = ["Metric", "Task", "no_bounds", "sensed_noise", "staircase", "tracking_limit"]
 
 Floats = NDArray[np.float64]
+_PERIOD_S = 1.0  # of all references whose tracking has a limit, or a multiple of theirs
+_COARSE_S = 5e-3  # updates: with shorter ones, the force is no limit between them
 
 
 @dataclass(frozen=True)
@@ -25,11 +28,13 @@ class Metric:
         name: in the results.
         unit: SI.
         title: for people.
+        limit: what its physical limit is and assumes; empty: there is none.
     """
 
     name: str
     unit: str
     title: str
+    limit: str = ""
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,8 @@ class Task:
         scenario: makes the scenario from the public device's identified model, for the device that
             is played and with random numbers of the seed.
         score: numbers by the names of the metrics; NaN where the task was not done.
-        bounds: physical limits by the names of the metrics, of the true device in a class of loop.
+        bounds: physical limits by the names of the metrics, of the true device in a scenario and a
+            class of loop.
         drawn: whether each seed draws its own device about the public one.
         classes: in which it is played.
     """
@@ -55,9 +61,47 @@ class Task:
     metrics: tuple[Metric, ...]
     scenario: Callable[[KnownActuator, np.random.Generator], Scenario]
     score: Callable[[Trace, Scenario], Mapping[str, float]]
-    bounds: Callable[[KnownActuator, LoopClass], Mapping[str, float]]
+    bounds: Callable[[KnownActuator, Scenario, LoopClass], Mapping[str, float]]
     drawn: bool = False
     classes: tuple[str, ...] = ("host-100hz", "chip-1khz", "oracle")
+
+
+def no_bounds(known: KnownActuator, scenario: Scenario, loop: LoopClass) -> Mapping[str, float]:
+    """Bounds of a task that has none."""
+    return {}
+
+
+def sensed_noise(known: KnownActuator, scenario: Scenario, loop: LoopClass, strain: float) -> float:
+    """Standard deviation of one measured strain.
+
+    Args:
+        known: true device.
+        scenario: with the bench.
+        loop: class.
+        strain: at which it is measured.
+    """
+    farad = float(known.law.capacitance_f(known.zero_length_m))
+    noise_f = noise_of(loop, scenario.device.config, farad)
+    return replace(known, capacitance_noise_f=noise_f).length_noise_m(strain) / known.zero_length_m
+
+
+def tracking_limit(
+    known: KnownActuator, scenario: Scenario, loop: LoopClass, from_s: float
+) -> float | None:
+    """Least tracking error of a reference that repeats after 1 s; None: not a limit at that rate.
+
+    Args:
+        known: true device.
+        scenario: with the reference.
+        loop: class.
+        from_s: beginning of a period, at an update.
+    """
+    if loop.period_s < _COARSE_S:
+        return None
+    time_s = np.asarray(from_s + TRACE_S * np.arange(round(_PERIOD_S / TRACE_S)), dtype=np.float64)
+    wanted = scenario.reference(time_s)
+    first_s = loop.switch_at * STEP_S
+    return least_tracking_error(known, wanted, TRACE_S, loop.period_s, first_s)
 
 
 def staircase(points: tuple[tuple[float, float], ...]) -> Callable[[Floats], Floats]:

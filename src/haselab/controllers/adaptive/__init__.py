@@ -1,0 +1,1 @@
+"""Controllers that change with what they meet: a period, an operating point, a load."""

@@ -101,15 +101,29 @@ class ReferencePlan:
 
     def _plan(self, start: tuple[float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits."""
+        for_s = self.duration_s(start, target_m, state)
         self._target_m = target_m
+        self._curve, self._for_s, self._at_s = _quintic(start, target_m, for_s), for_s, 0.0
+
+    def duration_s(
+        self, start: tuple[float, float], target_m: float, state: list[float],
+        longer: float = _LONGER,
+    ) -> float:  # fmt: skip
+        """Duration of the fastest polynomial within the limits.
+
+        Args:
+            start: length and speed.
+            target_m: length at which it comes to rest.
+            state: from which the branches and the load are.
+            longer: from one try to the next.
+        """
         period_s = self._period_s
         for_s = _LEAST * period_s
         while for_s < _LONGEST_S:
-            curve = _quintic(start, target_m, for_s)
-            if self._possible(curve, for_s, target_m, state):
+            if self._possible(_quintic(start, target_m, for_s), for_s, target_m, state):
                 break
-            for_s = period_s * math.ceil(_LONGER * for_s / period_s)
-        self._curve, self._for_s, self._at_s = _quintic(start, target_m, for_s), for_s, 0.0
+            for_s = period_s * math.ceil(longer * for_s / period_s)
+        return for_s
 
     def _possible(
         self, curve: tuple[float, ...], for_s: float, target_m: float, state: list[float]

@@ -32,19 +32,18 @@ _MOVED = 1.5
 _SHAKE, _RESERVE = 0.01, 0.15
 
 
-def design_observer(setting: ControllerSetting, shaken: float = _SHAKEN) -> Mapping[str, float]:
+def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
     """Choose bandwidth and expected load so that a change of load is rejected best.
 
     Minimises the integral of time times the squared error after a step of the load, over three
     strains of the reachable range. The peak sensitivity is at most 2.5 with the stiffness 10 %
     higher, and with it 10 % lower and the delay a fifth longer; at most 5 with the delay longer
     by half. Noise moves the actuator by at most 1.5 times the noise of the sensed length, the drive
-    by at most a share of its range and from one update to the next by at most what the loop allows
+    by at most 4 % of its range and from one update to the next by at most what the loop allows
     (standard deviations).
 
     Args:
         setting: timing and limits of the loop, and the actuator.
-        shaken: by which noise may move the drive, as a share of the highest drive.
     Returns:
         The parameters of `ObserverController`.
     Raises:
@@ -69,7 +68,7 @@ def design_observer(setting: ControllerSetting, shaken: float = _SHAKEN) -> Mapp
             noise_m = known.length_noise_m(strain)
             for stiffness, longer, peak in _SPREAD:
                 demands = Demands(
-                    noise_m, shaken * known.high_v, peak, _MOVED, _CHANGED * allowed_v
+                    noise_m, _SHAKEN * known.high_v, peak, _MOVED, _CHANGED * allowed_v
                 )
                 loop = linear_loop(law, setting, strain, (stiffness, longer * delay_s))
                 factor = penalty(loop, setting.period_s, demands)

@@ -20,7 +20,7 @@ from haselab.controllers.motion_model import MotionModel
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.reference_plan import ReferencePlan
 
-__all__ = ["MotionRecord", "as_q", "motion_record", "sensed_strain", "set_lag"]
+__all__ = ["MotionRecord", "as_q", "lag_of", "motion_record", "sensed_strain", "set_lag"]
 
 Floats = NDArray[np.float64]
 _ONE, _FULL = 2.0**30, 32767
@@ -45,22 +45,43 @@ class MotionRecord:
         low: strain at x = 0.
         span: strain of the whole table.
         unit_s: unit of time.
-        slopes: of the forces over x where the actuator rests, in units of x and time, at each knot.
         drag: acceleration over speed, in units of x and time.
         inertia_kg: of the motion.
+        high_v: highest drive.
     """
 
     numbers: NDArray[np.void]
     low: float
     span: float
     unit_s: float
-    slopes: Floats
     drag: float
     inertia_kg: float
+    high_v: float
 
     def acceleration_of(self, force_n: float, zero_length_m: float) -> float:
         """Acceleration by a force, in units of x and time."""
         return force_n / self.inertia_kg / zero_length_m / self.span * self.unit_s**2
+
+    def forces_at(self, strain: float) -> tuple[float, float, float]:
+        """Slope of the resting acceleration over x, acceleration by the highest drive, its slope.
+
+        Args:
+            strain: at which.
+        """
+        knots = np.linspace(0.0, 1.0, self.numbers["rest"].size)
+        x = (strain - self.low) / self.span
+        rest, push = (self.numbers[name] / 2.0**15 for name in ("rest", "push"))
+        slopes = [np.gradient(row, knots[1]) for row in (rest, push)]
+        rest_slope, push_slope = (float(np.interp(x, knots, row)) for row in slopes)
+        return rest_slope, float(np.interp(x, knots, push)), push_slope
+
+    def slope_at(self, strain: float) -> float:
+        """Slope of elastic minus electric force over x, at the drive that holds a strain."""
+        knots = np.linspace(0.0, 1.0, self.numbers["rest"].size)
+        rest_slope, push, push_slope = self.forces_at(strain)
+        rest = np.interp((strain - self.low) / self.span, knots, self.numbers["rest"] / 2.0**15)
+        carrier = float(self.numbers["carrier"]) / _ONE
+        return rest_slope - min(max(float(rest) / push, carrier), 1.0 + carrier) * push_slope
 
 
 def as_q(value: float, bits: int, what: str, most: int = _FULL) -> int:
@@ -97,6 +118,18 @@ def sensed_strain(known: KnownActuator, measurement: Measurement) -> float:
     return known.strain(known.sensed_length_m(measurement.capacitance_f, measurement.voltage_v))
 
 
+def lag_of(motion: MotionRecord, setting: ControllerSetting) -> tuple[float, float]:
+    """Age of a measurement when the drive acts, in units of time, and half of its square.
+
+    Args:
+        motion: for its unit of time.
+        setting: of the loop.
+    """
+    delay_s = 0.5 * setting.period_s if setting.delay_s is None else setting.delay_s
+    lag = delay_s / motion.unit_s
+    return lag, 0.5 * lag * lag
+
+
 def set_lag(gains: NDArray[np.void], motion: MotionRecord, setting: ControllerSetting) -> None:
     """Write the age of a measurement when the drive acts.
 
@@ -105,10 +138,9 @@ def set_lag(gains: NDArray[np.void], motion: MotionRecord, setting: ControllerSe
         motion: for its unit of time.
         setting: of the loop.
     """
-    delay_s = 0.5 * setting.period_s if setting.delay_s is None else setting.delay_s
-    lag = delay_s / motion.unit_s
+    lag, square = lag_of(motion, setting)
     gains["lag"] = as_q(lag, 15, "The delay", 2**13)
-    gains["lag_square"] = as_q(0.5 * lag * lag, 16, "The delay")
+    gains["lag_square"] = as_q(square, 16, "The delay")
 
 
 def motion_record(setting: ControllerSetting, reserve: float) -> MotionRecord:
@@ -173,9 +205,7 @@ def motion_record(setting: ControllerSetting, reserve: float) -> MotionRecord:
     rise = _FULL * setting.highest_rate_per_s * setting.period_s / known.high_v
     one["rise"] = math.floor(min(rise * (1.0 - 1e-6), _FULL))
     one["shift"] = shift
-    return MotionRecord(
-        one, low, span, unit_s, _slopes(rest, push, carrier), drag, model.inertia_kg
-    )
+    return MotionRecord(one, low, span, unit_s, drag, model.inertia_kg, known.high_v)
 
 
 def _accelerations(known: KnownActuator, strains: Floats) -> tuple[Floats, Floats]:
@@ -222,13 +252,6 @@ def _set_root(one: NDArray[np.void], push: Floats, carrier: float) -> None:
     shift = math.floor(math.log2(ratio)) + 1
     one["root_unit"] = min(round(2.0**16 * ratio / 2.0**shift), 65535)
     one["root_shift"] = shift
-
-
-def _slopes(rest: Floats, push: Floats, carrier: float) -> Floats:
-    """Slope of elastic minus electric force at the drive that holds each knot."""
-    w = np.clip(rest / push, carrier, 1.0 + carrier)
-    step = 1.0 / (rest.size - 1)
-    return np.asarray(np.gradient(rest, step) - w * np.gradient(push, step))
 
 
 def _set_moves(

@@ -9,11 +9,9 @@ rest to rest, two of which may overlap.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_are
 
 from haselab import _core
 from haselab.actuators import GRAVITY_M_S2
@@ -26,16 +24,18 @@ from haselab.controllers.chip.motion_record import (
     sensed_strain,
     set_lag,
 )
+from haselab.controllers.chip.observer_design import (
+    design_chip_observer,
+    feedback_gains,
+    steady_gains,
+)
 from haselab.controllers.kind import ControllerKind
-from haselab.controllers.observer_design import OBSERVER, design_observer
-from haselab.controllers.observer_law import critical_feedback, process_noise
+from haselab.controllers.observer_design import OBSERVER
 from haselab.controllers.protocol import ControllerSetting, Measurement
 
 __all__ = ["CHIP_OBSERVER", "ChipObserverController"]
 
-Floats = NDArray[np.float64]
 _WEIGHED_S = 0.04  # time constant of the mean load
-_SHAKEN = 0.06  # of the highest drive, by noise: more than on the bench, whose sensing is quieter
 
 
 class ChipObserverController:
@@ -85,63 +85,19 @@ class ChipObserverController:
 
     def _records(self, setting: ControllerSetting) -> tuple[MotionRecord, NDArray[np.void]]:
         motion = motion_record(setting, self._reserve)
-        per_x, per_v = critical_feedback(self._bandwidth, setting.period_s)
+        per_x, per_v = feedback_gains(motion, self._bandwidth, setting.period_s)
         gains = np.zeros((), _core.OBSERVER)
-        gains["kp"] = as_q(per_x * motion.unit_s**2, 10, "The gain of the length")
-        gains["kd"] = as_q(per_v * motion.unit_s, 10, "The gain of the speed")
+        gains["kp"] = as_q(per_x, 10, "The gain of the length")
+        gains["kd"] = as_q(per_v, 10, "The gain of the speed")
         set_lag(gains, motion, setting)
-        for k, row in enumerate(self._steady_gains(motion, setting, gains)):
-            for name, value in zip(("gain_x", "gain_v", "gain_load"), row, strict=True):
-                gains[name][k] = as_q(
-                    value, 13, "A gain of the observer", 2**13 if name == "gain_x" else 2**15 - 1
-                )
+        knots = gains["gain_x"].size
+        for k, x in enumerate(np.linspace(0.0, 1.0, knots)):
+            strain = motion.low + motion.span * float(x)
+            row = steady_gains(motion, setting, strain, self._load_n, self._shake)
+            gains["gain_x"][k] = as_q(row[0], 13, "A gain of the observer", 2**13)
+            gains["gain_v"][k] = as_q(row[1], 13, "A gain of the observer")
+            gains["gain_load"][k] = as_q(row[2], 13, "A gain of the observer")
         return motion, gains
-
-    def _steady_gains(
-        self, motion: MotionRecord, setting: ControllerSetting, gains: NDArray[np.void]
-    ) -> list[list[float]]:
-        """Gains of Kalman's filter for length, speed and load, at rest at each knot."""
-        known, period_s = setting.actuator, setting.period_s
-        assert known is not None
-        width_m, step = known.zero_length_m * motion.span, period_s / motion.unit_s
-        scale = np.array([1.0, motion.unit_s]) / width_m
-        noise = np.zeros((3, 3))
-        noise[:2, :2] = process_noise(self._shake, period_s) * np.outer(scale, scale)
-        load = motion.acceleration_of(self._load_n, known.zero_length_m)
-        noise[2, 2] = load**2 * period_s
-        lag, square = gains["lag"] / 2.0**15, gains["lag_square"] / 2.0**16
-        found = []
-        for k, stiffness in enumerate(motion.slopes):
-            strain = motion.low + motion.span * k / (motion.slopes.size - 1)
-            error = known.length_noise_m(strain) / width_m
-            a, accelerates = _transition(float(stiffness), motion.drag, step)
-            seen = np.array([1.0, -lag, 0.0]) + square * accelerates
-            p = solve_discrete_are(a.T, seen[:, None], noise / error**2, [[1.0]])
-            found.append((p @ seen / (seen @ p @ seen + 1.0)).tolist())
-        return found
-
-
-def _transition(stiffness: float, drag: float, step: float) -> tuple[Floats, Floats]:
-    """One step of the core from length, speed and load, and the acceleration in it."""
-    half = np.array([[1.0, 0.5 * step, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    accelerates = np.array([-stiffness, -drag - 0.5 * step * stiffness, 1.0])
-    after = half @ (half + np.outer([0.0, 1.0, 0.0], step * accelerates))
-    return after, accelerates
-
-
-def _design(setting: ControllerSetting) -> Mapping[str, float]:
-    """Choose bandwidth and expected load as for `observer`, with more noise of the drive.
-
-    Over three strains of the reachable range, the peak sensitivity is at most 2.5 with the
-    stiffness 10 % higher, and with it 10 % lower and the delay a fifth longer; at most 5 with the
-    delay longer by half. Noise moves the drive by at most 6 % of its range (standard deviation).
-
-    Args:
-        setting: timing of the loop, and the actuator.
-    Returns:
-        The parameters of `ChipObserverController`.
-    """
-    return design_observer(setting, _SHAKEN)
 
 
 CHIP_OBSERVER = ControllerKind(
@@ -150,6 +106,6 @@ CHIP_OBSERVER = ControllerKind(
     OBSERVER.parameters,
     output="voltage",
     needs_actuator=True,
-    design=_design,
+    design=design_chip_observer,
     loop=chip_setting,
 )

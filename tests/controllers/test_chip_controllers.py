@@ -64,6 +64,18 @@ def test_at_rest_it_keeps_the_drive_that_holds_the_strain(
     assert max(abs(value - drive_v) for value in found) < drive_v * 2.0**-11 + 4 * VOLT
 
 
+def test_it_weighs_what_rests_at_a_known_drive(known: KnownActuator) -> None:
+    drive_v, mass_kg = known.static_drive_v(0.05, 0.3), 0.3
+    controller = started("chip-observer", known, drive_v)
+    for _ in range(3):
+        controller.step(0.05, seen(0.05, drive_v))
+    # The mean of the load has a time constant of 40 ms, of which 3 ms have passed.
+    shown = 1.0 - math.exp(-3.0 / 40.0)
+    found_kg = (controller.estimated_load_kg - known.mass_kg) / shown  # type: ignore[attr-defined]
+    # 2^-15 of the largest acceleration, a tenth of which is the weight: 0.1 g, divided by 0.07
+    assert abs(found_kg - (mass_kg - known.mass_kg)) < 2e-3
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_without_a_valid_strain_it_keeps_the_drive(kind: str, known: KnownActuator) -> None:
     drive_v = known.static_drive_v(0.0)

@@ -61,6 +61,9 @@ class ChipObserverController:
         motion, gains = self._records(setting)
         self._loop = _core.Observer(motion.numbers, gains)
         self._per_load_n = 1.0 / (2.0**30 * motion.acceleration_of(1.0, self._known.zero_length_m))
+        # the branches relax a share of elastic force minus weight, not of the elastic force alone
+        relaxed = float(motion.numbers["branch_share"].sum()) / 2.0**15
+        self._relaxed_n = relaxed * GRAVITY_M_S2 * self._known.mass_kg
         self._load_mean_n, self._forget = 0.0, math.exp(-setting.period_s / _WEIGHED_S)
 
     @property
@@ -74,7 +77,7 @@ class ChipObserverController:
         if measurement.valid:
             strain = sensed_strain(self._known, measurement)
         found = self._loop.step(reference, strain, measurement.voltage_v, measurement.valid)
-        load_n = self._loop.load * self._per_load_n
+        load_n = self._loop.load * self._per_load_n - self._relaxed_n
         self._load_mean_n = load_n + self._forget * (self._load_mean_n - load_n)
         return found
 

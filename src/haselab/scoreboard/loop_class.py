@@ -33,6 +33,7 @@ class LoopClass:
         drive_step_v: resolution of the output, before the amplifier; 0: none.
         slew_v_per_s: fastest change of the output; infinite: any.
         volt_slew_v_per_s: the same for controllers whose output is the voltage.
+        on_chip: whether it is the loop of the microcontroller, the only one of kinds with a `loop`.
         true_states: whether the controller gets the true law, and capacitances without noise.
     """
 
@@ -45,6 +46,7 @@ class LoopClass:
     drive_step_v: float = 0.0
     slew_v_per_s: float = math.inf
     volt_slew_v_per_s: float = math.inf
+    on_chip: bool = False
     true_states: bool = False
 
     @property
@@ -72,6 +74,10 @@ class LoopClass:
         """Time from an event at the beginning of an update to the first output that knows of it."""
         return (self.steps + self.switch_at) * STEP_S
 
+    def suits(self, kind: ControllerKind) -> bool:
+        """Whether a kind of controller is made for this loop."""
+        return kind.loop is None or self.on_chip
+
     def slew_of(self, kind: ControllerKind) -> float:
         """Fastest change of the output of a kind of controller, in V/s."""
         return self.volt_slew_v_per_s if kind.output == "voltage" else self.slew_v_per_s
@@ -98,6 +104,7 @@ CLASSES = {
             CAPACITANCE_NOISE,
             slew_v_per_s=20.0,
             volt_slew_v_per_s=MOTION_RISE_V_PER_S,
+            on_chip=True,
         ),
         LoopClass("oracle", 10, 0, 9, 10, 0.0, true_states=True),
     )

@@ -14,6 +14,7 @@
 #define HS_CONTROLLER_H
 
 #include "hs.h"
+#include "hs_motion.h"
 
 #define HS_CONTROLLER_STATES 16
 #define HS_CONTROLLER_PARAMETERS 8
@@ -33,6 +34,8 @@ typedef struct {
 typedef union {
     float x[HS_CONTROLLER_STATES];
     hs_pid_state pid;
+    hs_force_state force; /* of the built-in controllers of the identified motion */
+    hs_observer_state observer;
 } hs_controller_state;
 
 typedef struct {
@@ -46,7 +49,8 @@ typedef struct {
 /* Start a new run. */
 void hs_controller_init(const hs_controller_setting *setting, hs_controller_state *state);
 
-/* One update: the new drive, in strain. The voltage table turns it into a voltage. */
+/* One update: the new drive, in strain, which the voltage table turns into a voltage; in V if the
+ * kind of the controller has the output "voltage". */
 float hs_controller_step(const hs_controller_setting *setting, hs_controller_state *state,
                          float reference, const hs_measurement *measurement);
 

@@ -213,7 +213,7 @@ static void close_loop(const app_config *c, app_state *s, app_outputs *out)
         return; /* keep the output for up to blind_updates */
     }
     out->corrected = u;
-    s->drive_v = toward(s->drive_v, hs_table_at(&c->voltage, out->corrected), c->rise_v);
+    s->drive_v = toward(s->drive_v, c->in_volts ? u : hs_table_at(&c->voltage, u), c->rise_v);
 }
 
 static void ramp_down(const app_config *c, app_state *s)

@@ -21,6 +21,7 @@ typedef struct {
     hs_strain_map strain;
     hs_controller_setting controller;
     hs_table voltage;                    /* corrected strain to drive, V */
+    uint8_t in_volts;                    /* 1: the controller gives the drive itself */
     float reference_low, reference_high; /* range of the desired strain */
     float drive_high_v;                  /* the lowest is 0 */
     float rise_v;                        /* largest change of the drive in one update, V */

@@ -236,7 +236,7 @@ typedef struct {
     uint8_t state; /* see states */
     float reference; /* desired strain */
     float strain; /* measured strain; 0 without one */
-    float corrected; /* the controller's output, in strain */
+    float corrected; /* the controller's output, in strain or in V */
     uint16_t code; /* of the output converter */
 } hp_trace;
 

@@ -9,6 +9,8 @@
 #include <tuple>
 
 #include "hs.h"
+#include "hs_motion.h"
+#include "records.h"
 
 namespace nb = nanobind;
 
@@ -60,6 +62,37 @@ void capacitances_from_quadrature(const hs_quadrature_config &config, Codes code
     }
 }
 
+// A controller of the motion: its configuration, of which a copy is kept, and its state.
+template <class Config, class Gains, class State, void (*init)(State *),
+          float (*update)(const Config *, State *, float, float, float, uint8_t)>
+class Motion {
+  public:
+    Motion(nb::handle motion, nb::handle gains)
+    {
+        const Records<const hs_motion_config> tables(motion);
+        const Records<const Gains> own(gains);
+        if (tables.size() != 1 || own.size() != 1) {
+            throw std::invalid_argument("one record of each kind is needed");
+        }
+        config_.motion = *tables.data();
+        config_.gains = *own.data();
+        init(&state_);
+    }
+    float step(float reference, float strain, float voltage_v, bool valid)
+    {
+        return update(&config_, &state_, reference, strain, voltage_v, valid ? 1 : 0);
+    }
+    const State &state() const { return state_; }
+
+  private:
+    Config config_{};
+    State state_{};
+};
+
+using Force = Motion<hs_force_config, hs_force_gains, hs_force_state, hs_force_init, hs_force_step>;
+using Observer = Motion<hs_observer_config, hs_observer_gains, hs_observer_state, hs_observer_init,
+                        hs_observer_step>;
+
 } // namespace
 
 NB_MODULE(_core, m)
@@ -95,4 +128,32 @@ NB_MODULE(_core, m)
         .def("reset", &Pid::reset)
         .def("step", &Pid::step)
         .def_prop_ro("integral", &Pid::integral);
+    m.attr("MOTION") = dtype_of<hs_motion_config>(
+        {FIELD(hs_motion_config, low), FIELD(hs_motion_config, per_strain),
+         FIELD(hs_motion_config, per_volt), FIELD(hs_motion_config, volt),
+         FIELD(hs_motion_config, carrier), FIELD(hs_motion_config, carrier_w),
+         FIELD(hs_motion_config, most),
+         FIELD(hs_motion_config, rest), FIELD(hs_motion_config, push),
+         FIELD(hs_motion_config, inverse), FIELD(hs_motion_config, highest),
+         FIELD(hs_motion_config, move), FIELD(hs_motion_config, branch_share),
+         FIELD(hs_motion_config, branch_gain), FIELD(hs_motion_config, branch_slow),
+         FIELD(hs_motion_config, drag), FIELD(hs_motion_config, lowest),
+         FIELD(hs_motion_config, rise), FIELD(hs_motion_config, root_unit),
+         FIELD(hs_motion_config, root_shift), FIELD(hs_motion_config, branches),
+         FIELD(hs_motion_config, shift)});
+    m.attr("FORCE") = dtype_of<hs_force_gains>(
+        {FIELD(hs_force_gains, kp), FIELD(hs_force_gains, kd), FIELD(hs_force_gains, ki),
+         FIELD(hs_force_gains, lag), FIELD(hs_force_gains, lag_square),
+         FIELD(hs_force_gains, filter)});
+    m.attr("OBSERVER") = dtype_of<hs_observer_gains>(
+        {FIELD(hs_observer_gains, kp), FIELD(hs_observer_gains, kd), FIELD(hs_observer_gains, lag),
+         FIELD(hs_observer_gains, lag_square), FIELD(hs_observer_gains, gain_x),
+         FIELD(hs_observer_gains, gain_v), FIELD(hs_observer_gains, gain_load)});
+    nb::class_<Force>(m, "Force")
+        .def(nb::init<nb::handle, nb::handle>(), nb::arg("motion"), nb::arg("gains"))
+        .def("step", &Force::step);
+    nb::class_<Observer>(m, "Observer")
+        .def(nb::init<nb::handle, nb::handle>(), nb::arg("motion"), nb::arg("gains"))
+        .def("step", &Observer::step)
+        .def_prop_ro("load", [](const Observer &o) { return o.state().load; });
 }

@@ -4,6 +4,7 @@ from haselab.controllers.builtin import OpenLoop, PidController, pid_controller
 from haselab.controllers.kind import ChosenController, ControllerKind, Parameter
 from haselab.controllers.known_actuator import KnownActuator, known_actuator
 from haselab.controllers.protocol import (
+    ChipController,
     Controller,
     ControllerSetting,
     LinearisableController,
@@ -13,6 +14,7 @@ from haselab.controllers.registry import CONTROLLERS, chosen_controller, paramet
 
 __all__ = [
     "CONTROLLERS",
+    "ChipController",
     "ChosenController",
     "Controller",
     "ControllerKind",

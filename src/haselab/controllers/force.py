@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,19 +29,39 @@ from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penal
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.sampled_point import SampledPoint, sampled_point
 
-__all__ = ["FORCE", "ForceController", "design_force", "force_loop"]
+__all__ = ["FORCE", "ForceController", "ForceDemands", "design_force", "force_loop"]
 
 Floats = NDArray[np.float64]
 _POINTS = (0.1, 0.5, 0.9)  # of the reachable range
 _SPREAD = ((1.1, 0.0), (0.9, 2e-3))  # stiffness, later_s
 _PEAK_SENSITIVITY = 1.8
-_NOISE = 1.2  # of the length, over that of one measurement
-_SHAKEN = 0.005  # of the highest drive, by noise
 _AUTHORITY = 0.5  # of the force beyond equilibrium that a step of the reference may take
 _STEP = 0.04
 _ERROR = 0.01  # strain that the proportional part may answer with all the spare force
 _LEAST_FILTER = 0.05  # of a period
 _GAIN = 1e6
+
+
+@dataclass(frozen=True)
+class ForceDemands:
+    """What noise may do in a loop, and where the search for gains starts.
+
+    Args:
+        moved: standard deviation of the length by noise, over that of one sensed length.
+        shaken: of the drive, over its highest value.
+        changed: change of the drive in one update, over the highest one that the loop allows.
+        slower: logarithms of the speeds from which the search starts, over the fastest loop.
+        filtered: power of that speed to which the derivative's filter is slower at the start.
+    """
+
+    moved: float = 1.2
+    shaken: float = 0.005
+    changed: float = math.inf
+    slower: tuple[float, ...] = (0.0, -0.7, -1.4)
+    filtered: float = 0.0
+
+
+_BENCH = ForceDemands()
 
 
 class ForceController:
@@ -170,16 +191,16 @@ class ForceController:
         return self._wanted, self._wanted_per_s, pulled
 
 
-def design_force(setting: ControllerSetting) -> Mapping[str, float]:
+def design_force(setting: ControllerSetting, demands: ForceDemands = _BENCH) -> Mapping[str, float]:
     """Choose the gains that reject a change of load best and stay robust over the whole range.
 
     Minimises the sum of squared errors after a step of the load, over three strains of the
     reachable range, with the stiffness 10 % lower and higher and the delay 2 ms longer. In each
-    case the peak sensitivity is at most 1.8, and the noise of the sensed length moves the actuator
-    by at most 1.2 times that noise and the drive by at most 0.5 % of its range (rms).
+    case the peak sensitivity is at most 1.8, and noise does at most what is demanded.
 
     Args:
         setting: timing of the loop, and the actuator.
+        demands: on the noise.
     Returns:
         The parameters of `ForceController`.
     Raises:
@@ -200,11 +221,11 @@ def design_force(setting: ControllerSetting) -> Mapping[str, float]:
         return kp, ki, kd, max(filter_s, _LEAST_FILTER * setting.period_s)
 
     def cost(values: Floats) -> float:
-        return sum(_cost(point, setting, gains(values), spare_n) for point in points)
+        return sum(_cost(point, setting, gains(values), demands, spare_n) for point in points)
 
     best = None
-    for shift in (0.0, -0.7, -1.4):
-        found = minimize(cost, start + np.array([2.0, 3.0, 1.0, 0.0]) * shift,
+    for shift in demands.slower:
+        found = minimize(cost, start + np.array([2.0, 3.0, 1.0, -demands.filtered]) * shift,
                          method="Nelder-Mead", options={"maxfev": 400, "xatol": 0.02})  # fmt: skip
         if best is None or found.fun < best.fun:
             best = found
@@ -215,7 +236,7 @@ def design_force(setting: ControllerSetting) -> Mapping[str, float]:
             "Shorten the delay."
         )
     kp, ki, kd, filter_s = (float(f"{value:.4g}") for value in gains(best.x))
-    needed_s = math.sqrt(inertia * known.zero_length_m * _STEP / (_AUTHORITY * _spare_n(known)))
+    needed_s = math.sqrt(inertia * known.zero_length_m * _STEP / (_AUTHORITY * spare_n))
     reference_s = max(needed_s, setting.period_s)
     return {"kp": kp, "ki": ki, "kd": kd, "filter_s": filter_s,
             "reference_s": float(f"{reference_s:.4g}")}  # fmt: skip
@@ -283,19 +304,22 @@ def force_loop(
 
 
 def _cost(
-    point: SampledPoint, setting: ControllerSetting, gains: tuple[float, ...], spare_n: float
-) -> float:
+    point: SampledPoint, setting: ControllerSetting, gains: tuple[float, ...],
+    demands: ForceDemands, spare_n: float,
+) -> float:  # fmt: skip
     """Cost of the loop, also where the proportional part asks for more than the spare force."""
     known = setting.actuator
     assert known is not None
     per_v2 = 0.5 / math.sqrt(point.volt2) / known.gain_v_per_v  # V of drive per V^2
-    demands = Demands(
-        known.length_noise_m(point.strain), _SHAKEN * known.high_v / per_v2, _PEAK_SENSITIVITY,
-        _NOISE,
+    allowed_v = setting.highest_rate_per_s * setting.period_s
+    changed = math.inf if math.isinf(demands.changed) else demands.changed * allowed_v / per_v2
+    kept = Demands(
+        known.length_noise_m(point.strain), demands.shaken * known.high_v / per_v2,
+        _PEAK_SENSITIVITY, demands.moved, changed,
     )  # fmt: skip
     missed = max(gains[0] * _ERROR / spare_n - 1.0, 0.0)
     loop = force_loop(point, setting, gains, known)
-    factor = penalty(loop, setting.period_s, demands, missed)
+    factor = penalty(loop, setting.period_s, kept, missed)
     return factor if factor > UNSTABLE else factor * squared_error(loop, setting.period_s)
 
 

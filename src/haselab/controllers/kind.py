@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from haselab.base import InputError
+from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.protocol import Controller, ControllerSetting
 
 __all__ = ["ChosenController", "ControllerKind", "Parameter"]
@@ -48,12 +49,13 @@ class ControllerKind:
         make: class or function that takes the parameters by name and returns a `Controller`.
         parameters: in the order in which the C step gets them.
         c_source: file with `hs_controller_init` and `hs_controller_step` for the microcontroller;
-            None: the kind runs only on the computer.
+            None: the kind runs only on the computer, unless it is a `ChipController`.
         output: what `step` returns: the corrected strain, which the voltage map of the loop turns
             into a voltage, or the voltage itself, before the amplifier.
         needs_actuator: whether the controller uses `ControllerSetting.actuator`.
         design: computes the parameters from the actuator and the timing of the loop, which the
             setting states; None: the parameters are typed, or searched by `haselab design`.
+        loop: setting of the only loop that the kind is designed for; None: that of the caller.
         preview_s: how far the controller looks ahead in the reference, see `Measurement.preview`.
     """
 
@@ -64,6 +66,7 @@ class ControllerKind:
     output: Literal["strain", "voltage"] = "strain"
     needs_actuator: bool = False
     design: Callable[[ControllerSetting], Mapping[str, float]] | None = None
+    loop: Callable[[KnownActuator], ControllerSetting] | None = None
     preview_s: float = 0.0
 
     def check(self, setting: ControllerSetting) -> None:

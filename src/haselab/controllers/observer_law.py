@@ -6,17 +6,45 @@ import math
 from copy import copy
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
 from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.motion_model import MotionModel
 from haselab.controllers.protocol import ControllerSetting
 
-__all__ = ["ObserverLaw"]
+__all__ = ["ObserverLaw", "critical_feedback", "process_noise"]
 
 _POINTS = 9  # strains of the reachable range at which the observer's gains are computed
 _CREEP = 1e-3  # of the weight, per root of a second: how uncertain the branches are
 _CORRECTIONS = 2
+
+
+def critical_feedback(bandwidth_rad_s: float, period_s: float) -> tuple[float, float]:
+    """Acceleration over error and over its rate with which an error decays without oscillation.
+
+    Args:
+        bandwidth_rad_s: of the decay.
+        period_s: for which an acceleration is held.
+    Returns:
+        Gains in 1/s^2 and 1/s.
+    Example:
+        >>> [round(gain) for gain in critical_feedback(10.0, 1e-6)]
+        [100, 20]
+    """
+    decay = math.exp(-bandwidth_rad_s * period_s)
+    return ((1.0 - decay) / period_s) ** 2, 0.5 * (1.0 - decay) * (3.0 + decay) / period_s
+
+
+def process_noise(shake_m_s2: float, period_s: float) -> NDArray[np.float64]:
+    """Covariance of length and speed after one period of unknown accelerations.
+
+    Args:
+        shake_m_s2: in m/s^2 per root of hertz.
+        period_s: of an update.
+    """
+    rows = [[period_s**2 / 3.0, period_s / 2.0], [period_s / 2.0, 1.0]]
+    return shake_m_s2**2 * period_s * np.array(rows)
 
 
 class ObserverLaw:
@@ -41,9 +69,7 @@ class ObserverLaw:
         self.delay_s = 0.5 * period_s if setting.delay_s is None else setting.delay_s
         self.whole = int(self.delay_s / period_s + 1e-9)  # periods of the delay
         self._late_s = self.delay_s - self.whole * period_s
-        decay = math.exp(-bandwidth_rad_s * period_s)
-        self._per_m = ((1.0 - decay) / period_s) ** 2
-        self._per_m_s = 0.5 * (1.0 - decay) * (3.0 + decay) / period_s
+        self._per_m, self._per_m_s = critical_feedback(bandwidth_rad_s, period_s)
         self._low_v, self._high_v = max(setting.drive_low, 0.0), setting.drive_high
         low, high = known.reachable()
         self._strains = np.linspace(low, high, _POINTS).tolist()
@@ -127,10 +153,7 @@ class ObserverLaw:
         branches = len(known.law.losses.branch_share)
         creep = (_CREEP * model.weight_n) ** 2 * period_s
         noise = np.diag([0.0, 0.0, *[creep] * branches, self._load_n**2 * period_s])
-        shaken = self._shake**2 * period_s
-        noise[:2, :2] = shaken * np.array(
-            [[period_s**2 / 3.0, period_s / 2.0], [period_s / 2.0, 1.0]]
-        )
+        noise[:2, :2] = process_noise(self._shake, period_s)
         unit = np.array([1e-6, 1e-4, *[1e-3] * branches, 1e-2])  # near 1, for the solver
         seen = np.zeros((1, unit.size))
         seen[0, 0] = 1.0

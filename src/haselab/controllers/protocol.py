@@ -8,7 +8,13 @@ from typing import Protocol, runtime_checkable
 
 from haselab.controllers.known_actuator import KnownActuator
 
-__all__ = ["Controller", "ControllerSetting", "LinearisableController", "Measurement"]
+__all__ = [
+    "ChipController",
+    "Controller",
+    "ControllerSetting",
+    "LinearisableController",
+    "Measurement",
+]
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,18 @@ class Controller(Protocol):
             measurement: of the block that has just ended.
         Returns:
             The drive until the next step, in strain or in V.
+        """
+
+
+@runtime_checkable
+class ChipController(Protocol):
+    """A controller that writes its C step for the microcontroller, configuration included."""
+
+    def c_text(self, setting: ControllerSetting) -> str:
+        """C file with the two functions of `core/include/hs_controller.h`.
+
+        Args:
+            setting: of the loop on the microcontroller.
         """
 
 

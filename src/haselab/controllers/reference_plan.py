@@ -112,15 +112,31 @@ class ReferencePlan:
 
     def _plan(self, start: tuple[float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits, else the one that exceeds them least."""
-        self._target_m, self._at_s = target_m, 0.0
+        for_s = self.duration_s(start, target_m, state)
+        self._target_m = target_m
+        self._curve, self._for_s, self._at_s = _quintic(start, target_m, for_s), for_s, 0.0
+
+    def duration_s(
+        self, start: tuple[float, float], target_m: float, state: list[float],
+        longer: float = _LONGER,
+    ) -> float:  # fmt: skip
+        """Duration of the fastest polynomial within the limits, else of that which exceeds least.
+
+        Args:
+            start: length and speed.
+            target_m: length at which it comes to rest.
+            state: from which the branches and the load are.
+            longer: from one try to the next.
+        """
         period_s, least_n = self._period_s, math.inf
-        for_s = _LEAST * period_s
+        for_s = found_s = _LEAST * period_s
         while for_s < _LONGEST_S and least_n > 0.0:
             curve = _quintic(start, target_m, for_s)
             excess_n = self._excess_n(curve, for_s, target_m, state)
             if excess_n < least_n:
-                least_n, self._curve, self._for_s = excess_n, curve, for_s
-            for_s = period_s * math.ceil(_LONGER * for_s / period_s)
+                least_n, found_s = excess_n, for_s
+            for_s = period_s * math.ceil(longer * for_s / period_s)
+        return found_s
 
     def _excess_n(
         self, curve: tuple[float, ...], for_s: float, target_m: float, state: list[float]

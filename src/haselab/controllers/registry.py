@@ -31,6 +31,8 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "pi": "haselab.controllers.builtin:PI",
         "pid": "haselab.controllers.builtin:PID",
         "force": "haselab.controllers.force:FORCE",
+        "chip-force": "haselab.controllers.chip.force:CHIP_FORCE",
+        "chip-observer": "haselab.controllers.chip.observer:CHIP_OBSERVER",
         "observer": "haselab.controllers.observer_design:OBSERVER",
         "learning": "haselab.controllers.adaptive.learning:LEARNING",
         "hybrid": "haselab.controllers.adaptive.hybrid:HYBRID",

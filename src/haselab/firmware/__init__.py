@@ -8,9 +8,14 @@ from haselab.firmware.frames import (
     unstuff,
 )
 from haselab.firmware.settings import (
+    CAPACITANCE_NOISE,
     CARRIER_HZ,
+    HIGHEST_DRIVE_V,
+    MOTION_RISE_V_PER_S,
     OUTPUT_V_PER_CODE,
     RATE_HZ,
+    UPDATE_AGE_S,
+    UPDATE_DELAY_S,
     ChipSettings,
     ControllerStep,
     FrontEnd,
@@ -20,9 +25,14 @@ from haselab.firmware.settings import (
 )
 
 __all__ = [
+    "CAPACITANCE_NOISE",
     "CARRIER_HZ",
+    "HIGHEST_DRIVE_V",
+    "MOTION_RISE_V_PER_S",
     "OUTPUT_V_PER_CODE",
     "RATE_HZ",
+    "UPDATE_AGE_S",
+    "UPDATE_DELAY_S",
     "ChipSettings",
     "ControllerStep",
     "FrameReader",

@@ -290,7 +290,7 @@ class Trace:
         state: see states.
         reference: desired strain.
         strain: measured strain; 0 without one.
-        corrected: the controller's output, in strain.
+        corrected: the controller's output, in strain or in V.
         code: of the output converter.
     """
 

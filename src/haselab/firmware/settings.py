@@ -16,9 +16,14 @@ from haselab import _core
 from haselab.base import InputError
 
 __all__ = [
+    "CAPACITANCE_NOISE",
     "CARRIER_HZ",
+    "HIGHEST_DRIVE_V",
+    "MOTION_RISE_V_PER_S",
     "OUTPUT_V_PER_CODE",
     "RATE_HZ",
+    "UPDATE_AGE_S",
+    "UPDATE_DELAY_S",
     "ChipSettings",
     "ControllerStep",
     "FrontEnd",
@@ -29,7 +34,13 @@ __all__ = [
 
 RATE_HZ = 1000
 CARRIER_HZ = 5000.0
-_SKEW_S = 125e-6  # from a reading of the voltage to the next of the current
+_SLOT_S = 125e-6
+# From the middle of the samples that are used to the end of their frame, and to the output.
+UPDATE_AGE_S, UPDATE_DELAY_S = 7.5 * _SLOT_S, 14.5 * _SLOT_S
+CAPACITANCE_NOISE = 2.7e-3  # standard deviation of one update, relative; docs/control/firmware.md
+HIGHEST_DRIVE_V = 1.9  # of the output, whose converter reaches 2.048 V
+MOTION_RISE_V_PER_S = 100.0  # of controllers that give the drive in V, from the identified motion
+_SKEW_S = _SLOT_S  # from a reading of the voltage to the next of the current
 _OUTPUT_V, _OUTPUT_CODES = 2.048, 4096
 OUTPUT_V_PER_CODE = _OUTPUT_V / _OUTPUT_CODES
 _TABLE_STEPS = 32
@@ -125,6 +136,7 @@ class ControllerStep:
         kind: its name.
         parameters: names and values, in the order in which the C step gets them.
         source: text of the C file, see core/include/hs_controller.h.
+        in_volts: whether its output is the drive in V, not a corrected strain.
     Raises:
         InputError: There are more parameters than the header can hold.
     """
@@ -132,6 +144,7 @@ class ControllerStep:
     kind: str
     parameters: tuple[tuple[str, float], ...]
     source: str
+    in_volts: bool = False
 
     def __post_init__(self) -> None:
         if len(self.parameters) > _PARAMETERS:
@@ -178,7 +191,7 @@ class ChipSettings:
     voltage_map: tuple[float, float, float, float]
     strain_map: tuple[float, float, float, float]
     front_end: FrontEnd = field(default_factory=FrontEnd)
-    drive_high_v: float = 1.9
+    drive_high_v: float = HIGHEST_DRIVE_V
     rise_v_per_s: float = 20.0
     ramp_v_per_s: float = 4.0
     link_s: float = 0.15
@@ -302,7 +315,10 @@ def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
             fields["usable_f"] = tuple(fields["usable_f"])
         if own := fields.get("own"):
             parameters = tuple((str(name), float(value)) for name, value in own["parameters"])
-            fields["own"] = ControllerStep(str(own["kind"]), parameters, str(own["source"]))
+            in_volts = own.get("in_volts", False) is True
+            fields["own"] = ControllerStep(
+                str(own["kind"]), parameters, str(own["source"]), in_volts
+            )
         return ChipSettings(**fields, front_end=FrontEnd(**front))
     except (KeyError, TypeError) as error:
         raise InputError(
@@ -385,6 +401,7 @@ def _body(s: ChipSettings) -> str:
             "voltage",
             f"{{{_single(s.strain_low)}, {_single(steps)}, {_TABLE_STEPS}, voltage_table}}",
         ),
+        ("in_volts", "1" if s.own is not None and s.own.in_volts else "0"),
         ("reference_low", _single(s.strain_low)),
         ("reference_high", _single(s.strain_high)),
         ("drive_high_v", _single(s.drive_high_v)),

@@ -19,7 +19,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import HaselabError, Progress, ResultError, SilentProgress
+from haselab.base import HaselabError, InputError, Progress, ResultError, SilentProgress
 from haselab.controllers import CONTROLLERS, ChosenController, KnownActuator
 from haselab.scoreboard.devices import Device, find_device
 from haselab.scoreboard.entrants import Designed, designed
@@ -260,11 +260,21 @@ def play_board(plan: Plan, progress: Progress | None = None) -> Game:
         progress: of the jobs.
     Returns:
         All results, in the order of the plan.
+    Raises:
+        InputError: No controller is made for the loop of any class.
     """
     bar = progress or SilentProgress()
     tasks = [TASKS[name] for name in plan.tasks]
     devices = sorted({task.device for task in tasks})
-    pairs = [(controller, loop) for controller in plan.controllers for loop in plan.classes]
+    pairs = [
+        (controller, loop) for controller in plan.controllers for loop in plan.classes
+        if CLASSES[loop].suits(CONTROLLERS.find(controller))
+    ]  # fmt: skip
+    if not pairs:
+        names = ", ".join(plan.controllers)
+        raise InputError(
+            f"{names} can only play in the loop of the microcontroller. Add --class chip-1khz."
+        )
     plays = [
         (controller, loop, task, index)
         for controller, loop in pairs for task in tasks if loop in task.classes

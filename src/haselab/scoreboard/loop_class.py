@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from haselab.controllers import ControllerKind
+from haselab.firmware import CAPACITANCE_NOISE, MOTION_RISE_V_PER_S
 from haselab.rig.twin.config import TwinConfig
 
 __all__ = ["CLASSES", "LoopClass", "noise_of"]
@@ -30,6 +32,8 @@ class LoopClass:
             the monitors of the bench.
         drive_step_v: resolution of the output, before the amplifier; 0: none.
         slew_v_per_s: fastest change of the output; infinite: any.
+        volt_slew_v_per_s: the same for controllers whose output is the voltage.
+        on_chip: whether it is the loop of the microcontroller, the only one of kinds with a `loop`.
         true_states: whether the controller gets the true law, and capacitances without noise.
     """
 
@@ -41,6 +45,8 @@ class LoopClass:
     relative_noise: float | None = None
     drive_step_v: float = 0.0
     slew_v_per_s: float = math.inf
+    volt_slew_v_per_s: float = math.inf
+    on_chip: bool = False
     true_states: bool = False
 
     @property
@@ -68,6 +74,14 @@ class LoopClass:
         """Time from an event at the beginning of an update to the first output that knows of it."""
         return (self.steps + self.switch_at) * STEP_S
 
+    def suits(self, kind: ControllerKind) -> bool:
+        """Whether a kind of controller is made for this loop."""
+        return kind.loop is None or self.on_chip
+
+    def slew_of(self, kind: ControllerKind) -> float:
+        """Fastest change of the output of a kind of controller, in V/s."""
+        return self.volt_slew_v_per_s if kind.output == "voltage" else self.slew_v_per_s
+
     @property
     def timing(self) -> tuple[int, int, int, int]:
         """As the compiled twin takes it."""
@@ -81,7 +95,17 @@ CLASSES = {
         # lock-in counts whole periods of the carrier. The output of a 16-bit converter of 10 V.
         LoopClass("host-100hz", 100, 20, 28, 100, drive_step_v=20.0 / 2**16),
         # the microcontroller: see docs/control/firmware.md for noise, delay and rate limit
-        LoopClass("chip-1khz", 10, 9, -4, 6, 2.7e-3, slew_v_per_s=20.0),
+        LoopClass(
+            "chip-1khz",
+            10,
+            9,
+            -4,
+            6,
+            CAPACITANCE_NOISE,
+            slew_v_per_s=20.0,
+            volt_slew_v_per_s=MOTION_RISE_V_PER_S,
+            on_chip=True,
+        ),
         LoopClass("oracle", 10, 0, 9, 10, 0.0, true_states=True),
     )
 }

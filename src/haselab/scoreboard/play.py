@@ -110,7 +110,7 @@ def setting_for(
     if loop.relative_noise is not None:
         farad = known.sensing_scale * float(known.law.capacitance_f(known.zero_length_m))
         known = replace(known, capacitance_noise_f=loop.relative_noise * farad)
-    rate = loop.slew_v_per_s if chosen.kind.output == "voltage" else math.inf
+    rate = loop.slew_of(chosen.kind) if chosen.kind.output == "voltage" else math.inf
     return ControllerSetting(
         loop.period_s, low, high, start, loop.delay_s, known, loop.sensed_before_s, rate
     )
@@ -125,7 +125,7 @@ class _Player:
         setting = setting_for(chosen, loop, known, start_v)
         self._running = RunningController(chosen, setting)
         self._known, self._loop, self._in_volts = known, loop, chosen.kind.output == "voltage"
-        self._slew_v = loop.slew_v_per_s * loop.period_s
+        self._slew_v = loop.slew_of(chosen.kind) * loop.period_s
         self._late = 0
         self.spent_s = 0.0
         self.drive_v = start_v

@@ -57,6 +57,7 @@ from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
+_TIMING_TOLERANCE = 0.01
 _FEW = 0.9  # share of plausible plants below which a design without --probability gets a warning
 
 
@@ -188,6 +189,11 @@ def _own_design(
         low, high = actuator.low_v, actuator.high_v
     setting = ControllerSetting(1.0 / rate_hz, low, high, delay_s=delay_s, actuator=actuator)
     kind.check(setting)
+    if kind.loop is not None:
+        assert actuator is not None
+        setting = kind.loop(actuator)
+        _refuse_other_loop(kind, setting, loop)
+        rate_hz, delay_s = 1.0 / setting.period_s, setting.delay_s or 0.0
     assert kind.design is not None
     chosen = kind.choose(kind.design(setting), model)
     section: dict[str, object] = {
@@ -199,6 +205,20 @@ def _own_design(
     _save(model, out, section, None)
     return {"kind": kind.name, "parameters": dict(chosen.values), "rate_hz": rate_hz,
             "delay_s": delay_s, "robustness": _first_paragraph(kind.design)}  # fmt: skip
+
+
+def _refuse_other_loop(
+    kind: ControllerKind, setting: ControllerSetting, loop: dict[str, Any]
+) -> None:
+    """Refuse timing in the options that is not that of the kind's only loop."""
+    own = {"rate_hz": 1.0 / setting.period_s, "delay_s": setting.delay_s or 0.0}
+    for name, value in own.items():
+        stated, option = loop[name], f"--{name.replace('_', '-')}"
+        if stated is not None and abs(stated / value - 1.0) > _TIMING_TOLERANCE:
+            raise InputError(
+                f"{option} is {stated:g}, but {kind.name} is for the microcontroller, with "
+                f"{value:g}. Leave out {option}, or design another kind."
+            )
 
 
 def _first_paragraph(design: Callable[..., object]) -> str:

@@ -17,12 +17,14 @@ from haselab.cli.output import OutputRule
 from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
 from haselab.control import PidGains, Saturation
 from haselab.control.reach import default_step
+from haselab.controllers import known_actuator
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
 from haselab.rig.chip import (
     ChipDesign,
     ChipFile,
     Firmware,
+    ModuleLimits,
     build_firmware,
     find_tool,
     load_board,
@@ -118,7 +120,8 @@ def build(
             raise InputError(doubt)
     file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
-    design = read_design(run, structure, front_end, source)
+    module = ModuleLimits() if file is None else file.module
+    design = read_design(run, structure, front_end, source, module)
     _check_gain(design.tables.drive.gain_v_per_v, front_end.gain, run)
     _check_current(design, front_end, run, "Lower its gain:")
     settings = design.settings if file is None else file.limited(design.settings)
@@ -240,7 +243,11 @@ def simulate(
     _say_narrowed(settings, design.limits, run)
     before, after = options["step"] or (0.0, _step_of(design))
     precondition_v = options["precondition"]
-    plan = StepPlan(before, after, options["before_s"], options["after_s"], zero_m, precondition_v)
+    in_volts = settings.own is not None and settings.own.in_volts
+    known = known_actuator(design.tables, run) if in_volts else None
+    plan = StepPlan(
+        before, after, options["before_s"], options["after_s"], zero_m, precondition_v, known
+    )
     case = None
     if settings.own is None:
         gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)

@@ -9,7 +9,7 @@ from haselab.rig.chip.calibrate import (
     chip_correction,
 )
 from haselab.rig.chip.chip_bench import ChipBench
-from haselab.rig.chip.design import ChipDesign, read_design
+from haselab.rig.chip.design import ChipDesign, ModuleLimits, read_design
 from haselab.rig.chip.opening import (
     ChipFile,
     ConnectedChip,
@@ -30,6 +30,7 @@ __all__ = [
     "CoSim",
     "ConnectedChip",
     "Firmware",
+    "ModuleLimits",
     "Output",
     "SerialChip",
     "SuppliedCoSim",

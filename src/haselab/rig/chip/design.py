@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from haselab.base import InputError
-from haselab.firmware import ChipSettings, ControllerStep, FrontEnd
+from haselab.controllers import ControllerSetting, known_actuator
+from haselab.controllers.chip.loop import chip_setting
+from haselab.firmware import (
+    HIGHEST_DRIVE_V,
+    MOTION_RISE_V_PER_S,
+    ChipSettings,
+    ControllerStep,
+    FrontEnd,
+)
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.sections import ControllerSection
 from haselab.models.maps import VoltageMap
@@ -16,10 +24,25 @@ from haselab.rig.chip.own_step import controller_step
 from haselab.store.actuator_file import read_run
 from haselab.store.toml import validated
 
-__all__ = ["ChipDesign", "read_design", "strains_within"]
+__all__ = ["ChipDesign", "ModuleLimits", "read_design", "strains_within"]
 
 _NO_GAINS = {"kp": 0.0, "ki": 0.0}
-_HIGHEST_DRIVE_V = 1.9  # of the microcontroller's output, whose converter reaches 2.048 V
+
+
+@dataclass(frozen=True)
+class ModuleLimits:
+    """What a high-voltage module reaches, where it is less than the microcontroller.
+
+    Args:
+        drive_high_v: highest drive; None: that of the output.
+        rise_v_per_s: fastest change of the drive; None: that of the firmware.
+    """
+
+    drive_high_v: float | None = None
+    rise_v_per_s: float | None = None
+
+
+_ANY_MODULE = ModuleLimits()
 
 
 @dataclass(frozen=True)
@@ -68,7 +91,11 @@ class ChipDesign:
 
 
 def read_design(
-    path: Path, kind: str | None, front_end: FrontEnd, source: Path | None = None
+    path: Path,
+    kind: str | None,
+    front_end: FrontEnd,
+    source: Path | None = None,
+    module: ModuleLimits = _ANY_MODULE,
 ) -> ChipDesign:
     """Read the settings of a microcontroller from an actuator file or the folder of a run.
 
@@ -79,6 +106,7 @@ def read_design(
         front_end: of the board.
         source: C file compiled in place of the PID; None: the C step of the kind. PI and PID need
             none.
+        module: limits of the high-voltage module, for a C step that is written for them.
     Returns:
         The settings, with continuous-time gains that are stepped at the microcontroller's rate. The
         drive is limited by `[drive] high_v`, the highest field and the microcontroller's output,
@@ -88,7 +116,7 @@ def read_design(
     """
     tables = validated(ActuatorTables, read_run(path), path)
     try:
-        settings, limits = _settings(tables, kind, front_end, source)
+        settings, limits = _settings(tables, kind, front_end, source, module)
         return ChipDesign(tables, settings, path, limits)
     except InputError as error:
         text = str(error)
@@ -96,10 +124,24 @@ def read_design(
 
 
 def _settings(
-    tables: ActuatorTables, kind: str | None, front_end: FrontEnd, source: Path | None
+    tables: ActuatorTables,
+    kind: str | None,
+    front_end: FrontEnd,
+    source: Path | None,
+    module: ModuleLimits,
 ) -> tuple[ChipSettings, tuple[float, float]]:
     """Settings, and the limits of the controller as designed."""
-    controller, step = _controller(tables, kind, source)
+    low_v, high_v = tables.drive_ends_v()
+    most_v = [
+        value for value in (HIGHEST_DRIVE_V, high_v, module.drive_high_v) if value is not None
+    ]
+    rise_v_per_s = module.rise_v_per_s or MOTION_RISE_V_PER_S
+
+    def setting() -> ControllerSetting | None:
+        known = known_actuator(tables)
+        return None if known is None else chip_setting(known, min(most_v), rise_v_per_s)
+
+    controller, step = _controller(tables, kind, source, setting)
     volt, strain = tables.voltage_map(), tables.strain_map()
     limits = controller.limits
     if limits is None and tables.controller is not None:
@@ -110,8 +152,7 @@ def _settings(
             "limits = {low = -0.05, high = 0.1}."
         )
     gains = _NO_GAINS if step is not None else _gains(controller)
-    low_v, high_v = tables.drive_ends_v()
-    high_v = _HIGHEST_DRIVE_V if high_v is None else min(_HIGHEST_DRIVE_V, high_v)
+    high_v = HIGHEST_DRIVE_V if high_v is None else min(HIGHEST_DRIVE_V, high_v)
     designed = (limits.low, limits.high)
     settings = ChipSettings(
         gains["kp"],
@@ -126,6 +167,8 @@ def _settings(
         own=step,
         usable_f=None if strain.range_f is None else strain.usable_f,
     )
+    if step is not None and step.in_volts:
+        settings = replace(settings, rise_v_per_s=rise_v_per_s)
     return settings, designed
 
 
@@ -148,7 +191,10 @@ def strains_within(
 
 
 def _controller(
-    tables: ActuatorTables, kind: str | None, source: Path | None
+    tables: ActuatorTables,
+    kind: str | None,
+    source: Path | None,
+    setting: Callable[[], ControllerSetting | None],
 ) -> tuple[ControllerSection, ControllerStep | None]:
     """Find the controller of a kind, and its C step; None for the firmware's PID."""
     if source is not None and kind is None:
@@ -158,7 +204,7 @@ def _controller(
         controller = tables.designed(kind)
     if source is None and controller.kind in ("pi", "pid"):
         return controller, None
-    return controller, controller_step(controller, source)
+    return controller, controller_step(controller, source, setting)
 
 
 def _gains(controller: ControllerSection) -> Mapping[str, float]:

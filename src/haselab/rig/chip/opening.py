@@ -14,14 +14,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from haselab.base import LimitError
-from haselab.firmware import ChipSettings, FrontEnd
+from haselab.firmware import MOTION_RISE_V_PER_S, ChipSettings, FrontEnd
 from haselab.models.maps import VoltageMap
 from haselab.rig import Camera, Frames, Gate, Rig
 from haselab.rig.bench_config import CameraField, SpecimenConfig
 from haselab.rig.cameras.opening import open_camera
 from haselab.rig.chip.calibrate import calibrated_firmware
 from haselab.rig.chip.chip_bench import ChipBench, describe_chip
-from haselab.rig.chip.design import read_design, strains_within
+from haselab.rig.chip.design import ModuleLimits, read_design, strains_within
 from haselab.rig.chip.link import ChipLink
 from haselab.rig.chip.serial_link import SerialChip
 from haselab.rig.chip.simulator import SLOT_S, SLOTS, CoSim
@@ -127,7 +127,10 @@ class ChipFile(PrintableSection):
         None, gt=0, lt=2.048, description="highest drive, if the module reaches less"
     )
     rise_v_per_s: float | None = Field(
-        None, gt=0, le=20, description="fastest change of the drive, if the module is slower"
+        None,
+        gt=0,
+        le=MOTION_RISE_V_PER_S,
+        description="fastest change of the drive, if the module is slower",
     )
     bandgap_v: float | None = Field(
         None,
@@ -149,6 +152,11 @@ class ChipFile(PrintableSection):
         if self.simulator is not None and (self.specimen or self.camera):
             raise ValueError("remove specimen and camera: with a table simulator the twin has them")
         return self
+
+    @property
+    def module(self) -> ModuleLimits:
+        """Limits of this bench's high-voltage module."""
+        return ModuleLimits(self.drive_high_v, self.rise_v_per_s)
 
     def limited(self, settings: ChipSettings) -> ChipSettings:
         """Apply the limits of this bench's high-voltage module to settings.
@@ -210,7 +218,8 @@ def opened_chip(file: ChipFile, path: Path, gate: Gate) -> Iterator[ConnectedChi
         InputError: The firmware is not the file's, or a compiler or libsimavr is missing.
     """
     source = None if file.controller_source is None else path.parent / file.controller_source
-    design = read_design(path.parent / file.run, file.structure, file.front_end.front_end(), source)
+    front_end = file.front_end.front_end()
+    design = read_design(path.parent / file.run, file.structure, front_end, source, file.module)
     settings, zero_m = file.limited(design.settings), design.zero_length_m
     with contextlib.ExitStack() as opened:
         if file.simulator is not None:

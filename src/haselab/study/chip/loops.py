@@ -19,9 +19,12 @@ from haselab.controllers import (
     CONTROLLERS,
     ChosenController,
     ControllerSetting,
+    KnownActuator,
     Measurement,
     pid_controller,
 )
+from haselab.controllers.chip.loop import chip_setting
+from haselab.firmware import UPDATE_DELAY_S as CHIP_DELAY_S
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Run, SetReference, Status
 from haselab.models.plant import Plant
@@ -48,9 +51,6 @@ __all__ = [
     "step_experiment",
 ]
 
-# 7.5 slots of 125 us from the middle of the samples that are used to the end of their frame, and 7
-# more to the output.
-CHIP_DELAY_S = 14.5 * 125e-6
 _CARRIER_V = 0.05
 _REFERENCE_BLOCKS = 50
 _SETTLED = 10  # of them, before the carrier has settled
@@ -71,6 +71,7 @@ class StepPlan:
         last_s: time after it, in s.
         zero_length_m: length of the sheet at zero strain, in m.
         precondition_v: highest drive before the step, see `precondition`.
+        actuator: for controllers whose output is the voltage.
     """
 
     before: float
@@ -79,6 +80,7 @@ class StepPlan:
     last_s: float
     zero_length_m: float
     precondition_v: float = 0.0
+    actuator: KnownActuator | None = None
 
 
 @dataclass(frozen=True)
@@ -206,9 +208,13 @@ def desktop_loop(
     )  # fmt: skip
     share = _reference_share(bench, Lockin(sensing), desk.carrier_hz)
     lockin = Lockin(replace(sensing, scale_s=sensing.admittance_scale_s * share))
-    limits = ControllerSetting(1.0 / desk.rate_hz, s.strain_low, s.strain_high, s.strain_start)
-    controller = controller_of(s).make()
-    controller.start(limits)
+    chosen, in_volts = controller_of(s), s.own is not None and s.own.in_volts
+    setting = ControllerSetting(1.0 / desk.rate_hz, s.strain_low, s.strain_high, s.strain_start)
+    if in_volts:
+        assert plan.actuator is not None, "the kind needs it"
+        setting = chip_setting(plan.actuator, s.drive_high_v, s.rise_v_per_s)
+    controller = chosen.make()
+    controller.start(setting)
     bench.sine(desk.carrier_hz, _CARRIER_V)
     held, after = round(plan.hold_s * desk.rate_hz), round(plan.last_s * desk.rate_hz)
     reference = np.r_[np.full(held, plan.before), np.full(after, plan.after)]
@@ -222,10 +228,13 @@ def desktop_loop(
             strains.append(_core.strain_from_capacitance(*s.strain_map, farad))
         if len(strains) == desk.averaged:
             strain = sum(strains) / desk.averaged
-            seen = Measurement(strain, farad, drive_v, (k + 1) / desk.rate_hz)
+            sensed_f = math.nan if in_volts else farad  # on the chip, the strain is by the map
+            seen = Measurement(strain, sensed_f, drive_v, (k + 1) / desk.rate_hz)
             drive = controller.step(float(wanted), seen)
-            corrected = min(max(drive, s.strain_low), s.strain_high)
-            wanted_v = _core.voltage_from_strain(*s.voltage_map, corrected)
+            wanted_v = drive
+            if not in_volts:
+                corrected = min(max(drive, s.strain_low), s.strain_high)
+                wanted_v = _core.voltage_from_strain(*s.voltage_map, corrected)
             change_v = min(max(wanted_v - drive_v, -most_v), most_v)
             drive_v = min(max(drive_v + change_v, 0.0), s.drive_high_v)
         waiting.append(drive_v)
@@ -399,7 +408,9 @@ def step_experiment(
         made = calibrated_firmware(settings, config, seed, Path(folder))
         chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)
     alone = settings.own is not None and settings.own.kind not in CONTROLLERS.packages()
+    fast_only = settings.own is not None and settings.own.in_volts  # designed for the chip's rate
     desks = [
-        desktop_loop(config, seed, settings, desk, plan) for desk in (() if alone else (SLOW, FAST))
+        desktop_loop(config, seed, settings, desk, plan)
+        for desk in (() if alone else (FAST,) if fast_only else (SLOW, FAST))
     ]
     return StepExperiment([*desks, chip.loop], chip, made.firmware, made.correction)

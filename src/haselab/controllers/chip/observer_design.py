@@ -30,8 +30,8 @@ __all__ = ["design_chip_observer", "feedback_gains", "linear_chip_loop", "steady
 
 Floats = NDArray[np.float64]
 _POINTS = (0.1, 0.5, 0.9)  # of the reachable range
-# stiffness; longer delay, of the stated one; peak sensitivity
-_SPREAD = ((1.1, 0.0, 2.5), (0.9, 0.2, 2.5), (1.0, 0.5, 5.0))
+# stiffness; later_s; peak sensitivity
+_SPREAD = ((1.1, 0.0, 2.5), (0.9, 0.5e-3, 2.5), (1.0, 5e-3, 6.0))
 _SHAKEN = 0.06  # of the highest drive, by noise
 _CHANGED, _MOVED = 1.0, 1.5
 _COUNTED_S = 0.5  # after a change of the load
@@ -130,9 +130,10 @@ def design_chip_observer(setting: ControllerSetting) -> Mapping[str, float]:
 
     Minimises the integral of time times the squared error after a step of the load, over three
     strains of the reachable range. The peak sensitivity is at most 2.5 with the stiffness 10 %
-    higher, and with it 10 % lower and the delay a fifth longer; at most 5 with the delay longer
-    by half. Noise moves the actuator by at most 1.5 times the noise of the sensed length, the drive
-    by at most 6 % of its range and from one update to the next by at most what the loop allows
+    higher, and with it 10 % lower and the delay 0.5 ms longer; at most 6 with the delay 5 ms
+    longer, which is three times that of the loop. Noise moves the actuator by at most 1.5 times
+    the noise of the sensed length, the drive by at most 6 % of its range and from one update to
+    the next by at most what the loop allows
     (standard deviations).
 
     Args:
@@ -147,9 +148,9 @@ def design_chip_observer(setting: ControllerSetting) -> Mapping[str, float]:
     motion = motion_record(setting, _RESERVE)
     delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
     points = [
-        (sampled_point(setting, strain, stiffness=stiffness, later_s=longer * delay_s), peak)
+        (sampled_point(setting, strain, stiffness=stiffness, later_s=later_s), peak)
         for strain in np.interp(_POINTS, (0.0, 1.0), known.reachable()).tolist()
-        for stiffness, longer, peak in _SPREAD
+        for stiffness, later_s, peak in _SPREAD
     ]
 
     def cost(logarithms: Floats) -> float:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import stat
 import sys
 from pathlib import Path
@@ -118,3 +119,40 @@ def test_a_device_is_written_to_and_not_replaced(tmp_path):
     assert (tmp_path / "sink").is_symlink()
     write_new(tmp_path / "sink", "x")
     assert (tmp_path / "sink").is_symlink() and Path("/dev/null").is_char_device()
+
+
+def test_a_new_file_has_its_name_when_it_is_complete_and_replaces_nothing(tmp_path, monkeypatch):
+    """Seen by whoever looks at each call that could make the name visible."""
+    path, seen = tmp_path / "new" / "a.txt", []
+    plain = {name: getattr(os, name) for name in ("link", "open", "replace")}
+
+    def watched(name):
+        def call(*given, **named):
+            try:
+                return plain[name](*given, **named)
+            finally:
+                seen.append(path.read_text() if path.exists() else None)
+
+        return call
+
+    for name in plain:
+        monkeypatch.setattr(os, name, watched(name))
+    write_new(path, "whole")
+    assert seen[-1] == "whole" and set(seen) <= {None, "whole"}
+    with pytest.raises(InputError, match="exists already"):
+        write_new(path, "other")
+    assert path.read_text() == "whole"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_without_links_of_the_file_system_a_new_file_is_written_as_well(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    write_new(tmp_path / "a.txt", "whole")
+    assert (tmp_path / "a.txt").read_text() == "whole"
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.txt"]
+    with pytest.raises(InputError, match="exists already"):
+        write_new(tmp_path / "a.txt", "other")
+    assert (tmp_path / "a.txt").read_text() == "whole"

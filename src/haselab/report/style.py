@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure, FigureBase
 from numpy.typing import ArrayLike
 
@@ -89,6 +90,7 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
         The document; text stays text.
     """
     buffer = io.StringIO()
+    _arrange(figure)
     figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
@@ -98,6 +100,15 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
     head_end = text.index(">") + 1
     label = title.replace("&", "&amp;").replace("<", "&lt;")
     return f'{text[: head_end - 1]} role="img">\n <title>{label}</title>{text[head_end:]}'
+
+
+def _arrange(figure: Figure) -> None:
+    """Place axes and texts, once. With a layout engine, `savefig` draws everything twice."""
+    FigureCanvasSVG(figure)  # whose texts have the sizes of the document
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
 
 
 def _named_ids(text: str, name: str) -> str:

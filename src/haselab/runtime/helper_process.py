@@ -130,9 +130,11 @@ def _main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     come, go = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # printed text must not get between two replies
+    gc.disable()  # imports leave hardly anything to collect
     for name in sys.argv[1:]:
         importlib.import_module(name)
     gc.freeze()  # the garbage collector need not look at them again
+    gc.enable()
     with contextlib.suppress(BrokenPipeError):
         _serve(come, go)
 

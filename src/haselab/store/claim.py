@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import secrets
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -122,9 +123,12 @@ def refuse_linked_folders(folder: Path, *names: str) -> None:
             )
 
 
-def create_exclusively(path: Path) -> None:
-    """Create an empty file that does not exist; a pipe or a device is not touched.
+def create_exclusively(path: Path, content: bytes = b"") -> None:
+    """Create a file that does not exist; a pipe or a device is not touched.
 
+    Args:
+        path: of the file.
+        content: nobody finds the file with less of it, where the file system has links.
     Raises:
         InputError: it exists, or no file can be created there.
         DeviceError: the disk refuses.
@@ -136,7 +140,10 @@ def create_exclusively(path: Path) -> None:
     if path.exists() and not (path.is_file() or path.is_dir()):
         return
     try:
-        path.open("xb").close()
+        if content:
+            _create_whole(path, content)
+        else:
+            path.open("xb").close()
     except FileExistsError:
         raise InputError(
             "This file exists already; it was not changed. Name a new path, or add --force to move "
@@ -144,6 +151,23 @@ def create_exclusively(path: Path) -> None:
         ) from None
     except OSError as error:
         raise _unwritable(path, error) from None
+
+
+def _create_whole(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name, and give it its name unless that is taken."""
+    draft = path.with_name(f".haselab-{secrets.token_hex(8)}")
+    try:
+        with draft.open("xb") as file:
+            file.write(content)
+        try:
+            path.hardlink_to(draft)  # unlike a rename, it replaces nothing
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links
+            path.open("xb").close()
+            draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def is_occupied(path: Path) -> bool:

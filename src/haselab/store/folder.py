@@ -15,7 +15,7 @@ from haselab.base import DeviceError, to_plain
 from haselab.store.claim import create_exclusively
 from haselab.store.text_file import parse_json, read_text
 
-__all__ = ["drafted", "read_json", "write_json", "write_new", "write_text"]
+__all__ = ["drafted", "json_text", "read_json", "write_json", "write_new", "write_text"]
 
 _LONGEST_ENDING = 16
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
@@ -70,19 +70,25 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a text file that did not exist before.
+    """Write a text file that did not exist before, in one step.
 
     Raises:
         InputError: the file exists already; it is not changed.
         DeviceError: the file cannot be written.
     """
-    create_exclusively(path)
-    write_text(path, text)
+    create_exclusively(path, text.encode("utf-8"))
+    if path.exists() and not path.is_file():  # a pipe or a device
+        write_text(path, text)
 
 
 def write_json(path: Path, data: Any) -> None:
     """Write a JSON file of estimates, arrays and plain values."""
-    write_text(path, json.dumps(to_plain(data), indent=1, allow_nan=False) + "\n")
+    write_text(path, json_text(data))
+
+
+def json_text(data: Any) -> str:
+    """JSON of estimates, arrays and plain values."""
+    return json.dumps(to_plain(data), indent=1, allow_nan=False) + "\n"
 
 
 def read_json(path: Path) -> Any:

@@ -10,8 +10,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from haselab.base import InputError, JsonObject, described, table_at
-from haselab.store.claim import create_exclusively
-from haselab.store.folder import read_json, write_json
+from haselab.store.folder import json_text, read_json, write_json, write_new
 
 __all__ = [
     "MANIFEST",
@@ -170,11 +169,8 @@ class Manifest:
         self, folder: Path, record: Mapping[str, Any], *, clock: Callable[[], datetime] = _now
     ) -> None:
         self._folder, self._clock = folder, clock
-        create_exclusively(folder / MANIFEST)
-        write_json(
-            folder / MANIFEST,
-            {"format": _FORMAT, "state": "OPEN", "opened": clock().isoformat()} | dict(record),
-        )
+        opened = {"format": _FORMAT, "state": "OPEN", "opened": clock().isoformat()}
+        write_new(folder / MANIFEST, json_text(opened | dict(record)))
 
     def __enter__(self) -> Self:
         return self

@@ -63,7 +63,7 @@ int16_t hs_motion_drive(const hs_motion_config *config, float voltage_v)
     if (!(drive > 0.0f)) {
         return 0;
     }
-    return drive < (float)FULL ? (int16_t)drive : FULL;
+    return (int16_t)(drive < (float)FULL ? (int32_t)drive : FULL);
 }
 
 /* ---- wanted motion ------------------------------------------------------------------------ */
@@ -189,7 +189,7 @@ static int16_t drive_of(const hs_motion_config *c, hs_place p, int32_t needed)
         return FULL;
     }
     root = (uint16_t)((((uint32_t)root * c->root_unit) >> 16) >> (shift - c->root_shift));
-    return root < FULL ? (int16_t)root : FULL;
+    return (int16_t)(root < FULL ? root : FULL);
 }
 
 int32_t hs_motion_put(const hs_motion_config *config, hs_motion_state *state, hs_place place,
@@ -197,7 +197,7 @@ int32_t hs_motion_put(const hs_motion_config *config, hs_motion_state *state, hs
 {
     const int16_t before = state->drive, high = value_at(config->highest, place);
     const int16_t free = drive_of(config, place, needed);
-    int16_t drive = free < config->lowest ? config->lowest : free;
+    int16_t drive = (int16_t)(free < config->lowest ? config->lowest : free);
     if (drive > high) {
         drive = high;
     }

@@ -181,7 +181,7 @@ def test_a_stored_calibration_comes_back_whole(stored, tmp_path):
     ("old", "new", "words"),
     [
         ("stray_s = [", "stray_s = [1e-6 , 0.0] #", "stray_s is .* but the references"),
-        ("tolerance = 0.01", "tolerance = 2.0", "tolerance 2; it must be in"),
+        ("tolerance = 0.01", "tolerance = 2.0", "tolerance 2; they must be in"),
         ("carrier_hz = 2000.0", "", "1 error.*the file has no key carrier_hz"),
         ("carrier_hz = 2000.0", "carrier_hz = 3000.0", "but the references in the file give"),
         ("amplifier =", "amplifer =", "amplifer: no such key"),

@@ -54,13 +54,13 @@ def test_a_blank_frees_the_choice_of_the_staircase(capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--carrier-hz", "90000"], "at least 2 periods and 3 samples per period are required"),
+        (["--carrier-hz", "90000"], "at least 2 periods and 3 samples per period are needed"),
         (["--carrier-hz", "nan"], "is not a finite number"),
         (["--rate-hz", "-1"], "rate_hz = -1; it must be above 0"),
         (["--blank-s", "0.009"], "three quarters of a block"),
         (["--update-s", "1"], "outside the block, [0, 0.01)"),
         (["--carrier-v", "5"], "Lower carrier_v"),
-        (["--capacitance-f", "x"], "not a valid float"),
+        (["--capacitance-f", "x"], "not a valid number"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(arguments, words, capsys):

@@ -321,7 +321,7 @@ def test_a_record_that_never_passes_0_v_ends_with_3_and_says_so(
         (["--carrier-hz", 2000], "--carrier-hz"),
         (["--blank-s", 0], "--blank-s"),
         (["--block-s", 0.01], "--block-s"),
-        (["--block-s", 60], "Shorten --block-s"),
+        (["--block-s", 60], "shorten --block-s"),
         (["--skew-s", 1], "skew_s"),
     ],
 )

@@ -278,7 +278,7 @@ def test_scales_of_points_and_of_a_ruler_agree_with_the_truth(clip, tmp_path, ca
         (("--scale-board", "9,5"), "not of the form COLUMNSxROWS,MM"),
         (("--fixed", "left"), "No point has the name left"),
         (("--lens", "nothing.json"), "No such file"),
-        (("--overlay", "a.gif"), "take .mp4"),
+        (("--overlay", "a.gif"), "Use .mp4"),
         (("--times", "nothing.csv"), "has no times"),
         (("--rest-frames", "9"), "has only 6 frames"),
     ],

@@ -289,8 +289,7 @@ def test_a_run_begins_without_the_carrier_before_which_the_mass_hung_for_long(sc
     start_s = scene.twin.time_s
     with scene.runner:
         pass
-    with SessionReader(scene.folder) as reader:
-        rows = reader.conditions()
+    rows = scene.session.conditions()
     np.testing.assert_array_equal(rows["time_s"][:2], start_s)
     np.testing.assert_array_equal(rows["carrier_v"][:2], [0.0, CARRIER_V])
 

@@ -28,7 +28,6 @@ from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
 from haselab.signals import linear_chirp, triangle
-from haselab.store.session.reader import SessionReader
 from haselab.store.session.writer import ExperimentPlan, ExperimentRecord, SessionWriter
 from haselab.store.video.opening import open_video
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,14 @@ from haselab.controllers.observer import ObserverController
 from haselab.controllers.observer_law import ObserverLaw
 from haselab.controllers.protocol import ControllerSetting
 
-__all__ = ["OBSERVER", "design_observer", "linear_loop"]
+__all__ = [
+    "OBSERVER",
+    "RESERVE",
+    "SHAKE_M_S2",
+    "best_parameters",
+    "design_observer",
+    "linear_loop",
+]
 
 Floats = NDArray[np.float64]
 _PREVIEW_S = 0.05
@@ -29,7 +36,7 @@ _SHAKEN = 0.04  # of the highest drive, by noise
 _COUNTED_S = 0.5  # after a change of the load
 _CHANGED = 1.0  # of the highest change of the drive in one update, by noise
 _MOVED = 1.5
-_SHAKE, _RESERVE = 0.01, 0.15
+SHAKE_M_S2, RESERVE = 0.01, 0.15
 
 
 def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
@@ -54,7 +61,6 @@ def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
     assert known is not None
     low, high = known.reachable()
     strains = [low + share * (high - low) for share in _POINTS]
-    weight_n = known.mass_kg * GRAVITY_M_S2
     delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
     allowed_v = setting.highest_rate_per_s * setting.period_s
 
@@ -62,7 +68,7 @@ def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
         bandwidth, load_n = np.exp(values).tolist()
         if bandwidth * delay_s > 1.0:  # beyond, limits of the drive hide what it does
             return float(2.0 * UNSTABLE * bandwidth * delay_s)
-        law = ObserverLaw(setting, bandwidth, load_n, _SHAKE)
+        law = ObserverLaw(setting, bandwidth, load_n, SHAKE_M_S2)
         total = 0.0
         for strain in strains:
             noise_m = known.length_noise_m(strain)
@@ -77,9 +83,27 @@ def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
                 total += factor * timed_error(loop, setting.period_s, _COUNTED_S)
         return total
 
-    start = np.log([0.1 / delay_s, 0.1 * weight_n])
-    found = minimize(of, start, method="Nelder-Mead",
-                     options={"maxfev": 60, "xatol": 0.02, "fatol": 1e-9})  # fmt: skip
+    return best_parameters(of, setting, evaluations=60)
+
+
+def best_parameters(
+    cost: Callable[[Floats], float], setting: ControllerSetting, *, evaluations: int
+) -> Mapping[str, float]:
+    """Search bandwidth and expected load of an observer.
+
+    Args:
+        cost: by the logarithms of both; above `UNSTABLE` where they are not possible.
+        setting: timing of the loop, and the actuator.
+        evaluations: at most.
+    Raises:
+        ResultError: No parameters keep the loop stable.
+    """
+    known = setting.actuator
+    assert known is not None
+    delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
+    start = np.log([0.1 / delay_s, 0.1 * known.mass_kg * GRAVITY_M_S2])
+    found = minimize(cost, start, method="Nelder-Mead",
+                     options={"maxfev": evaluations, "xatol": 0.02, "fatol": 1e-9})  # fmt: skip
     if found.fun > UNSTABLE:
         raise ResultError(
             f"No gains of the observer are stable with a delay of {setting.delay_s or 0.0:g} s. "
@@ -87,7 +111,7 @@ def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
         )
     bandwidth, load_n = np.exp(found.x).tolist()
     return {"bandwidth_rad_s": float(f"{bandwidth:.4g}"), "load_n": float(f"{load_n:.4g}"),
-            "shake_m_s2": _SHAKE, "reserve": _RESERVE}  # fmt: skip
+            "shake_m_s2": SHAKE_M_S2, "reserve": RESERVE}  # fmt: skip
 
 
 class _Joint:
@@ -173,8 +197,8 @@ OBSERVER = ControllerKind(
     (
         Parameter("bandwidth_rad_s", "rad/s", None, 1e-3, 1e4),
         Parameter("load_n", "N", None, 1e-9, 1e6),
-        Parameter("shake_m_s2", "m/s^2", _SHAKE, 1e-9, 1e6),
-        Parameter("reserve", "", _RESERVE, 0.0, 0.9),
+        Parameter("shake_m_s2", "m/s^2", SHAKE_M_S2, 1e-9, 1e6),
+        Parameter("reserve", "", RESERVE, 0.0, 0.9),
     ),
     output="voltage",
     needs_actuator=True,

@@ -15,13 +15,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
-from scipy.optimize import minimize
 
-from haselab.actuators import GRAVITY_M_S2
-from haselab.base import ResultError
 from haselab.controllers.chip.motion_record import MotionRecord, lag_of, motion_record
 from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, timed_error
+from haselab.controllers.observer_design import RESERVE, SHAKE_M_S2, best_parameters
 from haselab.controllers.observer_law import critical_feedback, process_noise
 from haselab.controllers.protocol import ControllerSetting
 from haselab.controllers.sampled_point import SampledPoint, sampled_point
@@ -35,7 +33,6 @@ _SPREAD = ((1.1, 0.0, 2.5), (0.9, 0.5e-3, 2.5), (1.0, 5e-3, 6.0))
 _SHAKEN = 0.06  # of the highest drive, by noise
 _CHANGED, _MOVED = 1.0, 1.5
 _COUNTED_S = 0.5  # after a change of the load
-_SHAKE, _RESERVE = 0.01, 0.15
 
 
 def feedback_gains(
@@ -145,8 +142,7 @@ def design_chip_observer(setting: ControllerSetting) -> Mapping[str, float]:
     """
     known = setting.actuator
     assert known is not None, "the kind needs it"
-    motion = motion_record(setting, _RESERVE)
-    delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
+    motion = motion_record(setting, RESERVE)
     points = [
         (sampled_point(setting, strain, stiffness=stiffness, later_s=later_s), peak)
         for strain in np.interp(_POINTS, (0.0, 1.0), known.reachable()).tolist()
@@ -157,24 +153,14 @@ def design_chip_observer(setting: ControllerSetting) -> Mapping[str, float]:
         bandwidth, load_n = np.exp(logarithms).tolist()
         total = 0.0
         for point, peak in points:
-            loop = linear_chip_loop(motion, setting, point, (bandwidth, load_n, _SHAKE))
+            loop = linear_chip_loop(motion, setting, point, (bandwidth, load_n, SHAKE_M_S2))
             factor = penalty(loop, setting.period_s, _demands(setting, known, point, peak))
             if factor > UNSTABLE:
                 return factor
             total += factor * timed_error(loop, setting.period_s, _COUNTED_S)
         return total
 
-    start = np.log([0.1 / delay_s, 0.1 * known.mass_kg * GRAVITY_M_S2])
-    found = minimize(cost, start, method="Nelder-Mead",
-                     options={"maxfev": 100, "xatol": 0.02, "fatol": 1e-9})  # fmt: skip
-    if found.fun > UNSTABLE:
-        raise ResultError(
-            f"No gains of the observer are stable with a delay of {setting.delay_s or 0.0:g} s. "
-            "Shorten the delay."
-        )
-    bandwidth, load_n = np.exp(found.x).tolist()
-    return {"bandwidth_rad_s": float(f"{bandwidth:.4g}"), "load_n": float(f"{load_n:.4g}"),
-            "shake_m_s2": _SHAKE, "reserve": _RESERVE}  # fmt: skip
+    return best_parameters(cost, setting, evaluations=100)
 
 
 def _demands(

@@ -2,8 +2,11 @@
 
     python -m benchmarks.identification.interval_coverage --reading hz --seeds 20 --out DIR
     python -m benchmarks.identification.interval_coverage --rows-14-to-21 --seeds 20 --out DIR
+    python -m benchmarks.identification.interval_coverage --replay --seeds 20 --out DIR
 
-With --rows-14-to-21, trials that only other rows need are left out: a third of the time.
+With --rows-14-to-21, trials that only other rows need are left out: a third of the time. With
+--replay, the same study is then played on the twin of the actuator that each seed identified, and
+its results are compared with the recorded ones.
 The truth of a run is what the same fits give on the same twin with all noise off. Seeds whose
 results.json is in the folder already are not run again. See README.md for how to read the table.
 """
@@ -25,14 +28,17 @@ from typing import Any
 import numpy as np
 
 from haselab.cli.study.study_run import execute
-from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
+from haselab.rig.twin.twin_file import load_twin
 from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.study.definition import builtin_study
 
 PROCESSES = 2
+REPLAY_SEED = 1000
+Z95 = 1.96
 NOT_PLAYED = ("pi_trials", "pid_trials", "extra_delay_trials", "saturating_trials")
 
 
@@ -66,21 +72,28 @@ class Spread:
         return self.claimed / self.scatter if self.scatter > 0.0 else float("inf")
 
 
-def run_part(folder: Path, seed: int, reading: str) -> str:
-    """The experiments of rows S14 to S21 in a quick study."""
-    out = folder / f"seed-{seed}"
+def run_part(out: Path, seed: int, config: TwinConfig, baseline_v: float | None = None) -> str:
+    """The experiments of rows S14 to S21 in a quick study; None: at the baseline that it finds."""
     if (out / "results.json").exists():
         return "there already"
     study = builtin_study(quick=True)
     fewer = study.steps.model_copy(update=dict.fromkeys(NOT_PLAYED, 0))
-    study = study.model_copy(update={"steps": fewer})
-    config = twin_of_reading(reading)
+    point = study.operating_point.model_copy(update={"baseline_v": baseline_v})
+    study = study.model_copy(update={"steps": fewer, "operating_point": point})
     rig = guard(make_twin(config, seed), Safety(SafetySettings()))
     arm_simulated(rig)
     with contextlib.redirect_stdout(io.StringIO()):
         execute(study, rig, config, seed, out, "none", as_json=True, physical_model=True)
     keep_results(out)
     return "done"
+
+
+def replay(folder: Path, seed: int) -> str:
+    """The same experiments at the same baseline on the twin of the actuator of a seed."""
+    recorded = folder / f"seed-{seed}"
+    config = load_twin(recorded / "actuator.toml")
+    baseline_v = _quantities(recorded / "results.json")["S18.baseline"]["value"]
+    return run_part(folder / f"replay-{seed}", REPLAY_SEED + seed, config, baseline_v)
 
 
 def keep_results(out: Path) -> None:
@@ -123,6 +136,44 @@ def _error(row: dict[str, Any]) -> float:
     if off == 0.0:
         return 0.0
     return off / std if std else float("inf")
+
+
+def replayed(folder: Path) -> str:
+    """Table of the results of recorded sessions next to those of their replays.
+
+    The two have independent noise, so z divides their difference by the root of the sum of both
+    squared half-widths of the 95 % intervals, which are 1.96 standard deviations.
+    """
+    found: dict[str, list[tuple[bool, float]]] = {}
+    for path in sorted(folder.glob("replay-*/results.json")):
+        recorded = path.parent.with_name(path.parent.name.replace("replay", "seed"))
+        first, second = (_quantities(one) for one in (recorded / "results.json", path))
+        for key in first.keys() & second.keys():
+            value, (low, high) = second[key]["value"], first[key]["ci95"]
+            half = 0.5 * float(np.hypot(high - low, np.diff(second[key]["ci95"])[0]))
+            z = Z95 * (value - first[key]["value"]) / half if half else 0.0
+            found.setdefault(key, []).append((low <= value <= high, z))
+    lines = [f"{'id':22s} {'inside':>9s} {'mean z':>8s} {'rms z':>8s} {'worst z':>8s}"]
+    for key, pairs in sorted(found.items()):
+        zs = np.array([one for _, one in pairs])
+        lines.append(
+            f"{key:22s} {sum(one for one, _ in pairs):4d}/{len(pairs):<4d} {zs.mean():8.2f} "
+            f"{np.sqrt(np.mean(zs**2)):8.2f} {zs[np.abs(zs).argmax()]:8.2f}"
+        )
+    every = [pair for pairs in found.values() for pair in pairs]
+    share = 100.0 * np.mean([one for one, _ in every])
+    both = 100.0 * np.mean([abs(z) <= Z95 for _, z in every])
+    lines.append(
+        f"\n{len(every)} pairs of id and seed: {share:.1f} % of the replayed results are inside "
+        f"the recorded 95 % interval, {both:.1f} % inside the interval of the difference."
+    )
+    return "\n".join(lines)
+
+
+def _quantities(path: Path) -> dict[str, dict[str, Any]]:
+    """Measured value and interval of each result that has one."""
+    rows = json.loads(path.read_text())["quantities"]
+    return {row["id"]: row["measured"] for row in rows if row["measured"].get("ci95")}
 
 
 def spread_of(key: str, rows: list[dict[str, Any]]) -> Spread:
@@ -169,19 +220,26 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--rows-14-to-21", action="store_true", help="leave other trials out")
+    parser.add_argument("--replay", action="store_true", help="and the twin of each actuator")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     options = ["--twin", str(given.twin)] if given.twin else ["--reading", given.reading]
     seeds = range(given.first_seed, given.first_seed + given.seeds)
     given.out.mkdir(parents=True, exist_ok=True)
-    for seed in seeds if given.rows_14_to_21 else ():
-        print(f"seed {seed}: {run_part(given.out, seed, given.reading)}", flush=True)
+    part = given.rows_14_to_21 or given.replay
+    for seed in seeds if part else ():
+        out, config = given.out / f"seed-{seed}", twin_of_reading(given.reading)
+        print(f"seed {seed}: {run_part(out, seed, config)}", flush=True)
+        if given.replay:
+            print(f"replay {seed}: {replay(given.out, seed)}", flush=True)
     with ThreadPoolExecutor(PROCESSES) as pool:
-        whole = () if given.rows_14_to_21 else seeds
+        whole = () if part else seeds
         jobs = pool.map(lambda seed: run_seed(given.out, seed, options), whole)
         for seed, message in zip(whole, jobs, strict=True):
             print(f"seed {seed}: {message}", file=sys.stderr, flush=True)
     print(table(*collect(given.out)))
+    if given.replay:
+        print(replayed(given.out))
 
 
 if __name__ == "__main__":

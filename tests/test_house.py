@@ -271,7 +271,7 @@ def test_tables_in_signatures_are_json_objects_not_anything() -> None:
 
 
 # Packages that may touch files, and packages that may draw.
-FILE_PACKAGES = {"store", "rig", "safety", "cli"}
+FILE_PACKAGES = {"panel", "store", "rig", "safety", "cli"}
 PLOT_PACKAGES = {"report", "cli"}
 FILE_MODULES = {"h5py", "av", "tifffile", "serial", "socket"}
 

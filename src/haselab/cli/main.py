@@ -50,6 +50,7 @@ _COMMANDS = {
     "recover": ("haselab.cli.data.recover", "Repair a recording whose program was killed."),
     "report": ("haselab.cli.study.report", "Write the report of a run or of an actuator file."),
     "twin": ("haselab.cli.bench.twin", "Describe or serve a simulated bench."),
+    "panel": ("haselab.cli.bench.panel", "Show and drive a bench in a browser."),
     "rig": ("haselab.cli.bench.rig", "Check a bench in stages, or make it safe."),
     "firmware": ("haselab.cli.model.firmware", "Build, simulate or flash the microcontroller."),
     "doctor": ("haselab.cli.doctor.command", "Report what is installed and which devices answer."),

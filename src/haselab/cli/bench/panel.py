@@ -1,0 +1,89 @@
+"""`haselab panel`: the bench in a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import tempfile
+import threading
+import webbrowser
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from haselab.base import DeviceError
+from haselab.cli.options import shared_option
+from haselab.panel.processes import Panel, running_panel
+from haselab.store.folder import write_new
+
+__all__ = ["command"]
+
+
+@click.command("panel")
+@shared_option(
+    "--rig", type=click.Path(path_type=Path), detail="Default: the twin of the reference study."
+)
+@shared_option(
+    "--actuator", type=click.Path(path_type=Path),
+    detail="With both maps and a controller, the panel can close the loop.",
+)  # fmt: skip
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, show_default=True,
+    help="Set the TCP port of the page. 0 uses a free one.",
+)  # fmt: skip
+@click.option("--no-browser", is_flag=True, help="Print the address only; open no browser.")
+def command(rig: Path | None, actuator: Path | None, port: int, no_browser: bool) -> None:
+    """Show and drive a bench in a browser.
+
+    HIGH VOLTAGE CAN BE APPLIED from the page on a real bench, after the bench was armed there. The
+    page has live signals, STOP, arming, a drive by hand and, with --actuator, a closed loop. It is
+    served on this computer only. Ctrl-C takes the output to 0 V and ends the panel.
+    """
+    with contextlib.ExitStack() as opened:
+        if rig is None:
+            folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
+            rig = folder / "twin.toml"
+            write_new(rig, 'kind = "twin"\n')
+        panel = opened.enter_context(running_panel(rig, actuator, port))
+        click.echo(panel.address)
+        if not no_browser:
+            webbrowser.open(panel.address)
+        _serve(panel)
+
+
+def _serve(panel: Panel) -> None:
+    """Serve the page until Ctrl-C, or until the bench process or STOP has ended.
+
+    Raises:
+        DeviceError: the bench process or the stop process ended by itself.
+    """
+    lost: list[str] = []
+
+    def watch() -> None:
+        while not panel.server.should_exit:
+            for name, process in (("bench process", panel.bench), ("stop process", panel.stop)):
+                with contextlib.suppress(Exception):
+                    process.wait(0.1)
+                if process.poll() is not None and not panel.server.should_exit:
+                    lost.append(name)
+                    panel.server.should_exit = True
+
+    def end(number: int, frame: FrameType | None) -> None:
+        panel.server.should_exit = True
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    with contextlib.ExitStack() as restored:
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                number = getattr(signal, name)
+                restored.callback(signal.signal, number, signal.signal(number, end))
+        watcher.start()
+        panel.server.run([panel.listener])
+        panel.server.should_exit = True
+        watcher.join()
+    if lost:
+        raise DeviceError(
+            f"The {lost[0]} has ended, so the panel ends too. Check that the bench is at 0 V, then "
+            "start the panel again."
+        )

@@ -1,0 +1,191 @@
+"""`python -m haselab.panel.bench_process RIG.toml FOLDER [A.toml]`: the process that has the bench.
+
+It reads the bench block by block into shared memory, and answers commands. FOLDER is private to
+one panel and holds
+
+- `live`: the signals, see `columns`;
+- `bench.sock`: commands of the web server, one JSON object per line, each with an `id`; the state
+  of the bench is sent 20 times a second;
+- `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
+
+It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from haselab.api.design import Actuator
+from haselab.base import HaselabError, InputError, JsonObject
+from haselab.panel.columns import LiveWriter
+from haselab.panel.live_bench import LiveBench
+from haselab.rig import Rig
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.rig_file import RigFile, TwinFile, load_rig, opened_rig
+from haselab.safety.gate import Gate
+from haselab.safety.guarded import guard
+from haselab.safety.guardian.client import Guardians, guardian_command
+from haselab.safety.rig_limits import safety_of
+from haselab.safety.state_machine import Safety
+
+__all__ = ["main"]
+
+_STATES_HZ = 20.0
+_BEHIND_S = 0.2  # a simulated bench that is further behind real time does not catch up
+_MOST_BYTES = 65536  # of one command
+
+
+class _Link:
+    """The socket of the web server: commands in, answers and states out. Runs in a thread."""
+
+    def __init__(self, folder: Path, bench: LiveBench) -> None:
+        self._bench = bench
+        self._server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._server.bind(str(folder / "bench.sock"))
+        self._server.listen(4)
+
+    def serve(self) -> None:
+        """Serve one web server after the other, until the program ends."""
+        while True:
+            client, _ = self._server.accept()
+            with client, contextlib.suppress(OSError, ValueError):
+                self._talk(client)
+
+    def _talk(self, client: socket.socket) -> None:
+        client.setblocking(False)
+        waiting, text, next_s = selectors.DefaultSelector(), b"", 0.0
+        waiting.register(client, selectors.EVENT_READ)
+        while True:
+            now_s = time.monotonic()
+            if now_s >= next_s:
+                next_s = now_s + 1.0 / _STATES_HZ
+                self._send(client, {"state": asdict(self._bench.state)})
+            if not waiting.select(max(next_s - time.monotonic(), 0.0)):
+                continue
+            data = client.recv(_MOST_BYTES)
+            if not data or len(text) > _MOST_BYTES:
+                return
+            *lines, text = (text + data).split(b"\n")
+            for line in lines:
+                self._send(client, self._answer(json.loads(line)))
+
+    def _answer(self, command: JsonObject) -> JsonObject:
+        number = command.get("id")
+        try:
+            given = command.get("values")
+            values = given if isinstance(given, dict) else {}
+            answer = self._bench.do(str(command.get("do")), str(command.get("holder")), values)
+        except HaselabError as error:
+            return {"id": number, "error": str(error)}
+        return {"id": number, "answer": answer, "state": asdict(self._bench.state)}
+
+    @staticmethod
+    def _send(client: socket.socket, message: JsonObject) -> None:
+        client.settimeout(1.0)
+        client.sendall(json.dumps(message).encode() + b"\n")
+        client.setblocking(False)
+
+
+def _stops(folder: Path, bench: LiveBench) -> None:
+    """Stop the bench for each datagram, and answer when 0 V was commanded."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as box:
+        box.bind(str(folder / "stop.sock"))
+        while True:
+            data, sender = box.recvfrom(512)
+            bench.stop(data.decode(errors="replace"))
+            with contextlib.suppress(OSError):
+                box.sendto(b"0 V commanded", sender)
+
+
+@contextlib.contextmanager
+def _opened(file: RigFile, path: Path, folder: Path) -> Iterator[tuple[Rig, Safety]]:
+    """Open the rig with its safety chain; a twin gets an interlock that other processes reach."""
+    gate = Gate()
+    with contextlib.ExitStack() as opened:
+        if isinstance(file, TwinFile):
+            gate.claim(f"simulated bench of panel {os.getppid()}", 1.0)
+            opened.callback(gate.release)
+        elif not isinstance(file, BenchConfig):
+            raise InputError(
+                f"The panel works with kind = 'twin' and 'bench', but the rig has kind = "
+                f"{file.kind!r}. Use haselab run with this rig. {path}"
+            )
+        rig = opened.enter_context(opened_rig(file, path, gate))
+        safety = Safety(safety_of(file, getattr(file, "safety", {}), path))
+        if isinstance(file, BenchConfig):
+            safety.guardians = opened.enter_context(
+                Guardians(guardian_command(path), folder / "guardian.log", gate.interlock)
+            )
+        yield rig, safety
+
+
+def _run(bench: LiveBench, block_s: float, *, paced: bool, ended: threading.Event) -> None:
+    next_s = time.monotonic()
+    while not ended.is_set():
+        bench.step()
+        if paced:
+            next_s = max(next_s + block_s, time.monotonic() - _BEHIND_S)
+            time.sleep(max(next_s - time.monotonic(), 0.0))
+
+
+def _watch_stdin(ended: threading.Event) -> None:
+    """End the process when the panel has ended."""
+    sys.stdin.read()
+    ended.set()
+
+
+def main(words: list[str]) -> int:
+    """Run the bench process.
+
+    Args:
+        words: rig file, folder, and optionally the actuator file.
+    Returns:
+        0, or 1 if the bench cannot be used; the reason is printed after `failed`.
+    """
+    path, folder = Path(words[0]), Path(words[1])
+    ended = threading.Event()
+    for name in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(name, lambda *_: ended.set())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the panel ends this process by its stdin
+    threading.Thread(target=_watch_stdin, args=(ended,), daemon=True).start()
+    try:
+        loop = Actuator.load(words[2]).loop() if len(words) > 2 else None
+        file = load_rig(path)
+        with _opened(file, path, folder) as (rig, safety):
+            about = rig.description
+            scales = (
+                about.volt_per_code / about.v_monitor_v_per_v,
+                about.volt_per_code / about.i_monitor_v_per_a,
+            )
+            live = folder / "live"
+            with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
+                bench = LiveBench(guard(rig, safety), writer, loop)
+                link = _Link(folder, bench)
+                threading.Thread(target=link.serve, daemon=True).start()
+                threading.Thread(target=_stops, args=(folder, bench), daemon=True).start()
+                assert rig.gate is not None
+                key = rig.gate.interlock.key  # type: ignore[attr-defined]
+                print(f"ready {key}", flush=True)
+                try:
+                    _run(bench, about.block_s, paced=rig.simulated, ended=ended)
+                finally:
+                    bench.close()
+    except HaselabError as error:
+        print(f"failed {' '.join(str(error).split())}", flush=True)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

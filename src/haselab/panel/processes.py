@@ -1,0 +1,138 @@
+"""The processes of a panel: bench, STOP and web server, started and ended together."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import uvicorn
+
+from haselab.base import DeviceError
+from haselab.panel.web import WebSettings, application
+from haselab.rig.bench_config import BenchConfig
+from haselab.rig.rig_file import load_rig
+
+__all__ = ["Panel", "running_panel"]
+
+_START_S = 60.0  # for the drivers of a bench
+_END_S = 10.0  # for the bench process to go to 0 V
+
+
+class _Server(uvicorn.Server):
+    """A web server that leaves signals to the panel, which must take the bench to 0 V."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Generator[None, None, None]:
+        """Change no signal handler."""
+        yield
+
+
+class Panel(NamedTuple):
+    """A panel that runs.
+
+    Args:
+        address: to open in a browser; it holds the token.
+        bench: its bench process.
+        stop: its stop process.
+        server: its web server, to be run by the caller.
+        listener: socket of the web server.
+    """
+
+    address: str
+    bench: subprocess.Popen[str]
+    stop: subprocess.Popen[str]
+    server: uvicorn.Server
+    listener: socket.socket
+
+
+def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
+    """Start a process of this package and read what it is ready with.
+
+    Raises:
+        DeviceError: It did not start.
+    """
+    command = [sys.executable, "-m", *words]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    late = threading.Timer(_START_S, process.kill)
+    late.start()
+    assert process.stdout is not None
+    line = process.stdout.readline().strip()
+    late.cancel()
+    word, _, rest = line.partition(" ")
+    if word != "ready":
+        _end(process)
+        raise DeviceError(rest or f"The {what} ended while it started. Its messages are above.")
+    return process, rest
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End a process by its stdin; kill it if it does not end."""
+    with contextlib.suppress(OSError):
+        assert process.stdin is not None
+        process.stdin.close()
+    try:
+        process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+@contextlib.contextmanager
+def running_panel(rig: Path, actuator: Path | None, port: int = 0) -> Iterator[Panel]:
+    """Start the bench process and the stop process; on exit, go to 0 V and end them.
+
+    Args:
+        rig: rig file.
+        actuator: actuator file, for a closed loop; None: there is none.
+        port: of the web server on the loopback address; 0: a free one.
+    Yields:
+        The panel; the caller runs its server.
+    Raises:
+        DeviceError: A process does not start, or the port is in use.
+    """
+    in_memory = Path("/dev/shm")
+    place = in_memory if in_memory.is_dir() and os.access(in_memory, os.W_OK) else None
+    with contextlib.ExitStack() as opened:
+        folder = Path(
+            opened.enter_context(tempfile.TemporaryDirectory(prefix="haselab-panel-", dir=place))
+        )
+        listener = opened.enter_context(socket.socket())
+        try:
+            listener.bind(("127.0.0.1", port))
+            listener.listen(128)  # a browser that is early waits
+        except OSError as error:
+            raise DeviceError(
+                f"Port {port} cannot be used ({error.strerror}). Choose another one with --port, "
+                "or leave it out for a free one."
+            ) from None
+        own = listener.getsockname()[1]
+        hosts = (f"127.0.0.1:{own}", f"localhost:{own}")
+        words = [str(rig), str(folder), *([] if actuator is None else [str(actuator)])]
+        bench, key = _started(["haselab.panel.bench_process", *words], "bench process")
+        opened.callback(_end, bench)
+        settings = WebSettings(folder, secrets.token_urlsafe(24), hosts, 0)
+        real = [str(rig)] if isinstance(load_rig(rig), BenchConfig) else []
+        words = ["0", str(folder), key, ",".join(settings.origins), *real]
+        stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
+        opened.callback(_end, stop)
+        settings.stop_port = int(stop_port)
+        server = _Server(
+            uvicorn.Config(
+                application(settings), log_level="warning", ws_max_size=65536, ws_ping_interval=5.0,
+                ws_per_message_deflate=False, timeout_graceful_shutdown=1,
+            )
+        )  # fmt: skip
+        yield Panel(
+            f"http://127.0.0.1:{own}/?token={settings.token}", bench, stop, server, listener
+        )

@@ -1,0 +1,98 @@
+// Charts of the live signals. Each column shows its smallest and its largest value.
+const resolved = (name) => { // light-dark() is resolved by the browser, not by the canvas
+  const probe = document.createElement("span");
+  probe.style.color = `var(${name})`;
+  document.body.append(probe);
+  const found = getComputedStyle(probe).color;
+  probe.remove();
+  return found;
+};
+
+const HEIGHT = 140;
+const PLOTS = [
+  { title: "Voltage", unit: "kV", of: "monitors", lines: [{ name: "voltage", channel: 0, scale: 1e-3 }] },
+  { title: "Current", unit: "mA", of: "monitors", lines: [{ name: "current", channel: 1, scale: 1e3 }] },
+  { title: "Capacitance", unit: "pF", of: "signals", lines: [{ name: "capacitance", channel: 2, scale: 1e12 }] },
+  { title: "Strain", unit: "%", of: "signals", lines: [{ name: "sensed", channel: 3, scale: 100 }, { name: "desired", channel: 1, scale: 100 }] },
+  { title: "Drive", unit: "V", of: "signals", lines: [{ name: "drive", channel: 0, scale: 1 }, { name: "monitor minus drive", channel: 4, scale: 1 }] },
+];
+
+const digits = (v) => Number(v.toPrecision(4));
+const range = (low, high, unit) => {
+  if (low === null || low === undefined) return "–";
+  return digits(low) === digits(high) ? `${digits(high)} ${unit}` : `${digits(low)} to ${digits(high)} ${unit}`;
+};
+
+export class Charts {
+  constructor(root, onZoom) {
+    this.onZoom = onZoom;
+    this.dragged = false;
+    addEventListener("mouseup", () => { this.dragged = false; });
+    this.plots = PLOTS.map((about) => this.make(root, about));
+    new ResizeObserver(() => this.resize()).observe(root);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => location.reload());
+  }
+
+  make(root, about) {
+    const card = document.createElement("section");
+    card.className = "card";
+    card.tabIndex = 0;
+    card.setAttribute("aria-label", `${about.title} in ${about.unit}. Arrow keys move the view, plus and minus zoom, End shows the present.`);
+    card.addEventListener("keydown", (event) => this.onZoom({ key: event.key, event }));
+    const values = document.createElement("p");
+    values.className = "values";
+    card.append(values);
+    root.append(card);
+    const text = resolved("--text"), line = resolved("--line");
+    const series = [{ label: "time" }];
+    const bands = [];
+    about.lines.forEach((one, k) => {
+      const stroke = resolved(k ? "--second" : "--first");
+      series.push({ label: `${one.name}, highest`, stroke, width: 1, points: { show: false } });
+      series.push({ label: `${one.name}, lowest`, stroke, width: 1, points: { show: false } });
+      bands.push({ series: [2 * k + 1, 2 * k + 2], fill: stroke.replace("rgb(", "rgba(").replace(")", ", 0.35)") });
+    });
+    const axis = { stroke: text, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
+    const plot = new uPlot({
+      width: Math.max(card.clientWidth - 24, 200), height: HEIGHT, series, bands, legend: { show: false },
+      scales: { x: { time: false } },
+      axes: [{ ...axis }, { ...axis, size: 70, label: `${about.title} (${about.unit})`, labelSize: 20 }],
+      cursor: { sync: { key: "haselab" }, drag: { x: true, y: false, setScale: false } },
+      hooks: {
+        setSelect: [(u) => {
+          if (u.select.width < 3) return;
+          const from = u.posToVal(u.select.left, "x"), to = u.posToVal(u.select.left + u.select.width, "x");
+          u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+          this.onZoom({ from, to });
+        }],
+      },
+    }, series.map(() => []), card);
+    plot.over.addEventListener("mousedown", () => { this.dragged = true; }); // the view stays meanwhile
+    plot.over.addEventListener("dblclick", () => this.onZoom({ key: "End" }));
+    return { about, plot, card, values };
+  }
+
+  resize() {
+    for (const { plot, card } of this.plots) plot.setSize({ width: Math.max(card.clientWidth - 24, 200), height: HEIGHT });
+  }
+
+  columns() { return Math.round((this.plots[0].plot.bbox.width || 800) / 2) || 400; }
+
+  draw(frame, from, to) {
+    for (const { about, plot, values } of this.plots) {
+      const { start, step, low, high } = frame[about.of];
+      const count = low[0].length, x = new Float64Array(count);
+      for (let k = 0; k < count; k++) x[k] = start + (k + 0.5) * step;
+      const data = [x];
+      for (const { channel, scale } of about.lines) {
+        for (const side of [high[channel], low[channel]]) data.push(Array.from(side, (v) => (Number.isNaN(v) ? null : v * scale)));
+      }
+      plot.setData(data, false);
+      plot.setScale("x", { min: from, max: to });
+      const at = plot.cursor.idx ?? count - 1;
+      const parts = about.lines.map((one, k) => `${one.name} ${range(data[2 * k + 2][at], data[2 * k + 1][at], about.unit)}`);
+      const when = plot.cursor.idx === null || plot.cursor.idx === undefined ? "" : ` at ${x[at]?.toFixed(4)} s`;
+      values.textContent = `${about.title}: ${parts.join(", ")}${when}`;
+    }
+  }
+}

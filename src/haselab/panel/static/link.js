@@ -1,0 +1,118 @@
+// The connection to the web server: frames in, commands out. It watches the age of the data.
+const SCHEMA = 1;
+const SILENT_MS = 900; // without a frame the connection is opened again
+
+export class Link {
+  constructor(onFrame, onChange) {
+    this.onFrame = onFrame;
+    this.onChange = onChange;
+    this.view = { span_s: 10, end_s: null, columns: 600 };
+    this.holder = "";
+    this.problem = "";
+    this.framedAt = -Infinity;
+    this.waiting = new Map();
+    this.number = 0;
+    this.token = new URLSearchParams(location.search).get("token") || sessionStorage.getItem("token") || "";
+    sessionStorage.setItem("token", this.token);
+    history.replaceState(null, "", location.pathname); // the token does not stay in the address
+    this.open();
+    setInterval(() => this.watch(), 100);
+    document.addEventListener("visibilitychange", () => this.watch());
+  }
+
+  get age_ms() { return performance.now() - this.framedAt; }
+
+  open() {
+    const socket = new WebSocket(`ws://${location.host}/live`);
+    this.socket = socket;
+    this.openedAt = performance.now();
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => socket.send(JSON.stringify({ token: this.token }));
+    socket.onmessage = ({ data }) => {
+      if (socket !== this.socket) return; // an old connection: its frames are old
+      if (typeof data === "string") this.heard(JSON.parse(data));
+      else this.framed(data);
+    };
+    socket.onclose = ({ code, reason }) => {
+      if (socket !== this.socket) return;
+      this.problem = code === 1008 ? `The server refused this page (${reason || "wrong address"}). Open the address that haselab panel printed.` : "";
+      this.socket = null;
+      this.lost();
+      this.onChange();
+    };
+  }
+
+  lost() {
+    for (const answer of this.waiting.values()) answer({ error: "The connection was lost before the answer." });
+    this.waiting.clear();
+  }
+
+  watch() {
+    const since = performance.now() - this.openedAt;
+    if (this.socket === null) {
+      if (since > 400 && !this.problem) this.open();
+    } else if (this.age_ms > SILENT_MS && since > SILENT_MS) {
+      const old = this.socket;
+      this.socket = null; // also when the old one never closes
+      old.close();
+      this.lost();
+      this.open();
+    }
+    this.onChange();
+  }
+
+  heard(message) {
+    if ("holder" in message) {
+      this.holder = message.holder;
+      this.send({ view: this.view });
+      return;
+    }
+    const answer = this.waiting.get(message.id);
+    this.waiting.delete(message.id);
+    if (answer) answer(message);
+  }
+
+  framed(buffer) {
+    const head = new DataView(buffer);
+    if (head.getUint16(0, true) !== SCHEMA) { location.reload(); return; }
+    const number = head.getUint32(4, true);
+    const [monitorStart, monitorStep, signalStart, signalStep] = [8, 16, 24, 32].map((at) => head.getFloat64(at, true));
+    const size = head.getUint32(40, true), columns = head.getUint32(44, true);
+    const about = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 48, size)));
+    const values = new Float32Array(buffer.slice(48 + size));
+    const rows = (values.length - 4 * columns) / 2 / 5;
+    const part = (start, count) => values.subarray(start, start + count);
+    const monitors = { start: monitorStart, step: monitorStep, low: [], high: [] };
+    for (let k = 0; k < 2; k++) {
+      monitors.low.push(part(k * columns, columns));
+      monitors.high.push(part((2 + k) * columns, columns));
+    }
+    const signals = { start: signalStart, step: signalStep, low: [], high: [] };
+    for (let k = 0; k < 5; k++) {
+      signals.low.push(part(4 * columns + k * rows, rows));
+      signals.high.push(part(4 * columns + (5 + k) * rows, rows));
+    }
+    this.framedAt = performance.now();
+    this.send({ ack: number });
+    this.onFrame({ ...about, monitors, signals });
+  }
+
+  send(message) {
+    if (this.socket && this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  setView(view) {
+    this.view = { ...this.view, ...view };
+    this.send({ view: this.view });
+  }
+
+  ask(what, values = {}) {
+    if (!this.socket || this.socket.readyState !== WebSocket.OPEN) {
+      return Promise.resolve({ error: "There is no connection to the panel." });
+    }
+    this.number += 1;
+    const id = this.number;
+    this.send({ id, do: what, values });
+    return new Promise((resolve) => this.waiting.set(id, resolve));
+  }
+}

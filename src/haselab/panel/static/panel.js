@@ -1,0 +1,150 @@
+import { html, render, useState, useEffect, useReducer } from "/static/vendor/htm-preact.js";
+import { Charts } from "/static/charts.js";
+import { Link } from "/static/link.js";
+
+const STALE_MS = 450;
+let frame = null;
+let charts = null;
+let redraw = () => {};
+let pending = false;
+
+const link = new Link((found) => {
+  frame = found;
+  if (pending) return; // only the newest frame is drawn
+  pending = true;
+  requestAnimationFrame(() => { pending = false; draw(); });
+}, () => redraw());
+
+function draw() {
+  redraw();
+  if (frame === null || charts === null || frame.end_s === null || charts.dragged) return;
+  const end = link.view.end_s ?? frame.end_s;
+  charts.draw(frame, end - link.view.span_s, end);
+}
+
+function zoom({ from, to, key, event }) {
+  if (frame === null || frame.end_s === null) return;
+  const { span_s } = link.view, end = link.view.end_s ?? frame.end_s;
+  const moves = { ArrowLeft: -0.25, ArrowRight: 0.25 }, factors = { "+": 0.5, "=": 0.5, "-": 2 };
+  if (from !== undefined) link.setView({ span_s: Math.max(to - from, 1e-4), end_s: to });
+  else if (key in moves) link.setView({ end_s: end + moves[key] * span_s });
+  else if (key in factors) link.setView({ span_s: Math.min(Math.max(span_s * factors[key], 1e-4), 1200), end_s: link.view.end_s });
+  else if (key === "End") link.setView({ span_s: 10, end_s: null });
+  else return;
+  if (event) event.preventDefault();
+}
+
+const kilo = (v, gain) => `${v.toFixed(3)} V (${(v * gain / 1000).toFixed(2)} kV)`;
+
+function Arming({ state, say }) {
+  const [request, setRequest] = useState(null);
+  const [limit, setLimit] = useState("");
+  const [known, setKnown] = useState(false);
+  async function ask() {
+    const found = await link.ask("request");
+    if (found.error) { say(found.error); return; }
+    say(""); setKnown(false); setLimit(""); setRequest(found.answer);
+  }
+  async function arm(event) {
+    event.preventDefault();
+    const values = { number: request.number, limit_v: Number(limit), acknowledged: known ? request.reason : "" };
+    const found = await link.ask("arm", values);
+    setRequest(null);
+    say(found.error || "");
+  }
+  if (request === null) return html`<button type="button" onClick=${ask}>Arm the bench …</button>`;
+  return html`<form onSubmit=${arm}>
+    <p><strong>${state.simulated ? "SIMULATED bench: no voltage is applied." : "HIGH VOLTAGE WILL BE APPLIED. Keep clear."}</strong></p>
+    <p>${request.limits}</p>
+    ${request.reason && html`<p class="error">The bench was made safe. Reason: ${request.reason}</p>
+      <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>`}
+    <label>Highest drive of this run, in V at the amplifier's input (${kilo(state.high_v, state.gain)} at most)
+      <input type="number" step="any" min="0" max=${state.high_v} required value=${limit} onInput=${(e) => setLimit(e.target.value)} />
+    </label>
+    <div class="row"><button class="danger" type="submit" disabled=${!limit || (request.reason && !known)}>Arm</button>
+    <button type="button" onClick=${() => setRequest(null)}>Cancel</button></div>
+  </form>`;
+}
+
+function Slider({ name, unit, low, high, step, value, send, about }) {
+  const [typed, type] = useState(null); // while it is being typed
+  const [sent, setSent] = useState(null); // until the bench has it
+  useEffect(() => setSent(null), [value]);
+  const put = (text) => { setSent(text); send(Number(text)); };
+  const now = sent ?? String(Number(value.toPrecision(6)));
+  const commit = () => { if (typed !== null && typed !== "") put(typed); type(null); };
+  return html`<label>${name}, in ${unit}${about ? `: ${about}` : ""}
+    <input type="range" min=${low} max=${high} step=${step} value=${now} onInput=${(e) => put(e.target.value)} /></label>
+    <label>${name}, typed, in ${unit}
+    <input type="number" min=${low} max=${high} step="any" value=${typed ?? now} onInput=${(e) => type(e.target.value)}
+      onBlur=${commit} onKeyDown=${(e) => e.key === "Enter" && commit()} /></label>`;
+}
+
+function Live({ state, say }) {
+  const ask = (what, values) => link.ask(what, values).then((found) => say(found.error || ""));
+  const low = Math.max(state.low_v, -state.limit_v);
+  return html`
+    <p class="badge live">Armed by this page up to ${kilo(state.limit_v, state.gain)}</p>
+    <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
+      about=${`now ${kilo(state.drive_v, state.gain)}, changes by 1 V/s`} send=${(v) => ask("drive", { value_v: v })} />
+    ${state.loop === null
+      ? html`<p>No loop: start the panel with --actuator A.toml, which has both maps and a controller.</p>`
+      : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
+          value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; a value closes it"}
+          send=${(v) => ask("loop", { strain: v / 100 })} />`}
+    <div class="row">
+      <button type="button" onClick=${() => ask("drive", { value_v: 0 })}>Ramp to 0 V</button>
+      ${state.mode === "loop" && html`<button type="button" onClick=${() => ask("open")}>Open the loop</button>`}
+      <button type="button" onClick=${() => ask("disarm")}>Disarm</button>
+    </div>`;
+}
+
+function Panel() {
+  const [, force] = useReducer((n) => n + 1, 0);
+  const [error, say] = useState("");
+  useEffect(() => {
+    redraw = force;
+    charts = new Charts(document.getElementById("charts"), zoom);
+    link.setView({ columns: charts.columns() });
+    addEventListener("resize", () => link.setView({ columns: charts.columns() }));
+  }, []);
+  const stale = link.age_ms > STALE_MS;
+  document.body.classList.toggle("stale", stale);
+  const state = frame?.state?.stage ? frame.state : null;
+  const seconds = link.age_ms / 1000;
+  const age = Number.isFinite(seconds) ? `NO NEW DATA for ${seconds.toFixed(1)} s` : "NO DATA YET";
+  const live = state !== null && state.holder !== "";
+  const mine = live && state.holder === link.holder;
+  const paused = link.view.end_s !== null;
+  return html`
+    <header>
+      <h1>${state ? state.name : "haselab panel"}</h1>
+      ${state?.simulated && html`<span class="badge">SIMULATED</span>`}
+      <span class=${`badge ${live ? "live" : ""} ${state?.stage === "tripped" ? "bad" : ""}`} role="status">${state ? `Bench: ${state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "Bench: unknown"}</span>
+      <span id="age" class=${`badge ${stale ? "bad" : ""}`} role="status">${stale ? age : paused ? "PAUSED view" : "data live"}</span>
+    </header>
+    <div class="layout">
+      <main class="charts">
+        <div class="row" role="group" aria-label="View">
+          <button type="button" aria-pressed=${paused} onClick=${() => link.setView(paused ? { end_s: null } : { end_s: frame?.end_s ?? null })}>${paused ? "Resume" : "Pause"}</button>
+          ${[1, 10, 60, 600].map((s) => html`<button type="button" onClick=${() => link.setView({ span_s: s })}>${s} s</button>`)}
+          <span>${Number(link.view.span_s.toPrecision(3))} s shown. Drag to zoom, double-click for the present.</span>
+        </div>
+        <div id="charts"></div>
+      </main>
+      <section class="controls" aria-label="Bench">
+        <div class=${`card ${live ? "warning" : ""}`}>
+          <h2>Bench</h2>
+          ${link.problem && html`<p class="error" role="alert">${link.problem}</p>`}
+          ${error && html`<p class="error" role="alert">${error}</p>`}
+          ${state?.reason && html`<p class="error">Last stop: ${state.reason}</p>`}
+          ${state === null ? html`<p>No bench process.</p>`
+            : mine ? html`<${Live} state=${state} say=${say} />`
+            : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>`
+            : html`<${Arming} state=${state} say=${say} />`}
+        </div>
+      </section>
+    </div>`;
+}
+
+render(html`<${Panel} />`, document.getElementById("panel"));

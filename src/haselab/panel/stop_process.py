@@ -1,0 +1,162 @@
+"""`python -m haselab.panel.stop_process PORT FOLDER KEY ORIGIN [RIG.toml]`: STOP, and nothing else.
+
+A small process with a port of its own, so that STOP waits for nothing: not for the web server, a
+plot, a command or a blocking call. `POST /stop` revokes the permission in the interlock KEY, which
+no program can use any more, and then sends the bench process to 0 V (`stop.sock` in FOLDER). On a
+real bench it also starts `haselab rig safe RIG.toml`, which uses connections of its own. STOP needs
+no token; pages of other origins are refused. `GET /ready` keeps the connection of a page open.
+
+This module uses only the standard library and the interlock, so it starts quickly.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from haselab.safety.interlock import Interlock
+
+__all__ = ["StopServer", "main"]
+
+_REASON = "STOP was pressed on the panel"
+_ANSWER_S = 2.0  # longest wait for the bench process
+
+
+class StopServer(ThreadingHTTPServer):
+    """Serves STOP.
+
+    Args:
+        port: on the loopback address; 0: a free one.
+        stop: called for each STOP; returns what to answer.
+        origins: of the pages that may call it.
+    """
+
+    daemon_threads = True
+    request_queue_size = 64
+
+    def __init__(
+        self, port: int, stop: Callable[[], dict[str, object]], origins: tuple[str, ...]
+    ) -> None:
+        self.stop, self.origins = stop, origins
+        super().__init__(("127.0.0.1", port), _Handler)
+
+    @property
+    def port(self) -> int:
+        """TCP port."""
+        return int(self.server_address[1])
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    timeout = 60.0
+    server: StopServer
+
+    def setup(self) -> None:
+        self.request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        super().setup()
+
+    def do_GET(self) -> None:
+        if self._allowed():
+            self._reply(200 if self.path == "/ready" else 404, {"ready": self.path == "/ready"})
+
+    def do_POST(self) -> None:
+        if not self._allowed():
+            return
+        if self.path != "/stop":
+            self._reply(404, {"error": "There is only /stop."})
+            return
+        self._reply(200, self.server.stop())
+        with contextlib.suppress(OSError):  # what the page sent has no meaning
+            self.rfile.read(min(int(self.headers.get("Content-Length") or 0), 4096))
+
+    def _allowed(self) -> bool:
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        name = host.rpartition(":")[0]
+        mine = name in ("127.0.0.1", "localhost") and (
+            origin is None or origin in self.server.origins
+        )
+        if not mine:
+            self._reply(403, {"error": "Only the panel's own page may use this port."})
+        return mine
+
+    def _reply(self, status: int, content: dict[str, object]) -> None:
+        body = json.dumps(content).encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        origin = self.headers.get("Origin")
+        if origin in self.server.origins:
+            self.send_header("Access-Control-Allow-Origin", str(origin))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Print nothing."""
+
+
+class _Stop:
+    """What STOP does."""
+
+    def __init__(self, folder: Path, key: str, rig: str) -> None:
+        self._folder, self._rig = folder, rig
+        self._interlock = Interlock(key)
+        self._safe: subprocess.Popen[bytes] | None = None
+        self._mutex = threading.Lock()
+
+    def __call__(self) -> dict[str, object]:
+        begun_s = time.perf_counter()
+        self._interlock.revoke(_REASON)
+        revoked_s = time.perf_counter() - begun_s
+        confirmed = self._tell_bench()
+        if self._rig:
+            self._rig_safe()
+        return {"revoked_ms": 1e3 * revoked_s, "commanded": confirmed,
+                "commanded_ms": 1e3 * (time.perf_counter() - begun_s)}  # fmt: skip
+
+    def _tell_bench(self) -> bool:
+        """Send the bench process to 0 V; whether it answered."""
+        own = self._folder / f"stop-{os.getpid()}-{threading.get_ident()}"
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as box:
+            try:
+                box.bind(str(own))
+                box.settimeout(_ANSWER_S)
+                box.sendto(_REASON.encode(), str(self._folder / "stop.sock"))
+                return bool(box.recv(64))
+            finally:
+                own.unlink(missing_ok=True)
+        return False
+
+    def _rig_safe(self) -> None:
+        """Start `haselab rig safe`, unless it is running."""
+        with self._mutex:
+            if self._safe is None or self._safe.poll() is not None:
+                command = [sys.executable, "-m", "haselab.cli", "rig", "safe", self._rig]
+                self._safe = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+
+
+def main(words: list[str]) -> None:
+    """Serve STOP until stdin ends.
+
+    Args:
+        words: port, folder, key of the interlock, origins of the page separated by commas, and
+            optionally the rig file of a real bench.
+    """
+    port, folder, key, origins = int(words[0]), Path(words[1]), words[2], words[3].split(",")
+    stop = _Stop(folder, key, words[4] if len(words) > 4 else "")
+    server = StopServer(port, stop, tuple(origins))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    print(f"ready {server.port}", flush=True)
+    sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

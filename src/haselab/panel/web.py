@@ -1,0 +1,345 @@
+"""The web server of the panel: its page, live signals and commands over one WebSocket a page.
+
+It reads the shared memory of the bench process and never makes it wait. A page gets the next frame
+only after it has acknowledged the last one, so a slow or frozen page gets fewer frames and no old
+ones. Only pages of this server may connect: Host and Origin are checked, and the first message must
+be the token that the panel printed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import json
+import math
+import secrets
+import struct
+from collections.abc import Coroutine
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from haselab.panel.columns import SIGNALS, Columns, LiveReader
+
+__all__ = ["SCHEMA", "WebSettings", "application"]
+
+SCHEMA = 1  # of a binary frame
+_STATIC = Path(__file__).parent / "static"
+_FRAME_S = 1.0 / 30.0
+_TOKEN_S = 3.0  # for the first message of a page
+_MOST_PAGES = 32
+_MOST_BYTES = 4096  # of a message of a page
+_MOST_COLUMNS = 4000
+_BENCH_S = 10.0  # longest wait for an answer of the bench process
+_HEAD = struct.Struct("<HHIddddII")
+
+
+@dataclass
+class WebSettings:
+    """What the web server needs.
+
+    Args:
+        folder: of the panel, with `live` and `bench.sock`.
+        token: that a page must send first.
+        hosts: values of Host that are accepted, such as `127.0.0.1:8000`.
+        stop_port: of the stop process, for the page.
+    """
+
+    folder: Path
+    token: str
+    hosts: tuple[str, ...]
+    stop_port: int
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        """Values of Origin that are accepted."""
+        return tuple(f"http://{host}" for host in self.hosts)
+
+
+class _SamePage:
+    """Refuses requests with a foreign Host or Origin, and adds headers against embedding."""
+
+    def __init__(self, app: ASGIApp, settings: WebSettings) -> None:
+        self._app, self._settings = app, settings
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
+        origin = headers.get("origin")
+        mine = headers.get("host") in self._settings.hosts
+        mine = mine and (origin is None or origin in self._settings.origins)
+        if scope["type"] == "websocket":
+            if not (mine and origin):
+                await send({"type": "websocket.close", "code": 1008})
+                return
+        elif not mine:
+            await Response("Only the panel's own page may use this server.", 403)(
+                scope, receive, send
+            )
+            return
+
+        async def with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                source = f"http://127.0.0.1:{self._settings.stop_port}"
+                policy = (
+                    f"default-src 'self'; connect-src 'self' {source} "
+                    f"{source.replace('127.0.0.1', 'localhost')}; img-src 'self' blob: data:; "
+                    "style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
+                )
+                message["headers"] += [
+                    (b"content-security-policy", policy.encode()),
+                    (b"x-content-type-options", b"nosniff"),
+                    (b"referrer-policy", b"no-referrer"),
+                    (b"cache-control", b"no-store"),
+                ]
+            await send(message)
+
+        await self._app(scope, receive, with_headers)
+
+
+class _Bench:
+    """Connection to the bench process; it is opened again when it was lost."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._writer: asyncio.StreamWriter | None = None
+        self._waiting: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._number = 0
+        self.state: dict[str, Any] | None = None
+        self.state_s = -math.inf  # when it arrived
+        self.reader: LiveReader | None = None
+
+    async def run(self) -> None:
+        """Stay connected."""
+        while True:
+            with contextlib.suppress(OSError, ValueError):
+                await self._connected()
+            self._lost()
+            await asyncio.sleep(0.1)
+
+    async def _connected(self) -> None:
+        path = str(self._folder / "bench.sock")
+        reader, self._writer = await asyncio.open_unix_connection(path, limit=1 << 20)
+        self.reader = LiveReader(self._folder / "live")
+        while line := await reader.readline():
+            message = json.loads(line)
+            if "state" in message:
+                self.state, self.state_s = message["state"], asyncio.get_running_loop().time()
+            answer = self._waiting.pop(message.get("id", -1), None)
+            if answer is not None and not answer.done():
+                answer.set_result(message)
+
+    def _lost(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        if self.reader is not None:
+            self.reader.close()
+        self._writer, self.reader = None, None
+        for answer in self._waiting.values():
+            if not answer.done():
+                answer.set_result({"error": "The bench process has ended. Start the panel again."})
+        self._waiting.clear()
+
+    async def ask(self, what: str, holder: str, values: dict[str, Any]) -> dict[str, Any]:
+        """Send a command and wait for its answer."""
+        if self._writer is None:
+            return {"error": "The bench process does not run. Start the panel again."}
+        self._number += 1
+        answer = asyncio.get_running_loop().create_future()
+        self._waiting[self._number] = answer
+        command = {"id": self._number, "do": what, "holder": holder, "values": values}
+        self._writer.write(json.dumps(command).encode() + b"\n")
+        try:
+            return await asyncio.wait_for(answer, _BENCH_S)
+        except TimeoutError:
+            return {"error": f"The bench process has not answered within {_BENCH_S:g} s."}
+
+
+@dataclass
+class _Page:
+    """One connected page."""
+
+    socket: WebSocket
+    holder: str = field(default_factory=lambda: secrets.token_hex(8))
+    span_s: float = 10.0
+    end_s: float | None = None  # None: the present
+    columns: int = 600
+    sent: int = 0
+    acknowledged: int = 0
+
+
+class _Server:
+    """Serves all pages of one bench."""
+
+    def __init__(self, settings: WebSettings) -> None:
+        self._settings = settings
+        self._bench = _Bench(settings.folder)
+        self._pages: set[int] = set()
+        self._tasks: set[asyncio.Task[None]] = set()  # so that none is collected while it runs
+
+    @contextlib.asynccontextmanager
+    async def lifespan(self, app: Starlette) -> Any:
+        task = asyncio.create_task(self._bench.run())
+        try:
+            yield
+        finally:
+            task.cancel()
+
+    async def page(self, request: Request) -> Response:
+        return FileResponse(_STATIC / "index.html")
+
+    async def about(self, request: Request) -> Response:
+        return JSONResponse(
+            {"stop_port": self._settings.stop_port, "signals": SIGNALS, "schema": SCHEMA}
+        )
+
+    async def live(self, socket: WebSocket) -> None:
+        if len(self._pages) >= _MOST_PAGES:
+            await socket.close(1013, "too many pages")
+            return
+        await socket.accept()
+        page = _Page(socket)
+        self._pages.add(id(page))
+        tasks: list[asyncio.Task[None]] = []
+        try:
+            if not await self._known(socket):
+                await socket.close(1008, "wrong token")
+                return
+            await socket.send_text(json.dumps({"holder": page.holder}))
+            tasks = [asyncio.create_task(self._frames(page))]
+            await self._messages(page)
+        except (WebSocketDisconnect, RuntimeError, OSError):
+            pass
+        finally:
+            self._pages.discard(id(page))
+            for task in tasks:
+                task.cancel()
+
+    async def _known(self, socket: WebSocket) -> bool:
+        try:
+            text = await asyncio.wait_for(socket.receive_text(), _TOKEN_S)
+            token = json.loads(text)["token"]
+        except (TimeoutError, ValueError, KeyError, TypeError):
+            return False
+        return isinstance(token, str) and hmac.compare_digest(
+            token.encode(), self._settings.token.encode()
+        )
+
+    async def _messages(self, page: _Page) -> None:
+        """Receive what a page sends: acknowledged frames, its view, commands."""
+        while True:
+            text = await page.socket.receive_text()
+            try:
+                message = json.loads(text) if len(text) <= _MOST_BYTES else None
+                assert isinstance(message, dict)
+                if "ack" in message:
+                    page.acknowledged = int(message["ack"])
+                elif "view" in message:
+                    self._set_view(page, message["view"])
+                elif "do" in message:
+                    self._start(self._command(page, message))
+                else:
+                    raise ValueError
+            except (ValueError, AssertionError, KeyError, TypeError, OverflowError):
+                await page.socket.close(1003, "not a message of the panel")
+                return
+
+    @staticmethod
+    def _set_view(page: _Page, view: dict[str, Any]) -> None:
+        span_s, end_s = float(view["span_s"]), view.get("end_s")
+        if not (1e-5 <= span_s <= 1e5 and math.isfinite(float(end_s or 0.0))):
+            raise ValueError
+        page.span_s, page.end_s = span_s, None if end_s is None else float(end_s)
+        page.columns = min(max(int(view["columns"]), 16), _MOST_COLUMNS)
+
+    async def _command(self, page: _Page, message: dict[str, Any]) -> None:
+        values = message.get("values")
+        answer = await self._bench.ask(
+            str(message["do"]), page.holder, values if isinstance(values, dict) else {}
+        )
+        answer["id"] = message.get("id")
+        with contextlib.suppress(RuntimeError, OSError, WebSocketDisconnect):
+            await page.socket.send_text(json.dumps(answer))
+
+    async def _frames(self, page: _Page) -> None:
+        """Send frames to one page, each after the last one was acknowledged."""
+        lease_s, loop = 0.0, asyncio.get_running_loop()
+        last: tuple[object, ...] = ()
+        with contextlib.suppress(RuntimeError, OSError, WebSocketDisconnect):
+            while True:
+                await asyncio.sleep(_FRAME_S)
+                if page.sent - page.acknowledged > 1:
+                    continue
+                state = self._bench.state or {}
+                if state.get("holder") == page.holder and loop.time() > lease_s:
+                    lease_s = loop.time() + 0.4
+                    self._start(self._renew(page))
+                blocks = self._bench.reader.blocks if self._bench.reader else -1
+                now = (blocks, page.span_s, page.end_s, page.columns, json.dumps(state))
+                if now == last:
+                    continue
+                last = now
+                page.sent += 1
+                await page.socket.send_bytes(self._frame(page, state))
+
+    def _start(self, job: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(job)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _renew(self, page: _Page) -> None:
+        await self._bench.ask("lease", page.holder, {})
+
+    def _frame(self, page: _Page, state: dict[str, Any]) -> bytes:
+        """A binary frame: numbers, the state as JSON, then columns as 32-bit floats."""
+        reader = self._bench.reader
+        end_s = reader.end_s if reader is not None else math.nan
+        shown_s = end_s if page.end_s is None else page.end_s
+        empty = Columns(0.0, 1.0, np.empty((0, 2)), np.empty((0, 2)))
+        monitors, signals = empty, Columns(0.0, 1.0, np.empty((0, 5)), np.empty((0, 5)))
+        if reader is not None and not math.isnan(shown_s):
+            monitors = reader.monitors(shown_s - page.span_s, shown_s, page.columns)
+            signals = reader.signals(shown_s - page.span_s, shown_s, page.columns)
+        text = json.dumps({"state": state, "end_s": None if math.isnan(end_s) else end_s}).encode()
+        text += b" " * (-len(text) % 8)
+        head = _HEAD.pack(
+            SCHEMA, 0, page.sent, monitors.start_s, monitors.step_s, signals.start_s,
+            signals.step_s, len(text), len(monitors.low),
+        )  # fmt: skip
+        arrays = [
+            np.ascontiguousarray(part.T, dtype="<f4").tobytes()
+            for part in (monitors.low, monitors.high, signals.low, signals.high)
+        ]
+        return b"".join((head, text, *arrays))
+
+
+def application(settings: WebSettings) -> Starlette:
+    """Make the web application.
+
+    Args:
+        settings: of the panel.
+    Returns:
+        For uvicorn.
+    """
+    server = _Server(settings)
+    routes = [
+        Route("/", server.page),
+        Route("/about", server.about),
+        WebSocketRoute("/live", server.live),
+        Mount("/static", StaticFiles(directory=_STATIC)),
+    ]
+    guard = Middleware(_SamePage, settings=settings)
+    return Starlette(routes=routes, middleware=[guard], lifespan=server.lifespan)

@@ -1,0 +1,174 @@
+"""The panel's page in Chromium: STOP, stale data, keyboard, zoom, size and accessibility."""
+
+import gzip
+import os
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from tests.panel.running import WAIT_S, RunningPanel
+
+STATIC = Path(__file__).parents[2] / "src" / "haselab" / "panel" / "static"
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
+WAIT_MS = 1e3 * WAIT_S
+
+
+@pytest.fixture(scope="module")
+def browser(installed: Callable[[str, str], str]) -> Iterator[Browser]:
+    path = installed("chromium", "chromium")
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        try:
+            yield found
+        finally:
+            found.close()
+
+
+@pytest.fixture
+def page(browser: Browser, panel: RunningPanel) -> Iterator[Page]:
+    """The page of a fresh panel, once it shows live data; it has asked nobody else for anything."""
+    with browser.new_context(viewport={"width": 1400, "height": 1000}) as context:
+        found, problems = context.new_page(), []
+        found.set_default_timeout(WAIT_MS)
+        found.on("pageerror", lambda error: problems.append(str(error)))
+        found.on("request", lambda sent: asked.append(sent.url))
+        asked: list[str] = []
+        found.goto(panel.address)
+        expect(found.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
+        expect(found.locator("#emergency-state")).to_have_text("STOP: ready", timeout=WAIT_MS)
+        yield found
+        assert not problems
+        assert all(re.match(r"(http|ws)://127\.0\.0\.1:|data:|blob:", url) for url in asked)
+
+
+def arm(page: Page, limit_v: str = "1.5") -> None:
+    page.get_by_role("button", name="Arm the bench").click()
+    page.get_by_label("Highest drive of this run").fill(limit_v)
+    page.get_by_role("button", name="Arm", exact=True).click()
+    expect(page.get_by_text("Armed by this page")).to_be_visible(timeout=WAIT_MS)
+
+
+def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
+    arm(page)
+    page.get_by_label("Drive, typed").fill("1")
+    page.keyboard.press("Tab")
+    expect(page.locator("header")).to_contain_text(
+        re.compile(r"running, 1\.000 V"), timeout=WAIT_MS
+    )
+    box = page.locator("#emergency").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 20, box["y"] + 20)
+    page.mouse.down()  # and not up
+    expect(page.locator("#emergency-state")).to_have_text("STOP: 0 V commanded", timeout=WAIT_MS)
+    expect(page.locator("header")).to_contain_text("Bench: tripped", timeout=WAIT_MS)
+    page.mouse.up()
+    # Recovery is a procedure on the page.
+    page.get_by_role("button", name="Arm the bench").click()
+    page.get_by_label("Highest drive of this run").fill("1")
+    expect(page.get_by_role("button", name="Arm", exact=True)).to_be_disabled()
+    page.get_by_label("The cause has been removed.").check()
+    page.get_by_role("button", name="Arm", exact=True).click()
+    expect(page.get_by_text("Armed by this page")).to_be_visible(timeout=WAIT_MS)
+
+
+def test_every_task_is_possible_by_keyboard(page: Page) -> None:
+    def tab_to(name: str) -> None:
+        for _ in range(60):
+            page.keyboard.press("Tab")
+            label = page.evaluate(
+                "(document.activeElement.labels?.[0] ?? document.activeElement).textContent"
+            )
+            if label.strip().startswith(name):
+                return
+        pytest.fail(f"no way to {name!r} by Tab")
+
+    tab_to("Arm the bench")
+    page.keyboard.press("Enter")
+    expect(page.get_by_label("Highest drive of this run")).to_be_visible(timeout=WAIT_MS)
+    tab_to("Highest drive")
+    page.keyboard.type("1.5")
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("Armed by this page")).to_be_visible(timeout=WAIT_MS)
+    tab_to("Drive, in V")
+    page.keyboard.press("End")
+    expect(page.locator("header")).to_contain_text(
+        re.compile(r"running, 1\.500 V"), timeout=WAIT_MS
+    )
+    page.keyboard.press("Escape")
+    expect(page.locator("header")).to_contain_text("Bench: tripped", timeout=WAIT_MS)
+
+
+def test_frozen_data_look_frozen_and_come_back(page: Page, panel: RunningPanel) -> None:
+    before = page.evaluate("document.querySelector('.values').textContent")
+    assert before
+    os.kill(panel.process.pid, signal.SIGSTOP)
+    try:
+        expect(page.locator("#age")).to_have_text(re.compile("NO NEW DATA"), timeout=WAIT_MS)
+        assert page.evaluate("document.body.classList.contains('stale')")
+    finally:
+        os.kill(panel.process.pid, signal.SIGCONT)
+    expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
+    assert not page.evaluate("document.body.classList.contains('stale')")
+
+
+def test_a_frozen_bench_looks_frozen_too(page: Page, panel: RunningPanel) -> None:
+    bench = panel.child("bench_process")
+    os.kill(bench, signal.SIGSTOP)
+    try:
+        expect(page.locator("#age")).to_have_text(re.compile("NO NEW DATA"), timeout=WAIT_MS)
+    finally:
+        os.kill(bench, signal.SIGCONT)
+    expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
+
+
+def test_a_drag_zooms_into_the_recorded_samples(page: Page) -> None:
+    time.sleep(2.0)  # of data
+    plot = page.locator(".u-over").first
+    box = plot.bounding_box()
+    assert box is not None
+    middle = box["y"] + 0.5 * box["height"]
+    page.mouse.move(box["x"] + 0.90 * box["width"], middle)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.95 * box["width"], middle, steps=5)
+    page.mouse.up()
+    shown = page.get_by_text("s shown.")
+    expect(shown).to_have_text(re.compile(r"^0\.[45]\d* s shown"), timeout=WAIT_MS)
+    expect(page.locator("#age")).to_have_text("PAUSED view", timeout=WAIT_MS)
+    page.get_by_role("button", name="Resume").click()
+    expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing(browser: Browser, shared_panel: RunningPanel, scheme: str) -> None:
+    with browser.new_context(color_scheme=scheme) as context:  # type: ignore[arg-type]
+        page = context.new_page()
+        page.set_default_timeout(WAIT_MS)
+        page.goto(shared_panel.address)
+        expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
+        page.get_by_role("button", name="Arm the bench").click()
+        expect(page.get_by_label("Highest drive of this run")).to_be_visible(timeout=WAIT_MS)
+        found = Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
+        page.get_by_role("button", name="Cancel").click()
+
+
+def test_a_page_without_the_token_says_what_to_do(
+    browser: Browser, shared_panel: RunningPanel
+) -> None:
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"http://{shared_panel.host}/")
+        said = page.get_by_role("alert")
+        expect(said).to_contain_text("Open the address that haselab panel printed", timeout=WAIT_MS)
+
+
+def test_the_page_is_small() -> None:
+    files = [path for path in STATIC.rglob("*") if path.suffix in (".html", ".js", ".css")]
+    assert len(files) > 5
+    assert sum(len(gzip.compress(path.read_bytes())) for path in files) < 150_000

@@ -58,7 +58,7 @@
 #define HP_ALARM_LOST_SAMPLE 2u /* a conversion was lost or late */
 #define HP_ALARM_LATE 4u /* updates are not completed */
 
-/* Why there is no strain; bits of core/include/hs.h and two of the firmware. */
+/* Why there is no strain: bits 1, 2 and 4 as in core/include/hs.h, others of the firmware. */
 #define HP_REASON_AMPLITUDE_LOST 1u /* no carrier on one of the monitors */
 #define HP_REASON_PHASE_OUT 2u /* the phase is not that of a capacitor */
 #define HP_REASON_CLIPPED 4u /* a sample at the end of the converter's range */

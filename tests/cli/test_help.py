@@ -115,3 +115,13 @@ def test_an_option_means_the_same_in_every_command() -> None:
         name, meaning = _name(option), _meaning(option)
         first, same = known.setdefault(name, (path, meaning))
         assert meaning == same, f"{name}: '{same}' in {first}, '{meaning}' in {path}"
+
+
+@pytest.mark.parametrize(
+    ("path", "option"),
+    [each for each in OPTIONS if isinstance(each[1].type, click.types.FloatParamType)],
+    ids=lambda each: str(getattr(each, "name", each)),
+)
+def test_every_number_refuses_nan(path: str, option: click.Option) -> None:
+    with pytest.raises(click.BadParameter, match="nan"):
+        option.type.convert("nan", option, None)

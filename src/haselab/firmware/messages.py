@@ -68,7 +68,7 @@ class Alarm(IntFlag):
 
 
 class Reason(IntFlag):
-    """Why there is no strain; bits of core/include/hs.h and two of the firmware."""
+    """Why there is no strain: bits 1, 2 and 4 as in core/include/hs.h, others of the firmware."""
 
     AMPLITUDE_LOST = 1  # no carrier on one of the monitors
     PHASE_OUT = 2  # the phase is not that of a capacitor
@@ -103,8 +103,8 @@ class Result(IntEnum):
 
 @dataclass(frozen=True)
 class Hello:
-    """Connects with a version of this table; the reply is identity. Only while the output is off:
-    it restarts the sequence numbers.
+    """Connects with a version of this table, and restarts the sequence numbers; the reply is
+    identity. Accepted only while the output is off.
 
     Args:
         version: of this table.
@@ -168,7 +168,8 @@ class SetReference:
 
 @dataclass(frozen=True)
 class KeepAlive:
-    """Keeps the link alive; without it the output is ramped down."""
+    """Keeps the link alive, as set_reference does. After 150 ms without either, the output is
+    ramped down."""
 
     CODE: ClassVar[int] = 6
     LAYOUT: ClassVar[str] = "<"

@@ -251,14 +251,14 @@ def _first_block(rig: Rig) -> bytes:
 @shared_option(
     "--capacitor", type=Real(1e-12, 1e-6), metavar="FARAD",
     detail="It must withstand high voltage. Also checks the scale of the current monitor; on a "
-    "microcontroller, measures the capacitor instead of closing the loop. With --live. Default: "
+    "microcontroller, measures the capacitor instead of closing the loop. Needs --live. Default: "
     "none.",
 )  # fmt: skip
 @click.option(
     "--loop-back",
     is_flag=True,
     help="Check only 50 starts of the output, with the board's output wired to the voltage "
-    "monitor's input and the amplifier disconnected. With --live.",
+    "monitor's input and the amplifier disconnected. Needs --live.",
 )
 @click.option(
     "--frames",

@@ -390,10 +390,10 @@ class _Out:
 @_option("--current-limit-a", "A block whose current reaches it is not valid. Default: no limit.")
 @shared_option("--v", "v_column", default="v_monitor_v", show_default=True)
 @shared_option("--i", "i_column", default="i_monitor_v", show_default=True)
-@shared_option("--experiment", detail="Needed if FILE is a session. Default: its only one.")
+@shared_option("--experiment", detail="Needed if the session has several. Default: its only one.")
 @column_options
-@_scale("--reactance-scale", 2.5e6, "Set the scale of eq. 2, for relative_capacitance only.")
-@_scale("--capacitance-scale", 10.0, "Set the scale of eq. 3, for relative_capacitance only.")
+@_scale("--reactance-scale", 2.5e6, "Set the scale in eq. 2 of the paper (relative_capacitance).")
+@_scale("--capacitance-scale", 10.0, "Set the scale in eq. 3 of the paper (relative_capacitance).")
 @actuator_option("The command reads carrier and calibration from [sensing].")
 @answer_options(None, "It is a CSV file with one row per block. Default: none.", plot=True)
 @unverified_option

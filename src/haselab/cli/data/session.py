@@ -178,7 +178,7 @@ def _import(
     """Import columns of voltage, current and perhaps strain as a session.
 
     FILE is CSV, MAT, NPZ, HDF5 or TDMS. The session can be sensed, exported and read like a
-    recorded one. With a strain, displacement or length, it has the tracks of a camera.
+    recorded one. A strain, displacement or length is stored like the tracks of a camera.
     """
     if out is None:
         raise InputError("Missing option '--out': the new folder of the session.")

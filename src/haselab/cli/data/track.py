@@ -318,7 +318,7 @@ def _request(options: dict[str, Any]) -> _Request:
     help="Read the times of the frames from a CSV file (frame, time_s), or from a session.h5 with "
     "--experiment. Default: from the frame rate.",
 )  # fmt: skip
-@shared_option("--experiment", detail="Needed if --times is a session. Default: its only one.")
+@shared_option("--experiment", detail="Needed if the session has several. Default: its only one.")
 @click.option(
     "--subset-px", type=INTEGER,
     help="Set the side of a subset in px, odd. Default: 15 with --points, from the size of the "

@@ -45,8 +45,9 @@ __all__ = ["creep", "hysteresis"]
     "--operators", type=INTEGER, help="Set the number of play operators. Default: chosen by BIC."
 )
 @click.option(
-    "--from-s", default=0.0, show_default=True, help="Ignore samples before this time, in s."
-)
+    "--from-s", type=REAL, default=0.0, show_default=True,
+    help="Ignore samples before this time, in s.",
+)  # fmt: skip
 @column_options
 @answer_options(plot=True)
 def hysteresis(
@@ -120,7 +121,7 @@ class _Forecast:
     "its first value.",
 )  # fmt: skip
 @click.option(
-    "--leave-out-s", default=0.0, show_default=True,
+    "--leave-out-s", type=REAL, default=0.0, show_default=True,
     help="Leave out this time after each change of the input, in s.",
 )  # fmt: skip
 @click.option(

@@ -82,7 +82,7 @@ _OF_SIGNAL = (
 )  # fmt: skip
 @click.option(
     "--samples-per-s", type=REAL, default=2.0, show_default=True,
-    help="Set the number of independent samples per second.",
+    help="Set the number of output samples per second whose noise is independent.",
 )  # fmt: skip
 @click.option(
     "--systematic", type=REAL, default=0.05, show_default=True,

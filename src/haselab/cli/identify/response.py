@@ -142,7 +142,7 @@ def free_response(
 ) -> None:
     """Fit a decaying oscillation to a free response.
 
-    The model is that of eqs. 6 and 7. The answer includes the decay rate, the damped and the
+    The model is eqs. 6 and 7 of the paper. The answer includes the decay rate, the damped and the
     natural frequency and both envelopes. Several FILES are repeated trials.
     """
     trials = []

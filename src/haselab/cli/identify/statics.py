@@ -88,8 +88,8 @@ def _between(
 )  # fmt: skip
 @click.option(
     "--prestretch", type=REAL,
-    help="State the equibiaxial stretch before the test, from which the stretch counts. Default: "
-    "none.",
+    help="State the equibiaxial stretch before the test. The column of the stretch is 1 in this "
+    "state. Default: none.",
 )  # fmt: skip
 @click.option(
     "--electrode-natural", type=REAL,
@@ -252,8 +252,8 @@ def voltage_map(
 ) -> None:
     """Fit the voltage as a function of strain.
 
-    The map is eq. 4, a sum of two exponentials. FILE has the columns of strain and voltage, in
-    order of time.
+    The map is a sum of two exponentials (eq. 4 of the paper). FILE has the columns of strain and
+    voltage, in order of time.
     """
     known = None if actuator is None else load_actuator(actuator, to_write=True)
     strain, voltage_v = read_quantities(
@@ -274,9 +274,7 @@ def voltage_map(
     "--strain-file", type=click.Path(path_type=Path),
     help="Read the strain from this file or session, recorded with the same clock. Default: FILE.",
 )  # fmt: skip
-@shared_option(
-    "--experiment", detail="Needed if --strain-file is a session. Default: its only one."
-)
+@shared_option("--experiment", detail="Needed if the session has several. Default: its only one.")
 @column_options
 @actuator_option("The command writes [sensing.strain_map]: the map from F, with its band.")
 @answer_options(plot=True)
@@ -295,9 +293,9 @@ def capacitance_map(
 ) -> None:
     """Fit the strain as a function of capacitance.
 
-    The map is eq. 5, a straight line. FILE has the columns of capacitance and strain. The slope
-    is per F for a capacitance in F, and per unit of relative capacitance otherwise. For
-    --actuator, a polynomial of degree 1 to 3 is fitted too.
+    The map is a straight line (eq. 5 of the paper). FILE has the columns of capacitance and
+    strain. The slope is per F for a capacitance in F, and per unit of relative capacitance
+    otherwise. With --actuator, a polynomial of degree 1 to 3 is fitted too.
     """
     known = None if actuator is None else load_actuator(actuator, to_write=True)
     files = [file] if strain_file is None else [file, strain_file]

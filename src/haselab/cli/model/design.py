@@ -12,7 +12,7 @@ import numpy as np
 
 from haselab.base import Estimate, InputError, ResultError, table_at
 from haselab.cli.actuator_file import load_actuator, save_section
-from haselab.cli.common import REAL, SEED, answer_options, emit
+from haselab.cli.common import REAL, SEED, Real, answer_options, emit
 from haselab.cli.model.charts import design_chart, loop_chart
 from haselab.cli.model.feedback import feedback_of, read_controller
 from haselab.cli.model.margins import margins_answer
@@ -69,9 +69,9 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @shared_option(
     "--controller", "--structure", "structure", default=USUAL_STRUCTURE, show_default=True,
-    detail="pi: as in the paper; pid: with the derivative of the filtered measurement. Another "
-    "registered kind computes its parameters from [model.physical], or has only its margins "
-    "computed, with the parameters of the file.",
+    detail="pi: as in the paper; pid: with the derivative of the filtered measurement. The "
+    "parameters of other kinds are computed from [model.physical]; for a kind that cannot compute "
+    "them, the command only computes the margins, with the parameters in the file.",
 )  # fmt: skip
 @loop_options
 @click.option(
@@ -81,7 +81,7 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @shared_option("--seed", type=SEED, default=0, show_default=True)
 @click.option(
-    "--probability", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    "--probability", type=Real(0.0, 1.0, min_open=True, max_open=True),
     help="Require that this share of the plausible plants keeps phase and gain margin, for example "
     "0.97. Needs a model with its covariance. Default: only report the share.",
 )  # fmt: skip

@@ -226,10 +226,10 @@ def simulate(
     RUN is an actuator file or the folder of a run. Three loops control the same twin: the
     microcontroller in co-simulation, and two loops on the desktop at 100 Hz and 1 kHz. The one at
     1 kHz has the delay and the limits of the microcontroller. All three are first calibrated with a
-    reference capacitor. The report of a run then shows them. For a PI or PID, the simulated step of
-    the microcontroller is compared with the step that [model] predicts. If they differ by more than
-    `frequency_spread` and the band of the strain map cover, the command names the cause and exits
-    with code 3.
+    reference capacitor. If RUN is a folder, its report then shows the three loops. For a PI or PID,
+    the simulated step of the microcontroller is compared with the step that [model] predicts. If
+    the difference is larger than `frequency_spread` and the band of the strain map explain, the
+    command names the cause and exits with code 3.
     """
     config = _twin(run, options["reading"], options["twin"], options["draw"])
     refuse_linked_folders(run, "firmware", "figures")

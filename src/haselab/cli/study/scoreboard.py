@@ -76,8 +76,9 @@ def command(
 ) -> None:
     """Play controllers against tasks on simulated devices.
 
-    Each controller is designed from the model that is identified from a simulated record, plays
-    each task, and is scored by the true length of the actuator, beside what is physically possible.
+    Each controller is designed from a model that is identified from a simulated record. It plays
+    each task. The scores are computed from the true length of the actuator, and compared with what
+    is physically possible.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the results.")

@@ -201,7 +201,7 @@ def answer_of_reference(
 
 
 def design_learning(setting: ControllerSetting) -> Mapping[str, float]:
-    """Take the design of `observer`, make it quieter, and learn the harmonics that surely shrink.
+    """Take the design of `observer`, make it quieter, and learn the harmonics whose error shrinks.
 
     The expected load is an eighth of that of `observer`: what repeats is learned, and noise moves
     the actuator less. A harmonic is learned if its error shrinks in each period (|1 - T| < 1), and
@@ -214,7 +214,7 @@ def design_learning(setting: ControllerSetting) -> Mapping[str, float]:
     Returns:
         The parameters of `LearningController`.
     Raises:
-        ResultError: The inner loop is not stable, or no harmonic surely shrinks.
+        ResultError: The inner loop is not stable, or the error of no harmonic shrinks in all cases.
     """
     inner = dict(design_observer(setting))
     inner["load_n"] = float(f"{inner['load_n'] / _QUIETER:.4g}")
@@ -231,7 +231,10 @@ def design_learning(setting: ControllerSetting) -> Mapping[str, float]:
             worst = np.maximum(worst, np.abs(1.0 - answer))
     last = int(np.argmax(worst >= _SHRINKS)) if (worst >= _SHRINKS).any() else worst.size
     if not last:
-        raise ResultError("No harmonic of the reference surely shrinks. Shorten the delay.")
+        raise ResultError(
+            "Learning would not reduce the error of any harmonic of the reference for all "
+            "actuators that the design considers. Shorten the delay of the loop."
+        )
     return {**inner, "cutoff_hz": float(f"{hertz[last - 1]:.4g}")}
 
 

@@ -286,14 +286,18 @@ class ModelControl(Section):
         gt=0, le=1000, description="mass that is hung in place of the rig's own, to be weighed",
         examples=[0.2],
     )  # fmt: skip
-    hold_s: float = Field(
-        gt=1, le=3600, description="time at each strain of the staircase", examples=[3.0]
+    outer_mass_kg: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="mass that stretches the actuator beyond its linear region at 0 V; if left "
+        "out, no trial is made there",
     )
-    linear_low: float = Field(
-        description="strain at the lower end of the linear region", examples=[-0.02]
+    hold_s: float = Field(
+        gt=1, le=3600, description="time at each strain beyond the linear region", examples=[2.0]
     )
     linear_high: float = Field(
-        description="strain at the upper end of the linear region", examples=[0.06]
+        description="strain at the upper end of the linear region", examples=[0.18]
     )
     highest_field_v_per_m: float = Field(
         gt=0, description="highest field that the controllers may use", examples=[34e6]
@@ -307,9 +311,6 @@ class ModelControl(Section):
     def _is_complete(self) -> Self:
         if self.step == 0.0:
             raise ValueError("step must not be 0")
-        low, high = self.linear_low, self.linear_high
-        if not low < high:
-            raise ValueError(f"linear_low = {low:g} must be below linear_high = {high:g}")
         return self
 
 

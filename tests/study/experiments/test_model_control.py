@@ -9,6 +9,7 @@ import pytest
 
 from haselab.actuators import GRAVITY_M_S2, equilibrium_m
 from haselab.base import Estimate, InputError, SilentProgress
+from haselab.controllers import known_actuator
 from haselab.controllers.adaptive.hybrid import HybridController
 from haselab.identify.physical.unknowns import fitted_parameters
 from haselab.models.actuator import ActuatorTables
@@ -18,7 +19,7 @@ from haselab.store.toml import validated
 from haselab.study.definition import Study, builtin_study, builtin_table
 from haselab.study.experiments.model_control import ModelControlTest
 from haselab.study.fits.maps import Maps
-from haselab.study.fits.model_control import range_results, set_points
+from haselab.study.fits.model_control import outer_results, set_points
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.static import Static
 from haselab.study.physical.session import FOLDER, NOT_HERE, analysed, model_study, with_model_rows
@@ -31,7 +32,7 @@ CONFIG = validated(TwinConfig, {"reading": "hz", "mullins": {"share": 0.0}}, "th
 LAW, MASS_KG, OTHER_KG, GAIN, CARRIER_V = CONFIG.law, 0.25, 0.2, 5000.0, 100.0
 ZERO_M = equilibrium_m(LAW, 5200.0, GRAVITY_M_S2 * MASS_KG)
 BUILTIN = builtin_table("model-control", ModelControl)
-LINEAR = {"linear_low": -0.02, "linear_high": 0.06}
+OUTER = {"linear_high": 0.18, "outer_mass_kg": 0.48}
 
 
 def tables() -> ActuatorTables:
@@ -58,7 +59,7 @@ def tables() -> ActuatorTables:
 
 def study(**changes: object) -> Study:
     table = {
-        **BUILTIN.model_dump(), **LINEAR, "trials": 1,
+        **BUILTIN.model_dump(), **OUTER, "trials": 1,
         "parameters": {"bandwidth_rad_s": 38.5, "load_n": 0.21}, **changes,
     }  # fmt: skip
     return Study.model_validate({"name": "model control", "model_control": table})
@@ -101,12 +102,12 @@ def test_the_hybrid_weighs_what_hangs_and_holds_the_strain_with_it(played, which
     assert f"{hung_kg:g} kg hung" in found.notes[f"S27.mass_error_{which}"]
 
 
-def test_the_staircase_leaves_the_linear_region_on_both_sides_without_an_error(played):
+def test_beyond_the_linear_region_it_steps_without_an_error(played):
     _, found, _ = played
     rows = {key: value.value for key, value in found.quantities.items()}
-    assert rows["S30.lowest"] < LINEAR["linear_low"] and rows["S30.highest"] > LINEAR["linear_high"]
-    assert abs(rows["S30.error_outside"]) < 5e-4 and abs(rows["S30.error_inside"]) < 5e-4
-    assert rows["S30.overshoot_outside"] < 0.05
+    assert OUTER["linear_high"] < rows["S30.lowest"] < rows["S30.highest"] - 0.01
+    assert abs(rows["S30.error"]) < 5e-4 and rows["S30.overshoot"] < 0.1
+    assert "0.48 kg hung" in found.notes["S30.error"]
 
 
 def test_the_masses_of_the_recording_are_those_that_the_controller_had(played):
@@ -137,42 +138,40 @@ def test_without_a_physical_model_it_says_so(tmp_path):
     assert "needs an actuator file with [model.physical]" in found.missing["S30.lowest"]
 
 
-def test_an_actuator_that_stays_in_its_linear_region_has_no_staircase():
-    wide = BUILTIN.model_copy(update={"linear_low": -0.05, "linear_high": 0.2})
-    assert set_points(wide, (-0.055, 0.205)) == (0.0,)
-    assert set_points(wide, (-0.07, 0.205)) == pytest.approx((0.0, -0.06))
-    assert set_points(BUILTIN, (-0.05, 0.15)) == pytest.approx((0.0, 0.085, 0.12))
+def test_strains_within_the_linear_region_are_not_those_of_row_s30():
+    assert set_points(BUILTIN, (0.2, 0.3)) == pytest.approx((0.23, 0.26, 0.23))
+    assert set_points(BUILTIN, (0.1, 0.3)) == ()
 
 
 def test_errors_at_rest_and_overshoot_are_those_of_the_camera():
-    """Strains 0, 0.2 with 5 % beyond it, 0: each half held, half at rest with a known error."""
-    points, frames = (0.0, 0.2, 0.0), 200
-    settings = BUILTIN.model_copy(update={"hold_s": 2.0})
-    strain = np.repeat([0.0005, 0.21, 0.1995, 0.0], [frames, 100, 100, frames])
+    """Strains 0.2, 0.3 with 10 % beyond it, 0.2: at the end of each a known error."""
+    strain = np.repeat([0.2005, 0.31, 0.2998, 0.2], [200, 100, 100, 200])
     time_s = 0.01 * np.arange(strain.size)
     none = np.empty(0)
     seen = Observation(
-        "staircase", {}, np.zeros(1), none, none, none, none, none, time_s, 0.05 * (1.0 + strain),
+        "steps", {}, np.zeros(1), none, none, none, none, none, time_s, 0.05 * (1.0 + strain),
         none, none, float("nan"), none,
     )  # fmt: skip
-    found, chart = range_results(seen, points, 0.05, settings, 5e-5)
-    assert found["S30.highest"].value == 0.2 and found["S30.lowest"].value == 0.0
-    assert found["S30.error_inside"].value == pytest.approx(-0.0005)
-    assert found["S30.error_outside"].value == pytest.approx(0.0005)
-    assert found["S30.overshoot_outside"].value == pytest.approx(0.05)
-    assert found["S30.error_outside"].std == pytest.approx(0.01 * 5e-5 / 0.05)  # the camera's bias
+    found, chart = outer_results(seen, (0.2, 0.3, 0.2), 0.05, BUILTIN, 5e-5)
+    assert found["S30.highest"].value == 0.3 and found["S30.lowest"].value == 0.2
+    assert found["S30.error"].value == pytest.approx(-0.0005)
+    assert found["S30.overshoot"].value == pytest.approx(0.1)
+    assert found["S30.error"].std == pytest.approx(0.01 * 5e-5 / 0.05)  # the camera's bias
     assert [curve.name for curve in chart.curves][:2] == ["desired", "hybrid"]
 
 
 def test_the_study_of_the_model_follows_from_the_findings():
-    region = {f"S17.region_{end}": Estimate.normal(value, 0.01, "")
-              for end, value in (("low", 1.2), ("high", 1.35))}  # fmt: skip
-    static = Static(0.04, None, 3, region, {}, {})  # type: ignore[arg-type]
-    maps = Maps(0.05, None, None, {}, {}, {})  # type: ignore[arg-type]
+    """The outer mass by the law alone: at 0 V it hangs 2 % strain beyond the linear region."""
+    known = known_actuator(tables())
+    static = Static(0.5 * ZERO_M, None, 3, {"S17.region_high": Estimate.normal(2.36, 0.01, "")},
+                    {}, {})  # type: ignore[arg-type]  # fmt: skip
+    maps = Maps(ZERO_M, None, None, {}, {}, {})  # type: ignore[arg-type]
     found = Findings({}, {}, {}, values={Static: static, Maps: maps})
-    table = model_study(builtin_study(), found, 0.2).table("model_control", ModelControl)
-    assert (table.linear_low, table.linear_high) == pytest.approx((-0.04, 0.08))
-    assert table.other_mass_kg == pytest.approx(0.16) and table.step == 0.04
+    table = model_study(builtin_study(), found, known).table("model_control", ModelControl)
+    assert table.linear_high == pytest.approx(0.18)
+    assert table.other_mass_kg == pytest.approx(0.2) and table.step == 0.04
+    length_m = equilibrium_m(LAW, 0.0, GRAVITY_M_S2 * table.outer_mass_kg)
+    assert length_m / ZERO_M - 1.0 == pytest.approx(0.20, abs=1e-3)
 
 
 def test_a_run_without_the_session_says_why_the_rows_are_missing(tmp_path):
@@ -184,7 +183,6 @@ def test_a_run_without_the_session_says_why_the_rows_are_missing(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"linear_low": 0.1}, "linear_low = 0.1 must be below linear_high = 0.06"),
         ({"step": 0.0}, "step must not be 0"),
     ],
 )

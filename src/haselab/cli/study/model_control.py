@@ -8,6 +8,7 @@ from haselab.base import HaselabError, Progress
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import arm
 from haselab.cli.study.physical_model import PhysicalModel
+from haselab.controllers import known_actuator
 from haselab.rig import Rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.safety.guarded import GuardedRig
@@ -52,18 +53,20 @@ def play_model_control(
     if model.fit.status != "ok":
         return f"needs the physical model, which was not found: {model.fit.status}"
     try:
-        plan = model_study(study, found, rig.description.mass_kg)
-        check_drives(plan, rig.description)
-        check_study(plan, rig.description, rating_of_twin(config, plan)).require()
         limits = rig.description.drive_limits
         ends = (limits.low, limits.high)
         write_actuator(folder, found, study, ends, rig.description.actuator_kind)
         model.save(folder, folder)
+        tables = load_actuator(folder / ACTUATOR)
+        known = known_actuator(tables, folder / ACTUATOR)
+        assert known is not None  # it was just saved
+        plan = model_study(study, found, known)
+        check_drives(plan, rig.description)
+        check_study(plan, rig.description, rating_of_twin(config, plan)).require()
         write_text(folder / FOLDER / "study.toml", toml_text(plan.model_dump(mode="json")))
         if isinstance(rig, GuardedRig):
             arm(rig.safety, None)
-        known = load_actuator(folder / ACTUATOR)
-        apart = replace(options, folder=folder / FOLDER, known=known)
+        apart = replace(options, folder=folder / FOLDER, known=tables)
         return run_study(plan, rig, apart, progress)
     except HaselabError as error:  # which leaves the study as it is
         return " ".join(str(error).split())

@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from haselab.base import InputError
 from haselab.control import Saturation
 from haselab.controllers import CONTROLLERS, ChosenController, KnownActuator
 from haselab.controllers.adaptive.hybrid import reach_of
@@ -24,7 +24,7 @@ from haselab.study.fits.maps import Maps
 from haselab.study.fits.model_control import (
     StepGroup,
     mass_errors,
-    range_results,
+    outer_results,
     set_points,
     step_results,
 )
@@ -36,15 +36,14 @@ from haselab.study.tables import ModelControl
 
 __all__ = ["ModelControlTest"]
 
-Floats = NDArray[np.float64]
 _REST, _REST_FRAMES = "rest", 15  # before anything moves, for the camera's reference
-_OBSERVER, _OWN, _OTHER, _RANGE = "observer", "hybrid-own", "hybrid-other", "staircase"
+_OBSERVER, _OWN, _OTHER, _OUTER = "observer", "hybrid-own", "hybrid-other", "hybrid-outside"
 _STEPS = {_OBSERVER: "observer", _OWN: "hybrid", _OTHER: "hybrid"}  # kind, by group of trials
-_NOT_BEYOND = "the actuator does not reach beyond its linear region within the permitted field."
+_NOT_BEYOND = "no mass holds the actuator beyond its linear region within the permitted field."
 
 
 class ModelControlTest(Experiment[ModelControl]):
-    """Steps with observer and with hybrid, which weighs two masses, and a staircase."""
+    """Steps with observer and hybrid, which weighs its mass, also beyond the linear region."""
 
     table = "model_control"
     title = "Control with the physical model"
@@ -55,7 +54,8 @@ class ModelControlTest(Experiment[ModelControl]):
         steps = {
             name: f"step with {kind}" for group, kind in _STEPS.items() for name in self._names(group)
         }
-        return {_REST: "at rest", **steps, _RANGE: "staircase with hybrid"}
+        outer = {_OUTER: "steps with hybrid"} if self.settings.outer_mass_kg else {}
+        return {_REST: "at rest", **steps, **outer}
 
     def _names(self, group: str) -> list[str]:
         return [f"{group}-{k + 1}" for k in range(self.settings.trials)]
@@ -67,33 +67,34 @@ class ModelControlTest(Experiment[ModelControl]):
 
     def masses_kg(self) -> tuple[float, ...]:
         """See `Experiment`."""
-        return (self.settings.other_mass_kg,)
+        outer_kg = self.settings.outer_mass_kg
+        return (self.settings.other_mass_kg, *([] if outer_kg is None else [outer_kg]))
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
-        settings, most_points = self.settings, 4
+        settings = self.settings
         steps_s = len(_STEPS) * settings.trials * (settings.zero_s + settings.step_s)
-        return steps_s + most_points * settings.hold_s
+        return steps_s + 3.0 * settings.hold_s
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""
         settings, analysis = self.settings, player.analysis
-        points = set_points(settings, self._reach(analysis))
-        staircase = np.concatenate([constant(s, settings.hold_s, UPDATE_HZ) for s in points])
         rest_s = _REST_FRAMES / settings.frame_rate_hz
         player.play(_REST, constant(0.0, rest_s, UPDATE_HZ), settings.frame_rate_hz)
         for group, kind in _STEPS.items():
             if group == _OTHER:
                 player.load(settings.other_mass_kg)
             for name in self._names(group):
-                self._close(player, name, kind, step_reference(settings))
+                player.settle(0.0, settings.rest_s)
+                loop = self._loop(analysis, kind)
+                player.close_loop(name, step_reference(settings), loop, settings.frame_rate_hz)
+        if (points := self._points(analysis)) and settings.outer_mass_kg:
+            player.load(settings.outer_mass_kg)
+            player.settle(0.0, settings.rest_s)
+            wanted = np.concatenate([constant(s, settings.hold_s, UPDATE_HZ) for s in points])
+            loop = self._loop(analysis, "hybrid")
+            player.close_loop(_OUTER, wanted, loop, settings.frame_rate_hz)
         player.load(player.mass_kg)
-        self._close(player, _RANGE, "hybrid", staircase)
-
-    def _close(self, player: Player, name: str, kind: str, reference: Floats) -> None:
-        player.settle(0.0, self.settings.rest_s)
-        loop = self._loop(player.analysis, kind)
-        player.close_loop(name, reference, loop, self.settings.frame_rate_hz)
 
     def fit(self, analysis: Analysis) -> ExperimentResult:
         """See `Experiment`."""
@@ -115,15 +116,15 @@ class ModelControlTest(Experiment[ModelControl]):
             loop, rig, self.study.sensing.carrier_hz, settings.zero_s,
         )  # fmt: skip
         for name, mass_kg in (("own", own_kg), ("other", other_kg)):
-            notes[f"S27.mass_error_{name}"] = f"{mass_kg:g} kg hung"
+            notes[f"S27.mass_error_{name}"] = f"{mass_kg:g} kg hung; mean of the time after the step"
         charts, missing = [drawn], {}
-        points = set_points(settings, self._reach(analysis))
-        if len(points) > 1:
-            by_point, chart = range_results(
-                analysis.observe(_RANGE), points, zero_m, settings, scale_m
+        if points := self._points(analysis):
+            outer, chart = outer_results(
+                analysis.observe(_OUTER), points, zero_m, settings, scale_m
             )
-            found |= by_point
+            found |= outer
             charts.append(chart)
+            notes["S30.error"] = f"hybrid; {settings.outer_mass_kg:g} kg hung"
         else:
             missing = dict.fromkeys(paper_rows("S30."), _NOT_BEYOND)
         return ExperimentResult(found, notes, tuple(charts), missing=missing)
@@ -153,6 +154,20 @@ class ModelControlTest(Experiment[ModelControl]):
 
     def _reach(self, analysis: Analysis) -> tuple[float, float]:
         return reach_of(known := self._known(analysis), known.mass_kg)
+
+    def _points(self, analysis: Analysis) -> tuple[float, ...]:
+        """Strains beyond the linear region; none if no mass holds the actuator there.
+
+        They stay where the maps are valid, which were fitted with the rig's own mass.
+        """
+        outer_kg = self.settings.outer_mass_kg
+        if outer_kg is None:
+            return ()
+        try:
+            low, high = reach_of(self._known(analysis), outer_kg)
+        except InputError:
+            return ()
+        return set_points(self.settings, (low, min(high, self._reach(analysis)[1])))
 
     def _loop(self, analysis: Analysis, kind: str) -> LoopSettings:
         if kind not in self._loops:

@@ -1,4 +1,4 @@
-"""Controllers of the physical model: steps, sensed weights and a staircase (S25, S27 and S30)."""
+"""Controllers of the physical model: steps, sensed weights, strains beyond the linear region (S25, S27, S30)."""
 
 from __future__ import annotations
 
@@ -30,16 +30,15 @@ from haselab.study.tables import ModelControl
 __all__ = [
     "StepGroup",
     "mass_errors",
-    "range_results",
+    "outer_results",
     "sensed_kg",
     "set_points",
     "step_results",
 ]
 
 Floats = NDArray[np.float64]
-_BEYOND = (0.35, 0.7)  # of the way from the linear region to the highest reachable strain
-_BELOW = 0.5  # the same, to the lowest one
-_LEAST = 0.01  # strain that must be reachable beyond the linear region
+_OUTER = (0.3, 0.6, 0.3)  # of the range that can be held with the outer mass
+_PARTS = 4  # of the time after a step
 _AT_REST = 1.0 / 3.0  # of a hold, at its end
 
 
@@ -59,22 +58,17 @@ class StepGroup:
 
 
 def set_points(settings: ModelControl, reach: tuple[float, float]) -> tuple[float, ...]:
-    """Strains of the staircase: zero, then one below the linear region, then two above it.
-
-    Those above come last, because creep keeps the actuator long for a while.
+    """Strains beyond the linear region: two of those that can be held, and the first one again.
 
     Args:
         settings: with the linear region.
-        reach: lowest and highest strain that the actuator can hold.
+        reach: lowest and highest strain that can be held with the outer mass.
     Returns:
-        The strains; zero alone if the actuator does not reach beyond the linear region.
+        The strains; none if they are not beyond the linear region.
     """
-    (low, high), found = reach, [0.0]
-    if settings.linear_low - low >= _LEAST:
-        found.append(settings.linear_low + _BELOW * (low - settings.linear_low))
-    if high - settings.linear_high >= _LEAST:
-        found += [settings.linear_high + s * (high - settings.linear_high) for s in _BEYOND]
-    return tuple(found)
+    low, high = reach
+    found = tuple(low + share * (high - low) for share in _OUTER)
+    return found if min(found) > settings.linear_high else ()
 
 
 def step_results(
@@ -172,7 +166,9 @@ def mass_errors(
     by_mass: Mapping[str, Sequence[Observation]], loop: LoopSettings, rig: RigDescription,
     carrier_hz: float, from_s: float,
 ) -> dict[str, Estimate]:  # fmt: skip
-    """Sensed minus hung mass, mean after the step, over the trials.
+    """Sensed minus hung mass, mean after the step.
+
+    The interval is that of the means of a quarter of that time, longer than the estimate remembers.
 
     Args:
         by_mass: trials by the id of the result.
@@ -184,24 +180,25 @@ def mass_errors(
         In kg, by id.
     """
     first = round(from_s / rig.block_s)
-    return {
-        key: normal_equivalent(over_trials(np.array([
-            float(sensed_kg(seen, loop, rig, carrier_hz)[first:].mean() - seen.mass_kg[-1])
-            for seen in trials
-        ]), "kg"))
-        for key, trials in by_mass.items()
-    }  # fmt: skip
+    found = {}
+    for key, trials in by_mass.items():
+        errors = [
+            sensed_kg(seen, loop, rig, carrier_hz)[first:] - seen.mass_kg[-1] for seen in trials
+        ]
+        parts = np.concatenate([np.array_split(one, _PARTS) for one in errors]).mean(axis=1)
+        found[key] = normal_equivalent(over_trials(parts, "kg"))
+    return found
 
 
-def range_results(
+def outer_results(
     seen: Observation, points: tuple[float, ...], zero_m: float, settings: ModelControl,
     scale_m_per_px: float,
 ) -> tuple[dict[str, Estimate], Chart]:  # fmt: skip
-    """Errors at rest and overshoots of the staircase, from the camera.
+    """Errors at rest and overshoots beyond the linear region, from the camera.
 
     Args:
         seen: the recording.
-        points: strains of the staircase, see `set_points`.
+        points: strains, see `set_points`.
         zero_m: length at zero strain.
         settings: the linear region, the time of each strain.
         scale_m_per_px: of the camera.
@@ -211,44 +208,39 @@ def range_results(
     time_s = seen.frame_time_s - seen.block_start_s[0]
     strain = seen.length_m / zero_m - 1.0
     resolution = POSITION_PX * scale_m_per_px / zero_m
-    errors: dict[bool, list[Estimate]] = {True: [], False: []}
-    overshoots = []
+    errors, overshoots = [], []
     for k, point in enumerate(points):
         end_s = (k + 1) * settings.hold_s
         rest = strain[(time_s >= end_s - _AT_REST * settings.hold_s) & (time_s < end_s)]
         scatter = float(rest.std(ddof=1)) / math.sqrt(rest.size)
         error = Estimate.normal(point - float(rest.mean()), scatter, "")
-        outside = not settings.linear_low <= point <= settings.linear_high
-        errors[outside].append(with_resolution(error, resolution))
-        if outside:
-            way = point - points[k - 1]
-            during = strain[(time_s >= end_s - settings.hold_s) & (time_s < end_s)]
-            past = float(((during - point) * math.copysign(1.0, way)).max()) / abs(way)
-            overshoot = Estimate.normal(max(past, 0.0), 0.0, "")
-            overshoots.append(with_resolution(overshoot, resolution / abs(way)))
+        errors.append(with_resolution(error, resolution))
+        if k == 0:  # the loop has just begun
+            continue
+        way = point - points[k - 1]
+        during = strain[(time_s >= end_s - settings.hold_s) & (time_s < end_s)]
+        past = float(((during - point) * math.copysign(1.0, way)).max()) / abs(way)
+        overshoot = Estimate.normal(max(past, 0.0), 0.0, "")
+        overshoots.append(with_resolution(overshoot, resolution / abs(way)))
     found = {
         "S30.lowest": _set(min(points)),
         "S30.highest": _set(max(points)),
-        "S30.error_inside": max(errors[False], key=_size),
-        "S30.error_outside": max(errors[True], key=_size),
-        "S30.overshoot_outside": max(overshoots, key=_size),
+        "S30.error": max(errors, key=_size),
+        "S30.overshoot": max(overshoots, key=_size),
     }
-    ends = np.array([0.0, len(points) * settings.hold_s])
-    lines = [
-        Curve(f"linear region, {name} end", ends, np.full(2, value))
-        for name, value in (("lower", settings.linear_low), ("upper", settings.linear_high))
-    ]
-    steps_s = settings.hold_s * np.arange(len(points) + 1.0)
-    desired = Curve("desired", np.repeat(steps_s, 2)[1:-1], np.repeat(points, 2))
+    ends_s = settings.hold_s * np.arange(len(points) + 1.0)
+    desired = Curve("desired", np.repeat(ends_s, 2)[1:-1], np.repeat(points, 2))
+    edge = np.full(2, settings.linear_high)
     chart = Chart(
         "model-range",
-        "Staircase beyond the linear region",
-        "Camera strain of one trial with hybrid (S30). The linear region is that of the "
-        "load-stretch curve (S17).",
+        "Steps beyond the linear region",
+        "Camera strain of one trial with hybrid and a heavy mass (S30). The linear region is that "
+        "of the load-stretch curve (S17).",
         "time (s)",
         "strain",
-        (desired, Curve("hybrid", time_s, strain), *lines),
-    )
+        (desired, Curve("hybrid", time_s, strain),
+         Curve("upper end of the linear region", ends_s[[0, -1]], edge)),
+    )  # fmt: skip
     return found, chart
 
 

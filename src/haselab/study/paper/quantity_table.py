@@ -22,7 +22,7 @@ _CALIBRATED_ONCE = (
     "calibration, which a run makes once: 0.1 % of capacitance corresponds to 0.008 of a step of "
     "0.04 and to 0.02 of one of 0.014"
 )
-_STAIRCASE = "linear region of the run and reach of its model"
+_OUTER = "linear region and reach of the run"
 _IN_HZ = "printed in rad/s; the same number in Hz is {:.1f} rad/s"
 
 
@@ -424,16 +424,11 @@ def _loops() -> dict[str, Quantity]:
             "deg",
             note="of the plant at the study's operating point",
         ),
-        "S30.lowest": Quantity("lowest strain of the staircase", "", setting=_STAIRCASE),
-        "S30.highest": Quantity("highest strain of the staircase", "", setting=_STAIRCASE),
-        "S30.error_inside": Quantity(
-            "largest strain error at rest, within the linear region", "", note="hybrid"
-        ),
-        "S30.error_outside": Quantity(
-            "largest strain error at rest, outside of the linear region", "", note="hybrid"
-        ),
-        "S30.overshoot_outside": Quantity(
-            "largest overshoot of a step out of the linear region",
+        "S30.lowest": Quantity("lowest strain of the steps", "", setting=_OUTER),
+        "S30.highest": Quantity("highest strain of the steps", "", setting=_OUTER),
+        "S30.error": Quantity("largest strain error at rest, outside of the linear region", ""),
+        "S30.overshoot": Quantity(
+            "largest overshoot of a step outside of the linear region",
             "",
             note="hybrid; camera noise included",
         ),

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from haselab.actuators import GRAVITY_M_S2
 from haselab.base import HaselabError, ResultError
+from haselab.controllers import KnownActuator
 from haselab.study.definition import Study, builtin_table
 from haselab.study.experiments.model_control import ModelControlTest
 from haselab.study.fits.maps import Maps
@@ -22,16 +24,17 @@ NOT_HERE = (
     "recording."
 )
 _OTHER_MASS = 0.8  # of the rig's own: it can be held at all strains of the step
-_DIGITS = 6  # of the numbers in the file of the study
+_BEYOND = 0.02  # strain beyond the linear region, at 0 V with the outer mass
+_DIGITS = 4  # of the numbers in the file of the study
 
 
-def model_study(study: Study, found: Findings, mass_kg: float) -> Study:
+def model_study(study: Study, found: Findings, known: KnownActuator) -> Study:
     """The study that is played with the identified model, after the reference study.
 
     Args:
         study: that was played.
         found: its findings, for the linear region of the load-stretch curve.
-        mass_kg: hung mass of the rig.
+        known: the identified actuator, with the rig's own mass.
     Returns:
         The study, with all numbers that it needs.
     Raises:
@@ -40,15 +43,14 @@ def model_study(study: Study, found: Findings, mass_kg: float) -> Study:
     maps, static = found.find(Maps), found.find(Static)
     if maps is None or static is None:
         raise ResultError("needs [triangle] and [static_load], which are not in this study.")
-    low, high = (
-        static.quantities[f"S17.region_{end}"].value * static.free_length_m / maps.length_m - 1.0
-        for end in ("low", "high")
-    )
+    end = static.quantities["S17.region_high"].value
+    high = end * static.free_length_m / maps.length_m - 1.0
+    outer_kg = known.elastic_n(known.length_m(high + _BEYOND)) / GRAVITY_M_S2
     table = builtin_table("model-control", ModelControl).model_copy(
         update={
             "step": study.steps.step,
-            "other_mass_kg": round(_OTHER_MASS * mass_kg, _DIGITS),
-            "linear_low": round(low, _DIGITS),
+            "other_mass_kg": round(_OTHER_MASS * known.mass_kg, _DIGITS),
+            "outer_mass_kg": round(outer_kg, _DIGITS),
             "linear_high": round(high, _DIGITS),
         }
     )

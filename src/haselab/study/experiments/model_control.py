@@ -179,8 +179,8 @@ class ModelControlTest(Experiment[ModelControl]):
         return {}
 
     def _make_loop(self, analysis: Analysis, kind: str) -> LoopSettings:
-        maps, limits = analysis.need(Maps), analysis.rig.drive_limits
         reach = self._reach(analysis)
+        maps, limits = analysis.need(Maps), analysis.rig.drive_limits
         within = maps.voltage_map.reach(reach, limits.low, limits.high) or reach
         loop = LoopSettings(
             ChosenController(CONTROLLERS.find(kind), ()), Saturation(*within), maps.voltage_map,

@@ -37,16 +37,6 @@ uint16_t hs_motion_root(uint32_t w, uint8_t *shift)
     return (uint16_t)(low + (uint16_t)(((uint32_t)more * (uint16_t)((w << 6) >> 16)) >> 16));
 }
 
-static uint32_t bits_of(float value)
-{
-    union {
-        float value;
-        uint32_t bits;
-    } same;
-    same.value = value;
-    return same.bits;
-}
-
 int32_t hs_motion_x(const hs_motion_config *config, float strain)
 {
     const float x = (strain - config->low) * config->per_strain;

@@ -10,6 +10,16 @@
 
 /* ---- numbers ------------------------------------------------------------------------------ */
 
+static inline uint32_t bits_of(float value)
+{
+    union {
+        float value;
+        uint32_t bits;
+    } same;
+    same.value = value;
+    return same.bits;
+}
+
 /* a b / 2^16, rounded down. */
 static inline int32_t scaled(int32_t a, int16_t b)
 {

@@ -11,17 +11,8 @@
 #include <stdio.h>
 
 #include "app.h"
+#include "hs_motion_step.h" /* bits_of */
 #include "settings.h"
-
-static uint32_t bits_of(float value)
-{
-    union {
-        float value;
-        uint32_t bits;
-    } same;
-    same.value = value;
-    return same.bits;
-}
 
 static int read_update(app_inputs *in)
 {

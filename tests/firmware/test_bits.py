@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import itertools
 import os
-import struct
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from haselab.firmware.messages import VERSION, Event, Hello, Run, SetReference, SetTelemetry, Trace
-from haselab.rig.chip import CoSim, Firmware, checkout
+from haselab.firmware.messages import Event, Trace
+from haselab.rig.chip import Firmware, checkout
 from haselab.rig.twin.twin_bench import TwinBench
+from tests.firmware.traces import UPDATES, latched, replayed, reported, traced
 
 ROOT = checkout()
 CORE = sorted((ROOT / "core").glob("*.c"))
@@ -23,45 +22,14 @@ REPLAY = [
     ROOT / "firmware/app/controller_pid.c",
     ROOT / "firmware/sim/replay.c",
 ]
-UPDATES = 10_000
 REFERENCES = (0.0, 0.03, 0.06, 0.02, -0.02, 0.045, 0.01, 0.08, -0.039, 0.03)
 KEPT = 1000
 GOLDEN = Path(__file__).resolve().parent / "data" / "trace.txt"
 
 
-def bits(value: float) -> str:
-    return struct.pack(">f", value).hex()
-
-
-def latched(trace: Trace) -> str:
-    return f"{' '.join(map(str, trace.codes))} {trace.event} {trace.alarms} {bits(trace.reference)}"
-
-
-def reported(trace: Trace) -> list[str]:
-    return [str(trace.state), str(trace.code), bits(trace.strain), bits(trace.corrected)]
-
-
-def replayed(program: Path, lines: list[str]) -> list[list[str]]:
-    done = subprocess.run(
-        [str(program)], input="\n".join(lines), capture_output=True, text=True, check=True
-    )
-    rows = [line.split() for line in done.stdout.splitlines()]
-    return [[row[0], row[3], row[5], row[6]] for row in rows]
-
-
 @pytest.fixture(scope="module")
 def traces(firmware: Firmware, cosim_program: Path, twin: TwinBench) -> list[Trace]:
-    """Arming, the loop closed, steps: every update of 10 s, as the chip reported it."""
-    with CoSim(cosim_program, firmware.elf, twin) as chip:
-        chip.run(0.02)
-        chip.query(Hello(VERSION))
-        chip.execute(SetTelemetry(0, 1))
-        chip.arm()
-        chip.execute(Run(0.0))
-        while len(chip.messages) < UPDATES + 200:
-            chip.execute(SetReference(REFERENCES[int(chip.time_s) % len(REFERENCES)]), 0.1)
-        assert chip.bad_frames == 0
-    found = [message for message in chip.messages if isinstance(message, Trace)]
+    found = traced(firmware, cosim_program, twin, REFERENCES)
     if os.environ.get("KEEP_TRACE"):
         lines = [f"{latched(trace)} | {' '.join(reported(trace))}\n" for trace in found[:KEPT]]
         GOLDEN.write_text("".join(lines), encoding="ascii")

@@ -123,11 +123,17 @@ def test_a_controller_that_fails_ends_its_task_and_the_others_go_on(truth, insta
     assert page == scoreboard_page(game)
 
 
-def test_a_task_that_takes_too_long_ends_with_its_reason(monkeypatch):
+def _compute(*_):
+    while True:
+        pass
+
+
+@pytest.mark.parametrize("hangs", [_compute, lambda *_: time.sleep(60.0)], ids=["busy", "waits"])
+def test_a_task_that_takes_too_long_ends_with_its_reason(monkeypatch, hangs):
     """Wherever the deadline falls: here between two steps of the controller."""
     monkeypatch.setattr(board, "_SLOWEST", 1e-3)
     monkeypatch.setattr(board, "_LEAST_S", 1e-3)
-    monkeypatch.setattr(board, "play", lambda *_: time.sleep(60.0))
+    monkeypatch.setattr(board, "play", hangs)
     entry = Entry("open-loop", "host-100hz", "hz")
     played = board._play(board._PlayJob(entry, "T4", 0, 7, true_actuator(HZ)))
     assert played.failure == "the controller takes longer than 0.001 times the task"

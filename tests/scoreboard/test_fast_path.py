@@ -129,6 +129,46 @@ def test_a_controller_gets_the_reference_the_preview_and_the_drive_in_force():
     assert sensed == pytest.approx(trace.strain[-100:].mean(), abs=5.0 * 2e-4 / math.sqrt(10.0))
 
 
+class Clocks:
+    """Wall time and processor time of steps that take what they are told to."""
+
+    wall_s = processor_s = 0.0
+
+    def perf_counter(self):
+        return self.wall_s
+
+    def thread_time(self):
+        return self.processor_s
+
+
+@pytest.mark.parametrize(
+    ("wall_s", "processor_s", "late"),
+    [
+        (0.051, 0.051, True),  # computes for more than five periods of 10 ms
+        (0.049, 0.049, False),
+        (0.4, 0.049, False),  # seven other programs on the same processor
+        (0.051, 0.0005, True),  # sleeps
+        (0.049, 0.0, False),
+    ],
+)
+def test_a_step_is_late_by_its_own_time_not_by_that_of_other_programs(
+    monkeypatch, wall_s, processor_s, late
+):
+    clocks = Clocks()
+
+    class Takes(OpenLoop):
+        def step(self, reference, measurement):
+            clocks.wall_s += wall_s
+            clocks.processor_s += processor_s
+            return reference
+
+    monkeypatch.setattr("haselab.scoreboard.play.time", clocks)
+    kind = ControllerKind("takes", Takes)
+    trace = play(scenario(), kind.choose(), HOST, true_actuator(HZ), np.random.default_rng(1))
+    assert trace.failure == ("5 steps in a row took longer than 5 periods" if late else "")
+    assert trace.step_s == pytest.approx(processor_s)
+
+
 def test_a_late_device_gets_each_drive_later():
     shifted = {}
     for late_s in (0.0, 0.004, 0.012):

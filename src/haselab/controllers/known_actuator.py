@@ -201,10 +201,15 @@ class KnownActuator:
         table, lengths = self.table, self._lengths_m[::step]
         longest = np.maximum(lengths, self.longest_m) / self.law.free_length_m
         softened = table.elastic_n[::step] * self.law.losses.softening(longest)
-        drives_v = np.array([
-            self.drive_v(float(length), float(force))
-            for length, force in zip(lengths, softened - GRAVITY_M_S2 * mass, strict=True)
-        ])  # fmt: skip
+        needed_n = softened - GRAVITY_M_S2 * mass
+        if len(table.pull_n_v2) == 1:  # as `drive_v`, at once
+            squares = needed_n / table.pull_n_v2[0, ::step] - self.carrier_v2
+            drives_v = np.sqrt(np.maximum(squares, 0.0)) / self.gain_v_per_v
+        else:
+            drives_v = np.array([
+                self.drive_v(float(length), float(force))
+                for length, force in zip(lengths, needed_n, strict=True)
+            ])  # fmt: skip
         field_v = self.highest_field_v_per_m * table.gap_m[::step] / self.gain_v_per_v
         first = int(np.argmax(drives_v > max(self.low_v, 0.0)))
         after = drives_v[first:]

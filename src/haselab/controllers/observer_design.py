@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,43 +64,53 @@ def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
     delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
     allowed_v = setting.highest_rate_per_s * setting.period_s
 
-    def of(values: Floats) -> float:
-        bandwidth, load_n = np.exp(values).tolist()
-        if bandwidth * delay_s > 1.0:  # beyond, limits of the drive hide what it does
-            return float(2.0 * UNSTABLE * bandwidth * delay_s)
+    def loops(bandwidth: float, load_n: float) -> Iterator[tuple[LinearLoop, Demands]]:
         law = ObserverLaw(setting, bandwidth, load_n, SHAKE_M_S2)
-        total = 0.0
         for strain in strains:
             noise_m = known.length_noise_m(strain)
             for stiffness, longer, peak in _SPREAD:
                 demands = Demands(
                     noise_m, _SHAKEN * known.high_v, peak, _MOVED, _CHANGED * allowed_v
                 )
-                loop = linear_loop(law, setting, strain, (stiffness, longer * delay_s))
-                factor = penalty(loop, setting.period_s, demands)
-                if factor > UNSTABLE:
-                    return factor
-                total += factor * timed_error(loop, setting.period_s, _COUNTED_S)
-        return total
+                yield linear_loop(law, setting, strain, (stiffness, longer * delay_s)), demands
 
-    return best_parameters(of, setting, evaluations=60)
+    # beyond, limits of the drive hide what the feedback does
+    return best_parameters(loops, setting, evaluations=60, fastest_rad_s=1.0 / delay_s)
 
 
 def best_parameters(
-    cost: Callable[[Floats], float], setting: ControllerSetting, *, evaluations: int
+    loops: Callable[[float, float], Iterable[tuple[LinearLoop, Demands]]],
+    setting: ControllerSetting,
+    *,
+    evaluations: int,
+    fastest_rad_s: float = math.inf,
 ) -> Mapping[str, float]:
     """Search bandwidth and expected load of an observer.
 
     Args:
-        cost: by the logarithms of both; above `UNSTABLE` where they are not possible.
+        loops: by both, all that must keep their demands and reject a load.
         setting: timing of the loop, and the actuator.
         evaluations: at most.
+        fastest_rad_s: highest bandwidth.
     Raises:
         ResultError: No parameters keep the loop stable.
     """
     known = setting.actuator
     assert known is not None
     delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
+
+    def cost(logarithms: Floats) -> float:
+        bandwidth, load_n = np.exp(logarithms).tolist()
+        if bandwidth > fastest_rad_s:
+            return float(2.0 * UNSTABLE * bandwidth / fastest_rad_s)
+        total = 0.0
+        for loop, demands in loops(bandwidth, load_n):
+            factor = penalty(loop, setting.period_s, demands)
+            if factor > UNSTABLE:
+                return factor
+            total += factor * timed_error(loop, setting.period_s, _COUNTED_S)
+        return total
+
     start = np.log([0.1 / delay_s, 0.1 * known.mass_kg * GRAVITY_M_S2])
     found = minimize(cost, start, method="Nelder-Mead",
                      options={"maxfev": evaluations, "xatol": 0.02, "fatol": 1e-9})  # fmt: skip

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from haselab import _core
 from haselab.base import SafetyError
-from haselab.controllers import Measurement
+from haselab.controllers import ControllerSetting, Measurement
+from haselab.rig import RigDescription
 from haselab.runtime.lockin import counted_s, lockin_of, printed_chain_of
 from haselab.runtime.loop import LoopSettings, RunningController
 from haselab.runtime.observer import Observer
@@ -25,7 +26,7 @@ from haselab.safety.guarded import GuardedRig
 from haselab.safety.watchdog.loop_model import loop_model
 from haselab.safety.watchdog.loop_watchdog import LoopSample, LoopWatchdog
 
-__all__ = ["ClosedLoop"]
+__all__ = ["ClosedLoop", "setting_on_rig"]
 
 _REACH_POINTS = 1001  # points of the saturation range where the loop's voltages are checked
 
@@ -53,9 +54,8 @@ class ClosedLoop:
         name: str,
     ) -> None:
         self._rig, self._loop, self._name = rig, loop, name
-        limits, block_s = rig.description.drive_limits, rig.description.block_s
-        age_s, delay_s = _timing_s(rig, carrier[0], loop)
-        setting = loop.setting(block_s, delay_s, (limits.low, limits.high), age_s)
+        block_s = rig.description.block_s
+        setting = setting_on_rig(rig.description, carrier[0], loop)
         self._controller = RunningController(loop.controller, setting)
         self._in_volts = loop.controller.kind.output == "voltage"
         self._ahead = loop.controller.kind.preview_steps(block_s)
@@ -165,19 +165,27 @@ def _sensor(
     return CapacitanceSensor(lockin_of(rig.description, carrier_hz), loop.strain_map)
 
 
-def _timing_s(
-    rig: GuardedRig, carrier_hz: float, loop: LoopSettings
-) -> tuple[float | None, float | None]:
-    """Age of the capacitance when its block ends, and when its output takes effect.
+def setting_on_rig(
+    rig: RigDescription, carrier_hz: float, loop: LoopSettings
+) -> ControllerSetting:
+    """What the controller of a loop is started with on a rig.
 
-    None: those of the camera are not known.
+    The delays of the camera are not known.
+
+    Args:
+        rig: nominal values.
+        carrier_hz: frequency of the sensing signal.
+        loop: controller and maps.
+    Raises:
+        InputError: The kind of the controller needs the identified actuator.
     """
-    if loop.video_zero_px is not None:
-        return None, None
-    about = rig.description
-    blocks = loop.extra_delay_blocks * about.block_s
-    age_s = 0.5 * counted_s(about, carrier_hz)
-    return age_s, age_s + about.switch_sample / about.rate_hz + blocks
+    age_s = delay_s = None
+    if loop.video_zero_px is None:
+        age_s = 0.5 * counted_s(rig, carrier_hz)
+        blocks_s = loop.extra_delay_blocks * rig.block_s
+        delay_s = age_s + rig.switch_sample / rig.rate_hz + blocks_s
+    limits_v = rig.drive_limits.low, rig.drive_limits.high
+    return loop.setting(rig.block_s, delay_s, limits_v, age_s)
 
 
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:

@@ -36,6 +36,7 @@ Result = TypeVar("Result")
 _SHOWN_S = 4e-3  # between two points of a trace that is kept
 _SLOWEST = 10.0  # times the duration of a task: a controller that takes longer does not return
 _LEAST_S = 20.0
+_BUSY = 4.0  # wall time over processor time that other programs explain
 _EXCESS = 1.02  # of the permitted field: what a sensed length may miss
 
 
@@ -231,22 +232,33 @@ def _random(seed: int, task: str, index: int) -> np.random.Generator:
 
 @contextmanager
 def _deadline(duration_s: float, reason: str) -> Iterator[None]:
-    """Raise `TimeoutError` in code that does not return, where the system can."""
+    """Raise `TimeoutError` in code that does not return, where the system can.
+
+    Args:
+        duration_s: of the processor; code that waits has `_BUSY` times as long.
+        reason: of the error.
+    """
 
     def stop(*_: object) -> None:
         raise TimeoutError(reason)
 
     try:
-        before = signal.signal(signal.SIGALRM, stop)
-    except (AttributeError, ValueError):  # no such signal, or not the main thread
+        timers = (
+            (signal.ITIMER_PROF, signal.SIGPROF, duration_s),
+            (signal.ITIMER_REAL, signal.SIGALRM, _BUSY * duration_s),
+        )
+        before = [signal.signal(number, stop) for _, number, _ in timers]
+    except (AttributeError, ValueError):  # no such signals, or not the main thread
         yield
         return
-    signal.setitimer(signal.ITIMER_REAL, duration_s)
     try:
+        for timer, _, longest_s in timers:
+            signal.setitimer(timer, longest_s)
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        for (timer, number, _), handler in zip(timers, before, strict=True):
+            signal.setitimer(timer, 0.0)
+            signal.signal(number, handler)
 
 
 # ---- the whole -----------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ __all__ = [
     "StepStudy",
     "Study",
     "builtin_study",
+    "builtin_table",
     "checked_study",
     "file_model",
     "load_step_study",
@@ -319,6 +320,17 @@ def _checked_file(
         except InputError as error:
             raise InputError(f"With the changes of [quick]: {error}") from None
     return study
+
+
+def builtin_table(name: str, kind: type[Table]) -> Table:
+    """A table of settings that comes with the package, in a file of its own.
+
+    Args:
+        name: of the file.
+        kind: the class that checks it.
+    """
+    path = _STUDIES / f"{name}.toml"
+    return validated(kind, read_toml(path, "study"), path)
 
 
 def builtin_study(*, quick: bool = False) -> Study:

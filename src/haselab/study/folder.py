@@ -28,7 +28,7 @@ from haselab.study.results import VERDICT_RULE, axis_interpretation, quantity_ro
 from haselab.study.simulated.truth import is_simulated
 from haselab.study.tables import Control
 
-__all__ = ["marked_unverified", "results_of", "sections_found", "write_design", "write_findings"]
+__all__ = ["marked_unverified", "results_of", "sections_found", "write_actuator", "write_design", "write_findings"]
 
 _FOUND: Mapping[type, tuple[str, ...]] = {  # sections by the type of the finding in them
     Maps: ("sensing.strain_map", "drive.voltage_map"),
@@ -127,10 +127,30 @@ def write_findings(
     write_json(folder / "analysis.json", _sections(found, study, header))
     limits = header["rig"]["drive_limits"]
     ends = (float(limits["low"]), float(limits["high"]))
-    maps, dynamics, loops = found.find(Maps), found.find(Dynamics), found.find(Loops)
-    kind = header["rig"].get("actuator_kind", PLANAR_HASEL)
-    write_design(folder, maps, dynamics, loops, study, ends, kind)
+    write_actuator(folder, found, study, ends, header["rig"].get("actuator_kind", PLANAR_HASEL))
     return results
+
+
+def write_actuator(
+    folder: Path,
+    found: Findings,
+    study: Study,
+    drive_limits: tuple[float, float],
+    kind: str = PLANAR_HASEL,
+) -> None:
+    """Write what a study found of its actuator to actuator.toml.
+
+    Args:
+        folder: of the run.
+        found: all findings.
+        study: saturation and names.
+        drive_limits: of the rig, in V.
+        kind: of the actuator.
+    Raises:
+        DeviceError: a file cannot be written.
+    """
+    maps, dynamics, loops = found.find(Maps), found.find(Dynamics), found.find(Loops)
+    write_design(folder, maps, dynamics, loops, study, drive_limits, kind)
 
 
 def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ class Player:
 
     def __init__(self, runner: Runner, experiment: AnyExperiment, analysis: Analysis) -> None:
         self._runner, self._name, self.analysis = runner, experiment.table, analysis
-        self.rig = analysis.rig
+        self.rig, self._hung_kg = analysis.rig, runner.mass_kg
         listed = declared(experiment, "drives", Drive, partial(experiment.drives, self.rig))
         drives = [np.append(0.0, drive.values_v) for drive in listed]
         self._low_v = min((float(values.min()) for values in drives), default=0.0)
@@ -62,7 +62,7 @@ class Player:
             DeviceError: disk or instrument failed.
         """
         self._check(drive_v)
-        self._runner.play(name, drive_v, frame_rate_hz, self.mass_kg, particles=particles)
+        self._runner.play(name, drive_v, frame_rate_hz, self._hung_kg, particles=particles)
 
     def settle(self, drive_v: float, duration_s: float) -> None:
         """Hold one output without recording, until creep has faded.
@@ -79,20 +79,29 @@ class Player:
     ) -> None:
         """Lift the mass, wait, drop it and record; see `Runner.release`."""
         self._check(np.array([drive_v]))
-        self._runner.release(name, drive_v, settle_s, record_s, frame_rate_hz, self.mass_kg)
+        self._runner.release(name, drive_v, settle_s, record_s, frame_rate_hz, self._hung_kg)
 
     def hang(
         self, name: str, masses_kg: list[float], settle_s: float, frame_rate_hz: float
     ) -> None:
         """Hang each mass in turn at 0 V, then the rig's own again; see `Runner.hang`."""
         self._runner.hang(name, masses_kg, settle_s, frame_rate_hz)
-        self._runner.load(self.mass_kg)
+        self.load(self.mass_kg)
+
+    def load(self, mass_kg: float) -> None:
+        """Hang a mass at 0 V, which stays; hang the rig's own again at the end.
+
+        Args:
+            mass_kg: one of `Experiment.masses_kg`, or the rig's own.
+        """
+        self._runner.load(mass_kg)
+        self._hung_kg = mass_kg
 
     def close_loop(
         self, name: str, reference: Floats, loop: LoopSettings, frame_rate_hz: float
     ) -> None:
         """Close the loop, with one desired strain per block; see `Runner.close_loop`."""
-        self._runner.close_loop(name, reference, loop, frame_rate_hz, self.mass_kg)
+        self._runner.close_loop(name, reference, loop, frame_rate_hz, self._hung_kg)
 
     def rest(self) -> None:
         """Set the drive to 0 V at once; the sensing signal stays on."""

@@ -42,6 +42,7 @@ EXPERIMENTS: Registry[type[ExperimentClass]] = Registry(
         "chirp": "haselab.study.experiments.chirp:ChirpTest",
         "control": "haselab.study.experiments.design:ControllerDesign",
         "steps": "haselab.study.experiments.steps:StepTest",
+        "model_control": "haselab.study.experiments.model_control:ModelControlTest",
     },
     _fault,
 )

@@ -37,7 +37,8 @@ VERDICT_RULE = (
     "Inconclusive: the interval is partly inside."
 )
 _PRINTED_ZETA = 0.09  # eq. 10
-_ON_CHIP = ("S26.", "S28.")  # played by `reproduce` beside the experiments
+# Played by `reproduce` beside the experiments.
+_APART = ("S25.rise_observer", "S25.overshoot_observer", "S25.error_observer", "S26.", "S27.", "S28.", "S30.")
 
 
 def verdict(quantity: Quantity, measured: Estimate) -> str:
@@ -133,13 +134,13 @@ def rows_of(study: Study) -> dict[str, Quantity]:
     """All results that a study may have, by id, in the order of the report.
 
     Args:
-        study: the reference study also has the rows of the chip's experiments.
+        study: the reference study also has the rows that `reproduce` plays beside it.
     """
     found: dict[str, Quantity] = {}
     for experiment in experiments_of(study):
         found |= rows_of_experiment(experiment)
     if study.is_reference:
-        found = paper_rows(*_ON_CHIP) | found
+        found = paper_rows(*_APART) | found
         return {key: found[key] for key in (*quantities(), *found) if key in found}
     return {key: row for key, row in found.items() if not row.reference_only}
 

@@ -102,9 +102,14 @@ def session_header(
 
 
 def _recorded(tables: ActuatorTables) -> dict[str, Any]:
-    """What an analysis of the recording needs of the actuator file: the maps."""
-    maps = {"sensing": {"strain_map"}, "drive": {"voltage_map"}, "actuator": {"geometry"}}
-    return tables.model_dump(mode="json", include=maps, exclude_none=True)
+    """What an analysis of the recording needs of the actuator file: maps, physical model, limits."""
+    needed = {
+        "actuator": {"geometry", "mass_kg", "parameters"},
+        "sensing": {"strain_map"},
+        "drive": {"voltage_map", "low_v", "high_v", "gain_v_per_v", "highest_field_v_per_m"},
+        "model": {"physical"},
+    }
+    return tables.model_dump(mode="json", include=needed, exclude_none=True)
 
 
 @contextlib.contextmanager

@@ -14,9 +14,11 @@ __all__ = [
     "Chirp",
     "Control",
     "FreeResponse",
+    "ModelControl",
     "OperatingPoint",
     "Sensing",
     "StaticLoad",
+    "StepTimes",
     "StepTrials",
     "Steps",
     "Triangle",
@@ -262,3 +264,54 @@ class StepTrials(Section):
         if self.step == 0.0:
             raise ValueError("step must not be 0")
         return self
+
+
+class ModelControl(Section):
+    """Closed loops with controllers that use the physical model (rows S25, S27 and S30)."""
+
+    step: float = Field(description="desired strain after the step", examples=[0.04])
+    zero_s: float = Field(
+        gt=1, le=3600, description="time at zero strain before the step", examples=[2.0]
+    )
+    step_s: float = Field(gt=1, le=3600, description="time after the step", examples=[2.0])
+    rest_s: float = Field(
+        ge=0, le=_DAY_S, description="wait at 0 V before each trial", examples=[10.0]
+    )
+    frame_rate_hz: float = _frames(100.0)
+    trials: int = Field(
+        ge=1, le=100, description="step trials with observer, and with hybrid for each mass",
+        examples=[2],
+    )  # fmt: skip
+    other_mass_kg: float = Field(
+        gt=0, le=1000, description="mass that is hung in place of the rig's own, to be weighed",
+        examples=[0.2],
+    )  # fmt: skip
+    outer_mass_kg: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="mass that stretches the actuator beyond its linear region at 0 V; if left "
+        "out, no trial is made there",
+    )
+    hold_s: float = Field(
+        gt=1, le=3600, description="time at each strain beyond the linear region", examples=[2.0]
+    )
+    linear_high: float = Field(
+        description="strain at the upper end of the linear region", examples=[0.18]
+    )
+    highest_field_v_per_m: float = Field(
+        gt=0, description="highest field that the controllers may use", examples=[34e6]
+    )
+    parameters: dict[str, float] = Field(
+        {},
+        description="parameters of observer and hybrid, which are the same; designed if left out",
+    )
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> Self:
+        if self.step == 0.0:
+            raise ValueError("step must not be 0")
+        return self
+
+
+StepTimes = Steps | StepTrials | ModelControl  # tables with a step and its times

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import struct
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +12,10 @@ import pytest
 from haselab.controllers import CONTROLLERS, ControllerSetting
 from haselab.firmware import ChipSettings, ControllerStep
 from haselab.firmware.messages import (
-    VERSION,
     Event,
-    Hello,
     KeepAlive,
     Run,
     SetReference,
-    SetTelemetry,
     State,
     Status,
     Trace,
@@ -29,11 +24,11 @@ from haselab.rig.chip import CoSim, Firmware, build_firmware, checkout
 from haselab.rig.twin.twin_bench import TwinBench
 from haselab.scoreboard.devices import find_device
 from haselab.scoreboard.knowledge import true_actuator
+from tests.firmware.traces import UPDATES, bits, latched, replayed, reported, traced
 
 ROOT = checkout()
 REPLAY = [*sorted((ROOT / "core").glob("*.c")), ROOT / "firmware/app/app.c",
           ROOT / "firmware/sim/replay.c"]  # fmt: skip
-UPDATES = 10_000
 REFERENCES = (0.0, 0.03, 0.06, 0.02, -0.02, 0.045, 0.01, 0.08, 0.078, 0.03)
 RISE_V_PER_S = 100.0
 BUDGET = 12_000  # of the 16,000 cycles of a millisecond
@@ -62,10 +57,6 @@ class Case:
     built: Firmware
 
 
-def bits(value: float) -> str:
-    return struct.pack(">f", value).hex()
-
-
 @pytest.fixture(scope="module", params=sorted(PARAMETERS))
 def case(request: pytest.FixtureRequest, settings: ChipSettings, folder: Path) -> Case:
     kind = request.param
@@ -81,17 +72,7 @@ def case(request: pytest.FixtureRequest, settings: ChipSettings, folder: Path) -
 
 @pytest.fixture(scope="module")
 def traces(case: Case, cosim_program: Path, twin: TwinBench) -> list[Trace]:
-    """Arming, the loop closed, steps: every update of 10 s, as the chip reported it."""
-    with CoSim(cosim_program, case.built.elf, twin) as chip:
-        chip.run(0.02)
-        chip.query(Hello(VERSION))
-        chip.execute(SetTelemetry(0, 1))
-        chip.arm()
-        chip.execute(Run(0.0))
-        while len(chip.messages) < UPDATES + 200:
-            chip.execute(SetReference(REFERENCES[int(chip.time_s) % len(REFERENCES)]), 0.1)
-        assert chip.bad_frames == 0
-    return [message for message in chip.messages if isinstance(message, Trace)]
+    return traced(case.built, cosim_program, twin, REFERENCES)
 
 
 @pytest.mark.parametrize("flags", [("-O0",), ("-O3", "-march=native")], ids=" ".join)
@@ -106,14 +87,8 @@ def test_ten_thousand_updates_of_the_chip_are_this_machines_bit_by_bit(
     assert len({trace.code for trace in traces}) > 300  # the loop moved
     program = host(f"{case.kind}{flags[0]}", [*REPLAY, folder / case.kind / "controller.c"],
                    f"-I{folder / case.kind}", *flags)  # fmt: skip
-    lines = [
-        f"{' '.join(map(str, t.codes))} {t.event} {t.alarms} {bits(t.reference)}" for t in traces
-    ]
-    done = subprocess.run(
-        [str(program)], input="\n".join(lines), capture_output=True, text=True, check=True
-    )
-    found = [[row[0], row[3], row[5], row[6]] for row in map(str.split, done.stdout.splitlines())]
-    told = [[str(t.state), str(t.code), bits(t.strain), bits(t.corrected)] for t in traces]
+    found = replayed(program, [latched(trace) for trace in traces])
+    told = [reported(trace) for trace in traces]
     # The first window reaches back to readings from before the first trace.
     different = [k for k in range(1, len(told)) if found[k] != told[k]]
     assert not different, (different[:5], traces[different[0]], found[different[0]])

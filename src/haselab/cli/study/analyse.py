@@ -23,6 +23,7 @@ from haselab.store.session.writer import SessionReader
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.chip.trials import is_chip_session
 from haselab.study.folder import write_findings
+from haselab.study.physical.session import NOT_HERE, analysed, with_model_rows
 from haselab.study.run import analyse_session
 
 __all__ = ["check_ends", "command"]
@@ -105,7 +106,8 @@ def command(
         model = identify_physical_model(path, study, found, unverified=unverified)
         found = model.joined(found)
     if study.is_reference:
-        found = with_chip_rows(found, folder)
+        by_model = NOT_HERE if folder is None else analysed(folder)
+        found = with_model_rows(with_chip_rows(found, folder), by_model)
     found = with_mass_limit(found, study, table_at(header, "rig_config"))
     noise_free = None if folder is None else _earlier_noise_free(folder)
     header = with_date(header, path.parent)

@@ -15,6 +15,7 @@ from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
+from haselab.cli.study.model_control import play_model_control
 from haselab.cli.study.noise_free_run import NoiseFreeRun
 from haselab.cli.study.physical_model import identify_physical_model
 from haselab.cli.study.recommended_mass import with_mass_limit
@@ -31,6 +32,7 @@ from haselab.study.definition import Study
 from haselab.study.experiment import ExperimentResult
 from haselab.study.feasibility import check_drives
 from haselab.study.folder import sections_found, write_findings
+from haselab.study.physical.session import NOT_HERE, with_model_rows
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, run_study, session_header
 
@@ -125,7 +127,8 @@ def execute(
     rig_config = config.model_dump(mode="json")
     options = RunOptions(folder, seed, cast(KeepVideo, keep_video), rig_config, known)
     noise_free_run = NoiseFreeRun(config, study, known)
-    _execute(study, rig, options, as_json, noise_free_run, parallel, physical_model)
+    modelled = config if physical_model else None
+    _execute(study, rig, options, as_json, noise_free_run, parallel, modelled)
 
 
 def execute_on(
@@ -149,7 +152,7 @@ def _execute(
     as_json: bool,
     noise_free_run: NoiseFreeRun | None = None,
     parallel: ParallelExperiments | None = None,
-    physical_model: bool = False,
+    modelled: TwinConfig | None = None,
 ) -> None:
     folder = options.folder
     _check_before_anything_moves(study, rig, folder)
@@ -166,11 +169,15 @@ def _execute(
         if noise_free_run is not None:
             running.enter_context(noise_free_run)
         found = run_study(study, rig, options, progress, fitted)
-        model = None
-        if physical_model:
+        model, by_model = None, NOT_HERE
+        if modelled is not None:
             progress.advance(0.0, "physical model")
             model = identify_physical_model(folder, study, found)
             found = model.joined(found)
+            if study.is_reference:
+                by_model = play_model_control(study, rig, modelled, options, found, model, progress)
+                if isinstance(by_model, str):
+                    click.echo(f"haselab: S27 and S30 were left out: {by_model}", err=True)
         if noise_free_run is not None:
             progress.advance(0.0, "noise-free reference run")
             noise_free = _noise_free(noise_free_run)
@@ -188,7 +195,7 @@ def _execute(
         if parallel is not None:
             parallel.stop()
     if study.is_reference:
-        found = with_chip_rows(found, folder)
+        found = with_model_rows(with_chip_rows(found, folder), by_model)
     found = with_mass_limit(found, study, options.rig_config)
     header = with_date(session_header(study, rig.description, options), folder)
     results = write_findings(folder, found, study, header, noise_free)

@@ -25,7 +25,7 @@ from haselab.study.own_controller import OWN, own_controller, own_names
 from haselab.study.paper.quantity_table import paper_rows
 from haselab.study.player import UPDATE_HZ, Player
 from haselab.study.quantity import Quantity
-from haselab.study.tables import Steps, StepTrials
+from haselab.study.tables import Steps, StepTimes
 
 __all__ = ["StepTest", "closed_names", "open_names", "step_reference"]
 
@@ -63,7 +63,7 @@ def closed_names(study: Study, group: str) -> list[str]:
     return [f"{group}-{k + 1}" for k in range(trials)]
 
 
-def step_reference(steps: Steps | StepTrials) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def step_reference(steps: StepTimes) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Desired strain of a trial, one value per block: zero, then the step."""
     zero = constant(0.0, steps.zero_s, UPDATE_HZ)
     return np.concatenate([zero, constant(steps.step, steps.step_s, UPDATE_HZ)])

@@ -19,7 +19,7 @@ from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.resolution import POSITION_PX, with_resolution
 from haselab.study.own_controller import OWN, own_note, own_quantities
-from haselab.study.tables import Steps, StepTrials
+from haselab.study.tables import StepTimes
 
 __all__ = [
     "ONE_TRIAL",
@@ -67,7 +67,7 @@ def collect_trials(
     trials: Sequence[Observation],
     zero_length_m: float,
     to_strain: StrainMap,
-    steps: Steps | StepTrials,
+    steps: StepTimes,
 ) -> Trials:
     """Collect the trials of one group at the frame times of the first one, with their metrics.
 
@@ -181,7 +181,7 @@ def _group_of(key: str) -> str:
 
 
 def with_camera_resolution(
-    estimate: Estimate, steps: Steps | StepTrials, strain_per_px: float
+    estimate: Estimate, steps: StepTimes, strain_per_px: float
 ) -> Estimate:
     """Add the camera's resolution to a metric, a time or a fraction of the step.
 
@@ -202,7 +202,7 @@ def with_camera_resolution(
 def make_comparison(
     groups: dict[str, Trials],
     quantities: dict[str, Estimate],
-    steps: Steps | StepTrials,
+    steps: StepTimes,
     strain_per_px: float,
     shown: str,
 ) -> Comparison:
@@ -238,7 +238,7 @@ def make_comparison(
     return Comparison(groups, quantities, figures, error)
 
 
-def _figures(groups: dict[str, Trials], steps: Steps | StepTrials, shown: str) -> dict[str, Any]:
+def _figures(groups: dict[str, Trials], steps: StepTimes, shown: str) -> dict[str, Any]:
     first = groups[shown]
     drawn = {
         name: {

@@ -22,6 +22,7 @@ _CALIBRATED_ONCE = (
     "calibration, which a run makes once: 0.1 % of capacitance corresponds to 0.008 of a step of "
     "0.04 and to 0.02 of one of 0.014"
 )
+_OUTER = "linear region and reach of the run"
 _IN_HZ = "printed in rad/s; the same number in Hz is {:.1f} rad/s"
 
 
@@ -382,6 +383,9 @@ def _loops() -> dict[str, Quantity]:
         "S25.error_own": Quantity(
             "steady-state error, controller of [control] kind", "", note=_ERROR
         ),
+        "S25.rise_observer": Quantity("rise time, observer with the physical model", "s"),
+        "S25.overshoot_observer": Quantity("overshoot, observer, ringing included", ""),
+        "S25.error_observer": Quantity("steady-state error, observer", "", note=_ERROR),
         "S26.rise": Quantity("rise time, loop on the chip", "s"),
         "S26.settling": Quantity("settling time, loop on the chip", "s"),
         "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),
@@ -391,6 +395,22 @@ def _loops() -> dict[str, Quantity]:
             note=f"{_ERROR}. {_CALIBRATED_ONCE}",
         ),
         "S26.phase_margin": Quantity("loop on the chip, phase margin", "deg"),
+        "S27.mass_error_own": Quantity("sensed minus hung mass, the mass of the study", "kg"),
+        "S27.mass_error_other": Quantity(
+            "sensed minus hung mass, another mass",
+            "kg",
+            note="the controller was not informed of this mass",
+        ),
+        "S27.rise_own": Quantity("rise time, hybrid", "s"),
+        "S27.overshoot_own": Quantity("overshoot, hybrid, ringing included", ""),
+        "S27.error_own": Quantity("steady-state error, hybrid", "", note=_ERROR),
+        "S27.rise_other": Quantity("rise time, hybrid with the other mass", "s"),
+        "S27.overshoot_other": Quantity(
+            "overshoot, hybrid with the other mass, ringing included", ""
+        ),
+        "S27.error_other": Quantity(
+            "steady-state error, hybrid with the other mass", "", note=_ERROR
+        ),
         "S28.rise": Quantity("rise time, miniature bench", "s"),
         "S28.settling": Quantity("settling time, miniature bench", "s"),
         "S28.overshoot": Quantity("overshoot, miniature bench, noise included", ""),
@@ -403,6 +423,14 @@ def _loops() -> dict[str, Quantity]:
             "miniature bench, phase margin",
             "deg",
             note="of the plant at the study's operating point",
+        ),
+        "S30.lowest": Quantity("lowest strain of the steps", "", setting=_OUTER),
+        "S30.highest": Quantity("highest strain of the steps", "", setting=_OUTER),
+        "S30.error": Quantity("largest strain error at rest, outside of the linear region", ""),
+        "S30.overshoot": Quantity(
+            "largest overshoot of a step outside of the linear region",
+            "",
+            note="hybrid; camera noise included",
         ),
     }
 

@@ -43,7 +43,7 @@ def study_rows() -> tuple[StudyRow, ...]:
     """All rows in the order of their numbers.
 
     Example:
-        >>> [row.here for row in study_rows() if row.id == "S30"]
+        >>> [row.here for row in study_rows() if row.id == "S29"]
         ['open']
     """
     data = tomllib.loads(_FILE.read_text(encoding="utf-8"))

@@ -1,0 +1,1 @@
+"""Experiments with the identified physical model, in a session of their own."""

@@ -12,6 +12,7 @@ from haselab.actuators import (
     ADDED_INERTIA,
     DRIFTS,
     GRAVITY_M_S2,
+    DeaStack,
     Drive,
     PlanarHasel,
     SampledLaw,
@@ -145,6 +146,18 @@ def test_records_of_two_actuators_give_no_numbers():
     records = [record(TRUE, 4, duration_s=15.0), record(other, 5, duration_s=15.0)]
     found = refused(records)
     assert found.startswith("the records contradict ") and "of one actuator" in found
+
+
+@pytest.mark.long
+def test_a_record_of_another_kind_is_refused_after_one_search(monkeypatch):
+    """Further searches, with more effects and another noise, would take ten times as long."""
+    calls = []
+    for name in ("search_with_all_effects", "refine", "find_extended_law"):
+        monkeypatch.setattr(f"haselab.identify.physical.fit.{name}", lambda *_: calls.append(1))
+    seen = record(TRUE, 4, duration_s=15.0)
+    fit = fit_actuator(DeaStack(), [seen], mass_kg=MASS_KG)
+    assert fit.status.startswith("the records contradict the model: ") and not fit.parameters
+    assert not calls
 
 
 @pytest.mark.long

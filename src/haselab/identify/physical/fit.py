@@ -107,7 +107,8 @@ def fit_actuator(
             kind=law.kind,
         )
     rejected: list[Rival] = []
-    if not found.converged:
+    # no effect of a few per cent explains what a constant length or capacitance explains better
+    if not found.converged and channel_residuals(plain, found).share > 0.0:
         found, rejected = search_with_all_effects(plain, start.without((CAMERA_SCALE,)), found)
     if not (found.converged or rejected):
         found, fault = _judge_early(plain, start.without((CAMERA_SCALE,)), found)

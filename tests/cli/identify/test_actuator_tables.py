@@ -22,7 +22,7 @@ def run(capsys, *arguments):
     return stop.value.code, printed.out, printed.err
 
 
-def table(path, mass_kg, *, seed=1, law=LAW, gain=GAIN, rows=1200):
+def table(path, mass_kg, *, seed=1, law=LAW, gain=GAIN, rows=1200, shift_m=0.0):
     """Held random voltages of 0 to 9 kV, what the law does, and noise."""
     rng = np.random.default_rng(seed)
     time_s = 0.01 * np.arange(rows)
@@ -36,7 +36,7 @@ def table(path, mass_kg, *, seed=1, law=LAW, gain=GAIN, rows=1200):
     sampled = SampledLaw(law, 11e3)
     start, _ = sampled.at_rest(0.0, 0.0, mass_kg * GRAVITY_M_S2)
     seen_m = sampled.respond(drive, time_s, start).length_m
-    length_m = seen_m + LENGTH_STD_M * rng.standard_normal(rows)
+    length_m = seen_m + shift_m + LENGTH_STD_M * rng.standard_normal(rows)
     capacitance_f = law.capacitance_f(seen_m) + CAPACITANCE_STD_F * rng.standard_normal(rows)
     columns = np.column_stack([time_s, 1e3 * u, length_m, 1e12 * capacitance_f])
     np.savetxt(path, columns, "%.12g", ";", header="Zeit (s);U (mV);length_m;C (pF)", comments="")
@@ -119,6 +119,23 @@ def test_intervals_allow_for_the_gain_or_mass_that_the_capacitances_contradict(
             assert high - low < 0.35 * (true or 0.3), (name, found)
 
 
+@pytest.mark.long
+def test_intervals_allow_for_a_wrong_zero_of_a_displacement_sensor(actuator, tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, shift_m=20e-6)
+    code, text, _ = run(capsys, file, "--actuator", actuator, *COLUMNS, "--json")
+    found = json.loads(text)["parameters"]
+    assert code == 0
+    for name, true in (("actuator.layer_thickness_m", 7e-4), ("camera.offset_m", 20e-6)):
+        low, high = found[name]["ci95"]
+        assert low < true < high, (name, found[name])
+    # the zero of 50 um alone moves the 50 layers of 35 mm by 0.14 %
+    assert found["actuator.layer_thickness_m"]["std"] < 2.0 * 7e-4 * 50e-6 / 35e-3
+    again = "--zero-std-m", "1e-7", "--json"
+    narrow = json.loads(run(capsys, file, "--actuator", actuator, *COLUMNS, *again)[1])
+    std = narrow["parameters"]["camera.offset_m"]["std"]
+    assert std == pytest.approx(1e-7, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -149,6 +166,17 @@ def test_a_record_with_few_values_gives_no_numbers(actuator, tmp_path, capsys):
     code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS)
     assert code == 3 and "the records have 14 values, too few for the 15 unknowns" in error, error
     assert "1 steps of the times are longer than the usual 0.01 s, the longest is 0.04 s" in error
+
+
+def test_a_value_that_is_not_finite_is_left_out_without_its_row(actuator, tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, rows=100)
+    lines = file.read_text().splitlines()
+    time, volt, _, farad = lines[6].split(";")
+    lines[6] = ";".join([time, volt, "inf", farad])
+    file.write_text("\n".join(lines))
+    code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS)
+    assert code == 2 and "Column length_m has inf in row 6 (1 such rows). Write nan" in error, error
+    assert "keep the rows" in error and "Remove" not in error
 
 
 def test_times_that_fall_and_records_given_twice_are_refused(actuator, tmp_path, capsys):

@@ -118,6 +118,25 @@ def test_a_standard_deviation_of_0_is_refused(tmp_path):
     assert result.exit_code == 2 and "--std" in result.stderr
 
 
+@pytest.mark.long
+def test_a_goal_that_no_experiment_reaches_ends_with_what_the_best_one_reaches(tmp_path):
+    out = tmp_path / "study.toml"
+    result = CliRunner().invoke(
+        identify, ["plan-experiment", str(file_of(tmp_path)), "--goal", GOAL, "--std", "1e-9",
+                   "--json", "--out", str(out)],
+    )  # fmt: skip
+    assert isinstance(result.exception, ResultError)  # exit code 3
+    answer = json.loads(result.stdout)
+    best = answer["relative_std_after"]
+    assert f"of 1e-09 for {GOAL}; the best one reaches {best:.2g}" in answer["status"]
+    assert str(result.exception).startswith(answer["status"])
+    reachable = float(
+        str(result.exception).partition("raise --std to at least ")[2].split()[0][:-1]
+    )
+    assert best <= reachable < 1.2 * best
+    assert checked_study(tomllib.loads(out.read_text()), out).name == f"experiment for {GOAL}"
+
+
 def test_where_nothing_is_measured_no_experiment_helps(tmp_path):
     records = {"gain_v_per_v": 5000.0, "highest_drive_v": 1.0}
     with pytest.raises(ResultError, match=r"No experiment of the catalogue reduces"):

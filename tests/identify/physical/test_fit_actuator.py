@@ -12,6 +12,7 @@ from haselab.actuators import (
     ADDED_INERTIA,
     DRIFTS,
     GRAVITY_M_S2,
+    DeaStack,
     Drive,
     PlanarHasel,
     SampledLaw,
@@ -19,7 +20,7 @@ from haselab.actuators import (
 )
 from haselab.base import InputError
 from haselab.identify.physical import MotionRecord, fit_actuator
-from haselab.identify.physical.misfit import SESSION_OFFSET_M, SHARED_PX, Misfit, SharedErrors
+from haselab.identify.physical.misfit import SHARED_PX, TRACKED_ZERO_M, Misfit, SharedErrors
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widen_std
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
@@ -143,7 +144,20 @@ def refused(records):
 def test_records_of_two_actuators_give_no_numbers():
     other = replace(TRUE, electrode_stiffness_n_per_m=220.0)
     records = [record(TRUE, 4, duration_s=15.0), record(other, 5, duration_s=15.0)]
-    assert refused(records).startswith("the records contradict the model: its ")
+    found = refused(records)
+    assert found.startswith("the records contradict ") and "of one actuator" in found
+
+
+@pytest.mark.long
+def test_a_record_of_another_kind_is_refused_after_one_search(monkeypatch):
+    """Further searches, with more effects and another noise, would take ten times as long."""
+    calls = []
+    for name in ("search_with_all_effects", "refine", "find_extended_law"):
+        monkeypatch.setattr(f"haselab.identify.physical.fit.{name}", lambda *_: calls.append(1))
+    seen = record(TRUE, 4, duration_s=15.0)
+    fit = fit_actuator(DeaStack(), [seen], mass_kg=MASS_KG)
+    assert fit.status.startswith("the records contradict the model: ") and not fit.parameters
+    assert not calls
 
 
 @pytest.mark.long
@@ -181,7 +195,7 @@ def test_no_record_is_refused():
 def test_the_zero_of_the_camera_may_move_between_records():
     """The misfit of an offset is its own square, not once more that of each length."""
     records = [record(TRUE, seed, duration_s=2.0) for seed in (1, 2)]
-    moved = replace(records[1], length_m=records[1].length_m + 2.0 * SESSION_OFFSET_M)
+    moved = replace(records[1], length_m=records[1].length_m + 2.0 * TRACKED_ZERO_M)
     start = Unknowns.of(TRUE, added_inertia_kg=0.0, mass_kg=MASS_KG)
 
     def squares(*seen):
@@ -209,8 +223,8 @@ def test_shared_errors_of_tracking_are_whitened(lengths, std_m):
     covariance = np.diag(stds**2) + shared
     both = white @ (covariance / np.outer(stds, stds)) @ white.T
     np.testing.assert_allclose(both, np.eye(count), atol=1e-6)
-    zero = SharedErrors.of_zero(SharedErrors.of(seen, stds), stds, SESSION_OFFSET_M)
-    white, covariance = zero.whitened(white), covariance + SESSION_OFFSET_M**2
+    zero = SharedErrors.of_zero(SharedErrors.of(seen, stds), stds, TRACKED_ZERO_M)
+    white, covariance = zero.whitened(white), covariance + TRACKED_ZERO_M**2
     both = white @ (covariance / np.outer(stds, stds)) @ white.T
     np.testing.assert_allclose(both, np.eye(count), atol=1e-6)
 

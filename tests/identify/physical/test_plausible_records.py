@@ -1,4 +1,4 @@
-"""Swapped units and wrong volts are named before a fit, for each kind of actuator."""
+"""Wrong units, volts, signs and masses are named before a fit, for each kind of actuator."""
 
 from dataclasses import replace
 
@@ -24,13 +24,12 @@ KINDS = {
     "dea-stack": (DeaStack(), 0.2, 9e3),
 }
 GAIN = 5e3
+FACTORS = (1.0, 1.5)  # of the masses of two records
 STD_M, STD_F = 4e-6, 3e-13
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
-def seen(request):
-    """Law and record of a kind: two seconds, a step to the highest voltage after one."""
-    law, mass_kg, highest_v = KINDS[request.param]
+def played(law, mass_kg, highest_v):
+    """Two seconds of a law, a step to the highest voltage after one."""
     edge_s = np.linspace(0.0, 2.0, 201)
     volt = np.where(edge_s[:-1] < 1.0, 0.0, highest_v)
     load_n, masses_kg = np.full(200, mass_kg * GRAVITY_M_S2), np.full(200, mass_kg)
@@ -39,10 +38,17 @@ def seen(request):
     start, _ = sampled.at_rest(0.0, 5e3, float(load_n[0]))
     found = sampled.respond(drive, edge_s[:-1], start)
     every, none = np.arange(200), np.zeros(200, np.int64)
-    return law, MotionRecord(
-        "a", drive, edge_s[:-1], found.length_m, np.full(200, STD_M), every, every,
+    return MotionRecord(
+        f"{mass_kg:g} kg", drive, edge_s[:-1], found.length_m, np.full(200, STD_M), every, every,
         found.capacitance_f, np.full(200, STD_F), ("all",), none, none,
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=list(KINDS))
+def seen(request):
+    """Law and record of a kind."""
+    law, mass_kg, highest_v = KINDS[request.param]
+    return law, played(law, mass_kg, highest_v)
 
 
 def scaled(record, **factors):
@@ -55,6 +61,25 @@ def driven(record, factor):
     return replace(
         record, drive=replace(drive, voltage_v=factor * drive.voltage_v, ripple_v2=ripple_v2)
     )
+
+
+def timed(record, factor):
+    drive = record.drive
+    return replace(
+        record, drive=replace(drive, edge_s=factor * drive.edge_s),
+        length_time_s=factor * record.length_time_s,
+    )  # fmt: skip
+
+
+def mirrored(record):
+    return replace(record, length_m=2.0 * record.length_m[0] - record.length_m)
+
+
+def loaded(record, factor):
+    drive = record.drive
+    return replace(record, drive=replace(
+        drive, load_n=factor * drive.load_n, mass_kg=factor * drive.mass_kg
+    ))  # fmt: skip
 
 
 def test_a_plausible_record_has_no_fault(seen):
@@ -73,8 +98,13 @@ def test_a_plausible_record_has_no_fault(seen):
         ),
         (lambda r: driven(r, 1.0 / GAIN), "not those at the amplifier's input"),
         (lambda r: driven(r, GAIN), "the amplifier's gain is not counted twice"),
+        (lambda r: driven(r, 1e-3), "check the amplifier's gain and the unit of the voltage (V)"),
+        (lambda r: timed(r, 1e3), "if all times were 1000 times shorter"),
+        (lambda r: timed(r, 1e-3), "if all times were 1000 times longer"),
+        (lambda r: timed(r, 1.0 / 60.0), "if all times were 60 times longer"),
+        (mirrored, "the lengths grow where the actuator contracts"),
     ],
-    ids=["mm", "km", "pF", "input volts", "gain twice"],
+    ids=["mm", "km", "pF", "input volts", "gain twice", "kV", "ms", "s for ms", "min", "sign"],
 )
 def test_swapped_units_and_volts_are_named_without_numbers(seen, bad, words):
     law, record = seen
@@ -88,3 +118,33 @@ def test_a_record_without_motion_may_have_a_small_drive(seen):
     rng = np.random.default_rng(1)
     still = replace(small, length_m=record.length_m[0] + STD_M * rng.standard_normal(200))
     assert find_implausible(law, [still]) == ""
+
+
+def test_starts_that_are_off_find_no_fault(seen):
+    """Stiffness and inertia of the start move the resonance, by up to a fifth."""
+    law, record = seen
+    mass_kg, highest_v = float(record.drive.mass_kg[0]), float(record.drive.voltage_v.max())
+    for factor in (0.7, 1.4):
+        heavier = loaded(played(law, factor * mass_kg, highest_v), 1.0 / factor)
+        assert find_implausible(law, [heavier]) == ""
+
+
+def test_a_lighter_mass_that_stretches_more_is_named_without_numbers(seen):
+    law, record = seen
+    mass_kg, highest_v = float(record.drive.mass_kg[0]), float(record.drive.voltage_v.max())
+    records = [played(law, f * mass_kg, highest_v) for f in FACTORS]
+    assert find_implausible(law, records) == ""
+    swapped = [
+        loaded(r, f / own) for r, f, own in zip(records, FACTORS[::-1], FACTORS, strict=True)
+    ]
+    fit = fit_actuator(law, swapped, mass_kg=1.5 * mass_kg)
+    assert "Check the masses, which may be swapped" in fit.status and not fit.parameters
+
+
+def test_a_record_of_one_length_and_many_capacitances_is_compared_with_no_motion(seen):
+    law, record = seen
+    one = replace(
+        record, length_time_s=record.length_time_s[:1], length_m=record.length_m[:1],
+        length_std_m=record.length_std_m[:1], length_experiment=record.length_experiment[:1],
+    )  # fmt: skip
+    assert find_implausible(law, [one]) == ""

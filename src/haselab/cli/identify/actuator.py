@@ -20,7 +20,7 @@ from haselab.cli.identify.common import FILES, RATE, emit_fit
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.identify.physical import ActuatorFit, MotionRecord, fit_actuator
+from haselab.identify.physical import TRACKED_ZERO_M, ActuatorFit, MotionRecord, fit_actuator
 from haselab.models.actuator.sections import ActuatorSection, ActuatorTables, PhysicalTable
 from haselab.pipelines.planning.actuator_file import planner_of
 from haselab.pipelines.planning.proposal import DETERMINED, Proposal
@@ -32,6 +32,8 @@ from haselab.store.session.reader import session_file
 from haselab.store.toml import validated
 
 __all__ = ["actuator", "law_of_section", "section_of_fit"]
+
+_TABLE_ZERO_M = 5e-5  # standard deviation of the zero of a displacement sensor, set by a caliper
 
 
 @click.command("actuator")
@@ -54,6 +56,9 @@ __all__ = ["actuator", "law_of_section", "section_of_fit"]
 )
 @shared_option("--zero-length-m", type=POSITIVE,
                detail="Used for tables with strains only. Default: that of A.toml.")  # fmt: skip
+@click.option("--zero-std-m", type=POSITIVE,
+              help="Set the standard deviation of the zero of the lengths in m. Default: 5e-5 with "
+              "tables, 2e-6 without.")  # fmt: skip
 @unverified_option
 @column_options
 @answer_options(plot=True)
@@ -66,6 +71,7 @@ def actuator(
     masses_kg: tuple[float, ...],
     gain_v_per_v: float | None,
     zero_length_m: float | None,
+    zero_std_m: float | None,
     columns: ColumnOptions,
     *,
     unverified: bool,
@@ -109,7 +115,11 @@ def actuator(
         )
     inputs = [session_file(file) for file in files]
     _refuse_twice(inputs)
-    fit = fit_actuator(law, records, mass_kg=mass_kg)
+    tracked = all(file.is_dir() or is_session(file) for file in files)
+    fit = fit_actuator(
+        law, records, mass_kg=mass_kg,
+        camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
+    )  # fmt: skip
     if not fit.succeeded:
         emit_fit(fit, inputs, as_json, out)
     section = section_of_fit(fit, records, gains_v_per_v[0])

@@ -16,6 +16,8 @@ from haselab.store.toml import toml_text
 
 __all__ = ["plan_for_actuator"]
 
+_NOT_BELOW = 1.05  # a number times this one, with two digits, is never below the number
+
 
 def plan_for_actuator(
     path: Path, goal: str, std: float | None, *, as_json: bool, out: Path | None
@@ -31,7 +33,8 @@ def plan_for_actuator(
     Raises:
         InputError: The file has no usable model, the parameter is unknown, or it is known well
             enough already.
-        ResultError: No experiment improves what is known of the parameter.
+        ResultError: No experiment improves what is known of the parameter, or none improves it
+            enough; the best one is printed and written all the same.
     """
     wanted = DETERMINED if std is None else std
     if not 0.0 < wanted < float("inf"):
@@ -62,6 +65,11 @@ def plan_for_actuator(
         emit(_answer(proposal, planner), as_json=True, out=None)
     else:
         click.echo("\n".join(_page(proposal, text)))
+    if proposal.status != "ok":
+        raise ResultError(
+            f"{proposal.status}. Play that study and plan again, or raise --std to at least "
+            f"{_NOT_BELOW * proposal.after:.2g}. {path}"
+        )
 
 
 def _planner(path: Path) -> Planner:
@@ -83,7 +91,6 @@ def _page(proposal: Proposal, text: str) -> list[str]:
     return [
         f"{proposal.parameter}: {proposal.text}",
         *proposal.notes,
-        *([] if proposal.status == "ok" else [f"Status: {proposal.status}."]),
         "",
         text.rstrip(),
     ]

@@ -21,10 +21,15 @@ from numpy.typing import NDArray
 
 from haselab.actuators import ActuatorLaw
 from haselab.base import InputError
-from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit
+from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, TRACKED_ZERO_M, Misfit
 from haselab.identify.physical.plausible import find_implausible
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.residuals import channel_of, channel_residuals, rms_of
+from haselab.identify.physical.residuals import (
+    channel_of,
+    channel_residuals,
+    rms_of,
+    status_of,
+)
 from haselab.identify.physical.result import ActuatorFit, result_of
 from haselab.identify.physical.rivals import (
     Rival,
@@ -45,6 +50,10 @@ _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _APART = 2.0  # rms over noise from which records are compared alone
 _LEAST_VALUES = 2  # for each unknown, without which nobody sees the noise
+_CONTRADICT = (
+    "the records contradict each other: the law explains each alone, but not all together. Check "
+    "that all are of one actuator, and mass, units and gain of each"
+)
 
 
 def fit_actuator(
@@ -53,7 +62,7 @@ def fit_actuator(
     *,
     mass_kg: float,
     added_inertia_kg: float | None = None,
-    camera_bias_m: float = 2e-6,
+    camera_bias_m: float = TRACKED_ZERO_M,
     camera_scale_std: float = 5e-5,
 ) -> ActuatorFit:
     """Identify a physical model from records.
@@ -63,8 +72,8 @@ def fit_actuator(
         records: of one actuator.
         mass_kg: hung mass, the scale of an added inertia.
         added_inertia_kg: where to start with that; None: 5 % of the hung mass.
-        camera_bias_m: standard deviation of the error that all lengths share; a track of 0.02 px
-            is usual.
+        camera_bias_m: standard deviation of the error that all lengths share, and of a further
+            one that those of each of several records share; a track of 0.02 px is usual.
         camera_scale_std: relative standard deviation of the camera's scale, with the slow
             errors of tracking over the picture.
     Returns:
@@ -98,8 +107,13 @@ def fit_actuator(
             kind=law.kind,
         )
     rejected: list[Rival] = []
-    if not found.converged:
+    # no effect of a few per cent explains what a constant length or capacitance explains better
+    if not found.converged and channel_residuals(plain, found).share > 0.0:
         found, rejected = search_with_all_effects(plain, start.without((CAMERA_SCALE,)), found)
+    if not (found.converged or rejected):
+        found, fault = _judge_early(plain, start.without((CAMERA_SCALE,)), found)
+        if fault:
+            return ActuatorFit(status=fault, kind=law.kind, evaluations=found.evaluations)
     if rejected:
         start = start.with_law(found.unknowns.present_law(), found.unknowns.drifts)
     misfit, found = _weighed(
@@ -112,9 +126,7 @@ def fit_actuator(
     rejected += more
     seen = channel_residuals(misfit, found)
     if len(records) > 1 and seen.excess[0] > _APART and _each_alone(misfit, start):
-        status = "the records contradict each other: the law explains each alone, but not all"
-        status += " together. Check that all are of one actuator, and mass, units and gain of each"
-        return ActuatorFit(status=status, kind=law.kind, evaluations=found.evaluations)
+        return ActuatorFit(status=_CONTRADICT, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
     others = compare_elastic_laws(misfit, found) if seen.explained else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
@@ -157,11 +169,44 @@ def _explains(misfit: Misfit, before: SearchResult, after: SearchResult) -> bool
     return seen.explained or left < (1.0 - _EXPLAINS) * seen.excess_energy
 
 
-def _each_alone(misfit: Misfit, start: Unknowns) -> bool:
-    """Whether the law explains each record alone, with parameters of its own."""
-    parts = [replace(misfit, records=[record]) for record in misfit.records]
-    alone = [(own, search(own, start)) for own in parts]
-    return all(part is not None and channel_residuals(own, part).explained for own, part in alone)
+def _judge_early(misfit: Misfit, start: Unknowns, found: SearchResult) -> tuple[SearchResult, str]:
+    """Judge records for which no search converged, before further ones that take minutes.
+
+    Args:
+        misfit: to minimise.
+        start: where the user began.
+        found: by the searches.
+    Returns:
+        The best result, which may start from what explains one of the records alone, and the reason
+        why the records contradict the model or each other; empty if that is not certain.
+    """
+    alone = _each_alone(misfit, start) if len(misfit.records) > 1 else []
+    for part in alone:
+        joint = refine(misfit, start.at(part.unknowns), found.evaluations)
+        if joint is not None and rms_of([joint.residuals]) < rms_of([found.residuals]):
+            found = joint
+    seen = channel_residuals(misfit, found)
+    if alone and seen.excess[0] > _APART:
+        return found, _CONTRADICT
+    missed = not found.converged and seen.misses_a_signal
+    return found, status_of(seen, 1.0, (), converged=False)[0] if missed else ""
+
+
+def _each_alone(misfit: Misfit, start: Unknowns) -> list[SearchResult]:
+    """What explains each record alone, with parameters of its own; empty if one is not explained.
+
+    Args:
+        misfit: of all records.
+        start: where the user began.
+    """
+    found: list[SearchResult] = []
+    for record in misfit.records:
+        own = replace(misfit, records=[record])
+        part = search(own, start)
+        if part is None or not channel_residuals(own, part).explained:
+            return []
+        found.append(part)
+    return found
 
 
 def _ordered(found: SearchResult) -> SearchResult:

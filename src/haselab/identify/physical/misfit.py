@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -29,8 +30,8 @@ from haselab.identify.physical.unknowns import (
 __all__ = [
     "CAPACITANCE",
     "LENGTH",
-    "SESSION_OFFSET_M",
     "SHARED_PX",
+    "TRACKED_ZERO_M",
     "Misfit",
     "ModelledRecord",
     "Segment",
@@ -41,7 +42,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 LENGTH, CAPACITANCE = "length", "capacitance"
-SESSION_OFFSET_M = 2e-6  # by which tracks of 0.02 px move the zero from one record to the next
+TRACKED_ZERO_M = 2e-6  # standard deviation of the zero of lengths from tracks of 0.02 px
 SHARED_PX = 3e-4  # error of tracking that all frames with the same pixels share
 _LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
@@ -300,7 +301,8 @@ class Misfit:
             std_m = self.length_factor * record.length_std_m
             parts = [SharedErrors.of(record, std_m)]
             if len(self.records) > 1:
-                parts.append(SharedErrors.of_zero(parts[0], std_m, SESSION_OFFSET_M))
+                zero_std_m = self.known.get(CAMERA_OFFSET, TRACKED_ZERO_M)
+                parts.append(SharedErrors.of_zero(parts[0], std_m, zero_std_m))
             found.append(parts)
         return found
 
@@ -361,7 +363,7 @@ class Misfit:
         try:
             if len(self.records) == 1:
                 return [one(self.records[0])]
-            with ThreadPoolExecutor() as pool:
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
                 return list(pool.map(one, self.records))
         except HaselabError:
             return None

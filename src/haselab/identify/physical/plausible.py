@@ -1,15 +1,19 @@
-"""Records that cannot be those of an actuator: swapped units, and voltages of another place."""
+"""Records that cannot be those of an actuator: wrong units, masses, signs and voltages."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.actuators import ActuatorLaw, equilibrium_m
-from haselab.base import LimitError
+from haselab.base import HaselabError, LimitError
+from haselab.identify.physical.misfit import model_record
 from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.unknowns import Unknowns
 
 __all__ = ["find_implausible"]
 
@@ -19,10 +23,22 @@ _LENGTH, _CAPACITANCE = 10.0, 100.0  # factor from the start values that no star
 _BREAKDOWN = 3.0  # fields over that of breakdown, likewise
 _UNSEEN = 0.01  # motion over the noise of a length
 _STILL = 20.0  # spread of the lengths over their noise, of an actuator that moves
+_FOLLOWS = 0.7  # correlation with the simulated motion, of lengths that follow the drive
+_LITTLE = 1e-3  # of the motion, which no start explains
+_LONGEST_S = 5e3  # of a simulation for these checks: seconds of computing
+_TIME_SCALES = (1e-3, 60.0, 1e3)  # true over stated times: ms or min for s, s for ms
+# of the times, because the resonance at the start values may be off; the most likely ones first
+_TUNED = (1.0, 0.85, 1.2, 0.7, 1.4, 0.6, 1.7)
+_LONGEST_TUNED_S = 500.0
+_ALIKE, _MORE_ALIKE = 0.6, 1.4  # correlation of steps: of right times; over that of wrong ones
+_LOW = 0.3  # of the highest voltage, below which the load decides the length
+_HEAVIER = 1.1  # load over another one, whose lengths are compared
+_REVERSED = 0.25  # of the simulated difference of two lengths
+_LEAST_LENGTHS = 5  # of a load
 
 
 def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
-    """Say which unit or voltage of the records is wrong by orders of magnitude.
+    """Say which unit, voltage, sign or mass of the records cannot be right.
 
     Args:
         law: at the start values, which may be off by a factor of 2.
@@ -31,10 +47,16 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
         What is wrong and what to do; empty if nothing is.
     """
     for record in records:
-        for fault in (_length(law, record), _capacitance(law, record), _voltage(law, record)):
+        for fault in (_length(law, record), _capacitance(law, record), _field(law, record)):
             if fault:
                 return f"{record.name}: {fault}"
-    return ""
+    beginnings = [_beginning(record) for record in records if _seen_early(record).any()]
+    lengths = [_simulated_m(law, record) for record in beginnings]
+    for record, length_m in zip(beginnings, lengths, strict=True):
+        for fault in (_drive(law, record, length_m), _times(law, record), _sign(record, length_m)):
+            if fault:
+                return f"{record.name}: {fault}"
+    return _loads(beginnings, lengths)
 
 
 def _length(law: ActuatorLaw, record: MotionRecord) -> str:
@@ -65,38 +87,51 @@ def _capacitance(law: ActuatorLaw, record: MotionRecord) -> str:
     )
 
 
-def _voltage(law: ActuatorLaw, record: MotionRecord) -> str:
-    drive = record.drive
-    highest_v = float(np.abs(drive.voltage_v).max())
-    if highest_v == 0.0:
-        return ""
+def _field(law: ActuatorLaw, record: MotionRecord) -> str:
+    highest_v = float(np.abs(record.drive.voltage_v).max())
     field_v_m = highest_v / float(law.gap_m(law.free_length_m))
-    if field_v_m > _BREAKDOWN * law.circuit.breakdown_v_per_m:
-        return (
-            f"the drive reaches {highest_v:.3g} V, a field of {field_v_m:.3g} V/m, and the "
-            f"dielectric breaks down at {law.circuit.breakdown_v_per_m:.3g} V/m. State the volts "
-            "at the actuator: check that the amplifier's gain is not counted twice"
-        )
-    moved_m = _moved_m(law, record, highest_v)
-    if moved_m is None or not record.length_m.size:
+    if field_v_m <= _BREAKDOWN * law.circuit.breakdown_v_per_m:
         return ""
-    noise_m = float(np.median(record.length_std_m))
-    if moved_m > _UNSEEN * noise_m or float(np.std(_at_usual_load(record))) < _STILL * noise_m:
+    return (
+        f"the drive reaches {highest_v:.3g} V, a field of {field_v_m:.3g} V/m, and the "
+        f"dielectric breaks down at {law.circuit.breakdown_v_per_m:.3g} V/m. State the volts "
+        "at the actuator: check that the amplifier's gain is not counted twice"
+    )
+
+
+def _drive(law: ActuatorLaw, record: MotionRecord, simulated_m: Floats | None) -> str:
+    """Whether the actuator moves far more than the stated voltages explain."""
+    highest_v = float(np.abs(record.drive.voltage_v).max())
+    moved_m = None if highest_v == 0.0 else _moved_m(law, record, highest_v)
+    if moved_m is None:
+        return ""
+    usual, noise_m = _usually_loaded(record), float(np.median(record.length_std_m))
+    seen_m = record.length_m[usual]
+    spread_m = float(np.std(seen_m))
+    moves = moved_m < _UNSEEN * noise_m and spread_m > _STILL * noise_m
+    if simulated_m is not None and moved_m < _LITTLE * spread_m:
+        moves = moves or _correlation(seen_m, simulated_m[usual]) > _FOLLOWS
+    if not moves:
         return ""
     return (
         f"the drive of at most {highest_v:.3g} V would move the actuator by {1e6 * moved_m:.2g} "
         "um, but it moves. State the volts at the actuator, not those at the amplifier's input: "
-        "check the amplifier's gain"
+        "check the amplifier's gain and the unit of the voltage (V)"
     )
 
 
-def _at_usual_load(record: MotionRecord) -> Floats:
-    """Lengths seen under the load that acted longest."""
+def _usually_loaded(record: MotionRecord) -> NDArray[np.bool_]:
+    """Which lengths were seen under the load that acted longest. Shape `(F,)`."""
     drive = record.drive
     _, of = np.unique(drive.load_n, return_inverse=True)
     usual = np.argmax(np.bincount(of, np.diff(drive.edge_s)))
-    at = np.clip(np.searchsorted(drive.edge_s, record.length_time_s) - 1, 0, of.size - 1)
-    return np.asarray(record.length_m[of[at] == usual])
+    return np.asarray(of[_interval(record)] == usual)
+
+
+def _interval(record: MotionRecord) -> NDArray[np.int64]:
+    """Interval of the drive in which each length was seen. Shape `(F,)`."""
+    at = np.searchsorted(record.drive.edge_s, record.length_time_s, side="right") - 1
+    return np.clip(at, 0, record.drive.voltage_v.size - 1)
 
 
 def _moved_m(law: ActuatorLaw, record: MotionRecord, voltage_v: float) -> float | None:
@@ -107,3 +142,161 @@ def _moved_m(law: ActuatorLaw, record: MotionRecord, voltage_v: float) -> float 
     except LimitError:
         return None
     return abs(at_m - rest_m)
+
+
+def _simulated_m(law: ActuatorLaw, record: MotionRecord, time_scale: float = 1.0) -> Floats | None:
+    """Lengths that the start values give; None where they describe no motion. Shape `(F,)`.
+
+    Args:
+        law: at the start values.
+        record: with what acted, and when the lengths were seen.
+        time_scale: true over stated times.
+    """
+    drive = record.drive
+    scaled = replace(
+        record,
+        drive=replace(drive, edge_s=time_scale * drive.edge_s),
+        length_time_s=time_scale * record.length_time_s,
+        exposure_s=time_scale * record.exposure_s,
+    )
+    mass_kg = float(drive.mass_kg.max())
+    start = Unknowns.of(law, added_inertia_kg=0.0, mass_kg=mass_kg)
+    try:
+        return model_record(start, scaled, derivatives=False).length_m
+    except HaselabError:
+        return None
+
+
+def _early_count(record: MotionRecord) -> int:
+    """Number of intervals within a simulation of a few seconds of computing; at least 1."""
+    edge_s = record.drive.edge_s
+    return max(int(np.searchsorted(edge_s, edge_s[0] + _LONGEST_S, side="right")) - 1, 1)
+
+
+def _seen_early(record: MotionRecord) -> NDArray[np.bool_]:
+    """Which lengths belong to these intervals. Shape `(F,)`."""
+    return np.asarray(record.length_time_s <= record.drive.edge_s[_early_count(record)])
+
+
+def _beginning(record: MotionRecord) -> MotionRecord:
+    """The part of a record that is simulated within a few seconds of computing; its lengths."""
+    drive, none = record.drive, np.zeros(0)
+    count, seen = _early_count(record), _seen_early(record)
+    empty = np.zeros(0, dtype=np.int64)
+    return replace(
+        record,
+        drive=replace(
+            drive, edge_s=drive.edge_s[: count + 1], voltage_v=drive.voltage_v[:count],
+            load_n=drive.load_n[:count], mass_kg=drive.mass_kg[:count],
+            ripple_v2=drive.ripple_v2[:count],
+        ),
+        length_time_s=record.length_time_s[seen], length_m=record.length_m[seen],
+        length_std_m=record.length_std_m[seen], length_experiment=record.length_experiment[seen],
+        window=empty, window_of=empty, window_weight=none, capacitance_f=none,
+        capacitance_std_f=none, capacitance_experiment=empty, capacitance_later_s=0.0, block=empty,
+    )  # fmt: skip
+
+
+def _correlation(one: Floats, other: Floats) -> float:
+    """Of two signals; 0 where one of them does not change."""
+    if one.size < _LEAST_LENGTHS or not (np.ptp(one) > 0.0 and np.ptp(other) > 0.0):
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def _times(law: ActuatorLaw, record: MotionRecord) -> str:
+    """Whether the lengths follow the drive in another unit of the times only."""
+    stated = _agreement(law, record, 1.0)
+    for scale in _TIME_SCALES if stated < _ALIKE else ():
+        other = _agreement(law, record, scale)
+        if other > max(_ALIKE, _MORE_ALIKE * stated):
+            change = f"{scale:g} times longer" if scale > 1.0 else f"{1.0 / scale:g} times shorter"
+            return (
+                "the lengths do not follow the drive as an actuator does, but they would if all "
+                f"times were {change} (correlation of the steps: {other:.2f}, now {stated:.2f}). "
+                "Check the unit of the times (s)"
+            )
+    return ""
+
+
+def _agreement(law: ActuatorLaw, record: MotionRecord, time_scale: float) -> float:
+    """Largest correlation of the steps from length to length with simulated ones.
+
+    Args:
+        law: at the start values, whose resonance may be off.
+        record: of the motion.
+        time_scale: true over stated times.
+    """
+    duration_s, best = time_scale * float(np.ptp(record.drive.edge_s)), 0.0
+    for tuned in _TUNED if duration_s < _LONGEST_TUNED_S else _TUNED[:1]:
+        if best > _ALIKE or duration_s > _LONGEST_S:
+            break
+        simulated_m = _simulated_m(law, record, tuned * time_scale)
+        if simulated_m is not None:
+            best = max(best, _correlation(np.diff(record.length_m), np.diff(simulated_m)))
+    return best
+
+
+def _sign(record: MotionRecord, simulated_m: Floats | None) -> str:
+    """Whether the lengths grow where the actuator contracts."""
+    if simulated_m is None or float(np.ptp(record.drive.voltage_v)) == 0.0:
+        return ""
+    usual = _usually_loaded(record)
+    found = _correlation(record.length_m[usual], simulated_m[usual])
+    if found > -_FOLLOWS:
+        return ""
+    return (
+        f"the lengths grow where the actuator contracts (correlation with the simulated lengths: "
+        f"{found:.2f}). Give lengths that fall when the actuator contracts, not a displacement "
+        "that rises"
+    )
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Length of a record under one load and a low voltage."""
+
+    name: str
+    load_n: float
+    seen_m: float
+    simulated_m: float
+    noise_m: float
+
+
+def _levels(record: MotionRecord, simulated_m: Floats) -> Iterator[_Level]:
+    drive, interval = record.drive, _interval(record)
+    volt = np.abs(drive.voltage_v)
+    low = volt[interval] <= _LOW * volt.max()
+    for load_n in np.unique(drive.load_n):
+        chosen = low & (drive.load_n[interval] == load_n)
+        if np.count_nonzero(chosen) >= _LEAST_LENGTHS:
+            yield _Level(
+                record.name,
+                float(load_n),
+                float(np.median(record.length_m[chosen])),
+                float(np.median(simulated_m[chosen])),
+                float(np.median(record.length_std_m)),
+            )
+
+
+def _loads(records: Sequence[MotionRecord], lengths: Sequence[Floats | None]) -> str:
+    """Whether the actuator is shorter under a heavier load, at a low voltage."""
+    levels = [
+        level
+        for record, length_m in zip(records, lengths, strict=True)
+        if length_m is not None
+        for level in _levels(record, length_m)
+    ]
+    for light, heavy in itertools.permutations(levels, 2):
+        longer_m = heavy.simulated_m - light.simulated_m
+        if heavy.load_n < _HEAVIER * light.load_n or longer_m <= 0.0:
+            continue
+        shorter_m = light.seen_m - heavy.seen_m
+        if shorter_m > max(_REVERSED * longer_m, _STILL * light.noise_m):
+            return (
+                f"{heavy.name}: the length is {1e3 * heavy.seen_m:.4g} mm under "
+                f"{heavy.load_n:.3g} N, but {1e3 * light.seen_m:.4g} mm under {light.load_n:.3g} N "
+                f"({light.name}), both at a low voltage. A heavier load must stretch the actuator. "
+                "Check the masses, which may be swapped, and that all records are of one actuator"
+            )
+    return ""

@@ -28,8 +28,8 @@ from haselab.base.estimate import Z95
 from haselab.identify.physical.misfit import (
     CAPACITANCE,
     LENGTH,
-    SESSION_OFFSET_M,
     SHARED_PX,
+    TRACKED_ZERO_M,
     model_record,
 )
 from haselab.identify.physical.record import MotionRecord
@@ -388,7 +388,7 @@ def predict_motion(
               if not experiments or name in experiments]  # fmt: skip
     frames = np.isin(record.length_experiment, wanted)
     length_by, offset_m = found.length_by, 0.0
-    zero_m = 0.0 if free_offset else SESSION_OFFSET_M
+    zero_m = 0.0 if free_offset else TRACKED_ZERO_M
     if free_offset and frames.any():
         weights = np.where(frames, noise_m**-2.0, 0.0)
         weights /= weights.sum()

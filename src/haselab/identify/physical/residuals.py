@@ -96,6 +96,11 @@ class ChannelResiduals:
         """Whether the law leaves nothing but noise."""
         return not (self.excess[0] > _SLIGHT and self.whiteness_p < _WHITE)
 
+    @property
+    def misses_a_signal(self) -> bool:
+        """Whether the law leaves much of the variance of a channel, and not only noise."""
+        return not self.explained and self.share < _LEAST_SHARE
+
 
 def channel_residuals(misfit: Misfit, found: SearchResult) -> ChannelResiduals:
     """Residuals of a search."""
@@ -128,7 +133,7 @@ def status_of(
             "noise. Check the mass, the units and that all records are of one actuator, or start "
             "nearer, by [actuator.parameters]"
         ), False
-    if not seen.explained and seen.share < _LEAST_SHARE:
+    if seen.misses_a_signal:
         return (
             f"the records contradict the model: it explains only {100.0 * max(seen.share, 0.0):.0f}"
             " % of the variance of a signal. Check the mass, the amplifier's gain, the units and "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -157,7 +158,7 @@ def _first_stage(misfit: Misfit, start: Unknowns, noise: float) -> tuple[_State 
         start.moved(_DRAWN * start.widths * rng.standard_normal(start.widths.size))
         for _ in range(_TRIALS)
     ]
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         found = list(pool.map(misfit.residuals, trials))
     costs = [np.inf if part is None else _bounded(part, noise) for part in found]
     best: tuple[float, _State] | None = None

@@ -54,7 +54,7 @@ class Proposal:
             return "ok"
         return (
             f"no experiment of the catalogue reaches a relative standard deviation of "
-            f"{self.wanted:g}; this one comes nearest"
+            f"{self.wanted:g} for {self.parameter}; the best one reaches {self.after:.2g}"
         )
 
     def answer(self) -> JsonObject:

@@ -245,8 +245,13 @@ def _finite(name: str, values: NDArray[Any], file: Path, *, may_lack: bool) -> F
     vector = np.ascontiguousarray(values, dtype=np.float64)
     bad = np.flatnonzero(~((np.abs(vector) <= _LARGEST) | (may_lack & np.isnan(vector))))
     if bad.size:
+        advice = (
+            "Write nan where it was not measured, and keep the rows, whose input still acts"
+            if may_lack
+            else f"Remove these rows, or use finite numbers up to {_LARGEST:g}"
+        )
         raise InputError(
             f"Column {name} has {vector[bad[0]]:g} in row {bad[0] + 1} ({bad.size} such rows). "
-            f"Remove these rows, or use finite numbers up to {_LARGEST:g}: {file}"
+            f"{advice}: {file}"
         )
     return vector

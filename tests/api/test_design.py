@@ -11,6 +11,7 @@ from haselab.cli.main import main
 from haselab.controllers.builtin import pid_controller
 from haselab.models import VoltageMap
 from haselab.models.actuator.strain_map import StrainMap
+from tests.cli.model.physical_files import ZERO_M, written
 
 PLANT = hl.Plant(1.0, 32.0, 0.3)
 TO_VOLT = VoltageMap(1.3, 3.1, -0.28, -26.9)
@@ -99,3 +100,40 @@ def test_a_loop_needs_both_maps_and_a_controller():
     ):
         with pytest.raises(InputError, match=lacks):
             known.loop()
+
+
+def with_observer(path, **absent):
+    """The twin's own actuator file with a controller that uses the physical model."""
+    text = written(path).read_text().replace(
+        "[drive]\n",
+        "[drive]\nlow_v = 0.0\nhigh_v = 2.0\n"
+        "voltage_map = { a1_v = 1.588, b1 = 1.688, a2_v = -0.605, b2 = -22.05 }\n",
+    )  # fmt: skip
+    text = text.replace(f"zero_length_m = {ZERO_M}", "zero_length_m = 0.05114")  # of the maps
+    for key in absent:
+        text = text.replace(key, "# " + key)
+    path.write_text(
+        text
+        + "[sensing.strain_map]\nslope_per_f = 1.053e9\noffset = -0.4339\n"
+        + "curvature_per_f2 = -6.163e17\ncubic_per_f3 = 1.811e26\n"
+        + '[controller]\nkind = "observer"\nlimits = { low = -0.05, high = 0.27 }\n'
+        + "[controller.parameters]\nbandwidth_rad_s = 26.8\nload_n = 0.5\nshake_m_s2 = 0.01\n"
+        + "reserve = 0.15\n"
+    )
+    return path
+
+
+def test_a_controller_of_the_physical_model_closes_a_loop_in_python(tmp_path):
+    known = hl.Actuator.load(with_observer(tmp_path / "actuator.toml"))
+    assert known.physical is not None
+    with hl.Runner(hl.twin(seed=1), baseline_v=1.0) as runner:
+        found = runner.close_loop(np.repeat([0.0, 0.03], 150), known)
+    sensed = known.strain_map.strain(found.capacitance_f)
+    assert sensed[120:150].mean() == pytest.approx(0.0, abs=1e-3)
+    assert sensed[-30:].mean() == pytest.approx(0.03, abs=1e-3)
+
+
+def test_a_file_without_what_its_controller_needs_says_what_is_missing(tmp_path):
+    path = with_observer(tmp_path / "actuator.toml", high_v=None)
+    with pytest.raises(InputError, match=r"needs drive\.high_v for a controller"):
+        hl.Actuator.load(path)

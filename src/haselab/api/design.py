@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from haselab.base import check_fields, checked, generator
+from haselab.base import InputError, check_fields, checked, generator
 from haselab.control import (
     Design,
     DesignSpec,
@@ -15,7 +15,7 @@ from haselab.control import (
     design_controller,
 )
 from haselab.control.plausible_design import USUAL_STRUCTURE, Structure
-from haselab.controllers import ChosenController
+from haselab.controllers import ChosenController, KnownActuator, known_actuator
 from haselab.controllers.registry import chosen_controller
 from haselab.identify import TransferFit
 from haselab.models import Plant, RationalModel, VoltageMap
@@ -87,6 +87,7 @@ class Actuator:
         saturation: limits of the controller's output, in strain. None: those of the design, else
             those of the reference study.
         plant: the model; None: not known yet.
+        physical: what controllers of the physical model use; None: not known yet.
     """
 
     voltage_map: VoltageMap | None = None
@@ -94,6 +95,7 @@ class Actuator:
     controller: Design | ChosenController | None = None
     saturation: Saturation | None = None
     plant: Plant | None = None
+    physical: KnownActuator | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -125,6 +127,7 @@ class Actuator:
             chosen,
             limits,
             None if model is None or not model.model_extra else model.plant(),
+            _physical(tables, chosen, path),
         )
 
     def loop(self) -> LoopSettings:
@@ -146,4 +149,22 @@ class Actuator:
             chosen = self.controller.gains.controller()
         else:
             limits, chosen = self.saturation or Saturation(), self.controller
-        return LoopSettings(chosen, limits, self.voltage_map, self.strain_map)
+        return LoopSettings(
+            chosen, limits, self.voltage_map, self.strain_map, actuator=self.physical
+        )
+
+
+def _physical(
+    tables: ActuatorTables, chosen: ChosenController | None, path: str | Path
+) -> KnownActuator | None:
+    """What controllers of the physical model use.
+
+    Raises:
+        InputError: the controller of the file needs it, and the file lacks a part of it.
+    """
+    try:
+        return known_actuator(tables, path)
+    except InputError:
+        if chosen is not None and chosen.kind.needs_actuator:
+            raise
+        return None

@@ -62,7 +62,8 @@ class ClosedLoop:
         self._sensor = _sensor(rig, camera_recorder, carrier[0], loop)
         self._watchdog = _watchdog(rig, carrier, loop)
         self._lost = self._outside = 0  # blocks
-        strains = np.linspace(loop.saturation.low, loop.saturation.high, _REACH_POINTS)
+        ends = (0.0, 0.0) if self._in_volts else (loop.saturation.low, loop.saturation.high)
+        strains = np.linspace(*ends, _REACH_POINTS)  # a voltage is limited in every step
         voltages = [self._voltage(float(strain)) for strain in (*strains, 0.0)]
         rig.description.drive_limits.check(voltages)
         self._output_v = self._voltage(0.0)

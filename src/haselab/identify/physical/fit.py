@@ -49,6 +49,7 @@ _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _APART = 2.0  # rms over noise from which records are compared alone
+_FEW_STEPS = 8  # from what explains one record to what explains all, if that exists
 _LEAST_VALUES = 2  # for each unknown, without which nobody sees the noise
 _CONTRADICT = (
     "the records contradict each other: the law explains each alone, but not all together. Check "
@@ -181,8 +182,9 @@ def _judge_early(misfit: Misfit, start: Unknowns, found: SearchResult) -> tuple[
         why the records contradict the model or each other; empty if that is not certain.
     """
     alone = _each_alone(misfit, start) if len(misfit.records) > 1 else []
-    for part in alone:
-        joint = refine(misfit, start.at(part.unknowns), found.evaluations)
+    if alone:
+        # the parameters of one actuator hardly differ from record to record
+        joint = refine(misfit, start.at(alone[0].unknowns), found.evaluations, steps=_FEW_STEPS)
         if joint is not None and rms_of([joint.residuals]) < rms_of([found.residuals]):
             found = joint
     seen = channel_residuals(misfit, found)

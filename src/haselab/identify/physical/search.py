@@ -94,24 +94,29 @@ def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> SearchResul
     return _last_stage(misfit, now, start, evaluations + count)
 
 
-def refine(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> SearchResult | None:
+def refine(
+    misfit: Misfit, start: Unknowns, evaluations: int = 0, *, steps: int = _LAST_STEPS
+) -> SearchResult | None:
     """Minimise the misfit from near its minimum.
 
     Args:
         misfit: to minimise.
         start: first values.
         evaluations: of the model, made before.
+        steps: at most.
     Returns:
         The new result; None if no motion exists there.
     """
     first = misfit.linearised(start)
     if first is None:
         return None
-    return _last_stage(misfit, _State(start, *first), start, evaluations + 1)
+    return _last_stage(misfit, _State(start, *first), start, evaluations + 1, steps)
 
 
-def _last_stage(misfit: Misfit, now: _State, start: Unknowns, evaluations: int) -> SearchResult:
-    now, used = _descend(misfit, now, start, 1.0, _LAST_STEPS, last=True)
+def _last_stage(
+    misfit: Misfit, now: _State, start: Unknowns, evaluations: int, steps: int = _LAST_STEPS
+) -> SearchResult:
+    now, used = _descend(misfit, now, start, 1.0, steps, last=True)
     pull = np.sqrt(vague_information(now.unknowns))
     columns = np.vstack([now.jacobian, np.diag(pull)])
     wanted = np.concatenate([now.residuals, -pull * now.unknowns.distance(start)])

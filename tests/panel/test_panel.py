@@ -1,6 +1,8 @@
 """A panel on the twin: arming, drive, loop, STOP, lost pages, and whoever may not connect."""
 
 import asyncio
+import contextlib
+import io
 import json
 import os
 import signal
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import websockets
+from PIL import Image
 
 from tests.panel.running import WAIT_S, RunningPanel, connected, ended, started
 
@@ -168,6 +171,40 @@ def test_a_socket_without_origin_or_token_is_refused(
 
     with pytest.raises(CLOSED, match=REFUSED):
         asyncio.run(play())
+
+
+def test_the_camera_picture_is_new_while_the_bench_is_armed(panel: RunningPanel) -> None:
+    def picture(token: str) -> tuple[bytes, float]:
+        request = urllib.request.Request(
+            f"http://{panel.host}/camera", headers={"X-Panel-Token": token}
+        )
+        with urllib.request.urlopen(request, timeout=WAIT_S) as answer:
+            return answer.read(), float(answer.headers["X-Age-S"])
+
+    async def play() -> None:
+        async with connected(panel) as page:
+            with pytest.raises(urllib.error.HTTPError, match="HTTP Error 404") as absent:
+                await asyncio.to_thread(picture, panel.token)
+            absent.value.close()
+            await page.arm()
+            seen: set[bytes] = set()
+            async with asyncio.timeout(WAIT_S):
+                while len(seen) < 3:
+                    await page.receive()
+                    with contextlib.suppress(urllib.error.HTTPError):  # not yet
+                        seen.add((await asyncio.to_thread(picture, panel.token))[0])
+            image = Image.open(io.BytesIO(seen.pop()))
+            assert image.format == "JPEG" and min(image.size) > 100
+            await page.ask("disarm")
+            begun_s = time.monotonic()
+            while time.monotonic() < begun_s + 1.5:
+                await page.receive()
+            assert (await asyncio.to_thread(picture, panel.token))[1] > 1.0
+
+    asyncio.run(play())
+    with pytest.raises(urllib.error.HTTPError, match="HTTP Error 403") as refused:
+        picture("guess")
+    refused.value.close()
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ It reads the bench block by block into shared memory, and answers commands. FOLD
 one panel and holds
 
 - `live`: the signals, see `columns`;
+- `camera.jpg`: the last frame of the camera;
 - `bench.sock`: commands of the web server, one JSON object per line, each with an `id`; the state
   of the bench is sent 20 times a second;
 - `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
@@ -170,7 +171,7 @@ def main(words: list[str]) -> int:
             )
             live = folder / "live"
             with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
-                bench = LiveBench(guard(rig, safety), writer, loop)
+                bench = LiveBench(guard(rig, safety), writer, loop, folder / "camera.jpg")
                 link = _Link(folder, bench)
                 threading.Thread(target=link.serve, daemon=True).start()
                 threading.Thread(target=_stops, args=(folder, bench), daemon=True).start()

@@ -6,9 +6,11 @@ import math
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from haselab.base import (
     HaselabError,
@@ -33,6 +35,7 @@ CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # of the reference study
 LEASE_S = 1.5  # longest time without a message from the page that armed the bench
 _RAMP_V_PER_S = 1.0  # at the amplifier's input: 5 kV/s with a gain of 5000
 _HEARTBEAT_S = 0.5
+_PICTURES_HZ = 5.0
 
 
 @dataclass(frozen=True)
@@ -97,12 +100,17 @@ class LiveBench:
         rig: the bench behind its safety chain.
         writer: of the live signals.
         loop: of the actuator file; None: no loop can be closed.
+        picture: JPEG file for the last camera frame while the bench is armed; None: no pictures.
     """
 
     def __init__(
-        self, rig: GuardedRig, writer: LiveWriter, loop: LoopSettings | None = None
+        self,
+        rig: GuardedRig,
+        writer: LiveWriter,
+        loop: LoopSettings | None = None,
+        picture: Path | None = None,
     ) -> None:
-        self._rig, self._writer, self._loop = rig, writer, loop
+        self._rig, self._writer, self._loop, self._picture = rig, writer, loop, picture
         about = rig.description
         self._lockin = lockin_of(about, CARRIER_HZ)
         self._mutex = threading.Lock()  # protects all below
@@ -192,6 +200,8 @@ class LiveBench:
             self._rig.safety.run()
             self._rig.begin()
             self._rig.generator.sine(CARRIER_HZ, CARRIER_V)
+            if self._picture is not None:
+                self._rig.camera.start(_PICTURES_HZ)
         except HaselabError:
             self._end()
             raise
@@ -291,6 +301,8 @@ class LiveBench:
                 return
             if self._closed is not None:
                 self._target_v = self._drive_v
+            if self._holder and self._picture is not None:
+                self._look(self._picture)
             self._write(codes, time_s)
             if self._holder and self._rig.safety.stage is Stage.TRIPPED:
                 self._end(self._rig.safety.reason)
@@ -325,6 +337,18 @@ class LiveBench:
         if self._closed is not None and self._reference is not None:
             self._closed.step(codes, self._reference)
         return codes, rig.acquisition.time_s
+
+    def _look(self, path: Path) -> None:
+        """Keep the last frame that has arrived, if there is a new one."""
+        try:
+            frames = self._rig.camera.take()
+        except HaselabError as error:
+            self._failed(error)
+            return
+        if frames is not None and len(frames.time_s):
+            new = path.with_suffix(".new")
+            Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
+            new.replace(path)
 
     def _next_v(self) -> float:
         if self._closed is not None:

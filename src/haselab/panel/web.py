@@ -15,6 +15,7 @@ import json
 import math
 import secrets
 import struct
+import time
 from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -206,6 +207,20 @@ class _Server:
             {"stop_port": self._settings.stop_port, "signals": SIGNALS, "schema": SCHEMA}
         )
 
+    async def camera(self, request: Request) -> Response:
+        """The last frame with its age, for a page with the token."""
+        if not self._is_token(request.headers.get("x-panel-token", "")):
+            return Response("The token of the panel is missing.", 403)
+        try:
+            path = self._settings.folder / "camera.jpg"
+            age_s = max(time.time() - path.stat().st_mtime, 0.0)
+            return Response(path.read_bytes(), 200, {"x-age-s": f"{age_s:.3f}"}, "image/jpeg")
+        except OSError:
+            return Response("There is no picture yet.", 404)
+
+    def _is_token(self, text: str) -> bool:
+        return hmac.compare_digest(text.encode(), self._settings.token.encode())
+
     async def live(self, socket: WebSocket) -> None:
         if len(self._pages) >= _MOST_PAGES:
             await socket.close(1013, "too many pages")
@@ -234,9 +249,7 @@ class _Server:
             token = json.loads(text)["token"]
         except (TimeoutError, ValueError, KeyError, TypeError):
             return False
-        return isinstance(token, str) and hmac.compare_digest(
-            token.encode(), self._settings.token.encode()
-        )
+        return isinstance(token, str) and self._is_token(token)
 
     async def _messages(self, page: _Page) -> None:
         """Receive what a page sends: acknowledged frames, its view, commands."""
@@ -338,6 +351,7 @@ def application(settings: WebSettings) -> Starlette:
     routes = [
         Route("/", server.page),
         Route("/about", server.about),
+        Route("/camera", server.camera),
         WebSocketRoute("/live", server.live),
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]

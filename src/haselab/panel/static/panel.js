@@ -99,6 +99,31 @@ function Live({ state, say }) {
     </div>`;
 }
 
+function Camera() {
+  const [seen, see] = useState({ url: "", age_s: null });
+  useEffect(() => {
+    let url = "";
+    async function look() {
+      try {
+        const answer = await fetch("/camera", { headers: { "X-Panel-Token": link.token }, signal: AbortSignal.timeout(2000) });
+        if (answer.ok) {
+          const old = url;
+          url = URL.createObjectURL(await answer.blob());
+          see({ url, age_s: Number(answer.headers.get("x-age-s")) });
+          if (old) setTimeout(() => URL.revokeObjectURL(old), 1000);
+        } else see({ url: "", age_s: null });
+      } catch { see((last) => ({ ...last, age_s: Infinity })); }
+      setTimeout(look, 200); // one request at a time
+    }
+    look();
+  }, []);
+  const old = !(seen.age_s < 1);
+  return html`<div class="card"><h2>Camera</h2>
+    ${seen.url ? html`<img class=${old ? "old" : ""} src=${seen.url} alt="Actuator in the last frame of the camera" />
+      <p class=${old ? "error" : ""}>${old ? "OLD PICTURE: the camera runs while the bench is armed." : "5 frames/s"}</p>`
+      : html`<p>No picture. The camera starts when the bench is armed.</p>`}</div>`;
+}
+
 function Panel() {
   const [, force] = useReducer((n) => n + 1, 0);
   const [error, say] = useState("");
@@ -143,6 +168,7 @@ function Panel() {
             : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>`
             : html`<${Arming} state=${state} say=${say} />`}
         </div>
+        <${Camera} />
       </section>
     </div>`;
 }

@@ -114,6 +114,8 @@ def test_a_plan_ends_at_rest_at_the_target_within_the_force_of_the_field(
 ):
     low, high = known.reachable()
     target = min(max(start + size, low + 0.005), high - 0.02)
+    if abs(target - start) < 1e-3:
+        target = start + 1e-3
     model, period_s = without_creep(known), 0.01
     plan = PredictedPlan(model, known, period_s, reserve, math.inf, POLE, STAGE_S)
     begin_m, target_m = known.length_m(start), known.length_m(target)
@@ -123,7 +125,7 @@ def test_a_plan_ends_at_rest_at_the_target_within_the_force_of_the_field(
     assert steps[0][:2] == (begin_m, 0.0)
     assert steps[-1] == (target_m, 0.0, 0.0)
     beyond = max((x - target_m) * math.copysign(1.0, target_m - begin_m) for x, _, _ in steps)
-    assert beyond <= 0.07 * abs(target_m - begin_m)
+    assert beyond <= 0.03 * abs(target_m - begin_m)
     half_s = 0.5 * period_s
     for x, v, a in steps:
         middle_m = x + half_s * v + 0.5 * half_s**2 * a

@@ -55,6 +55,8 @@ class ControllerKind:
         needs_actuator: whether the controller uses `ControllerSetting.actuator`.
         design: computes the parameters from the actuator and the timing of the loop, which the
             setting states; None: the parameters are typed, or searched by `haselab design`.
+        robustness: computes margins that the parameters guarantee in a setting, by name; None: the
+            docstring of `design` states all.
         loop: setting of the only loop that the kind is designed for; None: that of the caller.
         preview_s: how far the controller looks ahead in the reference, see `Measurement.preview`.
     """
@@ -66,6 +68,9 @@ class ControllerKind:
     output: Literal["strain", "voltage"] = "strain"
     needs_actuator: bool = False
     design: Callable[[ControllerSetting], Mapping[str, float]] | None = None
+    robustness: Callable[[ControllerSetting, Mapping[str, float]], Mapping[str, float]] | None = (
+        None
+    )
     loop: Callable[[KnownActuator], ControllerSetting] | None = None
     preview_s: float = 0.0
 

@@ -48,8 +48,8 @@ class MotionModel:
         self._carrier_v2 = known.carrier_v2
         self.weight_n = GRAVITY_M_S2 * known.mass_kg
         self.inertia_kg = known.mass_kg + known.added_inertia_kg + known.law.moving_mass_kg
-        self._damping = losses.damping_n_s_per_m
-        self._branches = list(zip(losses.branch_share, losses.branch_relaxation_s, strict=True))
+        self.damping_n_s_per_m = losses.damping_n_s_per_m
+        self.branches = list(zip(losses.branch_share, losses.branch_relaxation_s, strict=True))
 
     def stiffened(self, length_m: float, factor: float) -> MotionModel:
         """The same motion with another stiffness about a length, at which the force stays.
@@ -101,7 +101,7 @@ class MotionModel:
             drive_v: that acts, in V.
         """
         load_n = self.elastic_n(length_m) - self.weight_n - self.pull_n(length_m, drive_v)
-        return [length_m, 0.0, *[0.0] * len(self._branches), load_n]
+        return [length_m, 0.0, *[0.0] * len(self.branches), load_n]
 
     def moved(self, state: list[float], drive_v: float, time_s: float) -> list[float]:
         """State after a time at a drive.
@@ -116,9 +116,9 @@ class MotionModel:
         count = math.ceil(time_s / _STEP_S - 1e-9)
         step_s = time_s / count
         length_m, speed, *forces, load_n = state
-        branches = [(share, math.exp(-step_s / tau)) for share, tau in self._branches]
+        branches = [(share, math.exp(-step_s / tau)) for share, tau in self.branches]
         outer_n, inertia = self.weight_n + load_n, self.inertia_kg
-        drag = 0.5 * step_s * self._damping / inertia
+        drag = 0.5 * step_s * self.damping_n_s_per_m / inertia
         elastic_n = self.elastic_n(length_m)
         force_n = outer_n + self.pull_n(length_m, drive_v) - elastic_n - sum(forces)
         for _ in range(count):  # velocity Verlet, implicit in the damping
@@ -147,8 +147,8 @@ class MotionModel:
         """
         now_n = self.elastic_n(length_m)
         stretched_n = now_n - self.elastic_n(state[0])
-        creep_n = sum(state[2:-1]) + stretched_n * sum(share for share, _ in self._branches)
-        held_n = self.inertia_kg * pushed_m_s2 + self._damping * speed_m_s
+        creep_n = sum(state[2:-1]) + stretched_n * sum(share for share, _ in self.branches)
+        held_n = self.inertia_kg * pushed_m_s2 + self.damping_n_s_per_m * speed_m_s
         return held_n + now_n + creep_n - self.weight_n - state[-1]
 
     def linear(self, length_m: float, drive_v: float, time_s: float) -> Floats:
@@ -162,7 +162,7 @@ class MotionModel:
             Matrix of shape `(n, n)`.
         """
         rest = self.at_rest(length_m, drive_v)
-        changes = [0.1 * self._step_m, 1e-4, *[1e-3] * len(self._branches), 1e-3]
+        changes = [0.1 * self._step_m, 1e-4, *[1e-3] * len(self.branches), 1e-3]
         columns = []
         for k, change in enumerate(changes):
             ends = []

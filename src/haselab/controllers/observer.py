@@ -56,11 +56,14 @@ class ObserverController:
         self._acts_s = max(law.delay_s - age_s, 0.0)  # after the end of a block
         self._most_v = setting.highest_rate_per_s * period_s
         self._past_v = [setting.drive_start] * (law.whole + 2)  # the latest first
-        self._plan = ReferencePlan(
-            law.model, self._known, period_s, self._reserve, setting.highest_rate_per_s
-        )
+        self._plan = self._new_plan(law, setting)
         self._state: list[float] | None = None
         self._load_mean_n, self._forget = 0.0, math.exp(-period_s / _WEIGHED_S)
+
+    def _new_plan(self, law: ObserverLaw, setting: ControllerSetting) -> ReferencePlan:
+        return ReferencePlan(
+            law.model, self._known, setting.period_s, self._reserve, setting.highest_rate_per_s
+        )
 
     @property
     def estimated_load_kg(self) -> float:

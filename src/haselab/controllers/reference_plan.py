@@ -10,7 +10,7 @@ import numpy as np
 from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.motion_model import MotionModel
 
-__all__ = ["ReferencePlan"]
+__all__ = ["ReferencePlan", "cubic"]
 
 _CHECKED = 16  # times of a plan at which its force is checked
 _LONGER = 1.12  # from one try to the next
@@ -80,12 +80,12 @@ class ReferencePlan:
         place = acts_s / period_s + 2.0  # of the samples, the drive's effect
         at = min(int(place + 1e-9), len(samples) - 1)
         target_m, here = samples[at], self._here
-        if len(samples) > at + 4 and self._smooth(samples, at):
-            given = _cubic(samples, place, period_s)
+        if len(samples) > at + 4 and self.smooth(samples, at):
+            given = cubic(samples, place, period_s)
             rests = self._at_s >= self._for_s - _SAME
             if self._follows or (rests and abs(given[0] - here[0]) < _NEAR * self._most_m):
                 self._follows = True
-                after = self._here = _cubic(samples, place + 1.0, period_s)
+                after = self._here = cubic(samples, place + 1.0, period_s)
                 return (*given, 2.0 * (after[0] - given[0] - given[1] * period_s) / period_s**2)
         if self._follows or target_m != self._target_m:
             self._follows = False
@@ -98,7 +98,7 @@ class ReferencePlan:
             self._here = here[0] + 0.5 * period_s * (here[1] + speed), speed
         return (*here, (self._here[1] - here[1]) / period_s)
 
-    def _smooth(self, samples: list[float], at: int) -> bool:
+    def smooth(self, samples: list[float], at: int) -> bool:
         """Whether the samples about one are neither a step nor faster than the force of the field.
 
         In a step, one rise is much larger than both of its neighbours.
@@ -109,6 +109,11 @@ class ReferencePlan:
             for before, rise, after in zip(rises, rises[1:], rises[2:], strict=False)
         )
         return not alone and max(rises) <= self._most_m
+
+    def jumps(self, first_m: float, before_m: float, after_m: float) -> bool:
+        """Whether the second of two rises may be the beginning of a step."""
+        rise, last = abs(before_m - first_m), abs(after_m - before_m)
+        return last > _ALONE * rise + _SMALL * self._most_m
 
     def _plan(self, start: tuple[float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits, else the one that exceeds them least."""
@@ -184,7 +189,7 @@ def _value(curve: tuple[float, ...], t: float) -> tuple[float, float, float]:
     )
 
 
-def _cubic(samples: list[float], place: float, period_s: float) -> tuple[float, float]:
+def cubic(samples: list[float], place: float, period_s: float) -> tuple[float, float]:
     """Value and slope by the four samples about a place."""
     first = min(max(int(place + 1e-9) - 1, 0), len(samples) - 4)
     t = place - first - 1.0

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 
+import pytest
+
 from haselab.cli.main import main
+from haselab.models.actuator.spelling import misspelled_keys
 
 FILE = """
 [actuator]
@@ -48,6 +52,23 @@ def test_a_kind_with_a_design_writes_its_parameters_into_the_actuator_file(tmp_p
     assert section["limits"]["low"] < 0.0 < section["limits"]["high"]  # strains, for the loop
     assert section["loop"] == {"rate_hz": 100.0, "measurement_delay_s": 0.0056}
     assert "peak sensitivity is at most 1.8" in answer["robustness"]
+
+
+def test_a_kind_that_guarantees_margins_prints_them_and_writes_them(tmp_path, capsys):
+    file = tmp_path / "A.toml"
+    file.write_text(FILE)
+    code, out, _ = run(capsys, "design", file, "--controller", "h-infinity", "--delay-s", 0.0056,
+                       "--rate-hz", 100, "--json")  # fmt: skip
+    assert code == 0
+    answer, section = json.loads(out), tomllib.loads(file.read_text())["controller"]
+    epsilon = answer["stability_margin"]
+    assert 0.25 * (1.0 - 1e-3) < epsilon < 1.0
+    factor = (1.0 + epsilon) / (1.0 - epsilon)
+    assert answer["guaranteed_gain_margin_db"] == pytest.approx(20.0 * math.log10(factor))
+    assert section["margins"] == {name: answer[name] for name in (
+        "stability_margin", "guaranteed_gain_margin_db", "guaranteed_phase_margin_deg"
+    )}  # fmt: skip
+    assert misspelled_keys(tomllib.loads(file.read_text())) == []
 
 
 def test_without_a_physical_model_the_command_that_adds_it_is_named(tmp_path, capsys):

@@ -196,15 +196,18 @@ def _own_design(
         rate_hz, delay_s = 1.0 / setting.period_s, setting.delay_s or 0.0
     assert kind.design is not None
     chosen = kind.choose(kind.design(setting), model)
+    guaranteed = {} if kind.robustness is None else kind.robustness(setting, dict(chosen.values))
     section: dict[str, object] = {
         "kind": kind.name,
         "parameters": dict(chosen.values) or None,
         "limits": dict(zip(("low", "high"), strains, strict=True)) if actuator else None,
         "loop": {"rate_hz": rate_hz, "measurement_delay_s": delay_s},
+        "margins": dict(guaranteed) or None,
     }
     _save(model, out, section, None)
     return {"kind": kind.name, "parameters": dict(chosen.values), "rate_hz": rate_hz,
-            "delay_s": delay_s, "robustness": _first_paragraph(kind.design)}  # fmt: skip
+            "delay_s": delay_s, **guaranteed,
+            "robustness": _first_paragraph(kind.design)}  # fmt: skip
 
 
 def _refuse_other_loop(

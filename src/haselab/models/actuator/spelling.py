@@ -28,7 +28,8 @@ _WRITTEN = {
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")
 _MARGINS = ("phase_margin_deg", "phase_margin_deg_std", "gain_margin_db", "gain_margin_db_std",
             "delay_margin_s", "peak_sensitivity", "crossover_rad_s", "worst_phase_margin_deg",
-            "worst_gain_margin_db", "stable")  # fmt: skip
+            "worst_gain_margin_db", "stable", "stability_margin", "guaranteed_gain_margin_db",
+            "guaranteed_phase_margin_deg")  # fmt: skip
 # Their content is checked by whoever reads it, or is written only.
 _NOT_LOOKED_INTO = {
     "provenance",

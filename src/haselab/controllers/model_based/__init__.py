@@ -1,0 +1,1 @@
+"""Controllers that are synthesised from the identified model: predictive, H-infinity, polarity."""

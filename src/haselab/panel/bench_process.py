@@ -34,6 +34,7 @@ from haselab.panel.live_bench import LiveBench
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig, opened_rig
+from haselab.runtime.scheduling import with_priority
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.guardian.client import Guardians, guardian_command
@@ -133,11 +134,12 @@ def _opened(file: RigFile, path: Path, folder: Path) -> Iterator[tuple[Rig, Safe
 
 def _run(bench: LiveBench, block_s: float, *, paced: bool, ended: threading.Event) -> None:
     next_s = time.monotonic()
-    while not ended.is_set():
-        bench.step()
-        if paced:
-            next_s = max(next_s + block_s, time.monotonic() - _BEHIND_S)
-            time.sleep(max(next_s - time.monotonic(), 0.0))
+    with with_priority():
+        while not ended.is_set():
+            bench.step()
+            if paced:
+                next_s = max(next_s + block_s, time.monotonic() - _BEHIND_S)
+                time.sleep(max(next_s - time.monotonic(), 0.0))
 
 
 def _watch_stdin(ended: threading.Event) -> None:

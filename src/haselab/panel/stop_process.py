@@ -28,6 +28,7 @@ from haselab.safety.interlock import Interlock
 __all__ = ["StopServer", "main"]
 
 _REASON = "STOP was pressed on the panel"
+_NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
 
 
@@ -151,6 +152,8 @@ def main(words: list[str]) -> None:
             optionally the rig file of a real bench.
     """
     port, folder, key, origins = int(words[0]), Path(words[1]), words[2], words[3].split(",")
+    with contextlib.suppress(AttributeError, OSError):  # it needs little processor time
+        os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     stop = _Stop(folder, key, words[4] if len(words) > 4 else "")
     server = StopServer(port, stop, tuple(origins))
     threading.Thread(target=server.serve_forever, daemon=True).start()

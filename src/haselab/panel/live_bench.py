@@ -135,7 +135,7 @@ class LiveBench:
             limits = (self._loop.saturation.low, self._loop.saturation.high)
         return BenchState(
             safety.stage.value, self._mode, self._drive_v, self._target_v, self._reference,
-            self._limit_v, self._holder, safety.reason or self._reason, low, high,
+            self._limit_v, self._holder, safety.gate.interlock.reason or self._reason, low, high,
             about.amplifier_gain, limits, about.name, self._rig.simulated,
         )  # fmt: skip
 

@@ -36,6 +36,7 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "observer": "haselab.controllers.observer_design:OBSERVER",
         "learning": "haselab.controllers.adaptive.learning:LEARNING",
         "hybrid": "haselab.controllers.adaptive.hybrid:HYBRID",
+        "alternating": "haselab.controllers.model_based.alternating:ALTERNATING",
         "h-infinity": "haselab.controllers.model_based.h_infinity_design:H_INFINITY",
         "mpc": "haselab.controllers.model_based.mpc:MPC",
         "scheduled-pid": "haselab.controllers.adaptive.scheduled:SCHEDULED",

@@ -29,6 +29,7 @@ class Device:
         high_v: highest drive.
         zero_v: drive whose static strain is 0.
         late_s: added to the delay of the output, unknown to the controller.
+        low_v: lowest drive, 0 if it has one sign.
         stated_inertia_kg: inertia without weight that a person states who hangs the device, from
             which its identification starts; None: nobody has hung any.
     """
@@ -39,6 +40,7 @@ class Device:
     high_v: float
     zero_v: float
     late_s: float = 0.0
+    low_v: float = 0.0
     stated_inertia_kg: float | None = None
 
     @property
@@ -80,6 +82,11 @@ DEVICES = {
                2.0, 1.04, stated_inertia_kg=8.0),
         Device("retention", "planar HASEL, a fifth of the voltage acts with a delay of 5.7 s",
                _changed(dielectric={"relaxation_share": 0.2}), 2.0, 1.04),
+        Device("bipolar", "planar HASEL on a drive of both signs",
+               _changed(acquisition={"drive_low_v": -2.0}), 2.0, 1.04, low_v=-2.0),
+        Device("bipolar-retention", "the same, a fifth of the voltage acts late",
+               _changed(acquisition={"drive_low_v": -2.0}, dielectric={"relaxation_share": 0.2}),
+               2.0, 1.04, low_v=-2.0),
         Device("hysteresis", "planar HASEL with rate-independent hysteresis of 0.06 N",
                _changed(hysteresis={"force_n": 0.06, "width": 0.02}), 2.0, 1.04),
         Device("warming", "planar HASEL whose permittivity rises by 0.5 %",

@@ -150,7 +150,7 @@ def _actuator(
         law=law,
         mass_kg=device.mass_kg,
         zero_length_m=zero_m,
-        low_v=0.0,
+        low_v=device.low_v,
         high_v=device.high_v,
         gain_v_per_v=device.config.amplifier.gain,
         added_inertia_kg=added_kg,

@@ -45,7 +45,7 @@ _SPEED = 2.0  # of the pole's time constant: weight of the speed's error
 _BEYOND = 5.0  # weight of a length beyond a desired one that stays
 _LENGTHS = 201  # of the tables of forces
 _STIFFNESSES = 5  # of the models over the reachable range
-_ROUNDS, _FIRST_ROUNDS = 2, 6  # of a program: along a known plan, and after a jump
+_ROUNDS, _FIRST_ROUNDS = 1, 6  # of a program: along a known plan, and after a jump
 _NEAR_END = 0.2  # of the force that is left at the desired length, for the feedback at most
 _RESTS = 1e-6  # of the reachable range: so near, the plan rests
 _SAME_N = 1e-9
@@ -143,12 +143,13 @@ class PredictedPlan(ReferencePlan):
 
     def _followed(self, samples: list[float], place: float) -> Floats:
         """Length and speed of a smooth reference at the ends of the stages, on straight after."""
-        last, found = float(len(samples) - 2), []
-        for k in range(STAGES + 1):
-            wanted = place + k * self._steps
-            length_m, speed = cubic(samples, min(wanted, last), self._period_s)
-            found.append((length_m + max(wanted - last, 0.0) * self._period_s * speed, speed))
-        return np.array(found).T
+        last, period_s = float(len(samples) - 2), self._period_s
+        places = place + self._steps * np.arange(STAGES + 1.0)
+        known = [cubic(samples, at, period_s) for at in places[places < last].tolist()]
+        length_m, speed = cubic(samples, last, period_s)
+        after_s = period_s * (places[places >= last] - last)
+        on = np.stack([length_m + after_s * speed, np.full(after_s.size, speed)])
+        return np.hstack([np.array(known).reshape(-1, 2).T, on])
 
     def _solved(self, here: _Here, reference: Floats, state: list[float], rests: bool) -> _Here:
         """Length and speed one period later, on the plan that is best from here on.

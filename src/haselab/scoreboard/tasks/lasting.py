@@ -17,6 +17,7 @@ from haselab.scoreboard.play import Scenario, Trace
 from haselab.scoreboard.tasks.task import (
     Metric,
     Task,
+    no_bounds,
     sensed_noise,
     staircase,
     tracking_limit,
@@ -48,6 +49,32 @@ def _score_hold(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
     means = smoothed(strain, _MEAN_S)
     return {
         "error": float(np.abs(means - _SIZE).max()),
+        "peak_field_v_per_m": trace.peak_field_v_per_m,
+    }
+
+
+# ---- a drive of both signs, against retained charge ----------------------------------------------
+
+_HELD_AT, _CHARGED_S, _BACK_S, _LOW = 0.06, 120.0, 20.0, -0.03
+_AFTER_BACK_S = (0.5, 1.5)  # when the error after the way back is a mean
+
+
+def _charged(known: KnownActuator, rng: np.random.Generator) -> Scenario:
+    points = ((-math.inf, 0.0), (0.0, _HELD_AT), (_CHARGED_S, _LOW))
+    return Scenario(find_device("bipolar-retention"), known.zero_length_m, _CHARGED_S + _BACK_S,
+                    staircase(points))  # fmt: skip
+
+
+def _score_charged(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
+    time_s, strain = trace.between(_AFTER_S, _CHARGED_S)
+    first, last = (_CHARGED_S + after_s for after_s in _AFTER_BACK_S)
+    _, back = trace.between(first, last)
+    if back.size < round(0.99 * (last - first) / 1e-3):
+        return {}
+    return {
+        "error": float(np.abs(smoothed(strain, _MEAN_S) - _HELD_AT).max()),
+        "noise_at_rest": float(strain[time_s > 0.5 * _CHARGED_S].std()),
+        "error_after_return": abs(float(back.mean()) - _LOW),
         "peak_field_v_per_m": trace.peak_field_v_per_m,
     }
 
@@ -95,6 +122,12 @@ _HELD = (
            "noise alone: the mean of all measurements before, one constant unknown"),
     _FIELD,
 )  # fmt: skip
+_CHARGED = (
+    Metric("error", "", "largest error of a mean of 1 s while it is held, from 10 s on, in strain"),
+    Metric("noise_at_rest", "", "standard deviation of its second half, in strain"),
+    Metric("error_after_return", "", "mean error from 0.5 to 1.5 s after the way back, in strain"),
+    _FIELD,
+)
 _REPEATED = (
     Metric("error_first", "", "rms error over peak-to-peak, first period", TRACKING_LIMIT),
     Metric("error_after_ten", "", "the same after ten periods", TRACKING_LIMIT),
@@ -107,6 +140,8 @@ LASTING_TASKS = (
          _bounds_hold, classes=("host-100hz",)),
     Task("T6-retention", "the same with a fifth of the voltage acting late", "hz", _HELD,
          _hold("retention"), _score_hold, _bounds_hold, classes=("host-100hz",)),
+    Task("T6-bipolar", "hold for 2 min, then back, retention on a drive of both signs", "bipolar",
+         _CHARGED, _charged, _score_charged, no_bounds, classes=("host-100hz",)),
     Task("T7", "a trapezoid gait at 1 Hz, eleven times", "hz", _REPEATED, _periodic,
          _score_periodic, _bounds_periodic),
     Task("T7-drawn", "the same on devices drawn about hz that sense alike", "hz", _REPEATED,

@@ -14,6 +14,7 @@ __all__ = [
     "LinearLoop",
     "penalty",
     "sensitivity_of",
+    "shares_of",
     "squared_error",
     "timed_error",
 ]
@@ -23,6 +24,7 @@ _GRID = 120
 _DOUBLINGS, _GONE = 24, 1e-12
 UNSTABLE = 1e60
 _STRICT = 20.0  # by 1 % missed, the cost rises by a fifth
+_STEEP, _FARTHEST = 120.0, 1e7  # exponent up to which it does; factor at most from there on
 
 
 @dataclass(frozen=True)
@@ -78,26 +80,38 @@ def penalty(loop: LinearLoop, period_s: float, demands: Demands, missed: float =
     Returns:
         At least 1; more than `UNSTABLE` for an unstable loop.
     """
-    a, size = loop.a, float(np.abs(np.linalg.eigvals(loop.a)).max())
+    size = float(np.abs(np.linalg.eigvals(loop.a)).max())
     if not size < 1.0 - 1e-6:
         return 2.0 * UNSTABLE * size
+    shares = shares_of(loop, period_s, demands).values()
+    strict = _STRICT * (missed + sum(max(share - 1.0, 0.0) for share in shares))
+    # far off it still rises, so that a search finds its way back, but never to UNSTABLE
+    return math.exp(min(strict, _STEEP)) * min(max(strict / _STEEP, 1.0), _FARTHEST)
+
+
+def shares_of(loop: LinearLoop, period_s: float, demands: Demands) -> dict[str, float]:
+    """What a stable loop takes of each demand: above 1 it misses the demand.
+
+    Args:
+        loop: closed and stable.
+        period_s: of an update.
+        demands: of it.
+    Returns:
+        By the name of the demand, for messages.
+    """
+    a, direct = loop.a, loop.drive_noise
     moved = math.sqrt(_squares(a, loop.noise, loop.length))
-    direct = loop.drive_noise
     shaken = math.hypot(math.sqrt(_squares(a, loop.noise, loop.drive)), direct)
     first = float(loop.drive @ loop.noise) - direct
     later = _squares(a, loop.noise, loop.drive @ a - loop.drive)
     changed = math.sqrt(direct * direct + first * first + later)
-    sensitivity = float(np.abs(sensitivity_of(loop, period_s)[1]).max())
-    missed += sum(
-        max(value / most - 1.0, 0.0)
-        for value, most in (
-            (sensitivity, demands.peak_sensitivity),
-            (moved, demands.moved),
-            (shaken * demands.noise_m, demands.shaken),
-            (changed * demands.noise_m, demands.changed),
-        )
-    )
-    return math.exp(min(_STRICT * missed, 120.0))
+    return {
+        "the peak sensitivity": float(np.abs(sensitivity_of(loop, period_s)[1]).max())
+        / demands.peak_sensitivity,
+        "the noise of the length": moved / demands.moved,
+        "the noise of the drive": shaken * demands.noise_m / demands.shaken,
+        "the change of the drive by noise": changed * demands.noise_m / demands.changed,
+    }
 
 
 def squared_error(loop: LinearLoop, period_s: float) -> float:

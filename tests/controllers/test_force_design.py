@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def test_the_penalty_rises_with_what_is_missed_however_much_it_is():
     found = [penalty(LOOP, 0.01, Demands(1.0, shaken, 9.0, 9.0)) for shaken in
              (4.0, 3.0, 1.0, 0.1, 1e-2, 1e-4)]  # fmt: skip
     assert found[0] == 1.0
-    assert all(a < b < UNSTABLE for a, b in zip(found, found[1:], strict=False))
+    assert all(a < b < UNSTABLE for a, b in pairwise(found))
 
 
 def test_demands_that_no_gains_keep_are_refused_with_the_one_that_is_missed():

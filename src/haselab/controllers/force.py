@@ -312,9 +312,7 @@ def force_loop(
     return LinearLoop(a, load, noise, np.r_[point.b, np.zeros(3)], length, w_row, noise_row)
 
 
-def _demands(
-    point: SampledPoint, setting: ControllerSetting, demands: ForceDemands
-) -> Demands:
+def _demands(point: SampledPoint, setting: ControllerSetting, demands: ForceDemands) -> Demands:
     known = setting.actuator
     assert known is not None
     per_v2 = 0.5 / math.sqrt(point.volt2) / known.gain_v_per_v  # V of drive per V^2

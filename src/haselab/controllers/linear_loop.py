@@ -100,10 +100,11 @@ def shares_of(loop: LinearLoop, period_s: float, demands: Demands) -> dict[str, 
         By the name of the demand, for messages.
     """
     a, direct = loop.a, loop.drive_noise
-    moved = math.sqrt(_squares(a, loop.noise, loop.length))
-    shaken = math.hypot(math.sqrt(_squares(a, loop.noise, loop.drive)), direct)
+    noise = _gramian(a, loop.noise)
+    moved = math.sqrt(_squares(noise, loop.length))
+    shaken = math.hypot(math.sqrt(_squares(noise, loop.drive)), direct)
     first = float(loop.drive @ loop.noise) - direct
-    later = _squares(a, loop.noise, loop.drive @ a - loop.drive)
+    later = _squares(noise, loop.drive @ a - loop.drive)
     changed = math.sqrt(direct * direct + first * first + later)
     return {
         "the peak sensitivity": float(np.abs(sensitivity_of(loop, period_s)[1]).max())
@@ -123,7 +124,7 @@ def squared_error(loop: LinearLoop, period_s: float) -> float:
     """
     # a lasting load moves the loop to a new rest, in which the length is 0 again
     rest = np.asarray(np.linalg.solve(np.eye(loop.a.shape[0]) - loop.a, loop.load))
-    return math.sqrt(_squares(loop.a, rest, loop.length) * period_s)
+    return math.sqrt(_squares(_gramian(loop.a, rest), loop.length) * period_s)
 
 
 def timed_error(loop: LinearLoop, period_s: float, for_s: float) -> float:
@@ -159,12 +160,17 @@ def sensitivity_of(loop: LinearLoop, period_s: float) -> tuple[Floats, NDArray[n
     return np.asarray(omega), np.asarray(1.0 + states @ loop.drive)
 
 
-def _squares(a: Floats, start: Floats, row: Floats) -> float:
-    """Sum over all steps of the squared output that follows a start, by Smith's doubling."""
+def _gramian(a: Floats, start: Floats) -> Floats:
+    """Sum over all steps of the outer square of the state after a start, by Smith's doubling."""
     total, power = np.outer(start, start), a
     for _ in range(_DOUBLINGS):
         total = total + power @ total @ power.T
         power = power @ power
         if np.abs(power).max() < _GONE:
             break
-    return max(float(row @ total @ row), 0.0)
+    return total
+
+
+def _squares(gramian: Floats, row: Floats) -> float:
+    """Sum over all steps of the squared output of a row of the state."""
+    return max(float(row @ gramian @ row), 0.0)

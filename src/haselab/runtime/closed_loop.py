@@ -165,9 +165,7 @@ def _sensor(
     return CapacitanceSensor(lockin_of(rig.description, carrier_hz), loop.strain_map)
 
 
-def setting_on_rig(
-    rig: RigDescription, carrier_hz: float, loop: LoopSettings
-) -> ControllerSetting:
+def setting_on_rig(rig: RigDescription, carrier_hz: float, loop: LoopSettings) -> ControllerSetting:
     """What the controller of a loop is started with on a rig.
 
     The delays of the camera are not known.

@@ -79,7 +79,11 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Findings, li
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HybridController, "step", noted)
         options = RunOptions(folder, 5, "none", CONFIG.model_dump(mode="json"), tables())
-        found = run_study(study(), make_twin(CONFIG, 5), options, SilentProgress())
+        rig = make_twin(CONFIG, 5)
+        rig.source.write(1.5)  # as after another experiment: at first it still falls
+        rig.stand.wait(1.0)
+        rig.source.zero()
+        found = run_study(study(), rig, options, SilentProgress())
     return folder, found, estimates
 
 

@@ -25,7 +25,14 @@ from scipy.optimize import minimize
 from haselab.base import LimitError, ResultError
 from haselab.controllers.kind import ControllerKind, Parameter
 from haselab.controllers.known_actuator import KnownActuator
-from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, squared_error
+from haselab.controllers.linear_loop import (
+    UNSTABLE,
+    Demands,
+    LinearLoop,
+    penalty,
+    shares_of,
+    squared_error,
+)
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.sampled_point import SampledPoint, sampled_point
 
@@ -39,6 +46,7 @@ _AUTHORITY = 0.5  # of the force beyond equilibrium that a step of the reference
 _STEP = 0.04
 _ERROR = 0.01  # strain that the proportional part may answer with all the spare force
 _LEAST_FILTER = 0.05  # of a period
+_MISSED = 1.05  # of a demand, by gains that are still used
 _GAIN = 1e6
 
 
@@ -204,7 +212,7 @@ def design_force(setting: ControllerSetting, demands: ForceDemands = _BENCH) -> 
     Returns:
         The parameters of `ForceController`.
     Raises:
-        ResultError: No gains keep the loop stable.
+        ResultError: No gains keep the loop stable, or all demands.
     """
     FORCE.check(setting)
     known = setting.actuator
@@ -235,6 +243,7 @@ def design_force(setting: ControllerSetting, demands: ForceDemands = _BENCH) -> 
             f"No gains of the force loop are stable with a delay of {setting.delay_s or 0.0:g} s. "
             "Shorten the delay."
         )
+    _refuse_missed(points, setting, gains(best.x), demands)
     kp, ki, kd, filter_s = (float(f"{value:.4g}") for value in gains(best.x))
     needed_s = math.sqrt(inertia * known.zero_length_m * _STEP / (_AUTHORITY * spare_n))
     reference_s = max(needed_s, setting.period_s)
@@ -303,6 +312,18 @@ def force_loop(
     return LinearLoop(a, load, noise, np.r_[point.b, np.zeros(3)], length, w_row, noise_row)
 
 
+def _demands(point: SampledPoint, setting: ControllerSetting, demands: ForceDemands) -> Demands:
+    known = setting.actuator
+    assert known is not None
+    per_v2 = 0.5 / math.sqrt(point.volt2) / known.gain_v_per_v  # V of drive per V^2
+    allowed_v = setting.highest_rate_per_s * setting.period_s
+    changed = math.inf if math.isinf(demands.changed) else demands.changed * allowed_v / per_v2
+    return Demands(
+        known.length_noise_m(point.strain), demands.shaken * known.high_v / per_v2,
+        _PEAK_SENSITIVITY, demands.moved, changed,
+    )  # fmt: skip
+
+
 def _cost(
     point: SampledPoint, setting: ControllerSetting, gains: tuple[float, ...],
     demands: ForceDemands, spare_n: float,
@@ -310,17 +331,34 @@ def _cost(
     """Cost of the loop, also where the proportional part asks for more than the spare force."""
     known = setting.actuator
     assert known is not None
-    per_v2 = 0.5 / math.sqrt(point.volt2) / known.gain_v_per_v  # V of drive per V^2
-    allowed_v = setting.highest_rate_per_s * setting.period_s
-    changed = math.inf if math.isinf(demands.changed) else demands.changed * allowed_v / per_v2
-    kept = Demands(
-        known.length_noise_m(point.strain), demands.shaken * known.high_v / per_v2,
-        _PEAK_SENSITIVITY, demands.moved, changed,
-    )  # fmt: skip
     missed = max(gains[0] * _ERROR / spare_n - 1.0, 0.0)
     loop = force_loop(point, setting, gains, known)
-    factor = penalty(loop, setting.period_s, kept, missed)
+    factor = penalty(loop, setting.period_s, _demands(point, setting, demands), missed)
     return factor if factor > UNSTABLE else factor * squared_error(loop, setting.period_s)
+
+
+def _refuse_missed(
+    points: list[SampledPoint], setting: ControllerSetting, gains: tuple[float, ...],
+    demands: ForceDemands,
+) -> None:  # fmt: skip
+    """Refuse gains with which a loop misses a demand: the search found none that keep all."""
+    known = setting.actuator
+    assert known is not None
+    found = [
+        (share, name)
+        for point in points
+        for name, share in shares_of(
+            force_loop(point, setting, gains, known), setting.period_s,
+            _demands(point, setting, demands),
+        ).items()
+    ]  # fmt: skip
+    share, name = max(found)
+    if share > _MISSED:
+        raise ResultError(
+            f"No gains of the force loop keep all demands with updates of {setting.period_s:g} s: "
+            f"with the best ones found, {name} is {share:.3g} times what is allowed. Use the "
+            "controller 'observer', slower updates or a sensor with less noise."
+        )
 
 
 FORCE = ControllerKind(

@@ -14,6 +14,7 @@ __all__ = [
     "LinearLoop",
     "penalty",
     "sensitivity_of",
+    "shares_of",
     "squared_error",
     "timed_error",
 ]
@@ -23,6 +24,7 @@ _GRID = 120
 _DOUBLINGS, _GONE = 24, 1e-12
 UNSTABLE = 1e60
 _STRICT = 20.0  # by 1 % missed, the cost rises by a fifth
+_STEEP, _FARTHEST = 120.0, 1e7  # exponent up to which it does; factor at most from there on
 
 
 @dataclass(frozen=True)
@@ -78,26 +80,39 @@ def penalty(loop: LinearLoop, period_s: float, demands: Demands, missed: float =
     Returns:
         At least 1; more than `UNSTABLE` for an unstable loop.
     """
-    a, size = loop.a, float(np.abs(np.linalg.eigvals(loop.a)).max())
+    size = float(np.abs(np.linalg.eigvals(loop.a)).max())
     if not size < 1.0 - 1e-6:
         return 2.0 * UNSTABLE * size
-    moved = math.sqrt(_squares(a, loop.noise, loop.length))
-    direct = loop.drive_noise
-    shaken = math.hypot(math.sqrt(_squares(a, loop.noise, loop.drive)), direct)
+    shares = shares_of(loop, period_s, demands).values()
+    strict = _STRICT * (missed + sum(max(share - 1.0, 0.0) for share in shares))
+    # far off it still rises, so that a search finds its way back, but never to UNSTABLE
+    return math.exp(min(strict, _STEEP)) * min(max(strict / _STEEP, 1.0), _FARTHEST)
+
+
+def shares_of(loop: LinearLoop, period_s: float, demands: Demands) -> dict[str, float]:
+    """What a stable loop takes of each demand: above 1 it misses the demand.
+
+    Args:
+        loop: closed and stable.
+        period_s: of an update.
+        demands: of it.
+    Returns:
+        By the name of the demand, for messages.
+    """
+    a, direct = loop.a, loop.drive_noise
+    noise = _gramian(a, loop.noise)
+    moved = math.sqrt(_squares(noise, loop.length))
+    shaken = math.hypot(math.sqrt(_squares(noise, loop.drive)), direct)
     first = float(loop.drive @ loop.noise) - direct
-    later = _squares(a, loop.noise, loop.drive @ a - loop.drive)
+    later = _squares(noise, loop.drive @ a - loop.drive)
     changed = math.sqrt(direct * direct + first * first + later)
-    sensitivity = float(np.abs(sensitivity_of(loop, period_s)[1]).max())
-    missed += sum(
-        max(value / most - 1.0, 0.0)
-        for value, most in (
-            (sensitivity, demands.peak_sensitivity),
-            (moved, demands.moved),
-            (shaken * demands.noise_m, demands.shaken),
-            (changed * demands.noise_m, demands.changed),
-        )
-    )
-    return math.exp(min(_STRICT * missed, 120.0))
+    return {
+        "the peak sensitivity": float(np.abs(sensitivity_of(loop, period_s)[1]).max())
+        / demands.peak_sensitivity,
+        "the noise of the length": moved / demands.moved,
+        "the noise of the drive": shaken * demands.noise_m / demands.shaken,
+        "the change of the drive by noise": changed * demands.noise_m / demands.changed,
+    }
 
 
 def squared_error(loop: LinearLoop, period_s: float) -> float:
@@ -109,7 +124,7 @@ def squared_error(loop: LinearLoop, period_s: float) -> float:
     """
     # a lasting load moves the loop to a new rest, in which the length is 0 again
     rest = np.asarray(np.linalg.solve(np.eye(loop.a.shape[0]) - loop.a, loop.load))
-    return math.sqrt(_squares(loop.a, rest, loop.length) * period_s)
+    return math.sqrt(_squares(_gramian(loop.a, rest), loop.length) * period_s)
 
 
 def timed_error(loop: LinearLoop, period_s: float, for_s: float) -> float:
@@ -145,12 +160,17 @@ def sensitivity_of(loop: LinearLoop, period_s: float) -> tuple[Floats, NDArray[n
     return np.asarray(omega), np.asarray(1.0 + states @ loop.drive)
 
 
-def _squares(a: Floats, start: Floats, row: Floats) -> float:
-    """Sum over all steps of the squared output that follows a start, by Smith's doubling."""
+def _gramian(a: Floats, start: Floats) -> Floats:
+    """Sum over all steps of the outer square of the state after a start, by Smith's doubling."""
     total, power = np.outer(start, start), a
     for _ in range(_DOUBLINGS):
         total = total + power @ total @ power.T
         power = power @ power
         if np.abs(power).max() < _GONE:
             break
-    return max(float(row @ total @ row), 0.0)
+    return total
+
+
+def _squares(gramian: Floats, row: Floats) -> float:
+    """Sum over all steps of the squared output of a row of the state."""
+    return max(float(row @ gramian @ row), 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
@@ -57,6 +58,11 @@ def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
         ResultError: No parameters keep the loop stable.
     """
     OBSERVER.check(setting)
+    return dict(_design(setting))
+
+
+@functools.lru_cache(maxsize=8)  # kinds with an inner observer take the same design
+def _design(setting: ControllerSetting) -> Mapping[str, float]:
     known = setting.actuator
     assert known is not None
     low, high = known.reachable()

@@ -28,7 +28,14 @@ from haselab.study.results import VERDICT_RULE, axis_interpretation, quantity_ro
 from haselab.study.simulated.truth import is_simulated
 from haselab.study.tables import Control
 
-__all__ = ["marked_unverified", "results_of", "sections_found", "write_actuator", "write_design", "write_findings"]
+__all__ = [
+    "marked_unverified",
+    "results_of",
+    "sections_found",
+    "write_actuator",
+    "write_design",
+    "write_findings",
+]
 
 _FOUND: Mapping[type, tuple[str, ...]] = {  # sections by the type of the finding in them
     Maps: ("sensing.strain_map", "drive.voltage_map"),

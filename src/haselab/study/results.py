@@ -38,7 +38,15 @@ VERDICT_RULE = (
 )
 _PRINTED_ZETA = 0.09  # eq. 10
 # Played by `reproduce` beside the experiments.
-_APART = ("S25.rise_observer", "S25.overshoot_observer", "S25.error_observer", "S26.", "S27.", "S28.", "S30.")
+_APART = (
+    "S25.rise_observer",
+    "S25.overshoot_observer",
+    "S25.error_observer",
+    "S26.",
+    "S27.",
+    "S28.",
+    "S30.",
+)
 
 
 def verdict(quantity: Quantity, measured: Estimate) -> str:

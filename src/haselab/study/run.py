@@ -102,7 +102,7 @@ def session_header(
 
 
 def _recorded(tables: ActuatorTables) -> dict[str, Any]:
-    """What an analysis of the recording needs of the actuator file: maps, physical model, limits."""
+    """What an analysis needs of the actuator file: maps, physical model, limits."""
     needed = {
         "actuator": {"geometry", "mass_kg", "parameters"},
         "sensing": {"strain_map"},

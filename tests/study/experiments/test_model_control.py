@@ -79,7 +79,11 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Findings, li
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HybridController, "step", noted)
         options = RunOptions(folder, 5, "none", CONFIG.model_dump(mode="json"), tables())
-        found = run_study(study(), make_twin(CONFIG, 5), options, SilentProgress())
+        rig = make_twin(CONFIG, 5)
+        rig.source.write(1.5)  # as after another experiment: at first it still falls
+        rig.stand.wait(1.0)
+        rig.source.zero()
+        found = run_study(study(), rig, options, SilentProgress())
     return folder, found, estimates
 
 
@@ -113,14 +117,15 @@ def test_beyond_the_linear_region_it_steps_without_an_error(played):
 def test_the_masses_of_the_recording_are_those_that_the_controller_had(played):
     """Two loops of 4 s were played, then that of S30; the result computes the first two again.
 
-    In the first blocks, where the drive jumps, the lock-in of a whole record uses other samples
-    than that of a single block.
+    Where the drive jumps, at the start and at the step, the lock-in of a whole record uses other
+    samples than that of a single block.
     """
     _, found, estimates = played
     then, again = estimates[400:800], estimates[-400:]
-    assert again[50:] == pytest.approx(then[50:], abs=1e-5)
+    assert again == pytest.approx(then, abs=1e-3)
+    assert again[250:] == pytest.approx(then[250:], abs=1e-5)
     mean_kg = float(np.mean(then[200:]))
-    expected_kg = pytest.approx(mean_kg - OTHER_KG, abs=1e-6)
+    expected_kg = pytest.approx(mean_kg - OTHER_KG, abs=1e-5)
     assert found.quantities["S27.mass_error_other"].value == expected_kg
 
 

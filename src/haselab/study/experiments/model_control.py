@@ -52,7 +52,9 @@ class ModelControlTest(Experiment[ModelControl]):
     def recordings(self) -> dict[str, str]:
         """See `Experiment`."""
         steps = {
-            name: f"step with {kind}" for group, kind in _STEPS.items() for name in self._names(group)
+            name: f"step with {kind}"
+            for group, kind in _STEPS.items()
+            for name in self._names(group)
         }
         outer = {_OUTER: "steps with hybrid"} if self.settings.outer_mass_kg else {}
         return {_REST: "at rest", **steps, **outer}
@@ -80,6 +82,7 @@ class ModelControlTest(Experiment[ModelControl]):
         """See `Experiment`."""
         settings, analysis = self.settings, player.analysis
         rest_s = _REST_FRAMES / settings.frame_rate_hz
+        player.settle(0.0, settings.rest_s)
         player.play(_REST, constant(0.0, rest_s, UPDATE_HZ), settings.frame_rate_hz)
         for group, kind in _STEPS.items():
             if group == _OTHER:
@@ -116,7 +119,9 @@ class ModelControlTest(Experiment[ModelControl]):
             loop, rig, self.study.sensing.carrier_hz, settings.zero_s,
         )  # fmt: skip
         for name, mass_kg in (("own", own_kg), ("other", other_kg)):
-            notes[f"S27.mass_error_{name}"] = f"{mass_kg:g} kg hung; mean of the time after the step"
+            notes[f"S27.mass_error_{name}"] = (
+                f"{mass_kg:g} kg hung; mean of the time after the step"
+            )
         charts, missing = [drawn], {}
         if points := self._points(analysis):
             outer, chart = outer_results(

@@ -1,4 +1,4 @@
-"""Controllers of the physical model: steps, sensed weights, strains beyond the linear region (S25, S27, S30)."""
+"""Loops with the physical model: steps, weights, beyond the linear region (S25, S27, S30)."""
 
 from __future__ import annotations
 
@@ -128,7 +128,9 @@ def _curve(name: str, seen: Trials, settings: ModelControl) -> Curve:
     return Curve(name, seen.time_s[shown] - settings.zero_s, seen.strain.mean(axis=0)[shown])
 
 
-def sensed_kg(seen: Observation, loop: LoopSettings, rig: RigDescription, carrier_hz: float) -> Floats:
+def sensed_kg(
+    seen: Observation, loop: LoopSettings, rig: RigDescription, carrier_hz: float
+) -> Floats:
     """Hung mass as the controller of a recorded loop estimated it, update by update.
 
     The controller is started again and gets what it measured in the run.

@@ -180,9 +180,7 @@ def _group_of(key: str) -> str:
     return "open loop" if "_open" in key else "PI"
 
 
-def with_camera_resolution(
-    estimate: Estimate, steps: StepTimes, strain_per_px: float
-) -> Estimate:
+def with_camera_resolution(estimate: Estimate, steps: StepTimes, strain_per_px: float) -> Estimate:
     """Add the camera's resolution to a metric, a time or a fraction of the step.
 
     Args:

@@ -355,8 +355,8 @@ def _refuse_missed(
     share, name = max(found)
     if share > _MISSED:
         raise ResultError(
-            f"No gains of the force loop keep all demands with updates of {setting.period_s:g} s: "
-            f"with the best ones found, {name} is {share:.3g} times what is allowed. Use the "
+            f"No gains of the force loop meet all demands with updates of {setting.period_s:g} s: "
+            f"with the best ones found, {name} is {share:.3g} times its limit. Use the "
             "controller 'observer', slower updates or a sensor with less noise."
         )
 

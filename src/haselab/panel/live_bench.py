@@ -193,7 +193,7 @@ class LiveBench:
                 f"{limits.high:g} V. Type another one."
             )
         if request is None or request.number != values.get("number"):
-            raise SafetyError("This request to arm is no longer valid. Request arming again.")
+            raise SafetyError("This request is no longer valid. Press 'Arm the bench' again.")
         self._request = None
         self._rig.safety.arm(request, str(values.get("acknowledged", "")))
         try:
@@ -216,8 +216,9 @@ class LiveBench:
         low_v = max(self._rig.description.drive_limits.low, -self._limit_v)
         if not low_v <= target_v <= self._limit_v:
             raise LimitError(
-                f"The drive is {target_v:g} V, but the bench was armed for {low_v:g} to "
-                f"{self._limit_v:g} V. Choose another drive, or arm with another limit."
+                f"The requested drive is {target_v:g} V, but the bench was armed for {low_v:g} to "
+                f"{self._limit_v:g} V. Request a drive in this range, or arm with another "
+                "limit."
             )
         self._leave_loop()
         self._target_v = target_v
@@ -326,7 +327,7 @@ class LiveBench:
         if self._holder:
             now_s = time.monotonic()
             if now_s > self._seen_s + LEASE_S:
-                self._end("The page that had armed the bench is gone, so the output went to 0 V.")
+                self._end(f"No message from the page that armed the bench for {LEASE_S:g} s.")
             elif now_s > self._beat_s + _HEARTBEAT_S:
                 self._beat_s = now_s
                 rig.safety.heartbeat(0.0)

@@ -72,7 +72,10 @@ def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
     word, _, rest = line.partition(" ")
     if word != "ready":
         _end(process)
-        raise DeviceError(rest or f"The {what} ended while it started. Its messages are above.")
+        raise DeviceError(
+            rest
+            or f"The {what} ended, or was not ready within {_START_S:g} s. Its messages are above."
+        )
     return process, rest
 
 

@@ -1,10 +1,11 @@
 """`python -m haselab.panel.stop_process PORT FOLDER KEY ORIGIN [RIG.toml]`: STOP, and nothing else.
 
 A small process with a port of its own, so that STOP waits for nothing: not for the web server, a
-plot, a command or a blocking call. `POST /stop` revokes the permission in the interlock KEY, which
-no program can use any more, and then sends the bench process to 0 V (`stop.sock` in FOLDER). On a
-real bench it also starts `haselab rig safe RIG.toml`, which uses connections of its own. STOP needs
-no token; pages of other origins are refused. `GET /ready` keeps the connection of a page open.
+plot, a command or a blocking call. `POST /stop` revokes the permission in the interlock KEY, so
+that no haselab program can energise the bench, and then makes the bench process command 0 V
+(`stop.sock` in FOLDER). On a real bench it also starts `haselab rig safe RIG.toml`, which uses
+connections of its own. STOP needs no token; pages of other origins are refused. `GET /ready`
+keeps the connection of a page open.
 
 This module uses only the standard library and the interlock, so it starts quickly.
 """

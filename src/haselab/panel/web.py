@@ -151,13 +151,21 @@ class _Bench:
         self._writer, self.reader = None, None
         for answer in self._waiting.values():
             if not answer.done():
-                answer.set_result({"error": "The bench process has ended. Start the panel again."})
+                answer.set_result(
+                    {
+                        "error": "The bench process has ended. Check that the bench is at "
+                        "0 V, then start the panel again."
+                    }
+                )
         self._waiting.clear()
 
     async def ask(self, what: str, holder: str, values: dict[str, Any]) -> dict[str, Any]:
         """Send a command and wait for its answer."""
         if self._writer is None:
-            return {"error": "The bench process does not run. Start the panel again."}
+            return {
+                "error": "There is no connection to the bench process. Check that the "
+                "bench is at 0 V, then start the panel again."
+            }
         self._number += 1
         answer = asyncio.get_running_loop().create_future()
         self._waiting[self._number] = answer
@@ -166,7 +174,7 @@ class _Bench:
         try:
             return await asyncio.wait_for(answer, _BENCH_S)
         except TimeoutError:
-            return {"error": f"The bench process has not answered within {_BENCH_S:g} s."}
+            return {"error": f"No answer from the bench process for {_BENCH_S:g} s. Press STOP."}
 
 
 @dataclass
@@ -210,7 +218,9 @@ class _Server:
     async def camera(self, request: Request) -> Response:
         """The last frame with its age, for a page with the token."""
         if not self._is_token(request.headers.get("x-panel-token", "")):
-            return Response("The token of the panel is missing.", 403)
+            return Response(
+                "The token is missing or wrong. Open the address that haselab panel printed.", 403
+            )
         try:
             path = self._settings.folder / "camera.jpg"
             age_s = max(time.time() - path.stat().st_mtime, 0.0)

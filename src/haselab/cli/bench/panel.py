@@ -36,7 +36,7 @@ __all__ = ["command"]
 def command(rig: Path | None, actuator: Path | None, port: int, no_browser: bool) -> None:
     """Show and drive a bench in a browser.
 
-    HIGH VOLTAGE CAN BE APPLIED from the page on a real bench, after the bench was armed there. The
+    HIGH VOLTAGE WILL BE APPLIED on a real bench when a page arms and drives it. Keep clear. The
     page has live signals, STOP, arming, a drive by hand and, with --actuator, a closed loop. It is
     served on this computer only. Ctrl-C takes the output to 0 V and ends the panel.
     """

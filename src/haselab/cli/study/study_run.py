@@ -178,7 +178,8 @@ def _execute(
             if study.is_reference:
                 by_model = play_model_control(study, rig, modelled, options, found, model, progress)
                 if isinstance(by_model, str):
-                    click.echo(f"haselab: S27 and S30 were left out: {by_model}", err=True)
+                    rows = "S25 (observer), S27 and S30"
+                    click.echo(f"haselab: {rows} were left out: {by_model}", err=True)
         if noise_free_run is not None:
             progress.advance(0.0, "noise-free reference run")
             noise_free = _noise_free(noise_free_run)

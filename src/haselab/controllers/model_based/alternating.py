@@ -94,8 +94,8 @@ def _one_sign(setting: ControllerSetting) -> ControllerSetting:
     if setting.highest_rate_per_s * setting.period_s < 2.0 * high_v:
         raise InputError(
             f"Controller 'alternating' changes the drive by up to {2.0 * high_v:g} V in one "
-            f"update, but at most {setting.highest_rate_per_s * setting.period_s:g} V are allowed. "
-            "Use the controller observer."
+            f"update, but the rate limit of the drive permits "
+            f"{setting.highest_rate_per_s * setting.period_s:g} V. Use the controller observer."
         )
     return replace(
         setting, drive_low=0.0, drive_high=high_v, drive_start=abs(setting.drive_start),

@@ -79,8 +79,8 @@ def design_h_infinity(setting: ControllerSetting) -> Mapping[str, float]:
                     options={"maxfev": _EVALUATIONS, "xatol": 0.02, "fatol": 1e-9})  # fmt: skip
     if not best.fun < UNSTABLE:
         raise ResultError(
-            f"No weight of the loop shaping is stable with a delay of {setting.delay_s or 0.0:g} "
-            "s. Shorten the delay."
+            f"No weight of the loop shaping gives a stable loop with a dead time of "
+            f"{_dead_s(setting):g} s (delay and half an update). Shorten the delay."
         )
     found = {name: float(f"{value:.4g}")
              for name, value in zip(_NAMES, np.exp(best.x).tolist(), strict=True)}  # fmt: skip

@@ -76,8 +76,8 @@ def design_mpc(setting: ControllerSetting) -> Mapping[str, float]:
 
     Minimises the integral of time times the squared error after a step of the load. The peak
     sensitivity is at most 2.5 with the stiffness 10 % higher, and with it 10 % lower and the delay
-    a fifth longer; at most 5 with the delay longer by half. The plan is outside of the feedback, so
-    it changes none of these.
+    a fifth longer; at most 5 with the delay longer by half. While no limit
+    acts, the plan does not use the measurement, so it changes none of these.
 
     Args:
         setting: timing and limits of the loop, and the actuator.

@@ -14,8 +14,9 @@ $\sum_k \beta_k (x_k - r_k)^2 + \frac{4}{\omega^2} (\dot x_k - \dot r_k)^2 +
 so that without limits it follows the reference with two poles, the slower one at $-0.52\,\omega$.
 The box is that of the electric force between the lowest drive and the highest one that drive and
 field allow at the length of stage $k$, less a reserve for the feedback. The weight $\beta_k$ is 1,
-and 25 for lengths beyond a desired one that stays: a limited force would else overshoot. Box,
-weights and $h$ are those along the plan of the round before; the plan of the update before begins.
+and 25 for lengths beyond a desired one that stays: otherwise a limited force would overshoot.
+Box, weights and $h$ are computed along the plan of the previous iteration; the first one uses
+the plan of the previous update.
 
 While the actuator cannot follow the plan because the drive is at its limit, the plan starts from
 the estimated length and speed instead of those that were planned.

@@ -21,7 +21,7 @@
       if (!answer.ok) throw new Error(answer.statusText);
       if (!pressed) show("STOP: ready", false);
     } catch {
-      show("STOP DOES NOT ANSWER. Use the emergency stop of the bench.", true);
+      show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
     }
     setTimeout(ready, 2000);
   }
@@ -33,12 +33,12 @@
     try {
       const answer = await fetch(`${address}/stop`, { method: "POST", keepalive: true });
       const found = await answer.json();
-      show(found.commanded ? "STOP: 0 V commanded" : "STOP: permission revoked. The bench process does not answer: use the emergency stop of the bench.", !found.commanded);
+      show(found.commanded ? "STOP: 0 V commanded" : "THE BENCH PROCESS DOES NOT ANSWER. Press the emergency stop of the bench.", !found.commanded);
     } catch {
-      show("STOP DOES NOT ANSWER. Use the emergency stop of the bench.", true);
+      show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
     }
     button.classList.remove("pressed");
-    setTimeout(() => { pressed = false; }, 5000);
+    if (!state.classList.contains("bad")) setTimeout(() => { pressed = false; }, 5000); // a failure stays
   }
 
   button.addEventListener("pointerdown", stop);

@@ -43,7 +43,7 @@ export class Link {
   }
 
   lost() {
-    for (const answer of this.waiting.values()) answer({ error: "The connection was lost before the answer." });
+    for (const answer of this.waiting.values()) answer({ error: "The connection was lost before the answer, so the command may have been carried out. Check the state of the bench." });
     this.waiting.clear();
   }
 
@@ -108,7 +108,7 @@ export class Link {
 
   ask(what, values = {}) {
     if (!this.socket || this.socket.readyState !== WebSocket.OPEN) {
-      return Promise.resolve({ error: "There is no connection to the panel." });
+      return Promise.resolve({ error: "The command was not sent, because there is no connection to the panel." });
     }
     this.number += 1;
     const id = this.number;

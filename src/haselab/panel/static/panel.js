@@ -58,7 +58,7 @@ function Arming({ state, say }) {
     <p>${request.limits}</p>
     ${request.reason && html`<p class="error">The bench was made safe. Reason: ${request.reason}</p>
       <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>`}
-    <label>Highest drive of this run, in V at the amplifier's input (${kilo(state.high_v, state.gain)} at most)
+    <label>Highest drive of this run, in V at the amplifier's input, at most ${kilo(state.high_v, state.gain)}
       <input type="number" step="any" min="0" max=${state.high_v} required value=${limit} onInput=${(e) => setLimit(e.target.value)} />
     </label>
     <div class="row"><button class="danger" type="submit" disabled=${!limit || (request.reason && !known)}>Arm</button>
@@ -88,9 +88,9 @@ function Live({ state, say }) {
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
       about=${`now ${kilo(state.drive_v, state.gain)}, changes by 1 V/s`} send=${(v) => ask("drive", { value_v: v })} />
     ${state.loop === null
-      ? html`<p>No loop: start the panel with --actuator A.toml, which has both maps and a controller.</p>`
+      ? html`<p>The loop cannot be closed. Start the panel with --actuator A.toml, a file with both maps and a controller.</p>`
       : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
-          value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; a value closes it"}
+          value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; moving this slider closes it"}
           send=${(v) => ask("loop", { strain: v / 100 })} />`}
     <div class="row">
       <button type="button" onClick=${() => ask("drive", { value_v: 0 })}>Ramp to 0 V</button>
@@ -120,7 +120,7 @@ function Camera() {
   const old = !(seen.age_s < 1);
   return html`<div class="card"><h2>Camera</h2>
     ${seen.url ? html`<img class=${old ? "old" : ""} src=${seen.url} alt="Actuator in the last frame of the camera" />
-      <p class=${old ? "error" : ""}>${old ? "OLD PICTURE: the camera runs while the bench is armed." : "5 frames/s"}</p>`
+      <p class=${old ? "error" : ""}>${old ? "OLD PICTURE. The camera only films while the bench is armed." : "5 frames/s"}</p>`
       : html`<p>No picture. The camera starts when the bench is armed.</p>`}</div>`;
 }
 
@@ -146,14 +146,14 @@ function Panel() {
       <h1>${state ? state.name : "haselab panel"}</h1>
       ${state?.simulated && html`<span class="badge">SIMULATED</span>`}
       <span class=${`badge ${live ? "live" : ""} ${state?.stage === "tripped" ? "bad" : ""}`} role="status">${state ? `Bench: ${state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "Bench: unknown"}</span>
-      <span id="age" class=${`badge ${stale ? "bad" : ""}`} role="status">${stale ? age : paused ? "PAUSED view" : "data live"}</span>
+      <span id="age" class=${`badge ${stale ? "bad" : ""}`} role="status">${stale ? age : paused ? "VIEW PAUSED" : "data live"}</span>
     </header>
     <div class="layout">
       <main class="charts">
         <div class="row" role="group" aria-label="View">
           <button type="button" aria-pressed=${paused} onClick=${() => link.setView(paused ? { end_s: null } : { end_s: frame?.end_s ?? null })}>${paused ? "Resume" : "Pause"}</button>
           ${[1, 10, 60, 600].map((s) => html`<button type="button" onClick=${() => link.setView({ span_s: s })}>${s} s</button>`)}
-          <span>${Number(link.view.span_s.toPrecision(3))} s shown. Drag to zoom, double-click for the present.</span>
+          <span>${Number(link.view.span_s.toPrecision(3))} s shown. Drag over a plot to zoom. Double-click a plot to return to live data.</span>
         </div>
         <div id="charts"></div>
       </main>
@@ -162,8 +162,8 @@ function Panel() {
           <h2>Bench</h2>
           ${link.problem && html`<p class="error" role="alert">${link.problem}</p>`}
           ${error && html`<p class="error" role="alert">${error}</p>`}
-          ${state?.reason && html`<p class="error">Last stop: ${state.reason}</p>`}
-          ${state === null ? html`<p>No bench process.</p>`
+          ${state?.reason && html`<p class="error">Last message of the bench: ${state.reason}</p>`}
+          ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
             : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>`
             : html`<${Arming} state=${state} say=${say} />`}

@@ -246,7 +246,7 @@ def _finite(name: str, values: NDArray[Any], file: Path, *, may_lack: bool) -> F
     bad = np.flatnonzero(~((np.abs(vector) <= _LARGEST) | (may_lack & np.isnan(vector))))
     if bad.size:
         advice = (
-            "Write nan where it was not measured, and keep the rows, whose input still acts"
+            "Write nan where it was not measured. Keep the rows: the fit needs their input"
             if may_lack
             else f"Remove these rows, or use finite numbers up to {_LARGEST:g}"
         )

@@ -169,7 +169,8 @@ def _execute(
         if noise_free_run is not None:
             running.enter_context(noise_free_run)
         found = run_study(study, rig, options, progress, fitted)
-        model, by_model = None, NOT_HERE
+        model = None
+        by_model: Findings | str = NOT_HERE
         if modelled is not None:
             progress.advance(0.0, "physical model")
             model = identify_physical_model(folder, study, found)

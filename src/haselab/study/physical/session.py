@@ -58,7 +58,7 @@ def model_study(study: Study, found: Findings, known: KnownActuator) -> Study:
         name=f"{study.name}, with the physical model",
         sensing=study.sensing,
         model_control=table.model_dump(),
-    )  # type: ignore[call-arg]
+    )
 
 
 def analysed(folder: Path) -> Findings | str:

@@ -12,7 +12,7 @@ import pytest
 from haselab.firmware.messages import Event, Trace
 from haselab.rig.chip import Firmware, checkout
 from haselab.rig.twin.twin_bench import TwinBench
-from tests.firmware.traces import UPDATES, latched, replayed, reported, traced
+from tests.firmware.board.traces import UPDATES, latched, replayed, reported, traced
 
 ROOT = checkout()
 CORE = sorted((ROOT / "core").glob("*.c"))

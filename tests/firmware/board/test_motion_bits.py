@@ -24,7 +24,7 @@ from haselab.rig.chip import CoSim, Firmware, build_firmware, checkout
 from haselab.rig.twin.twin_bench import TwinBench
 from haselab.scoreboard.devices import find_device
 from haselab.scoreboard.knowledge import true_actuator
-from tests.firmware.traces import UPDATES, bits, latched, replayed, reported, traced
+from tests.firmware.board.traces import UPDATES, bits, latched, replayed, reported, traced
 
 ROOT = checkout()
 REPLAY = [*sorted((ROOT / "core").glob("*.c")), ROOT / "firmware/app/app.c",

@@ -184,7 +184,14 @@ CALLS = {
     RUNNER.close_loop: {"reference": (U, VECTOR), "actuator": (hl.Actuator(), OBJECT)},
     hl.Actuator: {
         name: (None, without(OBJECT, "nothing"))
-        for name in ("voltage_map", "strain_map", "controller", "saturation", "plant")
+        for name in (
+            "voltage_map",
+            "strain_map",
+            "controller",
+            "saturation",
+            "plant",
+            "physical",
+        )
     },
     hl.Actuator.load: {"path": ("no.toml", {**PATH, "folder": "."})},
     hl.Plant: {

@@ -125,7 +125,8 @@ def test_a_plan_ends_at_rest_at_the_target_within_the_force_of_the_field(
     assert steps[0][:2] == (begin_m, 0.0)
     assert steps[-1] == (target_m, 0.0, 0.0)
     beyond = max((x - target_m) * math.copysign(1.0, target_m - begin_m) for x, _, _ in steps)
-    assert beyond <= 0.03 * abs(target_m - begin_m)
+    # a plan that had been at a limit may pass the target: by less than the 5 % of goal T1
+    assert beyond <= 0.05 * abs(target_m - begin_m)
     half_s = 0.5 * period_s
     for x, v, a in steps:
         middle_m = x + half_s * v + 0.5 * half_s**2 * a

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -149,7 +150,8 @@ def test_a_signal_during_a_fit_still_ends_the_program(ends: BaseException) -> No
 def test_an_experiment_that_exits_while_it_plays_is_named(monkeypatch: Any) -> None:
     monkeypatch.setattr("haselab.study.analysis.experiments_of", lambda study: (own(),))
     with pytest.raises(ResultError, match=r"'play' of the experiment \[own\].*sys\.exit\(0\)"):
-        play_and_fit(lambda name: None, REFERENCE, RIG, Any)  # type: ignore[arg-type,return-value]
+        runner = SimpleNamespace(mass_kg=0.25)
+        play_and_fit(lambda name: None, REFERENCE, RIG, runner)  # type: ignore[arg-type,return-value]
 
 
 @pytest.mark.parametrize(

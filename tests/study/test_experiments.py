@@ -19,13 +19,14 @@ from haselab.safety.feasibility import Drive
 from haselab.store.toml import Section
 from haselab.study import Analysis, Experiment, ExperimentResult, NotPlayedError, Player, Quantity
 from haselab.study.analysis import experiments_of
-from haselab.study.definition import Study, builtin_study, load_study
+from haselab.study.definition import Study, builtin_study, builtin_table, load_study
 from haselab.study.feasibility import rating_of_twin, study_drives, study_masses_kg
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.static import Static
 from haselab.study.paper.quantity_table import quantities
 from haselab.study.pipeline import play_and_fit
 from haselab.study.registry import EXPERIMENTS
+from haselab.study.tables import ModelControl
 
 REFERENCE = builtin_study(quick=True)
 TRIANGLE = """
@@ -75,7 +76,10 @@ def analysis_of(study: Study, source: Any = None) -> Analysis:
 
 
 def test_the_rows_of_the_experiments_and_of_the_chip_are_the_table_of_results() -> None:
-    named = {key for one in experiments_of(REFERENCE) for key in one.rows()}
+    table = builtin_table("model-control", ModelControl).model_copy(update={"outer_mass_kg": 0.35})
+    session = Study(name="own", sensing=REFERENCE.sensing, model_control=table.model_dump())
+    played = (*experiments_of(REFERENCE), *experiments_of(session))
+    named = {key for one in played for key in one.rows()}
     others = ("S26.", "S28.", "S25.rise_own", "S25.overshoot_own", "S25.error_own")
     assert named == {key for key in quantities() if not key.startswith(others)}
 

@@ -176,7 +176,7 @@ def test_a_value_that_is_not_finite_is_left_out_without_its_row(actuator, tmp_pa
     file.write_text("\n".join(lines))
     code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS)
     assert code == 2 and "Column length_m has inf in row 6 (1 such rows). Write nan" in error, error
-    assert "keep the rows" in error and "Remove" not in error
+    assert "Keep the rows" in error and "Remove" not in error
 
 
 def test_times_that_fall_and_records_given_twice_are_refused(actuator, tmp_path, capsys):

@@ -26,14 +26,14 @@ __all__ = ["command"]
 )
 @shared_option(
     "--actuator", type=click.Path(path_type=Path),
-    detail="With both maps and a controller, the panel can close the loop.",
+    detail="With both maps and a controller, the panel can close the loop. Default: no loop.",
 )  # fmt: skip
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=0, show_default=True,
+    "--page-port", type=click.IntRange(0, 65535), default=0, show_default=True,
     help="Set the TCP port of the page. 0 uses a free one.",
 )  # fmt: skip
 @click.option("--no-browser", is_flag=True, help="Print the address only; open no browser.")
-def command(rig: Path | None, actuator: Path | None, port: int, no_browser: bool) -> None:
+def command(rig: Path | None, actuator: Path | None, page_port: int, no_browser: bool) -> None:
     """Show and drive a bench in a browser.
 
     HIGH VOLTAGE WILL BE APPLIED on a real bench when a page arms and drives it. Keep clear. The
@@ -45,7 +45,7 @@ def command(rig: Path | None, actuator: Path | None, port: int, no_browser: bool
             folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
             rig = folder / "twin.toml"
             write_new(rig, 'kind = "twin"\n')
-        panel = opened.enter_context(running_panel(rig, actuator, port))
+        panel = opened.enter_context(running_panel(rig, actuator, page_port))
         click.echo(panel.address)
         if not no_browser:
             webbrowser.open(panel.address)

@@ -111,5 +111,5 @@ def test_a_drive_of_one_sign_or_a_slow_one_is_refused(known):
         with pytest.raises(InputError, match=r"both signs .* 0 to 2 V\. Set drive\.low_v below 0"):
             act(one_sign)
     slow = replace(setting_for(CHOSEN, HOST, known, 0.0), highest_rate_per_s=100.0)
-    with pytest.raises(InputError, match=r"by up to 4 V in one update, but at most 1 V"):
+    with pytest.raises(InputError, match=r"by up to 4 V in one update, but the rate limit .* 1 V"):
         CHOSEN.make().start(slow)

@@ -116,8 +116,8 @@ def running_panel(rig: Path, actuator: Path | None, port: int = 0) -> Iterator[P
             listener.listen(128)  # a browser that is early waits
         except OSError as error:
             raise DeviceError(
-                f"Port {port} cannot be used ({error.strerror}). Choose another one with --page-port, "
-                "or leave it out for a free one."
+                f"Port {port} cannot be used ({error.strerror}). Choose another one with "
+                "--page-port, or leave it out for a free one."
             ) from None
         own = listener.getsockname()[1]
         hosts = (f"127.0.0.1:{own}", f"localhost:{own}")

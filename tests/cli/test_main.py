@@ -56,6 +56,18 @@ def test_each_kind_of_error_has_its_exit_code_and_one_line(
     assert message.count("\n") == 1
 
 
+def test_a_message_that_quotes_a_damaged_file_keeps_both_of_its_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = InputError(f"Column u has '{'1' * 300_000}'. Remove line 7: a.csv")
+    command_that_raises(error, monkeypatch)
+    assert run(["design"]) == 2
+    message = capsys.readouterr().err
+    assert len(message) < 2100
+    assert message.startswith("haselab: Column u has '111")
+    assert message.endswith("111'. Remove line 7: a.csv\n")
+
+
 def test_code_of_another_package_cannot_end_a_command_as_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -66,6 +66,7 @@ _BAD_PATHS = (
 # What click raises for a group without a command, since version 8.2; its message is the help.
 _NO_COMMAND = getattr(click.exceptions, "NoArgsIsHelpError", ())
 _CLOSED_PIPE = 141  # 128 + SIGPIPE, the exit status of a program that this signal ended
+_MOST_CHARACTERS = 2000  # of a message
 _BAD_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 
 
@@ -112,8 +113,11 @@ def cli() -> None:
 
 
 def _fail(message: str, exit_code: int) -> int:
+    line = " ".join(message.split())
+    if len(line) > _MOST_CHARACTERS:  # it quotes a damaged file; both ends say what to do
+        line = f"{line[: _MOST_CHARACTERS // 2]} … {line[-_MOST_CHARACTERS // 2 :]}"
     try:
-        click.echo(f"haselab: {' '.join(message.split())}", err=True)
+        click.echo(f"haselab: {line}", err=True)
     except OSError:  # stderr is closed too
         _silence(sys.stderr)
     return exit_code

@@ -158,3 +158,11 @@ def test_the_times_of_another_table_do_not_contradict_the_rate(tmp_path):
     np.savez(path, u=np.arange(40.0), rate_hz=400.0, time_s=np.arange(40) / 100.0)
     with pytest.raises(InputError, match=r"rate of 400 Hz, but column time_s has 100 rows"):
         read_table(path, ["u"])
+
+
+def test_a_cell_of_very_many_digits_is_examined_without_delay(tmp_path):
+    """Such a cell in a damaged file took 3 s; the time grew with the square of its length."""
+    file = tmp_path / "digits.csv"
+    file.write_text(f"u,y\n1,2\n{'1' * 300_000}.0.1,3\n4,5\n")
+    with pytest.raises(InputError, match=r"^Column u has .* in line 3"):
+        read_table(file, ["u", "y"])

@@ -108,3 +108,10 @@ def test_an_unknown_unit_of_a_labview_channel_is_refused(tmp_path):
     assert read_table(tmp_path / "a.tdms", ["y"])["y"].tolist() == [0.0, 1e-3, 2e-3, 3e-3]
     with pytest.raises(InputError, match=r"^Column 'g/u' states the unit 'furlong'"):
         read_table(tmp_path / "a.tdms", ["u"])
+
+
+def test_the_unit_of_a_very_long_header_is_found_without_delay():
+    """The time of a pattern that tries each place of a run of spaces grows with its third power."""
+    name = "x" + " " * 100_000 + "y"
+    assert split_header(name) == (name, "")
+    assert split_header(f"{name} [mV]") == (name, "mV")

@@ -19,7 +19,7 @@ __all__ = ["HEAD_BYTES", "TextLayout", "is_number", "layout_of", "split_cells"]
 HEAD_BYTES = 1 << 20
 _MOST_LINES, _MOST_CHARACTERS, _FEWEST_LINES = 400, 400_000, 12
 _NUMBER = re.compile(
-    r"[+-]?(?:(?:\d+(?P<mark>[.,])?\d*|[.,]\d+)(?:[eE][+-]?\d+)?|nan|inf(?:inity)?|∞)",
+    r"[+-]?(?:(?:\d+(?:(?P<mark>[.,])\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?|nan|inf(?:inity)?|∞)",
     re.IGNORECASE,
 )
 _MOST_SPOILT = 3

@@ -69,6 +69,7 @@ _BRACKETS = re.compile(
     r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\[\]]*)\]|\((?P<round>[^()]*)\)|\{(?P<curly>[^{}]*)\})\s*$"
 )
 _STROKE = re.compile(r"^(?P<name>.+?)\s*(?:/|,|\s+in\s)\s*(?P<unit>[^/,\s]+)$")
+_MOST_SEARCHED = 200  # characters at the end of a header; the patterns are slow on a long one
 _LOOKS_LIKE_ONE = re.compile(r"[fpnuµmkg]?(v|a|f|s|hz|m|n|pa|ohm|c|g)(\^\d)?", re.IGNORECASE)
 _STATED = re.compile(r"[^\s\d]{1,8}(\^-?\d)?")  # in square brackets
 _KNOWN = (
@@ -168,7 +169,13 @@ def split_header(header: str) -> tuple[str, str]:
         >>> split_header("U (measured)"), split_header("voltage_v")
         (('U (measured)', ''), ('voltage_v', ''))
     """
-    text = header.strip()
+    whole = header.strip()
+    first, text = whole[:-_MOST_SEARCHED], whole[-_MOST_SEARCHED:]
+    name, unit = _split(text)
+    return first + name, unit
+
+
+def _split(text: str) -> tuple[str, str]:
     if match := _BRACKETS.match(text):
         unit = next(part for part in match.group("square", "round", "curly") if part is not None)
         stated = (
@@ -177,14 +184,14 @@ def split_header(header: str) -> tuple[str, str]:
             or _LOOKS_LIKE_ONE.fullmatch(unit.strip()) is not None
         )
         if stated or (match["square"] is not None and _STATED.fullmatch(unit.strip())):
-            return match["name"].strip() or text, unit.strip()
+            return match["name"].rstrip() or text, unit.strip()
         return text, ""
     units = _UNITS.keys() | _REFUSED
     if (match := _STROKE.match(text)) and match["unit"] in units and match["unit"] not in "1-":
-        return match["name"].strip(), match["unit"]
+        return match["name"].rstrip(), match["unit"]
     name, _, word = text.rpartition(" ")
     if name and word in _LAST_WORDS:
-        return name.strip(), word
+        return name.rstrip(), word
     name, _, ending = text.rpartition("_")
     known = ending in _ENDINGS or ending == _AMBIGUOUS or (ending in units and len(ending) > 1)
     if name and known:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import uvicorn
 
 from haselab.base import DeviceError
+from haselab.panel.files import PanelFiles
 from haselab.panel.web import WebSettings, application
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
@@ -92,12 +93,11 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 @contextlib.contextmanager
-def running_panel(rig: Path, actuator: Path | None, port: int = 0) -> Iterator[Panel]:
+def running_panel(files: PanelFiles, port: int = 0) -> Iterator[Panel]:
     """Start the bench process and the stop process; on exit, go to 0 V and end them.
 
     Args:
-        rig: rig file.
-        actuator: actuator file, for a closed loop; None: there is none.
+        files: rig, actuator and recordings.
         port: of the web server on the loopback address; 0: a free one.
     Yields:
         The panel; the caller runs its server.
@@ -121,11 +121,12 @@ def running_panel(rig: Path, actuator: Path | None, port: int = 0) -> Iterator[P
             ) from None
         own = listener.getsockname()[1]
         hosts = (f"127.0.0.1:{own}", f"localhost:{own}")
-        words = [str(rig), str(folder), *([] if actuator is None else [str(actuator)])]
+        words = [str(files.rig), str(folder)]
+        words += [] if files.actuator is None else [str(files.actuator)]
         bench, key = _started(["haselab.panel.bench_process", *words], "bench process")
         opened.callback(_end, bench)
-        settings = WebSettings(folder, secrets.token_urlsafe(24), hosts, 0)
-        real = [str(rig)] if isinstance(load_rig(rig), BenchConfig) else []
+        settings = WebSettings(folder, secrets.token_urlsafe(24), hosts, 0, files)
+        real = [str(files.rig)] if isinstance(load_rig(files.rig), BenchConfig) else []
         words = ["0", str(folder), key, ",".join(settings.origins), *real]
         stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
         opened.callback(_end, stop)

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -31,7 +32,10 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from haselab.base import HaselabError, JsonObject, to_plain
 from haselab.panel.columns import SIGNALS, Columns, LiveReader
+from haselab.panel.files import PanelFiles
+from haselab.panel.requests import REQUESTS
 
 __all__ = ["SCHEMA", "WebSettings", "application"]
 
@@ -41,9 +45,11 @@ _FRAME_S = 1.0 / 30.0
 _TOKEN_S = 3.0  # for the first message of a page
 _MOST_PAGES = 32
 _MOST_BYTES = 4096  # of a message of a page
+_MOST_BODY_BYTES = 1 << 20  # of a request
 _MOST_COLUMNS = 4000
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
 _HEAD = struct.Struct("<HHIddddII")
+_NO_TOKEN = "The token is missing or wrong. Open the address that haselab panel printed."
 
 
 @dataclass
@@ -55,12 +61,14 @@ class WebSettings:
         token: that a page must send first.
         hosts: values of Host that are accepted, such as `127.0.0.1:8000`.
         stop_port: of the stop process, for the page.
+        files: that the panel was started with.
     """
 
     folder: Path
     token: str
     hosts: tuple[str, ...]
     stop_port: int
+    files: PanelFiles
 
     @property
     def origins(self) -> tuple[str, ...]:
@@ -217,16 +225,34 @@ class _Server:
 
     async def camera(self, request: Request) -> Response:
         """The last frame with its age, for a page with the token."""
-        if not self._is_token(request.headers.get("x-panel-token", "")):
-            return Response(
-                "The token is missing or wrong. Open the address that haselab panel printed.", 403
-            )
+        if not self._is_known(request):
+            return Response(_NO_TOKEN, 403)
         try:
             path = self._settings.folder / "camera.jpg"
             age_s = max(time.time() - path.stat().st_mtime, 0.0)
             return Response(path.read_bytes(), 200, {"x-age-s": f"{age_s:.3f}"}, "image/jpeg")
         except OSError:
             return Response("There is no picture yet.", 404)
+
+    async def request(self, request: Request) -> Response:
+        """Carry out one of `REQUESTS` in a thread and answer in JSON."""
+        if not self._is_known(request):
+            return JSONResponse({"error": _NO_TOKEN}, 403)
+        carry_out = REQUESTS.get(request.path_params["name"])
+        if carry_out is None:
+            return JSONResponse({"error": "There is no such request."}, 404)
+        try:
+            values = await _body(request)
+        except ValueError:
+            return JSONResponse({"error": "The request must hold one small JSON object."}, 400)
+        try:
+            answer = await run_in_threadpool(carry_out, self._settings.files, values)
+        except HaselabError as error:
+            return JSONResponse({"error": str(error)}, 422)
+        return JSONResponse(to_plain(answer))
+
+    def _is_known(self, request: Request) -> bool:
+        return self._is_token(request.headers.get("x-panel-token", ""))
 
     def _is_token(self, text: str) -> bool:
         return hmac.compare_digest(text.encode(), self._settings.token.encode())
@@ -349,6 +375,25 @@ class _Server:
         return b"".join((head, text, *arrays))
 
 
+async def _body(request: Request) -> JsonObject:
+    """The JSON object of a request.
+
+    Raises:
+        ValueError: It is too long, of another type, or no JSON object.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        raise ValueError
+    data = bytearray()
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > _MOST_BODY_BYTES:
+            raise ValueError
+    values = json.loads(data)
+    if not isinstance(values, dict):
+        raise ValueError
+    return values
+
+
 def application(settings: WebSettings) -> Starlette:
     """Make the web application.
 
@@ -362,6 +407,7 @@ def application(settings: WebSettings) -> Starlette:
         Route("/", server.page),
         Route("/about", server.about),
         Route("/camera", server.camera),
+        Route("/request/{name}", server.request, methods=["POST"]),
         WebSocketRoute("/live", server.live),
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]

@@ -14,6 +14,7 @@ import click
 
 from haselab.base import DeviceError
 from haselab.cli.options import shared_option
+from haselab.panel.files import PanelFiles
 from haselab.panel.processes import Panel, running_panel
 from haselab.store.folder import write_new
 
@@ -29,11 +30,17 @@ __all__ = ["command"]
     detail="With both maps and a controller, the panel can close the loop. Default: no loop.",
 )  # fmt: skip
 @click.option(
+    "--runs", type=click.Path(path_type=Path, file_okay=False), default=Path("out"),
+    show_default=True, metavar="DIR", help="List the recordings in this folder; add new ones.",
+)  # fmt: skip
+@click.option(
     "--page-port", type=click.IntRange(0, 65535), default=0, show_default=True,
     help="Set the TCP port of the page. 0 uses a free one.",
 )  # fmt: skip
 @click.option("--no-browser", is_flag=True, help="Print the address only; open no browser.")
-def command(rig: Path | None, actuator: Path | None, page_port: int, no_browser: bool) -> None:
+def command(
+    rig: Path | None, actuator: Path | None, runs: Path, page_port: int, no_browser: bool
+) -> None:
     """Show and drive a bench in a browser.
 
     HIGH VOLTAGE WILL BE APPLIED on a real bench when a page arms and drives it. Keep clear. The
@@ -45,7 +52,7 @@ def command(rig: Path | None, actuator: Path | None, page_port: int, no_browser:
             folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
             rig = folder / "twin.toml"
             write_new(rig, 'kind = "twin"\n')
-        panel = opened.enter_context(running_panel(rig, actuator, page_port))
+        panel = opened.enter_context(running_panel(PanelFiles(rig, actuator, runs), page_port))
         click.echo(panel.address)
         if not no_browser:
             webbrowser.open(panel.address)

@@ -115,4 +115,17 @@ export class Link {
     this.send({ id, do: what, values });
     return new Promise((resolve) => this.waiting.set(id, resolve));
   }
+
+  // An answer by HTTP, for what does not concern the bench itself.
+  async request(name, values = {}) {
+    try {
+      const answer = await fetch(`/request/${name}`, {
+        method: "POST", body: JSON.stringify(values),
+        headers: { "Content-Type": "application/json", "X-Panel-Token": this.token },
+      });
+      return await answer.json();
+    } catch {
+      return { error: "The web server of the panel does not answer. Read the messages in the terminal of haselab panel." };
+    }
+  }
 }

@@ -124,7 +124,20 @@ function Camera() {
       : html`<p>No picture. The camera starts when the bench is armed.</p>`}</div>`;
 }
 
+// Each is a module with a default component, imported when it is first opened.
+const TABS = { Live: "", Doctor: "/static/doctor.js" };
+
+function Lazy({ from, ...rest }) {
+  const [found, find] = useState({ part: null, error: "" });
+  useEffect(() => {
+    import(from).then((module) => find({ part: module.default, error: "" }), (error) => find({ part: null, error: String(error) }));
+  }, [from]);
+  if (found.error) return html`<p class="error">This page cannot be loaded: ${found.error}</p>`;
+  return found.part ? html`<${found.part} ...${rest} />` : html`<p>Loading …</p>`;
+}
+
 function Panel() {
+  const [tab, open] = useState("Live");
   const [, force] = useReducer((n) => n + 1, 0);
   const [error, say] = useState("");
   useEffect(() => {
@@ -148,15 +161,19 @@ function Panel() {
       <span class=${`badge ${live ? "live" : ""} ${state?.stage === "tripped" ? "bad" : ""}`} role="status">${state ? `Bench: ${state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "Bench: unknown"}</span>
       <span id="age" class=${`badge ${stale ? "bad" : ""}`} role="status">${stale ? age : paused ? "VIEW PAUSED" : "data live"}</span>
     </header>
-    <div class="layout">
-      <main class="charts">
+    <nav class="row" aria-label="Pages">
+      ${Object.keys(TABS).map((name) => html`<button type="button" aria-current=${name === tab ? "page" : "false"} onClick=${() => open(name)}>${name}</button>`)}
+    </nav>
+    ${TABS[tab] && html`<main class="tab"><${Lazy} from=${TABS[tab]} key=${tab} link=${link} state=${state} mine=${mine} /></main>`}
+    <div class="layout" role=${tab === "Live" ? "main" : null} hidden=${tab !== "Live"}>
+      <section class="charts" aria-label="Signals">
         <div class="row" role="group" aria-label="View">
           <button type="button" aria-pressed=${paused} onClick=${() => link.setView(paused ? { end_s: null } : { end_s: frame?.end_s ?? null })}>${paused ? "Resume" : "Pause"}</button>
           ${[1, 10, 60, 600].map((s) => html`<button type="button" onClick=${() => link.setView({ span_s: s })}>${s} s</button>`)}
           <span>${Number(link.view.span_s.toPrecision(3))} s shown. Drag over a plot to zoom. Double-click a plot to return to live data.</span>
         </div>
         <div id="charts"></div>
-      </main>
+      </section>
       <section class="controls" aria-label="Bench">
         <div class=${`card ${live ? "warning" : ""}`}>
           <h2>Bench</h2>

@@ -12,11 +12,24 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from tests.panel.running import WAIT_S, RunningPanel
+from tests.panel.running import WAIT_S, RunningPanel, ended, started
+
+TRIANGLE = """
+name = "one triangle"
+
+[triangle]
+low_v = 0.0
+high_v = 1.8
+frequency_hz = 0.5
+cycles = 4
+skipped_cycles = 1
+frame_rate_hz = 200.0
+"""
 
 STATIC = Path(__file__).parents[2] / "src" / "haselab" / "panel" / "static"
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
 WAIT_MS = 1e3 * WAIT_S
+PAGES = {"Studies": "Keep no camera frames", "Doctor": "checks"}  # a text of each, once it is there
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +169,62 @@ def test_axe_finds_nothing(browser: Browser, shared_panel: RunningPanel, scheme:
         found = Axe().run(page)
         assert found.violations_count == 0, found.generate_report()
         page.get_by_role("button", name="Cancel").click()
+        for name, content in PAGES.items():
+            page.get_by_role("button", name=name, exact=True).click()
+            expect(page.get_by_text(content).first).to_be_visible(timeout=WAIT_MS)
+            found = Axe().run(page)
+            assert found.violations_count == 0, f"{name}: {found.generate_report()}"
+
+
+def test_a_study_is_checked_armed_played_and_reported_by_keyboard_alone(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("triangle.toml").write_text(TRIANGLE)
+    panel = started()
+    try:
+        with browser.new_context() as context:
+            page = context.new_page()
+            page.set_default_timeout(WAIT_MS)
+            page.goto(panel.address)
+            press(page, "Studies")
+            study = page.get_by_role("combobox", name="Study")
+            study.focus()
+            page.keyboard.press("ArrowDown")  # the second of the list
+            expect(study).to_have_value("triangle.toml", timeout=WAIT_MS)
+            press(page, "Check")
+            expect(page.get_by_text("The bench can play this study")).to_be_visible(timeout=WAIT_MS)
+            press(page, "Arm the bench and play")
+            page.locator(".tab").get_by_label("Highest drive of this run").focus()
+            page.keyboard.type("1.8")
+            page.keyboard.press("Enter")
+            expect(page.locator(".tab").get_by_text("A study is played")).to_be_visible(
+                timeout=WAIT_MS
+            )
+            ending = page.locator(".tab").get_by_text("The study has ended")
+            expect(ending).to_be_visible(timeout=4 * WAIT_MS)
+            expect(page.get_by_role("button", name="Report")).to_be_visible(timeout=4 * WAIT_MS)
+            with context.expect_page() as opened:
+                press(page, "Report")
+            report = opened.value
+            expect(report.get_by_text("SIMULATED").first).to_be_visible(timeout=WAIT_MS)
+            report.close()
+            page.get_by_label("Note about").focus()
+            page.keyboard.type("first one")
+            page.keyboard.press("Tab")
+            note = next(tmp_path.glob("out/*")) / "notes.txt"
+            end_s = time.monotonic() + WAIT_S
+            while not note.exists() and time.monotonic() < end_s:
+                page.wait_for_timeout(100)
+            assert note.read_text() == "first one"
+    finally:
+        ended(panel)
+
+
+def press(page: Page, name: str) -> None:
+    """Press a button by keyboard alone."""
+    page.get_by_role("button", name=name).first.focus()
+    page.keyboard.press("Enter")
 
 
 def test_a_page_without_the_token_says_what_to_do(

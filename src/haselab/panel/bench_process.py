@@ -1,7 +1,7 @@
-"""`python -m haselab.panel.bench_process RIG.toml FOLDER [A.toml]`: the process that has the bench.
+"""`python -m haselab.panel.bench_process RIG.toml FOLDER RUNS [A.toml]`: has the bench.
 
-It reads the bench block by block into shared memory, and answers commands. FOLDER is private to
-one panel and holds
+It reads the bench block by block into shared memory, answers commands, and plays studies, whose
+recordings are new folders in RUNS. FOLDER is private to one panel and holds
 
 - `live`: the signals, see `columns`;
 - `camera.jpg`: the last frame of the camera;
@@ -30,9 +30,14 @@ from pathlib import Path
 from haselab.api.design import Actuator
 from haselab.base import HaselabError, InputError, JsonObject
 from haselab.panel.columns import LiveWriter
-from haselab.panel.live_bench import LiveBench
+from haselab.panel.files import PanelFiles
+from haselab.panel.live_bench import CARRIER_HZ, LiveBench
+from haselab.panel.study_job import StudyJob, actuator_tables
+from haselab.panel.study_player import StudyPlayer
+from haselab.pipelines.actuator_bench import prepare_bench
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
+from haselab.rig.operator import WeightHandler
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig, opened_rig
 from haselab.runtime.scheduling import with_priority
 from haselab.safety.gate import Gate
@@ -111,7 +116,9 @@ def _stops(folder: Path, bench: LiveBench) -> None:
 
 
 @contextlib.contextmanager
-def _opened(file: RigFile, path: Path, folder: Path) -> Iterator[tuple[Rig, Safety]]:
+def _opened(
+    file: RigFile, path: Path, folder: Path, operator: WeightHandler
+) -> Iterator[tuple[Rig, Safety]]:
     """Open the rig with its safety chain; a twin gets an interlock that other processes reach."""
     gate = Gate()
     with contextlib.ExitStack() as opened:
@@ -123,7 +130,7 @@ def _opened(file: RigFile, path: Path, folder: Path) -> Iterator[tuple[Rig, Safe
                 f"The panel works with kind = 'twin' and 'bench', but the rig has kind = "
                 f"{file.kind!r}. Use haselab run with this rig. {path}"
             )
-        rig = opened.enter_context(opened_rig(file, path, gate))
+        rig = opened.enter_context(opened_rig(file, path, gate, operator))
         safety = Safety(safety_of(file, getattr(file, "safety", {}), path))
         if isinstance(file, BenchConfig):
             safety.guardians = opened.enter_context(
@@ -142,6 +149,12 @@ def _run(bench: LiveBench, block_s: float, *, paced: bool, ended: threading.Even
                 time.sleep(max(next_s - time.monotonic(), 0.0))
 
 
+def _end_study_at(ended: threading.Event, bench: LiveBench) -> None:
+    """End the study that is being played when the panel ends."""
+    ended.wait()
+    bench.end_study("The panel has ended.")
+
+
 def _watch_stdin(ended: threading.Event) -> None:
     """End the process when the panel has ended."""
     sys.stdin.read()
@@ -152,20 +165,27 @@ def main(words: list[str]) -> int:
     """Run the bench process.
 
     Args:
-        words: rig file, folder, and optionally the actuator file.
+        words: rig file, folder, folder of recordings, and optionally the actuator file.
     Returns:
         0, or 1 if the bench cannot be used; the reason is printed after `failed`.
     """
-    path, folder = Path(words[0]), Path(words[1])
+    path, folder, runs = (Path(word) for word in words[:3])
+    actuator = Path(words[3]) if len(words) > 3 else None
+    files, player = PanelFiles(path, actuator, runs), StudyPlayer()
     ended = threading.Event()
     for name in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, lambda *_: ended.set())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the panel ends this process by its stdin
     threading.Thread(target=_watch_stdin, args=(ended,), daemon=True).start()
     try:
-        loop = Actuator.load(words[2]).loop() if len(words) > 2 else None
+        loop = None if actuator is None else Actuator.load(actuator).loop()
         file = load_rig(path)
-        with _opened(file, path, folder) as (rig, safety):
+        with _opened(file, path, folder, player.operator) as (rig, safety):
+            if actuator is not None and (note := prepare_bench(
+                rig, actuator_tables(actuator), actuator, CARRIER_HZ,
+                file.configuration(path) if isinstance(file, TwinFile) else None,
+            )):  # fmt: skip
+                print(f"haselab: {note}", file=sys.stderr)
             about = rig.description
             scales = (
                 about.volt_per_code / about.v_monitor_v_per_v,
@@ -173,7 +193,11 @@ def main(words: list[str]) -> int:
             )
             live = folder / "live"
             with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
-                bench = LiveBench(guard(rig, safety), writer, loop, folder / "camera.jpg")
+                bench = LiveBench(
+                    guard(rig, safety), writer, loop, folder / "camera.jpg",
+                    lambda chosen: StudyJob.of(files, file, chosen), player,
+                )  # fmt: skip
+                threading.Thread(target=_end_study_at, args=(ended, bench), daemon=True).start()
                 link = _Link(folder, bench)
                 threading.Thread(target=link.serve, daemon=True).start()
                 threading.Thread(target=_stops, args=(folder, bench), daemon=True).start()

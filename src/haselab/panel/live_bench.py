@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +24,8 @@ from haselab.base import (
     shown,
 )
 from haselab.panel.columns import LiveWriter
+from haselab.panel.study_job import StudyJob
+from haselab.panel.study_player import StudyPlayer
 from haselab.runtime.closed_loop import ClosedLoop
 from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
@@ -36,6 +40,7 @@ LEASE_S = 1.5  # longest time without a message from the page that armed the ben
 _RAMP_V_PER_S = 1.0  # at the amplifier's input: 5 kV/s with a gain of 5000
 _HEARTBEAT_S = 0.5
 _PICTURES_HZ = 5.0
+_MOST_EVENTS = 40  # that a page shows
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ class BenchState:
 
     Args:
         stage: of the safety chain: off, requested, armed, running or tripped.
-        mode: `idle`, `drive` (by hand) or `loop`.
+        mode: `idle`, `drive` (by hand), `loop` or `study`.
         drive_v: drive of the last block, in V.
         target_v: drive to which the ramp leads, in V.
         reference: desired strain; None: the loop is open.
@@ -57,6 +62,11 @@ class BenchState:
         loop: limits of the desired strain; None: the actuator file has no complete controller.
         name: of the rig.
         simulated: whether it is a twin.
+        task: what a study does now; empty without a study.
+        done: share of the study's time that has passed, 0 to 1.
+        prompt: step that a person must do and confirm; empty: none.
+        events: the last ones, each with its time on the clock of the rig, in s.
+        recorded: folder of the last study that was played to its end; empty: none.
     """
 
     stage: str
@@ -73,6 +83,11 @@ class BenchState:
     loop: tuple[float, float] | None
     name: str
     simulated: bool
+    task: str
+    done: float
+    prompt: str
+    events: tuple[tuple[float, str], ...]
+    recorded: str
 
 
 class _NoCamera:
@@ -101,6 +116,8 @@ class LiveBench:
         writer: of the live signals.
         loop: of the actuator file; None: no loop can be closed.
         picture: JPEG file for the last camera frame while the bench is armed; None: no pictures.
+        prepare: prepares the study that a page has chosen; None: no study can be played.
+        player: plays it.
     """
 
     def __init__(
@@ -109,6 +126,8 @@ class LiveBench:
         writer: LiveWriter,
         loop: LoopSettings | None = None,
         picture: Path | None = None,
+        prepare: Callable[[JsonObject], StudyJob] | None = None,
+        player: StudyPlayer | None = None,
     ) -> None:
         self._rig, self._writer, self._loop, self._picture = rig, writer, loop, picture
         about = rig.description
@@ -121,6 +140,13 @@ class LiveBench:
         self._limit_v = 0.0
         self._closed: ClosedLoop | None = None
         self._seen_s = self._beat_s = 0.0
+        self._prepare, self._player = prepare, player or StudyPlayer()
+        self._player.note = self._note
+        self._job: StudyJob | None = None
+        self._recorded = ""  # folder of the last study that was played to its end
+        self._end_study = ""  # why the study must end; empty: it may go on
+        self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
+        rig.bench.on_block = self._on_block
         self._settled = about.switch_in_block + round(1e-3 * about.rate_hz)
 
     # ---- from other threads ------------------------------------------------------------------
@@ -136,14 +162,16 @@ class LiveBench:
         return BenchState(
             safety.stage.value, self._mode, self._drive_v, self._target_v, self._reference,
             self._limit_v, self._holder, safety.gate.interlock.reason or self._reason, low, high,
-            about.amplifier_gain, limits, about.name, self._rig.simulated,
+            about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
+            self._player.done, self._player.prompt, tuple(self._events),
+            self._recorded,
         )  # fmt: skip
 
     def do(self, what: str, holder: str, values: JsonObject) -> JsonObject:
         """Carry out a command of a page.
 
         Args:
-            what: `request`, `arm`, `drive`, `loop`, `open`, `disarm` or `lease`.
+            what: `request`, `arm`, `drive`, `loop`, `open`, `confirm`, `disarm` or `lease`.
             holder: the page.
             values: arguments of the command.
         Returns:
@@ -156,18 +184,19 @@ class LiveBench:
         commands = {
             "request": self._request_arming, "arm": self._arm, "drive": self._drive_to,
             "loop": self._close_loop, "open": self._open_loop, "disarm": self._disarm,
-            "lease": self._lease,
+            "lease": self._lease, "confirm": self._confirm,
         }  # fmt: skip
         if what not in commands:
             raise InputError(
                 f"There is no command {shown(what)}. Use one of: {', '.join(commands)}."
             )
+        job = self._chosen(values) if what == "arm" else None  # which takes longer than a block
         with self._mutex:
             if self._holder and holder != self._holder and what not in ("disarm", "lease"):
                 raise SafetyError(
                     "Another page has armed the bench. It must disarm the bench first."
                 )
-            return commands[what](holder, values)
+            return self._arm(holder, values, job) if job else commands[what](holder, values)
 
     def stop(self, reason: str) -> None:
         """Take the bench to 0 V at once and latch the reason. Never waits for a command.
@@ -176,6 +205,18 @@ class LiveBench:
             reason: one sentence.
         """
         self._rig.safety.trip(reason)
+        self._note("STOP")
+
+    def end_study(self, reason: str) -> None:
+        """End a study that is being played; the bench goes to 0 V and the recording is kept.
+
+        Args:
+            reason: one sentence.
+        """
+        self._end_study = reason
+
+    def _note(self, what: str) -> None:
+        self._events.append((self._rig.bench.time_s, what))
 
     def _request_arming(self, holder: str, values: JsonObject) -> JsonObject:
         self._require_idle()
@@ -183,7 +224,7 @@ class LiveBench:
         return {"number": self._request.number, "limits": self._request.limits,
                 "reason": self._request.reason}  # fmt: skip
 
-    def _arm(self, holder: str, values: JsonObject) -> JsonObject:
+    def _arm(self, holder: str, values: JsonObject, job: StudyJob | None = None) -> JsonObject:
         self._require_idle()
         limit_v, request = _number(values, "limit_v"), self._request
         limits = self._rig.description.drive_limits
@@ -194,8 +235,19 @@ class LiveBench:
             )
         if request is None or request.number != values.get("number"):
             raise SafetyError("This request is no longer valid. Press 'Arm the bench' again.")
+        highest_v = 0.0 if job is None else job.highest_v(self._rig.description)
+        if highest_v > limit_v:
+            raise LimitError(
+                f"The study needs {highest_v:.4g} V, but the typed limit is {limit_v:g} V. Type at "
+                f"least {highest_v:.4g} V, or change the study."
+            )
         self._request = None
         self._rig.safety.arm(request, str(values.get("acknowledged", "")))
+        self._note("armed")
+        self._reason, self._seen_s, self._end_study = "", time.monotonic(), ""
+        if job is not None:  # `step` plays it
+            self._mode, self._holder, self._limit_v, self._job = "study", holder, limit_v, job
+            return {"folder": str(job.options.folder)}
         try:
             self._rig.safety.run()
             self._rig.begin()
@@ -208,6 +260,21 @@ class LiveBench:
         self._mode, self._holder, self._limit_v, self._reason = "drive", holder, limit_v, ""
         self._drive_v = self._target_v = 0.0
         self._seen_s = self._beat_s = time.monotonic()
+        return {}
+
+    def _chosen(self, values: JsonObject) -> StudyJob | None:
+        """The study that the bench is to be armed for, if there is one."""
+        wanted = values.get("study")
+        if wanted is None:
+            return None
+        if self._prepare is None or not isinstance(wanted, dict):
+            raise InputError("This panel cannot play a study. Use haselab run.")
+        return self._prepare(wanted)
+
+    def _confirm(self, holder: str, values: JsonObject) -> JsonObject:
+        if self._mode != "study" or holder != self._holder:
+            raise SafetyError("Only the page that started the study can confirm this step.")
+        self._player.confirm()
         return {}
 
     def _drive_to(self, holder: str, values: JsonObject) -> JsonObject:
@@ -256,7 +323,9 @@ class LiveBench:
         return {}
 
     def _disarm(self, holder: str, values: JsonObject) -> JsonObject:
-        if self._holder:
+        if self._mode == "study":
+            self.end_study("The study was ended from a page.")
+        elif self._holder:
             self._end("The bench was disarmed.")
         return {}
 
@@ -272,6 +341,8 @@ class LiveBench:
     def _require_armed(self, holder: str) -> None:
         if not self._holder or holder != self._holder or not self._rig.safety.live:
             raise self._rig.safety.refusal()
+        if self._mode == "study":
+            raise SafetyError("A study is being played. End it first.")
 
     def _leave_loop(self) -> None:
         if self._closed is not None:
@@ -283,6 +354,7 @@ class LiveBench:
         self._mode, self._holder, self._closed, self._reference = "idle", "", None, None
         self._drive_v = self._target_v = self._limit_v = 0.0
         self._reason = reason
+        self._note(reason or "0 V")
         try:
             self._rig.safe()
         except SafetyError as error:  # the latch keeps it
@@ -293,10 +365,13 @@ class LiveBench:
     # ---- of the thread that reads --------------------------------------------------------------
 
     def step(self) -> None:
-        """Put out the next drive, read one block, and write the live signals."""
+        """Put out the next drive and read one block; or play the study that is due."""
+        if self._job is not None:
+            self._play(self._job)
+            return
         with self._mutex:
             try:
-                codes, time_s = self._block()
+                self._block()
             except HaselabError as error:
                 self._failed(error)
                 return
@@ -304,7 +379,6 @@ class LiveBench:
                 self._target_v = self._drive_v
             if self._holder and self._picture is not None:
                 self._look(self._picture)
-            self._write(codes, time_s)
             if self._holder and self._rig.safety.stage is Stage.TRIPPED:
                 self._end(self._rig.safety.reason)
 
@@ -322,7 +396,30 @@ class LiveBench:
             self._rig.safety.trip(str(error))
         self._end(self._rig.safety.reason or str(error))
 
-    def _block(self) -> tuple[NDArray[np.int16], float]:
+    def _play(self, job: StudyJob) -> None:
+        """Play a study. Pages get answers meanwhile: only `_lease`, `_confirm` and `_disarm`."""
+        about, folder = self._rig.description, job.options.folder
+        self._lockin = lockin_of(about, job.study.sensing.carrier_hz)
+        reason = f"The study has ended. Its recording is in {folder}."
+        try:
+            self._player.play(job, self._rig, self._limit_v, self._why_not, self._picture)
+            self._recorded = folder.name
+        except HaselabError as error:
+            kept = f" The data recorded so far are in {folder}." if folder.is_dir() else ""
+            reason = f"{error}{kept}"
+        finally:
+            self._lockin = lockin_of(about, CARRIER_HZ)
+            with self._mutex:
+                self._job = None
+                self._end(reason)
+
+    def _why_not(self) -> str:
+        """Why the study must end; empty while it may go on."""
+        if time.monotonic() > self._seen_s + LEASE_S:
+            return f"No message from the page that started the study for {LEASE_S:g} s."
+        return self._end_study
+
+    def _block(self) -> None:
         rig = self._rig
         if self._holder:
             now_s = time.monotonic()
@@ -337,7 +434,6 @@ class LiveBench:
         codes = rig.acquisition.read()
         if self._closed is not None and self._reference is not None:
             self._closed.step(codes, self._reference)
-        return codes, rig.acquisition.time_s
 
     def _look(self, path: Path) -> None:
         """Keep the last frame that has arrived, if there is a new one."""
@@ -357,8 +453,13 @@ class LiveBench:
         most_v = _RAMP_V_PER_S * self._rig.description.block_s
         return self._drive_v + min(max(self._target_v - self._drive_v, -most_v), most_v)
 
-    def _write(self, codes: NDArray[np.int16], time_s: float) -> None:
-        about = self._rig.description
+    def _on_block(self, codes: NDArray[np.int16]) -> None:
+        """Write the live signals of each block that is read, and end a study that must end."""
+        about, time_s = self._rig.description, self._rig.bench.time_s
+        if self._job is not None:
+            self._drive_v = self._rig.present_drive_v
+            if self._rig.safety.live:
+                self._player.require_wanted()
         capacitance_f, _, valid = self._lockin.step(codes)
         sensed_f = capacitance_f if valid and self._holder else math.nan
         strain = math.nan

@@ -121,7 +121,7 @@ def running_panel(files: PanelFiles, port: int = 0) -> Iterator[Panel]:
             ) from None
         own = listener.getsockname()[1]
         hosts = (f"127.0.0.1:{own}", f"localhost:{own}")
-        words = [str(files.rig), str(folder)]
+        words = [str(files.rig), str(folder), str(files.runs)]
         words += [] if files.actuator is None else [str(files.actuator)]
         bench, key = _started(["haselab.panel.bench_process", *words], "bench process")
         opened.callback(_end, bench)

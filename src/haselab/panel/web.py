@@ -35,6 +35,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from haselab.base import HaselabError, JsonObject, to_plain
 from haselab.panel.columns import SIGNALS, Columns, LiveReader
 from haselab.panel.files import PanelFiles
+from haselab.panel.recordings import analyse_recorded
 from haselab.panel.requests import REQUESTS
 
 __all__ = ["SCHEMA", "WebSettings", "application"]
@@ -42,6 +43,7 @@ __all__ = ["SCHEMA", "WebSettings", "application"]
 SCHEMA = 1  # of a binary frame
 _STATIC = Path(__file__).parent / "static"
 _FRAME_S = 1.0 / 30.0
+_REPEAT_S = 0.3  # after which a frame is sent without new data, while the bench process answers
 _TOKEN_S = 3.0  # for the first message of a page
 _MOST_PAGES = 32
 _MOST_BYTES = 4096  # of a message of a page
@@ -122,14 +124,22 @@ class _SamePage:
 class _Bench:
     """Connection to the bench process; it is opened again when it was lost."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, files: PanelFiles) -> None:
+        self._folder, self._files = folder, files
         self._writer: asyncio.StreamWriter | None = None
         self._waiting: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._number = 0
         self.state: dict[str, Any] | None = None
         self.state_s = -math.inf  # when it arrived
         self.reader: LiveReader | None = None
+        self._blocks, self._new_s = -1, -math.inf  # when the number of blocks last changed
+
+    def age_s(self) -> float:
+        """Time since the last block was read, in s, to 30 ms."""
+        blocks, now_s = self.reader.blocks if self.reader else -1, asyncio.get_running_loop().time()
+        if blocks != self._blocks:
+            self._blocks, self._new_s = blocks, now_s
+        return now_s - self._new_s
 
     async def run(self) -> None:
         """Stay connected."""
@@ -146,10 +156,18 @@ class _Bench:
         while line := await reader.readline():
             message = json.loads(line)
             if "state" in message:
-                self.state, self.state_s = message["state"], asyncio.get_running_loop().time()
+                await self._take(message["state"])
             answer = self._waiting.pop(message.get("id", -1), None)
             if answer is not None and not answer.done():
                 answer.set_result(message)
+
+    async def _take(self, state: dict[str, Any]) -> None:
+        """Keep the state of the bench; analyse a study that has just been recorded."""
+        before = self.state
+        self.state, self.state_s = state, asyncio.get_running_loop().time()
+        if before is not None and state["recorded"] != before["recorded"]:
+            with contextlib.suppress(HaselabError, OSError):  # the page offers it again
+                await run_in_threadpool(analyse_recorded, self._files, state["recorded"])
 
     def _lost(self) -> None:
         if self._writer is not None:
@@ -203,7 +221,7 @@ class _Server:
 
     def __init__(self, settings: WebSettings) -> None:
         self._settings = settings
-        self._bench = _Bench(settings.folder)
+        self._bench = _Bench(settings.folder, settings.files)
         self._pages: set[int] = set()
         self._tasks: set[asyncio.Task[None]] = set()  # so that none is collected while it runs
 
@@ -232,7 +250,7 @@ class _Server:
             age_s = max(time.time() - path.stat().st_mtime, 0.0)
             return Response(path.read_bytes(), 200, {"x-age-s": f"{age_s:.3f}"}, "image/jpeg")
         except OSError:
-            return Response("There is no picture yet.", 404)
+            return Response(None, 204)  # no picture yet
 
     async def request(self, request: Request) -> Response:
         """Carry out one of `REQUESTS` in a thread and answer in JSON."""
@@ -337,7 +355,12 @@ class _Server:
                     lease_s = loop.time() + 0.4
                     self._start(self._renew(page))
                 blocks = self._bench.reader.blocks if self._bench.reader else -1
-                now = (blocks, page.span_s, page.end_s, page.columns, json.dumps(state))
+                age_s = self._bench.age_s()
+                answers = loop.time() < self._bench.state_s + _REPEAT_S
+                repeats = int(age_s / _REPEAT_S) if answers and age_s < math.inf else 0
+                now = (
+                    blocks, page.span_s, page.end_s, page.columns, json.dumps(state), repeats
+                )  # fmt: skip
                 if now == last:
                     continue
                 last = now
@@ -362,7 +385,12 @@ class _Server:
         if reader is not None and not math.isnan(shown_s):
             monitors = reader.monitors(shown_s - page.span_s, shown_s, page.columns)
             signals = reader.signals(shown_s - page.span_s, shown_s, page.columns)
-        text = json.dumps({"state": state, "end_s": None if math.isnan(end_s) else end_s}).encode()
+        about = {
+            "state": state,
+            "end_s": None if math.isnan(end_s) else end_s,
+            "age_s": min(self._bench.age_s(), 1e9),
+        }
+        text = json.dumps(about).encode()
         text += b" " * (-len(text) % 8)
         head = _HEAD.pack(
             SCHEMA, 0, page.sent, monitors.start_s, monitors.step_s, signals.start_s,

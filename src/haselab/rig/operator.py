@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Protocol, TextIO
+from typing import Protocol
 
 from haselab.base import DeviceError, LimitError
 
-__all__ = ["BenchStand", "Clock", "OperatorWeights", "WeightHandler", "check_mass", "check_wait"]
+__all__ = [
+    "Answers", "BenchStand", "Clock", "OperatorWeights", "Prompts", "WeightHandler", "check_mass",
+    "check_wait",
+]  # fmt: skip
 
 _LONGEST_WAIT_S = 86400.0
 _HEAVIEST_KG = 20.0
@@ -67,6 +70,23 @@ class Clock(Protocol):
         """Let time pass."""
 
 
+class Answers(Protocol):
+    """Where the confirmations of a person come from."""
+
+    def readline(self) -> str:
+        """Wait for a confirmation; empty: there will be none."""
+
+
+class Prompts(Protocol):
+    """Where prompts to a person go."""
+
+    def write(self, text: str, /) -> int:
+        """Show a prompt."""
+
+    def flush(self) -> None:
+        """Show it now."""
+
+
 class OperatorWeights:
     """A person at the terminal, who reads each step and confirms it with Enter.
 
@@ -75,7 +95,7 @@ class OperatorWeights:
         output: stream to which prompts are written.
     """
 
-    def __init__(self, ask: TextIO | None = None, output: TextIO | None = None) -> None:
+    def __init__(self, ask: Answers | None = None, output: Prompts | None = None) -> None:
         self._ask, self._output = ask or sys.stdin, output or sys.stderr
 
     def _request(self, prompt: str, task: str) -> None:

@@ -142,14 +142,18 @@ class RealBench(Closing):
     Args:
         config: of the bench.
         gate: wraps all its drivers.
+        operator: hangs the masses; None: a person at the terminal.
     Raises:
         DeviceError: An instrument or its driver is missing or does not reply correctly; or another
             program uses the bench.
         InputError: An instrument is not the one that the rig file names.
     """
 
-    def __init__(self, config: BenchConfig, gate: Gate) -> None:
+    def __init__(
+        self, config: BenchConfig, gate: Gate, operator: WeightHandler | None = None
+    ) -> None:
         self.config = config
+        self._operator = operator
         description = config.describe()
         context = OpenContext(description, config.exposure)
         daq = daq_of(config.daq)
@@ -192,7 +196,7 @@ class RealBench(Closing):
 
     def _weight_handler(self, opened: contextlib.ExitStack) -> WeightHandler:
         if self.config.stand.address is None:
-            return OperatorWeights()
+            return self._operator or OperatorWeights()
         client = TwinClient(self.config.stand.address)
         opened.callback(client.close)
         return client

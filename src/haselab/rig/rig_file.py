@@ -22,6 +22,7 @@ from haselab.rig.bench_config import (
 )
 from haselab.rig.chip import ChipFile, opened_chip
 from haselab.rig.instruments.registry import instrument_of
+from haselab.rig.operator import WeightHandler
 from haselab.rig.real_bench import RealBench
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
@@ -187,13 +188,16 @@ def load_rig_to_shut_down(path: Path) -> tuple[RigFile | BenchOutputs, list[tupl
 
 
 @contextlib.contextmanager
-def opened_rig(file: RigFile, path: Path, gate: Gate) -> Iterator[Rig]:
+def opened_rig(
+    file: RigFile, path: Path, gate: Gate, operator: WeightHandler | None = None
+) -> Iterator[Rig]:
     """Open the rig of a file; the context ends at 0 V and closes all connections.
 
     Args:
         file: from `load_rig`.
         path: of the rig file.
         gate: wraps its drivers.
+        operator: hangs the masses of a real bench; None: a person at the terminal.
     Raises:
         DeviceError: An instrument or its driver is missing.
         InputError: An instrument is not the one that the file names, or the session is missing.
@@ -205,7 +209,7 @@ def opened_rig(file: RigFile, path: Path, gate: Gate) -> Iterator[Rig]:
         finally:
             rig.safe()
     elif isinstance(file, BenchConfig):
-        with RealBench(file, gate) as bench:
+        with RealBench(file, gate, operator) as bench:
             yield bench.rig
     elif isinstance(file, ChipFile):
         with opened_chip(file, path, gate) as chip:

@@ -64,6 +64,7 @@ class GuardedBench:
         self.asked_guardian = False  # since anything was energised
         self._requests = -1  # number that the gate had let through then
         self.turn = threading.Lock()  # several threads report instruments
+        self.on_block: Callable[[NDArray[np.int16]], None] = lambda codes: None  # of each block
 
     def outdate(self) -> None:
         """Discard what was found off if any driver was given a request since."""
@@ -200,6 +201,7 @@ class GuardedAcquisition(_Part):
         before, self._left_out = self._left_out, b.left_out
         if self._left_out == before:
             b.present_drive_v = b.requested_v
+        b.on_block(codes)
         own = b.rig.controller is not None  # which has its own checks
         fault = "" if own else b.watch.fault(codes, b.present_drive_v, follows=follows)
         if fault and b.safety.stage in LIVE:

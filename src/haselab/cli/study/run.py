@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -23,13 +22,11 @@ from haselab.cli.study.study_run import (
     twin_rig,
 )
 from haselab.cli.study.twin_option import draw_option, name_origin, on_bench_of, twin_of_options
-from haselab.pipelines.calibration_file import load_calibration
+from haselab.pipelines.actuator_bench import prepare_bench
 from haselab.rig import Rig
 from haselab.rig.chip import ChipFile
-from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig
 from haselab.rig.twin.config import TwinConfig
-from haselab.runtime.lockin import lockin_of
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
@@ -182,53 +179,12 @@ def load_study_with_actuator(path: Path, actuator: Path | None, *, quick: bool) 
 
 
 def _prepared(rig: Rig, study: Study, actuator: Path | None, twin: TwinConfig | None = None) -> Rig:
-    """The bench with the calibration of an actuator file, and its drive limited by that file.
-
-    The twin of an identified actuator reads capacitances as the calibrated bench did, so the
-    calibration of that bench is left out.
-
-    Raises:
-        InputError: no voltage is within both limits, or the calibration is for another carrier,
-            sampling rate or amplifier.
-    """
-    if actuator is None:
-        return rig
-    _limit(rig, actuator)
-    if load_actuator(actuator).sensing.is_calibrated:
-        found, d = load_calibration(actuator), rig.description
-        if twin is not None and twin.origin is not None and found.amplifier != d.amplifier:
-            click.echo(
-                f"haselab: the calibration is for {found.amplifier!r} and is left out on the twin. "
-                f"{actuator}",
-                err=True,
-            )
-            return rig
-        found.apply(lockin_of(d, study.sensing.carrier_hz).config, amplifier=d.amplifier)
-        scale_s, stray_s = ((z.real, z.imag) for z in (found.scale_s, found.stray_s))
-        calibration = MonitorCalibration(scale_s, stray_s, found.offsets_v)
-        rig.description = replace(d, calibration=calibration)
+    """The bench with the limits and the calibration of an actuator file, see `prepare_bench`."""
+    if actuator is not None:
+        tables = load_actuator(actuator)
+        if note := prepare_bench(rig, tables, actuator, study.sensing.carrier_hz, twin):
+            click.echo(f"haselab: {note}", err=True)
     return rig
-
-
-def _limit(rig: Rig, actuator: Path) -> None:
-    """Limit the drive to what the actuator withstands as well.
-
-    Raises:
-        InputError: no voltage is within both ranges.
-    """
-    limits = narrowed = rig.description.drive_limits
-    low, high = load_actuator(actuator).drive_ends_v(rig.description.amplifier_gain)
-    source = f"[drive] of {actuator}"
-    if low is not None and low > limits.low:
-        narrowed = replace(narrowed, low=low, low_source=source)
-    if high is not None and high < limits.high:
-        narrowed = replace(narrowed, high=high, high_source=source)
-    if not narrowed.low < narrowed.high:
-        raise InputError(
-            f"[drive] permits {low} to {high} V, but the rig outputs {limits.low:g} to "
-            f"{limits.high:g} V. Change low_v, high_v and highest_field_v_per_m. {actuator}"
-        )
-    rig.description = replace(rig.description, drive_limits=narrowed)
 
 
 def _start_from(actuator: Path | None, folder: Path) -> None:

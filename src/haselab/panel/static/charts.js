@@ -24,9 +24,11 @@ const range = (low, high, unit) => {
 };
 
 export class Charts {
-  constructor(root, onZoom) {
+  constructor(root, onZoom, onResize) {
     this.onZoom = onZoom;
+    this.onResize = onResize;
     this.dragged = false;
+    this.events = []; // time and text of each, marked in all plots
     addEventListener("mouseup", () => { this.dragged = false; });
     this.plots = PLOTS.map((about) => this.make(root, about));
     new ResizeObserver(() => this.resize()).observe(root);
@@ -56,9 +58,10 @@ export class Charts {
     const plot = new uPlot({
       width: Math.max(card.clientWidth - 24, 200), height: HEIGHT, series, bands, legend: { show: false },
       scales: { x: { time: false } },
-      axes: [{ ...axis }, { ...axis, size: 70, label: `${about.title} (${about.unit})`, labelSize: 20 }],
+      axes: [{ ...axis }, { ...axis, size: 70, label: about.unit, labelSize: 20 }],
       cursor: { sync: { key: "haselab" }, drag: { x: true, y: false, setScale: false } },
       hooks: {
+        draw: [(u) => this.mark(u, text)],
         setSelect: [(u) => {
           if (u.select.width < 3) return;
           const from = u.posToVal(u.select.left, "x"), to = u.posToVal(u.select.left + u.select.width, "x");
@@ -72,13 +75,37 @@ export class Charts {
     return { about, plot, card, values };
   }
 
+  mark(u, colour) {
+    const { ctx, bbox } = u, ratio = devicePixelRatio;
+    ctx.save();
+    ctx.strokeStyle = ctx.fillStyle = colour;
+    ctx.font = `${11 * ratio}px system-ui, sans-serif`;
+    ctx.setLineDash([4 * ratio, 4 * ratio]);
+    let free = -Infinity; // where the last text ends
+    for (const [at_s, what] of this.events) {
+      if (at_s < u.scales.x.min || at_s > u.scales.x.max) continue;
+      const x = Math.round(u.valToPos(at_s, "x", true)), label = what.length > 28 ? `${what.slice(0, 27)}…` : what;
+      ctx.beginPath();
+      ctx.moveTo(x, bbox.top);
+      ctx.lineTo(x, bbox.top + bbox.height);
+      ctx.stroke();
+      if (x < free) continue;
+      ctx.fillText(label, x + 4 * ratio, bbox.top + 12 * ratio);
+      free = x + ctx.measureText(label).width + 8 * ratio;
+    }
+    ctx.restore();
+  }
+
   resize() {
+    if (this.plots[0].card.clientWidth === 0) return; // another page is shown
     for (const { plot, card } of this.plots) plot.setSize({ width: Math.max(card.clientWidth - 24, 200), height: HEIGHT });
+    this.onResize(this.columns());
   }
 
   columns() { return Math.round((this.plots[0].plot.bbox.width || 800) / 2) || 400; }
 
   draw(frame, from, to) {
+    this.events = frame.state.events ?? [];
     for (const { about, plot, values } of this.plots) {
       const { start, step, low, high } = frame[about.of];
       const count = low[0].length, x = new Float64Array(count);

@@ -10,6 +10,7 @@ export class Link {
     this.holder = "";
     this.problem = "";
     this.framedAt = -Infinity;
+    this.blockAge = 0; // when the last frame was sent, in s
     this.waiting = new Map();
     this.number = 0;
     this.token = new URLSearchParams(location.search).get("token") || sessionStorage.getItem("token") || "";
@@ -20,7 +21,10 @@ export class Link {
     document.addEventListener("visibilitychange", () => this.watch());
   }
 
-  get age_ms() { return performance.now() - this.framedAt; }
+  // Of the last block that the bench has read.
+  get age_ms() { return this.silent_ms + 1000 * this.blockAge; }
+
+  get silent_ms() { return performance.now() - this.framedAt; }
 
   open() {
     const socket = new WebSocket(`ws://${location.host}/live`);
@@ -51,7 +55,7 @@ export class Link {
     const since = performance.now() - this.openedAt;
     if (this.socket === null) {
       if (since > 400 && !this.problem) this.open();
-    } else if (this.age_ms > SILENT_MS && since > SILENT_MS) {
+    } else if (this.silent_ms > SILENT_MS && since > SILENT_MS) {
       const old = this.socket;
       this.socket = null; // also when the old one never closes
       old.close();
@@ -93,6 +97,7 @@ export class Link {
       signals.high.push(part(4 * columns + (5 + k) * rows, rows));
     }
     this.framedAt = performance.now();
+    this.blockAge = about.age_s;
     this.send({ ack: number });
     this.onFrame({ ...about, monitors, signals });
   }

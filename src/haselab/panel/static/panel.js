@@ -1,6 +1,7 @@
 import { html, render, useState, useEffect, useReducer } from "/static/vendor/htm-preact.js";
 import { Charts } from "/static/charts.js";
 import { Link } from "/static/link.js";
+import { Arming, Playing, kilo } from "/static/bench.js";
 
 const STALE_MS = 450;
 let frame = null;
@@ -34,38 +35,6 @@ function zoom({ from, to, key, event }) {
   if (event) event.preventDefault();
 }
 
-const kilo = (v, gain) => `${v.toFixed(3)} V (${(v * gain / 1000).toFixed(2)} kV)`;
-
-function Arming({ state, say }) {
-  const [request, setRequest] = useState(null);
-  const [limit, setLimit] = useState("");
-  const [known, setKnown] = useState(false);
-  async function ask() {
-    const found = await link.ask("request");
-    if (found.error) { say(found.error); return; }
-    say(""); setKnown(false); setLimit(""); setRequest(found.answer);
-  }
-  async function arm(event) {
-    event.preventDefault();
-    const values = { number: request.number, limit_v: Number(limit), acknowledged: known ? request.reason : "" };
-    const found = await link.ask("arm", values);
-    setRequest(null);
-    say(found.error || "");
-  }
-  if (request === null) return html`<button type="button" onClick=${ask}>Arm the bench …</button>`;
-  return html`<form onSubmit=${arm}>
-    <p><strong>${state.simulated ? "SIMULATED bench: no voltage is applied." : "HIGH VOLTAGE WILL BE APPLIED. Keep clear."}</strong></p>
-    <p>${request.limits}</p>
-    ${request.reason && html`<p class="error">The bench was made safe. Reason: ${request.reason}</p>
-      <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>`}
-    <label>Highest drive of this run, in V at the amplifier's input, at most ${kilo(state.high_v, state.gain)}
-      <input type="number" step="any" min="0" max=${state.high_v} required value=${limit} onInput=${(e) => setLimit(e.target.value)} />
-    </label>
-    <div class="row"><button class="danger" type="submit" disabled=${!limit || (request.reason && !known)}>Arm</button>
-    <button type="button" onClick=${() => setRequest(null)}>Cancel</button></div>
-  </form>`;
-}
-
 function Slider({ name, unit, low, high, step, value, send, about }) {
   const [typed, type] = useState(null); // while it is being typed
   const [sent, setSent] = useState(null); // until the bench has it
@@ -83,6 +52,7 @@ function Slider({ name, unit, low, high, step, value, send, about }) {
 function Live({ state, say }) {
   const ask = (what, values) => link.ask(what, values).then((found) => say(found.error || ""));
   const low = Math.max(state.low_v, -state.limit_v);
+  if (state.mode === "study") return html`<${Playing} state=${state} link=${link} say=${say} />`;
   return html`
     <p class="badge live">Armed by this page up to ${kilo(state.limit_v, state.gain)}</p>
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
@@ -106,7 +76,7 @@ function Camera() {
     async function look() {
       try {
         const answer = await fetch("/camera", { headers: { "X-Panel-Token": link.token }, signal: AbortSignal.timeout(2000) });
-        if (answer.ok) {
+        if (answer.status === 200) {
           const old = url;
           url = URL.createObjectURL(await answer.blob());
           see({ url, age_s: Number(answer.headers.get("x-age-s")) });
@@ -125,7 +95,7 @@ function Camera() {
 }
 
 // Each is a module with a default component, imported when it is first opened.
-const TABS = { Live: "", Doctor: "/static/doctor.js" };
+const TABS = { Live: "", Studies: "/static/studies.js", Doctor: "/static/doctor.js" };
 
 function Lazy({ from, ...rest }) {
   const [found, find] = useState({ part: null, error: "" });
@@ -142,9 +112,9 @@ function Panel() {
   const [error, say] = useState("");
   useEffect(() => {
     redraw = force;
-    charts = new Charts(document.getElementById("charts"), zoom);
-    link.setView({ columns: charts.columns() });
-    addEventListener("resize", () => link.setView({ columns: charts.columns() }));
+    charts = new Charts(document.getElementById("charts"), zoom, (columns) => {
+      if (columns !== link.view.columns) link.setView({ columns });
+    });
   }, []);
   const stale = link.age_ms > STALE_MS;
   document.body.classList.toggle("stale", stale);
@@ -164,7 +134,7 @@ function Panel() {
     <nav class="row" aria-label="Pages">
       ${Object.keys(TABS).map((name) => html`<button type="button" aria-current=${name === tab ? "page" : "false"} onClick=${() => open(name)}>${name}</button>`)}
     </nav>
-    ${TABS[tab] && html`<main class="tab"><${Lazy} from=${TABS[tab]} key=${tab} link=${link} state=${state} mine=${mine} /></main>`}
+    ${TABS[tab] && html`<main class="tab"><${Lazy} from=${TABS[tab]} key=${tab} link=${link} state=${state} mine=${mine} show=${open} /></main>`}
     <div class="layout" role=${tab === "Live" ? "main" : null} hidden=${tab !== "Live"}>
       <section class="charts" aria-label="Signals">
         <div class="row" role="group" aria-label="View">
@@ -183,7 +153,7 @@ function Panel() {
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
             : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>`
-            : html`<${Arming} state=${state} say=${say} />`}
+            : html`<${Arming} state=${state} link=${link} say=${say} />`}
         </div>
         <${Camera} />
       </section>

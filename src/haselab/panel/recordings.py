@@ -1,0 +1,207 @@
+"""The recordings that a panel lists: their notes, reports, and the comparison of two."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from haselab.base import InputError, JsonObject, shown
+from haselab.panel.files import PanelFiles
+from haselab.store.folder import write_text
+from haselab.store.manifest import read_manifest, recorded_when
+
+__all__ = ["analyse", "analyse_recorded", "compare", "listed", "note", "report"]
+
+_NOTES, _LOG = "notes.txt", "analysis.log"
+_MOST_LETTERS = 10_000
+_MOST_FOLDERS = 2000
+_running: dict[Path, subprocess.Popen[bytes]] = {}  # analyses by folder
+_starting = threading.Lock()
+
+
+def _recording(files: PanelFiles, name: object) -> Path:
+    """The folder of a recording by its name in the list.
+
+    Raises:
+        InputError: there is no such recording.
+    """
+    found = {path.name: path for path in _folders(files)}
+    if not isinstance(name, str) or name not in found:
+        raise InputError(f"There is no recording {shown(name)} in {files.runs}.")
+    return found[name]
+
+
+def _folders(files: PanelFiles) -> list[Path]:
+    if not files.runs.is_dir():
+        return []
+    return sorted(path.parent for path in files.runs.glob("*/session.h5"))[-_MOST_FOLDERS:]
+
+
+def listed(files: PanelFiles, values: JsonObject) -> JsonObject:
+    """All recordings in the folder of the panel, the newest first.
+
+    Args:
+        files: of the panel.
+        values: none.
+    Returns:
+        `folder` and `recordings`: name, study, date, seconds, state, note, and whether there is a
+        report.
+    """
+    found = [_described(path) for path in _folders(files)]
+    found.sort(key=lambda one: str(one["opened"]), reverse=True)
+    return {"folder": str(files.runs.resolve()), "recordings": found}
+
+
+def _described(folder: Path) -> dict[str, Any]:
+    try:
+        manifest = read_manifest(folder)
+    except InputError as error:
+        manifest, state = {}, " ".join(str(error).split())
+    else:
+        ended = str(manifest.get("ended", ""))
+        state = ended if manifest.get("state") == "SEALED" else "not ended: run haselab recover"
+    study, when = manifest.get("study"), recorded_when(manifest) if manifest else {}
+    return {
+        "name": folder.name,
+        "study": study.get("name", "") if isinstance(study, dict) else "",
+        "opened": str(manifest.get("opened", "")),
+        "seconds": when.get("duration_s"),
+        "state": state,
+        "note": _read(folder / _NOTES),
+        "report": (folder / "report.html").is_file(),
+    }
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")[:_MOST_LETTERS]
+    except (OSError, ValueError):
+        return ""
+
+
+def note(files: PanelFiles, values: JsonObject) -> JsonObject:
+    """Keep a note about a recording in a text file beside it.
+
+    Args:
+        files: of the panel.
+        values: `name` of the recording and `text` of the note.
+    Returns:
+        An empty object.
+    Raises:
+        InputError: there is no such recording, or the note is no text or too long.
+    """
+    folder, text = _recording(files, values.get("name")), values.get("text")
+    if not isinstance(text, str) or len(text) > _MOST_LETTERS:
+        raise InputError(f"A note must be a text of at most {_MOST_LETTERS} characters.")
+    write_text(folder / _NOTES, text)
+    return {}
+
+
+def report(files: PanelFiles, values: JsonObject) -> JsonObject:
+    """The report of a recording, one HTML page without scripts.
+
+    Args:
+        files: of the panel.
+        values: `name` of the recording.
+    Returns:
+        `html`.
+    Raises:
+        InputError: there is no such recording, or no report yet.
+    """
+    folder = _recording(files, values.get("name"))
+    try:
+        return {"html": (folder / "report.html").read_text(encoding="utf-8")}
+    except (OSError, ValueError):
+        why = " ".join(_read(folder / _LOG).split())
+        raise InputError(
+            f"There is no report of {folder.name} yet."
+            + (f" The last analysis said: {why}" if why else " Press Analyse.")
+        ) from None
+
+
+def analyse(files: PanelFiles, values: JsonObject) -> JsonObject:
+    """Run `haselab analyse` on a recording and wait for its end.
+
+    Args:
+        files: of the panel.
+        values: `name` of the recording.
+    Returns:
+        An empty object.
+    Raises:
+        InputError: there is no such recording, or the analysis had no result.
+    """
+    folder = _recording(files, values.get("name"))
+    if _analysis(folder).wait() != 0:
+        raise InputError(" ".join(_read(folder / _LOG).split()) or "No result.")
+    return {}
+
+
+def analyse_recorded(files: PanelFiles, name: str) -> None:
+    """Start the analysis of a study that was just recorded, without waiting for its end.
+
+    Args:
+        files: of the panel.
+        name: of the recording.
+    """
+    _analysis(_recording(files, name))
+
+
+def _analysis(folder: Path) -> subprocess.Popen[bytes]:
+    """`haselab analyse` on a folder, with a low priority: the one that runs, or a new one."""
+    with _starting:
+        running = _running.get(folder)
+        if running is None or running.poll() is not None:
+            words = ["-m", "haselab.cli", "analyse", str(folder), "--force", "--json"]
+            nice = [] if sys.platform == "win32" else ["nice", "-n", "10"]
+            with (folder / _LOG).open("wb") as log:
+                running = _running[folder] = subprocess.Popen(
+                    [*nice, sys.executable, *words], stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL, stderr=log,
+                )  # fmt: skip
+        return running
+
+
+def compare(files: PanelFiles, values: JsonObject) -> JsonObject:
+    """Compare the results of two recordings, row by row.
+
+    Args:
+        files: of the panel.
+        values: `first` and `second`, names of recordings.
+    Returns:
+        `rows`: id, name, unit, both values with their intervals, and the difference in standard
+        deviations of both together; null where a recording has no such row or no deviation.
+    Raises:
+        InputError: there is no such recording, or one has no results.
+    """
+    first, second = (_results(files, values.get(which)) for which in ("first", "second"))
+    return {"rows": [_row(key, first.get(key), second.get(key)) for key in {**first, **second}]}
+
+
+def _results(files: PanelFiles, name: object) -> dict[str, Any]:
+    folder = _recording(files, name)
+    try:
+        content = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+        return {row["id"]: row for row in content["quantities"] if row["measured"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(
+            f"{folder.name} has no results that can be read. Press Analyse first."
+        ) from None
+
+
+def _row(key: str, first: dict[str, Any] | None, second: dict[str, Any] | None) -> dict[str, Any]:
+    one, other = (None if row is None else row["measured"] for row in (first, second))
+    deviations = None
+    if one and other:
+        together = math.hypot(one["std"] or math.nan, other["std"] or math.nan)
+        if together > 0.0:
+            deviations = (other["value"] - one["value"]) / together
+    about = first or second or {}
+    return {
+        "id": key, "name": about["name"], "unit": about["unit"], "first": one,
+        "second": other, "deviations": deviations,
+    }  # fmt: skip

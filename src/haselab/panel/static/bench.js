@@ -1,0 +1,54 @@
+// Arming, and the progress of a study: for the live page and the page of the studies.
+import { html, useState } from "/static/vendor/htm-preact.js";
+
+export const kilo = (v, gain) => `${v.toFixed(3)} V (${(v * gain / 1000).toFixed(2)} kV)`;
+
+// Two steps: read the limits, then type one. With a study, the bench is armed to play it.
+export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
+  const [request, setRequest] = useState(null);
+  const [limit, setLimit] = useState("");
+  const [known, setKnown] = useState(false);
+  const [sent, setSent] = useState(false);
+  async function ask() {
+    const found = await link.ask("request");
+    if (found.error) { say(found.error); return; }
+    say(""); setKnown(false); setLimit(""); setRequest(found.answer);
+  }
+  async function arm(event) {
+    event.preventDefault();
+    const values = { number: request.number, limit_v: Number(limit), acknowledged: known ? request.reason : "" };
+    if (study !== null) values.study = study;
+    setSent(true);
+    const found = await link.ask("arm", values);
+    setSent(false);
+    setRequest(null);
+    say(found.error || "");
+    if (!found.error) onArmed(found.answer);
+  }
+  if (request === null) return html`<button type="button" onClick=${ask}>${study === null ? "Arm the bench …" : "Arm the bench and play …"}</button>`;
+  return html`<form onSubmit=${arm}>
+    <p><strong>${state.simulated ? "SIMULATED bench: no voltage is applied." : "HIGH VOLTAGE WILL BE APPLIED. Keep clear."}</strong></p>
+    <p>${request.limits}</p>
+    ${request.reason && html`<p class="error">The bench was made safe. Reason: ${request.reason}</p>
+      <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>`}
+    <label>Highest drive of this run, in V at the amplifier's input, at most ${kilo(state.high_v, state.gain)}
+      <input type="number" step="any" min="0" max=${state.high_v} required value=${limit} onInput=${(e) => setLimit(e.target.value)} />
+    </label>
+    <div class="row"><button class="danger" type="submit" disabled=${sent || !limit || (request.reason && !known)}>${sent ? "Checking …" : study === null ? "Arm" : "Arm and play"}</button>
+    <button type="button" onClick=${() => setRequest(null)}>Cancel</button></div>
+  </form>`;
+}
+
+// A study that this page has started: what it does, what a person must do, and how to end it.
+export function Playing({ state, link, say }) {
+  const ask = (what) => link.ask(what).then((found) => say(found.error || ""));
+  const share = Math.round(100 * state.done);
+  return html`
+    <p class="badge live">A study is played, up to ${kilo(state.limit_v, state.gain)}</p>
+    <p role="status">${state.task || "starting"}</p>
+    <progress max="100" value=${share} aria-label="Progress of the study">${share} %</progress> ${share} %
+    ${state.prompt && html`<div class="card warning" role="alert"><p>${state.prompt}</p>
+      <button type="button" onClick=${() => ask("confirm")}>Done</button></div>`}
+    <div class="row"><button type="button" onClick=${() => ask("disarm")}>End the study</button></div>
+    <p>Keep this page open. If it is closed, the study ends at 0 V.</p>`;
+}

@@ -1,0 +1,121 @@
+// Choose, check and play a study; the list of recordings.
+import { html, useState, useEffect } from "/static/vendor/htm-preact.js";
+import { Arming, Playing, kilo } from "/static/bench.js";
+
+const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
+const when = (s) => (s === null ? "unknown" : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
+
+function Chooser({ link, state, mine, onEnd }) {
+  const [list, setList] = useState(null);
+  const [chosen, choose] = useState({ study: "", quick: false, experiments: [], keep_video: "sample" });
+  const [checked, setChecked] = useState(null);
+  const [error, say] = useState("");
+  useEffect(() => {
+    link.request("studies").then((found) => {
+      if (found.error) { say(found.error); return; }
+      setList(found.studies);
+      pick(found.studies, found.studies[0].name);
+    });
+  }, []);
+  function change(part) { choose({ ...chosen, ...part }); setChecked(null); say(""); }
+  function pick(studies, name) {
+    const found = studies.find((one) => one.name === name);
+    change({ study: name, experiments: found.experiments.map((one) => one.table) });
+  }
+  async function check() {
+    setChecked("checking");
+    const found = await link.request("check-study", chosen);
+    setChecked(found.error ? null : found);
+    say(found.error || "");
+  }
+  const busy = state !== null && state.holder !== "";
+  if (busy && state.mode === "study" && mine) return html`<div class="card warning"><h2>Study</h2>
+    ${error && html`<p class="error" role="alert">${error}</p>`}<${Playing} state=${state} link=${link} say=${say} /></div>`;
+  if (list === null) return html`<div class="card"><h2>Study</h2><p class=${error ? "error" : ""} role="status">${error || "Reading the studies …"}</p></div>`;
+  const titles = list.find((one) => one.name === chosen.study)?.experiments ?? [];
+  const toggle = (table, on) => change({ experiments: titles.map((one) => one.table).filter((one) => (one === table ? on : chosen.experiments.includes(one))) });
+  return html`<div class="card"><h2>Study</h2>
+    ${error && html`<p class="error" role="alert">${error}</p>`}
+    ${state?.reason && html`<p role="status">Last message of the bench: ${state.reason}</p>`}
+    <label>Study <select value=${chosen.study} onChange=${(e) => pick(list, e.target.value)}>
+      ${list.map((one) => html`<option value=${one.name}>${one.name}</option>`)}</select></label>
+    <fieldset><legend>Experiments</legend>
+      ${titles.map((one) => html`<label><input type="checkbox" checked=${chosen.experiments.includes(one.table)}
+        onChange=${(e) => toggle(one.table, e.target.checked)} /> ${one.title} (${one.table})</label>`)}</fieldset>
+    <label><input type="checkbox" checked=${chosen.quick} onChange=${(e) => change({ quick: e.target.checked })} /> Short version</label>
+    <label><input type="checkbox" checked=${chosen.keep_video === "none"} onChange=${(e) => change({ keep_video: e.target.checked ? "none" : "sample" })} /> Keep no camera frames</label>
+    <div class="row"><button type="button" disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check</button></div>
+    ${checked === "checking" && html`<p role="status">Checking the study against the limits of the bench …</p>`}
+    ${checked !== null && checked !== "checking" && html`
+      <p role="status">${!checked.rated ? "The rating of this bench is not known (the rig file has no [rating]), so the study was not checked against it."
+        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} on the clock of the bench, and up to ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
+      ${checked.checks.length > 0 && html`<table><thead><tr><th scope="col">Check</th><th scope="col">Where</th><th scope="col">Needed</th><th scope="col">Limit</th><th scope="col">What to do</th></tr></thead>
+        <tbody>${checked.checks.map((one) => html`<tr><td>${one.name}</td><td>${one.where}</td><td class=${one.ok ? "" : "error"}>${number(one.requested)} ${one.unit}</td>
+          <td>${number(one.limit)} ${one.unit}</td><td>${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}
+      ${checked.ok && (busy ? html`<p>The bench is armed. Disarm it on the Live page before you play a study.</p>`
+        : state && html`<${Arming} state=${state} link=${link} say=${say} study=${chosen} onArmed=${() => setChecked(null)} />`)}`}
+  </div>`;
+}
+
+function Comparison({ link, names, close }) {
+  const [found, see] = useState(null);
+  useEffect(() => { link.request("compare", { first: names[0], second: names[1] }).then(see); }, [names.join()]);
+  if (found === null) return html`<p role="status">Comparing …</p>`;
+  if (found.error) return html`<p class="error" role="alert">${found.error}</p>`;
+  const cell = (one) => (one === null ? "–" : html`${number(one.value)} <small>[${number(one.ci95[0])}, ${number(one.ci95[1])}]</small>`);
+  return html`<div class="card"><h2>Comparison</h2><p>Difference: second minus first, in standard deviations of both together.</p>
+    <button type="button" onClick=${close}>Close</button>
+    <table><thead><tr><th scope="col">Row</th><th scope="col">Name</th><th scope="col">Unit</th><th scope="col">${names[0]}</th><th scope="col">${names[1]}</th><th scope="col">Difference</th></tr></thead>
+    <tbody>${found.rows.map((one) => html`<tr><td>${one.id}</td><td>${one.name}</td><td>${one.unit}</td><td>${cell(one.first)}</td><td>${cell(one.second)}</td>
+      <td class=${Math.abs(one.deviations) > 3 ? "error" : ""}>${one.deviations === null ? "–" : one.deviations.toFixed(1)}</td></tr>`)}</tbody></table></div>`;
+}
+
+function Recordings({ link, state }) {
+  const [found, see] = useState({ folder: "", recordings: [] });
+  const [search, setSearch] = useState("");
+  const [marked, mark] = useState([]);
+  const [compared, setCompared] = useState(null);
+  const [error, say] = useState("");
+  const [busy, setBusy] = useState("");
+  const read = () => link.request("recordings").then((list) => (list.error ? say(list.error) : see(list)));
+  useEffect(() => { read(); const timer = setInterval(read, 5000); return () => clearInterval(timer); }, []);
+  useEffect(() => { read(); }, [state?.mode]);
+  async function open(name) {
+    const page = window.open("", "_blank"); // at once: a later one would be blocked as a pop-up
+    const answer = await link.request("report", { name });
+    say(answer.error || "");
+    if (answer.error) { page?.close(); return; }
+    page.location = URL.createObjectURL(new Blob([answer.html], { type: "text/html" }));
+  }
+  async function analyse(name) {
+    setBusy(name);
+    const answer = await link.request("analyse", { name });
+    setBusy("");
+    say(answer.error || "");
+    read();
+  }
+  const keep = (name, text) => link.request("note", { name, text }).then((answer) => say(answer.error || ""));
+  const wanted = search.toLowerCase().split(/\s+/).filter(Boolean);
+  const shown = found.recordings.filter((one) => {
+    const text = `${one.name} ${one.study} ${one.opened} ${one.state} ${one.note}`.toLowerCase();
+    return wanted.every((word) => text.includes(word));
+  });
+  const toggle = (name, on) => mark(on ? [...marked, name].slice(-2) : marked.filter((one) => one !== name));
+  return html`${compared && html`<${Comparison} link=${link} names=${compared} close=${() => setCompared(null)} />`}
+    <div class="card"><h2>Recordings</h2>
+    ${error && html`<p class="error" role="alert">${error}</p>`}
+    <p>${found.recordings.length} in ${found.folder}</p>
+    <label>Search <input type="search" value=${search} onInput=${(e) => setSearch(e.target.value)} /></label>
+    <div class="row"><button type="button" disabled=${marked.length !== 2} onClick=${() => setCompared(marked)}>Compare the two that are marked</button></div>
+    <table><thead><tr><th scope="col">Mark</th><th scope="col">Recording</th><th scope="col">Study</th><th scope="col">Ended</th><th scope="col">Note</th><th scope="col">Results</th></tr></thead>
+    <tbody>${shown.map((one) => html`<tr key=${one.name}>
+      <td><input type="checkbox" aria-label=${`Mark ${one.name}`} checked=${marked.includes(one.name)} onChange=${(e) => toggle(one.name, e.target.checked)} /></td>
+      <td>${one.name}<br /><small>${one.opened.slice(0, 19).replace("T", " ")}</small></td><td>${one.study}</td><td>${one.state}</td>
+      <td><textarea aria-label=${`Note about ${one.name}`} rows="2" defaultValue=${one.note} onBlur=${(e) => e.target.value !== one.note && keep(one.name, e.target.value)}></textarea></td>
+      <td>${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
+        <button type="button" disabled=${busy !== ""} onClick=${() => analyse(one.name)}>${busy === one.name ? "Analysing …" : "Analyse"}</button></td></tr>`)}</tbody></table></div>`;
+}
+
+export default function Studies({ link, state, mine }) {
+  return html`<${Chooser} link=${link} state=${state} mine=${mine} /><${Recordings} link=${link} state=${state} />`;
+}

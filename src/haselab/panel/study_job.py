@@ -1,0 +1,255 @@
+"""The studies that a panel can play: chosen by a page, checked before the bench is armed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from haselab.base import InputError, JsonObject, shown
+from haselab.models.actuator import ActuatorTables
+from haselab.panel.files import PanelFiles
+from haselab.rig import RigDescription
+from haselab.rig.operator import OperatorWeights
+from haselab.rig.rig_file import RigFile, TwinFile, load_rig
+from haselab.runtime.camera_recorder import KeepVideo
+from haselab.store.actuator_file import ACTUATOR, read_actuator
+from haselab.store.folder import write_text
+from haselab.store.text_file import read_text
+from haselab.store.toml import validated
+from haselab.study.analysis import experiments_of
+from haselab.study.definition import Study, builtin_study, load_study
+from haselab.study.feasibility import (
+    check_settings,
+    check_study,
+    check_study_on_rig,
+    rated_rig,
+    study_drives,
+)
+from haselab.study.known import with_actuator_tables
+from haselab.study.run import RunOptions
+
+__all__ = [
+    "PageOperator", "StudyJob", "actuator_tables", "available", "check", "chosen_study",
+]  # fmt: skip
+
+_REFERENCE = "reference study"
+_MOST_BYTES, _MOST_FILES = 65536, 200
+
+
+@dataclass(frozen=True)
+class StudyJob:
+    """A study that a bench is armed for.
+
+    Args:
+        study: that is played.
+        options: of its recording.
+        actuator: actuator file that it starts from; None: there is none.
+    """
+
+    study: Study
+    options: RunOptions
+    actuator: Path | None
+
+    @classmethod
+    def of(cls, files: PanelFiles, file: RigFile, values: JsonObject) -> StudyJob:
+        """Prepare the study that a page has chosen.
+
+        Args:
+            files: of the panel.
+            file: the rig file.
+            values: `study`, `quick`, `experiments` and `keep_video` of the page.
+        Returns:
+            The job; its folder is a new one.
+        Raises:
+            InputError: there is no such study, or no result can come from it.
+            LimitError: the bench cannot play it.
+        """
+        study = chosen_study(files, values)
+        feasible = check_study_on_rig(file, study, files.rig)
+        if feasible is not None:
+            feasible.require()
+        keep: KeepVideo = "none" if values.get("keep_video") == "none" else "sample"
+        named = re.sub(r"[^\w.-]+", "-", study.name)[:60].strip("-.")
+        name = f"{datetime.now():%Y-%m-%d-%H%M%S}-{named}"
+        rig_config, seed = file.model_dump(mode="json"), 0
+        if isinstance(file, TwinFile):  # the recording says so, and of which actuator
+            rig_config, seed = file.configuration(files.rig).model_dump(mode="json"), file.seed
+        options = RunOptions(files.runs / name, seed, keep, rig_config, _tables(files))
+        return cls(study, options, files.actuator)
+
+    def begin(self) -> None:
+        """Put a copy of the actuator file into the folder of the run, which is added to there."""
+        if self.actuator is not None:
+            text = read_text(self.actuator, "actuator file")
+            write_text(self.options.folder / ACTUATOR, text)
+
+    def highest_v(self, rig: RigDescription) -> float:
+        """Highest drive that its experiments declare, in V."""
+        return max(
+            (float(abs(d.values_v).max()) for d in study_drives(self.study, rig)), default=0.0
+        )
+
+
+def actuator_tables(path: Path) -> ActuatorTables:
+    """The checked sections of an actuator file.
+
+    Args:
+        path: of the file.
+    Returns:
+        Its sections.
+    Raises:
+        InputError: no such file, or an impossible value.
+    """
+    return validated(ActuatorTables, read_actuator(path), path)
+
+
+def _tables(files: PanelFiles) -> ActuatorTables | None:
+    return None if files.actuator is None else actuator_tables(files.actuator)
+
+
+def _study_files(files: PanelFiles) -> list[Path]:
+    """TOML files in the folder from which the panel was started that may be studies."""
+    places = sorted([*Path().glob("*.toml"), *Path("studies").glob("*.toml")])[:_MOST_FILES]
+    others = {files.rig.resolve(), files.actuator.resolve() if files.actuator else None}
+    return [
+        path for path in places
+        if path.resolve() not in others and path.stat().st_size <= _MOST_BYTES
+    ]  # fmt: skip
+
+
+def available(files: PanelFiles) -> JsonObject:
+    """Names of the studies that can be chosen, with the titles of their experiments.
+
+    Args:
+        files: of the panel.
+    Returns:
+        `studies`: each with `name` and `experiments`, their tables and titles.
+    """
+    found: list[JsonObject] = [{"name": _REFERENCE, "experiments": _experiments(builtin_study())}]
+    for path in _study_files(files):
+        try:
+            found.append({"name": str(path), "experiments": _experiments(load_study(path))})
+        except InputError:  # another kind of file
+            continue
+    return {"studies": found}
+
+
+def _experiments(study: Study) -> list[JsonObject]:
+    played = [one for one in experiments_of(study) if one.recordings()]
+    return [{"table": one.table, "title": one.title} for one in played]
+
+
+def chosen_study(files: PanelFiles, values: JsonObject) -> Study:
+    """The study that a page has chosen, with what the actuator file knows.
+
+    Args:
+        files: of the panel.
+        values: `study`, a name of `available`; `quick`; `experiments`, the tables to be played, or
+            none for all of them.
+    Returns:
+        The study.
+    Raises:
+        InputError: there is no such study or experiment, or no result can come from it.
+    """
+    name, quick = values.get("study"), values.get("quick") is True
+    if name == _REFERENCE:
+        study = builtin_study(quick=quick)
+    elif name in [str(path) for path in _study_files(files)]:
+        study = load_study(Path(str(name)), quick=quick)
+    else:
+        raise InputError(f"There is no study {shown(name)} in this folder. Choose one of the list.")
+    study = _reduced(study, values.get("experiments"))
+    if (tables := _tables(files)) is not None:
+        study = with_actuator_tables(study, tables)
+    check_settings(study)
+    return study
+
+
+def _reduced(study: Study, wanted: object) -> Study:
+    """The study with some of its experiments; what is not played is kept, such as [control]."""
+    played = {str(one["table"]): one for one in _experiments(study)}
+    if not isinstance(wanted, Sequence) or isinstance(wanted, str) or set(wanted) == set(played):
+        return study
+    unknown = [one for one in wanted if one not in played]
+    if unknown or not wanted:
+        raise InputError(
+            f"Choose at least one of the experiments {', '.join(played)}"
+            + (f"; there is no {shown(unknown[0])}." if unknown else ".")
+        )
+    content = study.model_dump(mode="json")
+    content["name"] = f"{study.name}: {', '.join(wanted)}"
+    kept = {name: table for name, table in content.items() if name not in set(played) - set(wanted)}
+    return Study.model_validate(kept)
+
+
+def check(files: PanelFiles, values: JsonObject) -> JsonObject:
+    """Check whether the bench can play a study, before anybody arms it.
+
+    Args:
+        files: of the panel.
+        values: as in `chosen_study`.
+    Returns:
+        `checks`, each with the number and its limit; `ok`; `rated`: whether the rating of the bench
+        is known; `seconds` on the clock of the bench; and `highest_v`, of the drive.
+    Raises:
+        InputError: as `chosen_study`.
+    """
+    study, file = chosen_study(files, values), load_rig(files.rig)
+    rated = rated_rig(file, study, files.rig)
+    if rated is None:
+        return {"checks": [], "ok": True, "rated": False, "seconds": None, "highest_v": None}
+    found = check_study(study, *rated)
+    drives = study_drives(study, rated[0])
+    return {
+        "checks": [
+            {"name": one.name, "where": one.where, "requested": one.requested,
+             "limit": one.allowed, "unit": one.unit, "ok": one.ok,
+             "advice": "" if one.ok else one.advice}
+            for one in found.checks
+        ],
+        "ok": found.ok,
+        "rated": True,
+        "seconds": sum(float(one.seconds(rated[0])) for one in experiments_of(study)),
+        "highest_v": max((float(abs(d.values_v).max()) for d in drives), default=0.0),
+    }  # fmt: skip
+
+
+class _Replies:
+    """The page's confirmation of a step, as the stream that a person at the terminal types on."""
+
+    def __init__(self, confirmed: Callable[[], bool]) -> None:
+        self._confirmed = confirmed
+
+    def readline(self) -> str:
+        """Wait for the confirmation; empty if the study is to end."""
+        return "\n" if self._confirmed() else ""
+
+
+class _Prompts:
+    """Where prompts go."""
+
+    def __init__(self, show: Callable[[str], None]) -> None:
+        self._show = show
+
+    def write(self, text: str) -> int:
+        """Show a prompt on the page that armed the bench."""
+        self._show(text.replace("\a", "").replace(" and press Enter:", ".").strip())
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+
+class PageOperator(OperatorWeights):
+    """A person at the page that armed the bench hangs the masses.
+
+    Args:
+        show: shows a prompt.
+        confirmed: waits for the confirmation; False if the study is to end instead.
+    """
+
+    def __init__(self, show: Callable[[str], None], confirmed: Callable[[], bool]) -> None:
+        super().__init__(_Replies(confirmed), _Prompts(show))

@@ -1,0 +1,161 @@
+"""Plays a study on the bench of the panel, and asks the page for what a person must do."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from haselab.base import HaselabError, Limits
+from haselab.panel.study_job import PageOperator, StudyJob
+from haselab.rig import Camera
+from haselab.rig.cameras.source import KnownCamera
+from haselab.rig.protocols import Frames
+from haselab.safety.guarded import GuardedRig
+from haselab.study.run import run_study
+
+__all__ = ["FilmedCamera", "StudyEndedError", "StudyPlayer"]
+
+_POLL_S = 0.1
+_PICTURE_S = 0.2
+
+
+class StudyEndedError(HaselabError):
+    """Somebody ended a study: no fault, so the bench is not tripped."""
+
+
+class FilmedCamera:
+    """A camera whose last frame is also kept as a JPEG file, five times a second at most.
+
+    Args:
+        camera: that takes the frames.
+        path: of the file.
+    """
+
+    def __init__(self, camera: Camera, path: Path) -> None:
+        self._camera, self._path, self._next_s = camera, path, 0.0
+
+    @property
+    def uncertainty_s(self) -> float:
+        """See `haselab.rig.KnownCamera`; 0 if the camera does not know it."""
+        return self._camera.uncertainty_s if isinstance(self._camera, KnownCamera) else 0.0
+
+    @property
+    def dropped(self) -> int:
+        """See `haselab.rig.KnownCamera`; 0 if the camera does not know it."""
+        return self._camera.dropped if isinstance(self._camera, KnownCamera) else 0
+
+    def start(self, rate_hz: float) -> None:
+        """See `haselab.rig.Camera`."""
+        self._camera.start(rate_hz)
+
+    def take(self) -> Frames | None:
+        """See `haselab.rig.Camera`."""
+        frames = self._camera.take()
+        if frames is not None and len(frames.time_s) and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + _PICTURE_S
+            new = self._path.with_suffix(".new")
+            Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
+            new.replace(self._path)
+        return frames
+
+    def stop(self) -> None:
+        """See `haselab.rig.Camera`."""
+        self._camera.stop()
+
+
+class StudyPlayer:
+    """Plays one study after the other; it is the progress listener of each."""
+
+    def __init__(self) -> None:
+        self.note: Callable[[str], None] = lambda what: None  # takes the start of an experiment
+        self._total = self._passed = 0.0
+        self._confirmed = threading.Event()
+        self._why_not: Callable[[], str] = lambda: ""
+        self.task, self.prompt = "", ""
+        self.operator = PageOperator(self._show, self._wait)
+
+    @property
+    def done(self) -> float:
+        """Share of the study's time that has passed, 0 to 1."""
+        return min(self._passed / self._total, 1.0) if self._total else 0.0
+
+    def play(self, job: StudyJob, rig: GuardedRig, limit_v: float, why_not: Callable[[], str],
+             picture: Path | None) -> None:  # fmt: skip
+        """Play a study on an armed bench; the bench ends at 0 V.
+
+        Args:
+            job: the study.
+            rig: the armed bench.
+            limit_v: highest drive that was typed when the bench was armed, in V.
+            why_not: says why the study must end; empty while it may go on. It is asked for each
+                block.
+            picture: JPEG file for the last frame; None: none.
+        Raises:
+            HaselabError: see `run_study`; the recorded data are kept.
+        """
+        self._why_not, self._passed, self._total = why_not, 0.0, 0.0
+        full, played = rig.description, rig
+        narrowed = replace(full, drive_limits=_within(full.drive_limits, limit_v))
+        if picture is not None:
+            played = replace(rig, camera=FilmedCamera(rig.camera, picture))
+        rig.plain.description = played.description = narrowed  # both are asked
+        try:
+            job.begin()
+            run_study(job.study, played, job.options, self)
+        finally:
+            rig.plain.description = full
+            self.task = self.prompt = ""
+            self._why_not = lambda: ""
+
+    def require_wanted(self) -> None:
+        """End the study if it must end.
+
+        Raises:
+            StudyEndedError: with the reason.
+        """
+        if reason := self._why_not():
+            raise StudyEndedError(reason)
+
+    def confirm(self) -> None:
+        """Confirm the step that the prompt asks for."""
+        self._confirmed.set()
+
+    def _show(self, prompt: str) -> None:
+        self._confirmed.clear()
+        self.prompt = prompt
+
+    def _wait(self) -> bool:
+        while not self._confirmed.wait(_POLL_S):
+            if self._why_not():
+                return False
+        self.prompt = ""
+        return True
+
+    # ---- Progress ------------------------------------------------------------------------------
+
+    def start(self, total: float) -> None:
+        """See `Progress`."""
+        self._total = total
+
+    def advance(self, amount: float, what: str) -> None:
+        """See `Progress`."""
+        self._passed += amount
+        if what != self.task:
+            self.task = what
+            self.note(what)
+        self.require_wanted()
+
+    def stop(self) -> None:
+        """See `Progress`."""
+
+
+def _within(limits: Limits, limit_v: float) -> Limits:
+    source = "the limit typed on the page"
+    high = min(limits.high, limit_v)
+    low = max(limits.low, -limit_v)
+    return replace(limits, low=low, high=high, low_source=source, high_source=source)

@@ -1,0 +1,294 @@
+"""Studies from the panel: what is checked, what is recorded, and each way in which one ends."""
+
+import asyncio
+import json
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from haselab.base import InputError
+from haselab.panel.files import PanelFiles
+from haselab.panel.recordings import compare, listed, note, report
+from haselab.panel.study_job import available, check, chosen_study
+from haselab.store.session.reader import SessionReader
+from tests.panel.running import WAIT_S, Page, RunningPanel, connected, ended, started
+
+TRIANGLE = """
+name = "one triangle"
+
+[triangle]
+low_v = 0.0
+high_v = 1.8
+frequency_hz = 0.5
+cycles = 4
+skipped_cycles = 1
+frame_rate_hz = 200.0
+"""
+STUDY = {"study": "triangle.toml", "keep_video": "none"}
+LONG = {"study": "reference study", "experiments": ["triangle", "static_load"]}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder from which a panel is started, with a study."""
+    (tmp_path / "triangle.toml").write_text(TRIANGLE)
+    (tmp_path / "rig.toml").write_text('kind = "twin"\n')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def files(folder: Path) -> PanelFiles:
+    return PanelFiles(folder / "rig.toml", None, folder / "out")
+
+
+async def play(page: Page, study: dict[str, Any], limit_v: float = 1.8) -> dict[str, Any]:
+    asked = (await page.ask("request"))["answer"]
+    return await page.ask(
+        "arm", number=asked["number"], limit_v=limit_v, acknowledged=asked["reason"], study=study
+    )
+
+
+def recorded(folder: Path) -> tuple[dict[str, Any], str]:
+    """Manifest and all events of the only recording."""
+    (session,) = folder.glob("out/*/session.h5")
+    manifest = json.loads((session.parent / "manifest.json").read_text())
+    with SessionReader(session) as reader:
+        return manifest, " ".join(text for _, text in reader.events())
+
+
+def request(panel: RunningPanel, name: str, body: bytes = b"{}", **headers: str) -> dict[str, Any]:
+    given = {"Content-Type": "application/json", "X-Panel-Token": panel.token, **headers}
+    asked = urllib.request.Request(f"http://{panel.host}/request/{name}", body, given)
+    with urllib.request.urlopen(asked, timeout=WAIT_S) as answer:
+        return json.load(answer)
+
+
+def test_a_study_from_a_page_is_recorded_and_analysed_like_one_of_haselab_run(
+    folder: Path,
+) -> None:
+    """Both play the same twin with the same noise, but the panel's has been idle before."""
+    panel = started()
+
+    async def through_the_page() -> None:
+        async with connected(panel) as page:
+            answer = await play(page, STUDY)
+            assert "answer" in answer, answer
+            assert (await page.until(lambda state: state["mode"] == "study"))["drive_v"] == 0.0
+            seen = []
+            while page.state["mode"] == "study":
+                await page.receive()
+                seen.append(page.state["drive_v"])
+            assert 1.0 < max(seen) <= 1.8
+            assert page.state["stage"] == "off" and page.state["drive_v"] == 0.0
+            assert "The study has ended." in page.state["reason"]
+            assert "triangle" in [text for _, text in page.state["events"]]
+
+    try:
+        asyncio.run(through_the_page())
+        (name,) = (one["name"] for one in request(panel, "recordings")["recordings"])
+        request(panel, "analyse", json.dumps({"name": name}).encode())
+    finally:
+        ended(panel)
+    manifest, events = recorded(folder)
+    assert manifest["ended"] == "complete" and "end triangle" in events
+    assert (
+        "SIMULATED"
+        in report(PanelFiles(folder / "rig.toml", None, folder / "out"), {"name": name})["html"]
+    )
+    command = [sys.executable, "-m", "haselab.cli", "run", "triangle.toml", "--rig", "rig.toml"]
+    done = subprocess.run([*command, "--out", "out/run"], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    files = PanelFiles(folder / "rig.toml", None, folder / "out")
+    rows = compare(files, {"first": name, "second": "run"})["rows"]
+    deviations = {row["id"]: row["deviations"] for row in rows if row["deviations"] is not None}
+    assert "S14.a1" in deviations and "S15.slope" in deviations
+    assert max(map(abs, deviations.values())) < 4.0  # of about ten rows, chance: 1e-3
+    assert "one triangle" in report(files, {"name": name})["html"]
+
+
+@pytest.mark.parametrize("how", ["end", "stop", "lost page", "signal"])
+def test_every_end_of_a_study_is_at_zero_with_the_reason_and_the_data(
+    folder: Path, how: str
+) -> None:
+    panel = started()
+    said = {
+        "end": "The study was ended from a page", "stop": "STOP", "signal": "The panel has ended",
+        "lost page": "No message from the page",
+    }[how]  # fmt: skip
+
+    async def play_and_end() -> None:
+        async with connected(panel) as watching:
+            async with connected(panel) as page:
+                assert "answer" in await play(page, LONG, 2.0)
+                await page.until(lambda state: state["drive_v"] > 0.5)
+                await watching.until(lambda state: state["mode"] == "study")
+                if how == "end":
+                    assert "A study is being" in (await page.ask("drive", value_v=1.0))["error"]
+                    assert "Another page" in (await watching.ask("drive", value_v=1.0))["error"]
+                    assert "Another page" in (await watching.ask("confirm"))["error"]
+                    await watching.ask("disarm")  # everybody may end it
+                elif how == "stop":
+                    panel.stop(Origin=f"http://{panel.host}")
+                elif how == "signal":
+                    panel.process.send_signal(signal.SIGTERM)
+                    return
+            after = await watching.until(lambda state: state["mode"] == "idle")
+            assert after["drive_v"] == 0.0
+            assert said in after["reason"]
+            assert after["stage"] == ("tripped" if how == "stop" else "off")
+
+    try:
+        asyncio.run(play_and_end())
+    finally:
+        ended(panel)
+    manifest, events = recorded(folder)
+    assert manifest["state"] == "SEALED" and manifest["ended"] != "complete"
+    assert said in events and "output at 0 V" in events
+
+
+REFUSED = [
+    (STUDY, 1.5, "The study needs 1.8 V, but the typed limit is 1.5 V"),
+    ({"study": "../triangle.toml"}, 1.8, "There is no study '../triangle.toml'"),
+    ({"study": 7}, 1.8, "There is no study 7"),
+    ({**STUDY, "experiments": ["chirp"]}, 1.8, "there is no 'chirp'"),
+    ({**STUDY, "experiments": []}, 1.8, "Choose at least one of the experiments triangle"),
+    ({"study": "high.toml"}, 2.0, "1) highest drive voltage is 2.5 V in triangle (limit 2 V)"),
+    ("triangle.toml", 1.8, "This panel cannot play a study"),
+]
+
+
+def test_a_study_that_cannot_be_played_leaves_the_bench_off(folder: Path) -> None:
+    (folder / "high.toml").write_text(TRIANGLE.replace("1.8", "2.5"))
+    panel = started()
+
+    async def attempt() -> None:
+        async with connected(panel) as page:
+            for study, limit_v, said in REFUSED:
+                assert said in (await play(page, study, limit_v))["error"]
+                state = await page.until(lambda state: True)
+                assert state["stage"] in ("off", "requested") and state["mode"] == "idle"
+
+    try:
+        asyncio.run(attempt())
+    finally:
+        ended(panel)
+    assert not (folder / "out").exists()
+
+
+def test_the_limits_of_the_actuator_file_are_those_of_the_panel(
+    folder: Path, actuator_file: Path
+) -> None:
+    own = folder / "actuator.toml"
+    own.write_text(actuator_file.read_text().replace("[drive]", "[drive]\nhigh_v = 1.2"))
+    panel = started("--actuator", str(own))
+
+    async def attempt() -> None:
+        async with connected(panel) as page:
+            assert (await page.until(lambda state: True))["high_v"] == 1.2
+            assert "at most 1.2 V" in (await page.arm(1.5))["error"]
+
+    try:
+        asyncio.run(attempt())
+    finally:
+        ended(panel)
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "headers", "code"),
+    [
+        ("recordings", b"{}", {"X-Panel-Token": "guess"}, 403),
+        ("recordings", b"a=1", {"Content-Type": "application/x-www-form-urlencoded"}, 400),
+        ("recordings", b"[]", {}, 400),
+        ("recordings", b"{", {}, 400),
+        ("note", b'{"text": "' + b"x" * (1 << 20) + b'"}', {}, 400),
+        ("nothing", b"{}", {}, 404),
+        ("report", b'{"name": "../secret"}', {}, 422),
+        ("note", b'{"name": "/etc", "text": ""}', {}, 422),
+        ("recordings", b"{}", {"Origin": "http://example.org"}, 403),
+        ("recordings", b"{}", {"Host": "example.org"}, 403),
+    ],
+)
+def test_a_request_that_is_not_of_the_page_is_refused(
+    shared_panel: RunningPanel, name: str, body: bytes, headers: dict[str, str], code: int
+) -> None:
+    with pytest.raises(urllib.error.HTTPError, match=rf"HTTP Error {code}") as refused:
+        request(shared_panel, name, body, **headers)
+    refused.value.close()
+
+
+def test_the_doctor_of_the_panel_says_what_haselab_doctor_says(shared_panel: RunningPanel) -> None:
+    found = request(shared_panel, "doctor")
+    kinds = {one["kind"] for one in found["findings"]}
+    assert {"runtime", "extension", "rig"} <= kinds and not found["in_use"]
+
+
+# ---- without a bench ---------------------------------------------------------------------------
+
+
+def test_studies_of_the_folder_are_listed_and_other_files_are_not(files: PanelFiles) -> None:
+    Path("broken.toml").write_text("name = [")
+    Path("other.toml").write_text("a = 1")
+    names = [one["name"] for one in available(files)["studies"]]
+    assert names == ["reference study", "triangle.toml"]
+
+
+def test_some_experiments_of_a_study_keep_their_settings(files: PanelFiles) -> None:
+    whole = chosen_study(files, {"study": "reference study"})
+    part = chosen_study(files, {"study": "reference study", "experiments": ["triangle"]})
+    assert part.triangle == whole.triangle and not part.has("chirp")
+    assert not part.is_reference
+
+
+def test_a_study_beyond_the_bench_is_found_by_the_check(files: PanelFiles) -> None:
+    Path("high.toml").write_text(TRIANGLE.replace("1.8", "2.5"))
+    found = check(files, {"study": "high.toml"})
+    assert not found["ok"]
+    (bad,) = (one for one in found["checks"] if one["name"] == "highest drive voltage")
+    assert (bad["requested"], bad["limit"], bad["ok"]) == (2.5, 2.0, False)
+    assert bad["advice"]
+    fine = check(files, {"study": "triangle.toml"})
+    assert fine["ok"] and fine["highest_v"] == 1.8 and fine["seconds"] == pytest.approx(8.0)
+
+
+def recording(files: PanelFiles, name: str, rows: dict[str, tuple[float, float]]) -> None:
+    folder = files.runs / name
+    folder.mkdir(parents=True)
+    (folder / "session.h5").touch()
+    quantities = [
+        {"id": key, "name": key, "unit": "V",
+         "measured": {"value": value, "std": std, "ci95": [value - std, value + std]}}
+        for key, (value, std) in rows.items()
+    ]  # fmt: skip
+    (folder / "results.json").write_text(json.dumps({"quantities": quantities}))
+
+
+def test_the_difference_of_two_recordings_is_in_deviations_of_both(files: PanelFiles) -> None:
+    recording(files, "a", {"x": (1.0, 0.3), "gone": (1.0, 0.1), "exact": (20.0, 0.0)})
+    recording(files, "b", {"x": (2.5, 0.4), "new": (1.0, 0.1), "exact": (20.0, 0.0)})
+    rows = {row["id"]: row for row in compare(files, {"first": "a", "second": "b"})["rows"]}
+    assert rows["x"]["deviations"] == pytest.approx(3.0)  # 1.5 over hypot(0.3, 0.4)
+    assert rows["gone"]["second"] is None and rows["new"]["first"] is None
+    assert rows["exact"]["deviations"] is None
+    (files.runs / "b" / "results.json").write_text("{}")
+    with pytest.raises(InputError, match="b has no results"):
+        compare(files, {"first": "a", "second": "b"})
+
+
+def test_a_note_stays_with_its_recording(files: PanelFiles) -> None:
+    recording(files, "a", {})
+    note(files, {"name": "a", "text": "new shell\nno drift"})
+    (found,) = listed(files, {})["recordings"]
+    assert found["note"] == "new shell\nno drift"
+    assert re.search("manifest", found["state"]), "a folder without a manifest is listed as such"
+    with pytest.raises(InputError, match="at most 10000 characters"):
+        note(files, {"name": "a", "text": "x" * 10_001})
+    with pytest.raises(InputError, match=r"no recording '\.\./a'"):
+        note(files, {"name": "../a", "text": ""})

@@ -31,7 +31,7 @@ __all__ = ["command"]
 )  # fmt: skip
 @click.option(
     "--runs", type=click.Path(path_type=Path, file_okay=False), default=Path("out"),
-    show_default=True, metavar="DIR", help="List the recordings in this folder; add new ones.",
+    show_default=True, metavar="DIR", help="Write recordings to this folder, and list those in it.",
 )  # fmt: skip
 @click.option(
     "--page-port", type=click.IntRange(0, 65535), default=0, show_default=True,

@@ -12,6 +12,7 @@ import json
 import mmap
 import os
 import struct
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,7 +54,7 @@ class _Memory:
         shapes = [
             (kept, 1 if factor == 1 else 2, 2) for factor, kept in zip(_FACTORS, _KEPT, strict=True)
         ]
-        rows = (_BLOCKS, 1 + len(SIGNALS))
+        rows = (_BLOCKS, 2 + len(SIGNALS))  # time, signals, clock of the computer
         size = _HEADER + sum(2 * int(np.prod(shape)) for shape in shapes) + 8 * int(np.prod(rows))
         flags = os.O_RDWR | (os.O_CREAT | os.O_EXCL if create else 0)
         file = os.open(path, flags, 0o600)
@@ -146,7 +147,7 @@ class LiveWriter:
                 parts = codes.reshape(columns, _FACTORS[k], 2)
                 np.minimum.reduce(parts, axis=1, out=into[:, 0])
                 np.maximum.reduce(parts, axis=1, out=into[:, 1])
-        memory.rows[count % _BLOCKS] = (time_s, *values)
+        memory.rows[count % _BLOCKS] = (time_s, *values, time.monotonic())
         memory.counters = (count + 1, first)
         self._last_s = time_s
 
@@ -180,6 +181,12 @@ class LiveReader:
         """Time at the end of the last block, on the rig's clock; NaN before the first."""
         count = self.blocks
         return float(self._memory.rows[(count - 1) % _BLOCKS, 0]) if count else float("nan")
+
+    @property
+    def written_s(self) -> float:
+        """When the last block was written, on the monotonic clock of the computer; NaN: never."""
+        count = self.blocks
+        return float(self._memory.rows[(count - 1) % _BLOCKS, -1]) if count else float("nan")
 
     def monitors(self, from_s: float, to_s: float, most: int) -> Columns:
         """Both monitors between two times, reduced to the smallest and the largest values.
@@ -265,7 +272,7 @@ class LiveReader:
         per = max(-(-(end - begin) // max(most, 1)), 1)
         begin += -begin % per
         end = begin + max(end - begin, 0) // per * per
-        rows = self._memory.rows[np.arange(begin, end) % _BLOCKS][:, 1:]
+        rows = self._memory.rows[np.arange(begin, end) % _BLOCKS][:, 1:-1]
         parts = rows.reshape(-1, per, len(SIGNALS))
         absent = np.isnan(parts)
         low = np.where(absent, np.inf, parts).min(axis=1, initial=np.inf)

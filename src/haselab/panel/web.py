@@ -131,15 +131,13 @@ class _Bench:
         self._number = 0
         self.state: dict[str, Any] | None = None
         self.state_s = -math.inf  # when it arrived
+        self.state_text = "{}"  # as JSON, made once for all pages
         self.reader: LiveReader | None = None
-        self._blocks, self._new_s = -1, -math.inf  # when the number of blocks last changed
 
     def age_s(self) -> float:
-        """Time since the last block was read, in s, to 30 ms."""
-        blocks, now_s = self.reader.blocks if self.reader else -1, asyncio.get_running_loop().time()
-        if blocks != self._blocks:
-            self._blocks, self._new_s = blocks, now_s
-        return now_s - self._new_s
+        """Time since the last block was read, in s; infinite before the first."""
+        written_s = self.reader.written_s if self.reader else math.nan
+        return math.inf if math.isnan(written_s) else max(time.monotonic() - written_s, 0.0)
 
     async def run(self) -> None:
         """Stay connected."""
@@ -165,6 +163,7 @@ class _Bench:
         """Keep the state of the bench; analyse a study that has just been recorded."""
         before = self.state
         self.state, self.state_s = state, asyncio.get_running_loop().time()
+        self.state_text = json.dumps(state)
         if before is not None and state["recorded"] != before["recorded"]:
             with contextlib.suppress(HaselabError, OSError):  # the page offers it again
                 await run_in_threadpool(analyse_recorded, self._files, state["recorded"])
@@ -359,13 +358,13 @@ class _Server:
                 answers = loop.time() < self._bench.state_s + _REPEAT_S
                 repeats = int(age_s / _REPEAT_S) if answers and age_s < math.inf else 0
                 now = (
-                    blocks, page.span_s, page.end_s, page.columns, json.dumps(state), repeats
+                    blocks, page.span_s, page.end_s, page.columns, self._bench.state_text, repeats
                 )  # fmt: skip
                 if now == last:
                     continue
                 last = now
                 page.sent += 1
-                await page.socket.send_bytes(self._frame(page, state))
+                await page.socket.send_bytes(self._frame(page))
 
     def _start(self, job: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(job)
@@ -375,7 +374,7 @@ class _Server:
     async def _renew(self, page: _Page) -> None:
         await self._bench.ask("lease", page.holder, {})
 
-    def _frame(self, page: _Page, state: dict[str, Any]) -> bytes:
+    def _frame(self, page: _Page) -> bytes:
         """A binary frame: numbers, the state as JSON, then columns as 32-bit floats."""
         reader = self._bench.reader
         end_s = reader.end_s if reader is not None else math.nan
@@ -385,12 +384,12 @@ class _Server:
         if reader is not None and not math.isnan(shown_s):
             monitors = reader.monitors(shown_s - page.span_s, shown_s, page.columns)
             signals = reader.signals(shown_s - page.span_s, shown_s, page.columns)
-        about = {
-            "state": state,
+        times = {
             "end_s": None if math.isnan(end_s) else end_s,
             "age_s": min(self._bench.age_s(), 1e9),
+            "written_s": None if reader is None or math.isnan(end_s) else reader.written_s,
         }
-        text = json.dumps(about).encode()
+        text = f'{{"state": {self._bench.state_text}, {json.dumps(times)[1:]}'.encode()
         text += b" " * (-len(text) % 8)
         head = _HEAD.pack(
             SCHEMA, 0, page.sent, monitors.start_s, monitors.step_s, signals.start_s,

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 
 from haselab.base import InputError
 from haselab.panel.files import PanelFiles
-from haselab.panel.recordings import compare, listed, note, report
+from haselab.panel.recordings import analyse, compare, listed, note, report
 from haselab.panel.study_job import available, check, chosen_study
 from haselab.store.session.reader import SessionReader
 from tests.panel.running import WAIT_S, Page, RunningPanel, connected, ended, started
@@ -94,7 +95,10 @@ def test_a_study_from_a_page_is_recorded_and_analysed_like_one_of_haselab_run(
     try:
         asyncio.run(through_the_page())
         (name,) = (one["name"] for one in request(panel, "recordings")["recordings"])
-        request(panel, "analyse", json.dumps({"name": name}).encode())
+        end_s = time.monotonic() + 8 * WAIT_S
+        while not (found := request(panel, "recordings")["recordings"][0])["report"]:
+            assert found["analysing"] and not found["problem"] and time.monotonic() < end_s
+            time.sleep(0.5)
     finally:
         ended(panel)
     manifest, events = recorded(folder)
@@ -292,3 +296,13 @@ def test_a_note_stays_with_its_recording(files: PanelFiles) -> None:
         note(files, {"name": "a", "text": "x" * 10_001})
     with pytest.raises(InputError, match=r"no recording '\.\./a'"):
         note(files, {"name": "../a", "text": ""})
+
+
+def test_an_analysis_that_fails_is_named_in_the_list(files: PanelFiles) -> None:
+    recording(files, "a", {})
+    analyse(files, {"name": "a"})
+    end_s = time.monotonic() + WAIT_S
+    while (found := listed(files, {})["recordings"][0])["analysing"]:
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+    assert found["problem"].startswith("haselab: ") and "session.h5" in found["problem"]

@@ -49,8 +49,8 @@ def listed(files: PanelFiles, values: JsonObject) -> JsonObject:
         files: of the panel.
         values: none.
     Returns:
-        `folder` and `recordings`: name, study, date, seconds, state, note, and whether there is a
-        report.
+        `folder` and `recordings`: name, study, date, seconds, state, note, whether it is being
+        analysed, what the last analysis failed with, and whether there is a report.
     """
     found = [_described(path) for path in _folders(files)]
     found.sort(key=lambda one: str(one["opened"]), reverse=True)
@@ -65,6 +65,7 @@ def _described(folder: Path) -> dict[str, Any]:
     else:
         ended = str(manifest.get("ended", ""))
         state = ended if manifest.get("state") == "SEALED" else "not ended: run haselab recover"
+    running = _running.get(folder)
     study, when = manifest.get("study"), recorded_when(manifest) if manifest else {}
     return {
         "name": folder.name,
@@ -73,6 +74,8 @@ def _described(folder: Path) -> dict[str, Any]:
         "seconds": when.get("duration_s"),
         "state": state,
         "note": _read(folder / _NOTES),
+        "analysing": running is not None and running.poll() is None,
+        "problem": " ".join(_read(folder / _LOG).split()) if running and running.poll() else "",
         "report": (folder / "report.html").is_file(),
     }
 
@@ -125,7 +128,7 @@ def report(files: PanelFiles, values: JsonObject) -> JsonObject:
 
 
 def analyse(files: PanelFiles, values: JsonObject) -> JsonObject:
-    """Run `haselab analyse` on a recording and wait for its end.
+    """Start `haselab analyse` on a recording; the list says when it has ended, and how.
 
     Args:
         files: of the panel.
@@ -133,11 +136,9 @@ def analyse(files: PanelFiles, values: JsonObject) -> JsonObject:
     Returns:
         An empty object.
     Raises:
-        InputError: there is no such recording, or the analysis had no result.
+        InputError: there is no such recording.
     """
-    folder = _recording(files, values.get("name"))
-    if _analysis(folder).wait() != 0:
-        raise InputError(" ".join(_read(folder / _LOG).split()) or "No result.")
+    _analysis(_recording(files, values.get("name")))
     return {}
 
 

@@ -76,9 +76,8 @@ function Recordings({ link, state }) {
   const [marked, mark] = useState([]);
   const [compared, setCompared] = useState(null);
   const [error, say] = useState("");
-  const [busy, setBusy] = useState("");
   const read = () => link.request("recordings").then((list) => (list.error ? say(list.error) : see(list)));
-  useEffect(() => { read(); const timer = setInterval(read, 5000); return () => clearInterval(timer); }, []);
+  useEffect(() => { read(); const timer = setInterval(read, 3000); return () => clearInterval(timer); }, []);
   useEffect(() => { read(); }, [state?.mode]);
   async function open(name) {
     const page = window.open("", "_blank"); // at once: a later one would be blocked as a pop-up
@@ -88,9 +87,7 @@ function Recordings({ link, state }) {
     page.location = URL.createObjectURL(new Blob([answer.html], { type: "text/html" }));
   }
   async function analyse(name) {
-    setBusy(name);
     const answer = await link.request("analyse", { name });
-    setBusy("");
     say(answer.error || "");
     read();
   }
@@ -113,7 +110,8 @@ function Recordings({ link, state }) {
       <td>${one.name}<br /><small>${one.opened.slice(0, 19).replace("T", " ")}</small></td><td>${one.study}</td><td>${one.state}</td>
       <td><textarea aria-label=${`Note about ${one.name}`} rows="2" defaultValue=${one.note} onBlur=${(e) => e.target.value !== one.note && keep(one.name, e.target.value)}></textarea></td>
       <td>${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
-        <button type="button" disabled=${busy !== ""} onClick=${() => analyse(one.name)}>${busy === one.name ? "Analysing …" : "Analyse"}</button></td></tr>`)}</tbody></table></div>`;
+        <button type="button" disabled=${one.analysing} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button>
+        ${one.problem && html`<p class="error">${one.problem}</p>`}</td></tr>`)}</tbody></table></div>`;
 }
 
 export default function Studies({ link, state, mine }) {

@@ -147,14 +147,8 @@ def _frame(path: Path, stamp: tuple[int, int], number: int) -> tuple[Frame, int,
         InputError: the video cannot be read, or has no such frame.
     """
     with open_video(path) as video:
-        count = video.frame_count
-        if 0 <= number < max(count, 1):
-            for index, (time_s, frame) in enumerate(video.timed()):
-                if index == number:
-                    return frame.copy(), count, time_s
-    raise InputError(
-        f"Frame {number} does not exist: the video has {count} frames, numbered from 0. {path}"
-    )
+        time_s, frame = video.frame(number)
+        return frame, video.frame_count, time_s
 
 
 @lru_cache(maxsize=4)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect
 
@@ -35,13 +36,15 @@ UPPER = [(MIDDLE_PX + k * CAMERA.fiducial_spacing_px, CAMERA.top_px) for k in (-
 LOWER = [(x, y + LENGTH_M / CAMERA.scale_m_per_px) for x, y in UPPER]
 
 
-def centre_std_px() -> float:
-    """Standard deviation of a fiducial's centre: `locate_particles` for white noise, at its scale.
+def centre_std_px(
+    sigma: float = CAMERA.fiducial_sigma_px,
+    depth: float = CAMERA.fiducial_depth_grey,
+    noise: float = (CAMERA.shot_gain_grey * 255.0 + CAMERA.read_noise_grey**2 + 1 / 12) ** 0.5,
+) -> float:
+    """Standard deviation of a dot's centre: `locate_particles` for white noise, at its scale.
 
     The response to a dot of depth A at its own scale has the curvature -A / (2 sigma²).
     """
-    sigma, depth = CAMERA.fiducial_sigma_px, CAMERA.fiducial_depth_grey
-    noise = np.sqrt(CAMERA.shot_gain_grey * 255.0 + CAMERA.read_noise_grey**2 + 1 / 12)
     u = sigma**-2
     slope_std = noise * np.sqrt((2 - np.exp(-u) * (2 - 4 * u + u**2)) * u / (8 * np.pi))
     return float(slope_std / (depth / (2 * sigma**2)))
@@ -456,6 +459,33 @@ def test_a_video_that_cannot_be_shown_is_refused_in_one_line(
     with pytest.raises(InputError, match=message) as refused:
         asked(Videos(video.parents[1]), "pick-frame", **values)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("sigma", [3.0, 5.0, 7.0, 9.0])
+def test_a_click_near_a_large_dot_among_particles_finds_its_centre(
+    tmp_path: Path, sigma: float
+) -> None:
+    rng = np.random.default_rng(3)
+    large = np.array([(60.3, 50.6), (200.2, 50.1), (60.7, 250.4), (200.4, 250.8)])
+    small = rng.uniform([40, 100], [220, 200], (120, 2))
+    y, x = np.mgrid[:300, :260]
+    image = np.full(y.shape, 160.0)
+    for dots, width, depth in ((large, sigma, 110.0), (small, 2.0, 70.0)):
+        for cx, cy in dots:
+            image -= depth * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * width**2))
+    path = tmp_path / "marks.tif"
+    grey = np.rint(rng.normal(image, 2.0)).clip(0, 255).astype(np.uint8)
+    tifffile.imwrite(path, grey[None], photometric="minisblack")
+    videos = Videos(tmp_path)
+    for truth in large:
+        click = truth + rng.uniform(-6, 6, 2)
+        found = asked(
+            videos, "pick-snap", video="marks.tif", frame=0, place=click.tolist(), reach=12.0
+        )
+        # the scale of the detection is within an eighth of an octave of the dot's
+        error = 5 * centre_std_px(sigma, 110.0, np.hypot(2.0, 12**-0.5)) * 2**0.25
+        assert found["snapped"]
+        np.testing.assert_allclose(found["place"], truth, atol=error)
 
 
 @pytest.mark.parametrize(

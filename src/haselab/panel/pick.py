@@ -24,7 +24,8 @@ from haselab.store.manifest import MANIFEST
 from haselab.store.video.grey_range import grey_range
 from haselab.store.video.listing import list_videos
 from haselab.store.video.opening import open_video
-from haselab.tracking.options import Frame
+from haselab.tracking.options import Floats, Frame
+from haselab.tracking.particles.detect import DotProfile, detect_dot_near, find_profile
 
 __all__ = ["PICK_REQUESTS", "Videos"]
 
@@ -32,6 +33,8 @@ _MOST_VIDEOS = 2000
 _MOST_POINTS = 5000
 _ALL_DOTS = 1 << 30
 _LONGEST_NAME = 200
+_LARGE = 1.4  # times the particles' standard deviation: a large dot
+_LARGE_REACH_PX = 6.0  # a large dot is chosen before a particle that is nearer by less than this
 T = TypeVar("T")
 
 
@@ -152,13 +155,33 @@ def _frame(path: Path, stamp: tuple[int, int], number: int) -> tuple[Frame, int,
 
 
 @lru_cache(maxsize=4)
-def _dots(path: Path, stamp: tuple[int, int], number: int) -> Points:
-    """All dots of a frame, as `haselab track --auto` finds them."""
+def _dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points, DotProfile]:
+    """All dots of a frame, as `haselab track --auto` finds them, and the profile of particles."""
     frame = _frame(path, stamp, number)[0]
+    profile = find_profile(frame)
     try:
-        return find_points(frame, _ALL_DOTS, None)
+        return find_points(frame, _ALL_DOTS, None), profile
     except ResultError:
-        return Points([], np.zeros((0, 2)), 0)
+        return Points([], np.zeros((0, 2)), 0), profile
+
+
+def _large_dot(
+    frame: Frame, profile: DotProfile, place_px: Floats, reach_px: float
+) -> Floats | None:
+    """The nearest dot within reach that is too large to be a particle.
+
+    `find_points` locates its centre at the scale of the particles, with an error of up to a pixel
+    on a dot that is several times as large.
+    """
+    found = [
+        detect_dot_near(
+            frame, place_px, reach_px=reach_px, least_sigma_px=_LARGE * profile.sigma_px,
+            polarity=polarity,
+        )
+        for polarity in sorted({profile.polarity, "dark"})
+    ]  # fmt: skip
+    near = [centre for centre in found if centre is not None]
+    return min(near, key=lambda centre: float(np.hypot(*(centre - place_px))), default=None)
 
 
 def _of(videos: Videos, values: JsonObject) -> tuple[str, Path, tuple[int, int], int]:
@@ -203,11 +226,17 @@ def _snap(videos: Videos, values: JsonObject) -> JsonObject:
     _, path, stamp, number = _of(videos, values)
     (x, y) = _numbers(values.get("place"), "place", 2)
     (reach,) = _numbers(values.get("reach"), "reach", 1)
-    dots = _dots(path, stamp, number)
-    away = np.hypot(*(dots.place_px - [x, y]).T)
-    if not away.size or away.min() > reach:
+    (dots, profile), place = _dots(path, stamp, number), np.array([x, y])
+    away = np.hypot(*(dots.place_px - place).T)
+    nearest = int(np.argmin(away)) if away.size else -1
+    large = None
+    if not dots.gauge:  # the dots of clamps have their centres already
+        large = _large_dot(_frame(path, stamp, number)[0], profile, place, reach)
+    least = away[nearest] if away.size else np.inf
+    if large is not None and np.hypot(*(large - place)) < least + _LARGE_REACH_PX:
+        return {"place": large.tolist(), "snapped": True, "name": ""}
+    if least > reach:
         return {"place": [x, y], "snapped": False, "name": ""}
-    nearest = int(np.argmin(away))
     name = dots.names[nearest]
     return {
         "place": dots.place_px[nearest].tolist(),
@@ -267,7 +296,7 @@ def _save(videos: Videos, values: JsonObject) -> JsonObject:
     names = [row[0].strip() if isinstance(row[0], str) else "" for row in rows]
     place = [_numbers(row[1:], "The position of a point", 2) for row in rows]
     frame = _frame(path, stamp, 0)[0]
-    dots = _dots(path, stamp, 0)
+    dots, _ = _dots(path, stamp, 0)
     points = Points(names, np.array(place).reshape(-1, 2), dots.subset_px or 15)
     table = videos.table(name, str(values.get("table") or ""))
     text = points_table(points, frame, table)

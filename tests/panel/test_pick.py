@@ -153,6 +153,8 @@ def test_picked_points_are_those_that_track_finds_and_give_its_strain(
     picking.click(LOWER[1][0] + 6, LOWER[1][1] + 3)
     picking.page.get_by_role("button", name="Ruler", exact=True).click()
     picking.click(UPPER[0][0] + 4, UPPER[0][1] - 5)
+    picking.click(UPPER[1][0] + 2, UPPER[1][1] + 2)  # where a point is; the third click begins anew
+    picking.page.get_by_role("button", name="Undo").click()
     picking.click(UPPER[2][0] - 3, UPPER[2][1] - 6)
     span_mm = 1e3 * CAMERA.scale_m_per_px * 2 * CAMERA.fiducial_spacing_px
     picking.page.get_by_label("Distance, in mm").fill(f"{span_mm:g}")
@@ -493,7 +495,7 @@ def test_a_click_near_a_large_dot_among_particles_finds_its_centre(
     [
         ([], "There is no point to save"),
         ([["a", 600.0, 60.0]], "1 of 1 points are outside the frame, the first is 'a'"),
-        ([["a", 155.0, 60.0], ["a", 255.0, 60.0]], "Two points have the name 'a'"),
+        ([["a", 155.0, 60.0], ["a", 255.0, 60.0]], "Two points have the same name, 'a'"),
         ([["", 155.0, 60.0]], "Give it a name of printable characters"),
         ([["a\nb", 155.0, 60.0]], "Give it a name of printable characters"),
         ([["a", 2.0, 60.0]], "too close to the edge"),

@@ -1,5 +1,5 @@
 // Points, a ruler and a region on a frame of a video, for haselab track.
-import { html, useState, useEffect, useLayoutEffect, useRef } from "/static/vendor/htm-preact.js";
+import { html, useState, useEffect, useLayoutEffect, useMemo, useRef } from "/static/vendor/htm-preact.js";
 
 const REACH = { mouse: 12, touch: 24, pen: 16 }; // to a mark, in px of the screen
 const SNAP = 24; // to a dot, in px of the screen
@@ -90,13 +90,13 @@ function withMark(work, kind, at, name) {
 
 const moved = (id, at) => (work) => ({ ...work, marks: work.marks.map((one) => (one.id === id ? { ...one, ...at } : one)) });
 
-function Mark({ mark, pixel, chosen, faint }) {
+function Mark({ mark, pixel, chosen, faint, named }) {
   const size = 7 * pixel, shape = mark.kind === "point"
     ? html`<circle cx=${mark.x} cy=${mark.y} r=${size} />` : html`<rect x=${mark.x - size} y=${mark.y - size} width=${2 * size} height=${2 * size} />`;
   const cross = html`<path d=${`M${mark.x - 1.6 * size} ${mark.y}h${3.2 * size}M${mark.x} ${mark.y - 1.6 * size}v${3.2 * size}`} />`;
   return html`<g class=${`mark ${mark.kind} ${chosen ? "chosen" : ""} ${faint ? "faint" : ""}`}>
     <g class="halo">${shape}${cross}</g>${shape}${cross}
-    ${mark.kind === "point" && html`<text x=${mark.x + 2 * size} y=${mark.y - size} font-size=${14 * pixel}>${mark.name}</text>`}</g>`;
+    ${mark.kind === "point" && (named || chosen) && html`<text x=${mark.x + 2 * size} y=${mark.y - size} font-size=${14 * pixel}>${mark.name}</text>`}</g>`;
 }
 
 function Picture({ picture, index, work, chosen, choose, mode, add, drawn, settle, view, frame }) {
@@ -108,7 +108,8 @@ function Picture({ picture, index, work, chosen, choose, mode, add, drawn, settl
   function nearest(event) {
     const at = view.place(event), reach = (REACH[event.pointerType] ?? 16) * view.pixel;
     const away = (one) => Math.hypot(one.x - at.x, one.y - at.y);
-    const near = work.marks.filter((one) => away(one) < reach && (index === 0 || one.kind === "ruler"));
+    // Of the chosen kind alone: the ends of a ruler are often at points.
+    const near = work.marks.filter((one) => one.kind === mode && away(one) < reach && (index === 0 || mode === "ruler"));
     return near.sort((a, b) => away(a) - away(b))[0] ?? null;
   }
   function down(event) {
@@ -171,7 +172,7 @@ function Picture({ picture, index, work, chosen, choose, mode, add, drawn, settl
     event.preventDefault();
   }
   const line = { x1: ruler[0]?.x, y1: ruler[0]?.y, x2: ruler[1]?.x, y2: ruler[1]?.y };
-  const middle = 10 * view.pixel;
+  const middle = 10 * view.pixel, few = work.marks.length * (view.w / picture.width) < 15; // else names would hide the dots
   return html`<div class="frame" ref=${frame} tabindex="0" role="application" aria-label="Picture with marks" aria-describedby="pick-keys"
       style=${`aspect-ratio: ${picture.width} / ${picture.height}; max-width: calc(75vh * ${picture.width / picture.height})`}
       onPointerDown=${down} onPointerMove=${move} onPointerUp=${up} onPointerCancel=${up} onWheel=${wheel} onKeyDown=${key}>
@@ -179,7 +180,8 @@ function Picture({ picture, index, work, chosen, choose, mode, add, drawn, settl
       <image href=${picture.picture} x="-0.5" y="-0.5" width=${picture.width} height=${picture.height} preserveAspectRatio="none" />
       ${region.length > 1 && html`<rect class="area" x=${Math.min(region[0].x, region[1].x)} y=${Math.min(region[0].y, region[1].y)} width=${Math.abs(region[1].x - region[0].x)} height=${Math.abs(region[1].y - region[0].y)} />`}
       ${ruler.length > 1 && html`<line class="halo" ...${line} /><line class="line" ...${line} />`}
-      ${work.marks.map((mark) => html`<${Mark} key=${mark.id} mark=${mark} pixel=${view.pixel} chosen=${mark.id === chosen} faint=${index > 0 && mark.kind !== "ruler"} />`)}
+      ${work.marks.map((mark) => html`<${Mark} key=${mark.id} mark=${mark} pixel=${view.pixel} chosen=${mark.id === chosen} faint=${index > 0 && mark.kind !== "ruler"}
+        named=${few || !/^p\d+$/.test(mark.name)} />`)}
       <path class="middle" d=${`M${view.x - middle} ${view.y}h${2 * middle}M${view.x} ${view.y - middle}v${2 * middle}`} />
     </svg></div>`;
 }
@@ -193,7 +195,7 @@ function Chosen({ mark, work, picture, remove }) {
     <div class="row">${coordinate("x")}${coordinate("y")}<button type="button" onClick=${remove}>Delete</button></div></div>`;
 }
 
-export default function Pick({ link }) {
+function Picker({ link }) {
   const [list, setList] = useState(null);
   const [video, setVideo] = useState(kept.video);
   const [index, setIndex] = useState(0);
@@ -209,6 +211,7 @@ export default function Pick({ link }) {
   const [done, setDone] = useState(null);
   const wanted = useRef(null);
   const frame = useRef(null);
+  const card = useRef(null);
   const work = useWork();
   const view = useView(picture, frame);
   const fail = (found) => { say({ text: found.error, bad: true }); return null; };
@@ -254,6 +257,8 @@ export default function Pick({ link }) {
     document.addEventListener("keydown", shortcut);
     return () => document.removeEventListener("keydown", shortcut);
   }, []);
+
+  useEffect(() => { card.current?.scrollIntoView({ block: "nearest" }); }, [done]);
 
   const ends = work.marks.filter((one) => one.kind === "ruler");
   const ruler = ends.length === 2 && Number(work.length) > 0 ? [ends[0].x, ends[0].y, ends[1].x, ends[1].y, Number(work.length)] : null;
@@ -331,9 +336,9 @@ export default function Pick({ link }) {
   const message = html`<p role=${said.bad ? "alert" : "status"} class=${said.bad ? "error" : ""}>${said.text}</p>`;
   const mark = work.marks.find((one) => one.id === chosen);
   const points = work.marks.filter((one) => one.kind === "point");
-  const saved = done && done.marks === work.marks && html`<div class="card" role="status"><h2>Saved</h2>
+  const saved = done && done.marks === work.marks && html`<div class="card" role="status" ref=${card}><h2>Saved</h2>
       <p>${done.points} points: <code>${done.path}</code></p>
-      <p>${done.scale_mm_per_px ? `Scale: ${done.scale}. ` : "No scale: lengths stay in pixels. "}Follow the points with</p><p><code>${done.command}</code></p></div>`;
+      <p>${done.scale_mm_per_px ? `Scale: ${done.scale}. ` : "No scale: lengths stay in pixels. "}Track the points with this command:</p><p><code>${done.command}</code></p></div>`;
   if (done && list.only) return html`${saved}<p>haselab track --pick has ended. Close this page.</p>`;
   return html`
     ${!list.only && html`<label>Video or recording <select value=${video} onChange=${(e) => open(e.target.value)}>
@@ -355,7 +360,7 @@ export default function Pick({ link }) {
         <div class="said">${message}</div>
         <label>Frame ${index} of 0 to ${Math.max(picture.frames - 1, 0)}${picture.time_s === null ? "" : `, ${picture.time_s.toFixed(4)} s`}
           <input type="range" min="0" max=${Math.max(picture.frames - 1, 0)} step="1" value=${index} onInput=${(e) => show(video, Number(e.target.value))} /></label>
-        <p id="pick-keys">Click or tap to add a mark, drag it to move it. Scroll, pinch, or press + and - to zoom. Arrow keys move the selected mark by 1 px, with Shift by 0.1 px; without
+        <p id="pick-keys">Choose what to pick. Click or tap to add a mark, drag it to move it. Scroll, pinch, or press + and - to zoom. Arrow keys move the selected mark by 1 px, with Shift by 0.1 px; without
           a selected mark they move the picture. Enter adds a mark in the middle. S moves the selected mark to the nearest dot, Delete removes it, D deselects it. 0 shows the whole picture, Ctrl+Z undoes, Ctrl+Y redoes.</p>
       </section>
       <section class="controls" aria-label="Marks">
@@ -377,4 +382,9 @@ export default function Pick({ link }) {
           <button type="button" disabled=${!points.length} onClick=${save}>Save ${points.length} points</button></div>
         ${saved}
       </section></div>`}`;
+}
+
+// The panel draws its pages with every frame of data, but nothing changes here then.
+export default function Pick({ link }) {
+  return useMemo(() => html`<${Picker} link=${link} />`, [link]);
 }

@@ -192,7 +192,7 @@ def _check_points(names: list[str], place: Floats, frame: Frame, path: Path) -> 
     """Refuse names that are used twice, and points outside the frame."""
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"Two points have the name {twice!r}. Rename one of them. {path}")
+        raise InputError(f"Two points have the same name, {twice!r}. Rename one of them. {path}")
     height, width = frame.shape
     last = np.array([width, height]) - 0.5
     outside = ~((place >= -0.5) & (place <= last)).all(axis=1)

@@ -302,6 +302,29 @@ def test_a_view_that_is_zoomed_and_moved_places_marks_where_they_are_seen(
     assert float(page.get_by_label("x, in px").input_value()) == pytest.approx(200, abs=pixel)
 
 
+def test_two_fingers_zoom_and_place_no_mark(browser: Browser, served: RunningPanel) -> None:
+    with browser.new_context(viewport={"width": 820, "height": 1180}, has_touch=True) as context:
+        page = context.new_page()
+        page.set_default_timeout(WAIT_MS)
+        page.goto(served.address)
+        picture = page.get_by_role("application")
+        expect(picture).to_be_visible(timeout=WAIT_MS)
+        picking = Picking(served.process, page)
+        x, y = picking.place(256, 256)
+        touch = context.new_cdp_session(page)
+        for kind, apart in (("touchStart", 40), ("touchMove", 60), ("touchMove", 80)):
+            fingers = [{"x": x - apart, "y": y, "id": 1}, {"x": x + apart, "y": y, "id": 2}]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        seen = page.locator(".frame svg").get_attribute("viewBox")
+        assert seen is not None
+        left, top, width, height = map(float, seen.split())
+        assert width == height == pytest.approx(CAMERA.width_px / 2)  # 80 to 160 px apart
+        assert left + width / 2 == pytest.approx(256, abs=CAMERA.width_px / 820)
+        assert top + height / 2 == pytest.approx(256, abs=CAMERA.width_px / 820)
+        assert picking.marks() == []
+
+
 def test_dots_of_a_region_become_points(picking: Picking, tmp_path: Path) -> None:
     page = picking.page
     page.get_by_role("button", name="Region", exact=True).click()

@@ -357,8 +357,8 @@ def _request(options: dict[str, Any]) -> _Request:
 )  # fmt: skip
 @answer_options(
     _OUTPUTS,
-    "It is a CSV file with the tracks, or with the points for --pick. Default: none, but with "
-    "--pick VIDEO-points.csv.",
+    "It is a CSV file with the tracks, and required. With --pick, it is a CSV file with the "
+    "points. Default with --pick: VIDEO-points.csv.",
     plot=True,
 )
 @unverified_option

@@ -48,6 +48,7 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--mass-kg": (None, "State the hung mass in kg."),
     "--method": (None, "Choose the method."),
     "--model": (None, "Choose the model."),
+    "--no-browser": (None, "Print the address only; open no browser."),
     "--out": (None, "Write the result to this path."),
     "--output": ("COLUMN", "Name the column of the output."),
     "--physical-model/--no-physical-model": (

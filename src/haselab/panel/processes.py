@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ import uvicorn
 
 from haselab.base import DeviceError
 from haselab.panel.files import PanelFiles
+from haselab.panel.page_server import Access, WebServer, listening
 from haselab.panel.web import WebSettings, application
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
@@ -26,15 +26,6 @@ __all__ = ["Panel", "running_panel"]
 
 _START_S = 60.0  # for the drivers of a bench
 _END_S = 10.0  # for the bench process to go to 0 V
-
-
-class _Server(uvicorn.Server):
-    """A web server that leaves signals to the panel, which must take the bench to 0 V."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Generator[None, None, None]:
-        """Change no signal handler."""
-        yield
 
 
 class Panel(NamedTuple):
@@ -110,33 +101,22 @@ def running_panel(files: PanelFiles, port: int = 0) -> Iterator[Panel]:
         folder = Path(
             opened.enter_context(tempfile.TemporaryDirectory(prefix="haselab-panel-", dir=place))
         )
-        listener = opened.enter_context(socket.socket())
-        try:
-            listener.bind(("127.0.0.1", port))
-            listener.listen(128)  # a browser that is early waits
-        except OSError as error:
-            raise DeviceError(
-                f"Port {port} cannot be used ({error.strerror}). Choose another one with "
-                "--page-port, or leave it out for a free one."
-            ) from None
-        own = listener.getsockname()[1]
-        hosts = (f"127.0.0.1:{own}", f"localhost:{own}")
+        listener = opened.enter_context(listening(port))
+        access = Access(listener.getsockname()[1])
         words = [str(files.rig), str(folder), str(files.runs)]
         words += [] if files.actuator is None else [str(files.actuator)]
         bench, key = _started(["haselab.panel.bench_process", *words], "bench process")
         opened.callback(_end, bench)
-        settings = WebSettings(folder, secrets.token_urlsafe(24), hosts, 0, files)
+        settings = WebSettings(folder, access, 0, files)
         real = [str(files.rig)] if isinstance(load_rig(files.rig), BenchConfig) else []
-        words = ["0", str(folder), key, ",".join(settings.origins), *real]
+        words = ["0", str(folder), key, ",".join(access.origins), *real]
         stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
         opened.callback(_end, stop)
         settings.stop_port = int(stop_port)
-        server = _Server(
+        server = WebServer(
             uvicorn.Config(
                 application(settings), log_level="warning", ws_max_size=65536, ws_ping_interval=5.0,
                 ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             )
         )  # fmt: skip
-        yield Panel(
-            f"http://127.0.0.1:{own}/?token={settings.token}", bench, stop, server, listener
-        )
+        yield Panel(access.address, bench, stop, server, listener)

@@ -7,12 +7,21 @@ from collections.abc import Callable, Mapping
 from haselab.base import JsonObject
 from haselab.panel.doctor import examine
 from haselab.panel.files import PanelFiles
+from haselab.panel.pick import PICK_REQUESTS, Videos
 from haselab.panel.recordings import analyse, compare, listed, note, report
 from haselab.panel.study_job import available, check
 
 __all__ = ["REQUESTS"]
 
-REQUESTS: Mapping[str, Callable[[PanelFiles, JsonObject], JsonObject]] = {
+_Request = Callable[[PanelFiles, JsonObject], JsonObject]
+
+
+def _on_videos(carry_out: Callable[[Videos, JsonObject], JsonObject]) -> _Request:
+    """A request of the page Pick, on the videos of the recordings."""
+    return lambda files, values: carry_out(Videos(files.runs), values)
+
+
+REQUESTS: Mapping[str, _Request] = {
     "studies": lambda files, values: available(files),
     "check-study": check,
     "recordings": listed,
@@ -21,5 +30,6 @@ REQUESTS: Mapping[str, Callable[[PanelFiles, JsonObject], JsonObject]] = {
     "analyse": analyse,
     "compare": compare,
     "doctor": lambda files, values: examine(files.rig),
+    **{name: _on_videos(carry_out) for name, carry_out in PICK_REQUESTS.items()},
 }
 """By name: called in a thread of the web server. A `HaselabError` becomes the page's message."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import json
 import math
 import secrets
@@ -18,6 +17,7 @@ import struct
 import time
 from collections.abc import Coroutine
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,31 +27,27 @@ from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from haselab.base import HaselabError, JsonObject, to_plain
+from haselab.base import HaselabError
 from haselab.panel.columns import SIGNALS, Columns, LiveReader
 from haselab.panel.files import PanelFiles
+from haselab.panel.page_server import NO_TOKEN, STATIC, Access, OnlyOwnPages, routes_of
 from haselab.panel.recordings import analyse_recorded
 from haselab.panel.requests import REQUESTS
 
 __all__ = ["SCHEMA", "WebSettings", "application"]
 
 SCHEMA = 1  # of a binary frame
-_STATIC = Path(__file__).parent / "static"
 _FRAME_S = 1.0 / 30.0
 _REPEAT_S = 0.3  # after which a frame is sent without new data, while the bench process answers
 _TOKEN_S = 3.0  # for the first message of a page
 _MOST_PAGES = 32
 _MOST_BYTES = 4096  # of a message of a page
-_MOST_BODY_BYTES = 1 << 20  # of a request
 _MOST_COLUMNS = 4000
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
 _HEAD = struct.Struct("<HHIddddII")
-_NO_TOKEN = "The token is missing or wrong. Open the address that haselab panel printed."
 
 
 @dataclass
@@ -60,65 +56,19 @@ class WebSettings:
 
     Args:
         folder: of the panel, with `live` and `bench.sock`.
-        token: that a page must send first.
-        hosts: values of Host that are accepted, such as `127.0.0.1:8000`.
+        access: who may connect.
         stop_port: of the stop process, for the page.
         files: that the panel was started with.
     """
 
     folder: Path
-    token: str
-    hosts: tuple[str, ...]
+    access: Access
     stop_port: int
     files: PanelFiles
 
-    @property
-    def origins(self) -> tuple[str, ...]:
-        """Values of Origin that are accepted."""
-        return tuple(f"http://{host}" for host in self.hosts)
-
-
-class _SamePage:
-    """Refuses requests with a foreign Host or Origin, and adds headers against embedding."""
-
-    def __init__(self, app: ASGIApp, settings: WebSettings) -> None:
-        self._app, self._settings = app, settings
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
-        headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
-        origin = headers.get("origin")
-        mine = headers.get("host") in self._settings.hosts
-        mine = mine and (origin is None or origin in self._settings.origins)
-        if scope["type"] == "websocket":
-            if not (mine and origin):
-                await send({"type": "websocket.close", "code": 1008})
-                return
-        elif not mine:
-            await Response("Only the panel's own page may use this server.", 403)(
-                scope, receive, send
-            )
-            return
-
-        async def with_headers(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                source = f"http://127.0.0.1:{self._settings.stop_port}"
-                policy = (
-                    f"default-src 'self'; connect-src 'self' {source} "
-                    f"{source.replace('127.0.0.1', 'localhost')}; img-src 'self' blob: data:; "
-                    "style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
-                )
-                message["headers"] += [
-                    (b"content-security-policy", policy.encode()),
-                    (b"x-content-type-options", b"nosniff"),
-                    (b"referrer-policy", b"no-referrer"),
-                    (b"cache-control", b"no-store"),
-                ]
-            await send(message)
-
-        await self._app(scope, receive, with_headers)
+    def stop_sources(self) -> str:
+        """Addresses of the stop process, which pages may request."""
+        return f"http://127.0.0.1:{self.stop_port} http://localhost:{self.stop_port}"
 
 
 class _Bench:
@@ -233,7 +183,7 @@ class _Server:
             task.cancel()
 
     async def page(self, request: Request) -> Response:
-        return FileResponse(_STATIC / "index.html")
+        return FileResponse(STATIC / "index.html")
 
     async def about(self, request: Request) -> Response:
         return JSONResponse(
@@ -242,37 +192,14 @@ class _Server:
 
     async def camera(self, request: Request) -> Response:
         """The last frame with its age, for a page with the token."""
-        if not self._is_known(request):
-            return Response(_NO_TOKEN, 403)
+        if not self._settings.access.is_known(request):
+            return Response(NO_TOKEN, 403)
         try:
             path = self._settings.folder / "camera.jpg"
             age_s = max(time.time() - path.stat().st_mtime, 0.0)
             return Response(path.read_bytes(), 200, {"x-age-s": f"{age_s:.3f}"}, "image/jpeg")
         except OSError:
             return Response(None, 204)  # no picture yet
-
-    async def request(self, request: Request) -> Response:
-        """Carry out one of `REQUESTS` in a thread and answer in JSON."""
-        if not self._is_known(request):
-            return JSONResponse({"error": _NO_TOKEN}, 403)
-        carry_out = REQUESTS.get(request.path_params["name"])
-        if carry_out is None:
-            return JSONResponse({"error": "There is no such request."}, 404)
-        try:
-            values = await _body(request)
-        except ValueError:
-            return JSONResponse({"error": "The request must hold one small JSON object."}, 400)
-        try:
-            answer = await run_in_threadpool(carry_out, self._settings.files, values)
-        except HaselabError as error:
-            return JSONResponse({"error": str(error)}, 422)
-        return JSONResponse(to_plain(answer))
-
-    def _is_known(self, request: Request) -> bool:
-        return self._is_token(request.headers.get("x-panel-token", ""))
-
-    def _is_token(self, text: str) -> bool:
-        return hmac.compare_digest(text.encode(), self._settings.token.encode())
 
     async def live(self, socket: WebSocket) -> None:
         if len(self._pages) >= _MOST_PAGES:
@@ -302,7 +229,7 @@ class _Server:
             token = json.loads(text)["token"]
         except (TimeoutError, ValueError, KeyError, TypeError):
             return False
-        return isinstance(token, str) and self._is_token(token)
+        return isinstance(token, str) and self._settings.access.is_token(token)
 
     async def _messages(self, page: _Page) -> None:
         """Receive what a page sends: acknowledged frames, its view, commands."""
@@ -402,25 +329,6 @@ class _Server:
         return b"".join((head, text, *arrays))
 
 
-async def _body(request: Request) -> JsonObject:
-    """The JSON object of a request.
-
-    Raises:
-        ValueError: It is too long, of another type, or no JSON object.
-    """
-    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-        raise ValueError
-    data = bytearray()
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > _MOST_BODY_BYTES:
-            raise ValueError
-    values = json.loads(data)
-    if not isinstance(values, dict):
-        raise ValueError
-    return values
-
-
 def application(settings: WebSettings) -> Starlette:
     """Make the web application.
 
@@ -434,9 +342,10 @@ def application(settings: WebSettings) -> Starlette:
         Route("/", server.page),
         Route("/about", server.about),
         Route("/camera", server.camera),
-        Route("/request/{name}", server.request, methods=["POST"]),
         WebSocketRoute("/live", server.live),
-        Mount("/static", StaticFiles(directory=_STATIC)),
+        *routes_of(
+            settings.access, {name: partial(do, settings.files) for name, do in REQUESTS.items()}
+        ),
     ]
-    guard = Middleware(_SamePage, settings=settings)
+    guard = Middleware(OnlyOwnPages, access=settings.access, sources=settings.stop_sources)
     return Starlette(routes=routes, middleware=[guard], lifespan=server.lifespan)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 import tempfile
 import threading
 import webbrowser
 from pathlib import Path
-from types import FrameType
 
 import click
 
 from haselab.base import DeviceError
 from haselab.cli.options import shared_option
 from haselab.panel.files import PanelFiles
+from haselab.panel.page_server import serve
 from haselab.panel.processes import Panel, running_panel
 from haselab.store.folder import write_new
 
@@ -37,7 +36,7 @@ __all__ = ["command"]
     "--page-port", type=click.IntRange(0, 65535), default=0, show_default=True,
     help="Set the TCP port of the page. 0 uses a free one.",
 )  # fmt: skip
-@click.option("--no-browser", is_flag=True, help="Print the address only; open no browser.")
+@shared_option("--no-browser", is_flag=True)
 def command(
     rig: Path | None, actuator: Path | None, runs: Path, page_port: int, no_browser: bool
 ) -> None:
@@ -76,19 +75,11 @@ def _serve(panel: Panel) -> None:
                     lost.append(name)
                     panel.server.should_exit = True
 
-    def end(number: int, frame: FrameType | None) -> None:
-        panel.server.should_exit = True
-
     watcher = threading.Thread(target=watch, daemon=True)
-    with contextlib.ExitStack() as restored:
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-            if hasattr(signal, name):
-                number = getattr(signal, name)
-                restored.callback(signal.signal, number, signal.signal(number, end))
-        watcher.start()
-        panel.server.run([panel.listener])
-        panel.server.should_exit = True
-        watcher.join()
+    watcher.start()
+    serve(panel.server, panel.listener)
+    panel.server.should_exit = True
+    watcher.join()
     if lost:
         raise DeviceError(
             f"The {lost[0]} has ended, so the panel ends too. Check that the bench is at 0 V, then "

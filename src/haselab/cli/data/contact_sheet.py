@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from haselab.base import DeviceError
-from haselab.cli.data.grey_range import grey_range
+from haselab.store.video.grey_range import grey_range
 from haselab.tracking import FrameTracks
 from haselab.tracking.options import Floats, Frame
 

@@ -24,9 +24,10 @@ from haselab.cli.common import (
 )
 from haselab.cli.data.track_chart import track_chart
 from haselab.cli.data.track_link import link_clip
+from haselab.cli.data.track_pick import save_picked
 from haselab.cli.data.track_pictures import overlay_to
 from haselab.cli.options import shared_option
-from haselab.cli.output import OutputRule
+from haselab.cli.output import OutputKind, OutputRule
 from haselab.cli.plot import save_plot
 from haselab.pipelines.prefetch import map_in_order
 from haselab.pipelines.tracking.gauge import gauge_of, strain_answer
@@ -73,10 +74,17 @@ _TURN_S = 0.5e-3
 
 def _beside(options: Mapping[str, Any]) -> tuple[str, ...]:
     """Endings of the files beside the table; a lens only if one is calibrated."""
+    if options["pick"]:
+        return ()
     return ("-strain.csv", "-lens.json") if options["lens_board"] else ("-strain.csv",)
 
 
-_OUTPUTS = OutputRule(options=("overlay", "report"), beside=_beside)
+def _kind(options: Mapping[str, Any]) -> OutputKind:
+    """A table of tracks is created at once; a table of picked points when it is saved."""
+    return "late" if options["pick"] else "file"
+
+
+_OUTPUTS = OutputRule(kind=_kind, options=("overlay", "report"), beside=_beside)
 
 
 @dataclass(frozen=True)
@@ -270,6 +278,12 @@ def _request(options: dict[str, Any]) -> _Request:
     "them, as with --auto.",
 )  # fmt: skip
 @click.option("--auto", is_flag=True, help="Find the points automatically.")
+@click.option(
+    "--pick",
+    is_flag=True,
+    help="Choose the points on a page in the browser, and save them only.",
+)
+@shared_option("--no-browser", is_flag=True)
 @click.option("--count", type=click.IntRange(1), default=300, show_default=True,
     help="Find at most this many particles.",
 )  # fmt: skip
@@ -341,11 +355,18 @@ def _request(options: dict[str, Any]) -> _Request:
     "--report", type=click.Path(path_type=Path), metavar="FILE.html",
     help="Write a page about the tracks. Default: none.",
 )  # fmt: skip
-@answer_options(_OUTPUTS, "It is a CSV file with the tracks.  [required]", plot=True)
+@answer_options(
+    _OUTPUTS,
+    "It is a CSV file with the tracks, and required. With --pick, it is a CSV file with the "
+    "points. Default with --pick: VIDEO-points.csv.",
+    plot=True,
+)
 @unverified_option
 def command(
     video: Path,
     auto: bool,
+    pick: bool,
+    no_browser: bool,
     link: bool,
     unverified: bool,
     as_json: bool,
@@ -357,8 +378,14 @@ def command(
 
     VIDEO is any file that FFmpeg reads, a folder of images, a TIFF stack, .cine or .mraw. The
     strain is computed from the points named upper* and lower*. With --auto these are the two rows
-    of three dots on the clamps, or three particles near each end.
+    of three dots on the clamps, or three particles near each end. With --pick, a page on this
+    computer shows the video; the command ends when the points are saved.
     """
+    if pick:
+        save_picked(video, out, no_browser=no_browser, as_json=as_json)
+        return
+    if no_browser:
+        raise click.UsageError("--no-browser needs --pick.")
     if out is None:
         raise click.UsageError("Missing option '--out': the CSV file for the tracks.")
     request = _request(options)

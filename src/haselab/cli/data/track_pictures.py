@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError
-from haselab.cli.data.grey_range import grey_range
+from haselab.store.video.grey_range import grey_range
 from haselab.tracking import FrameTracks
 from haselab.tracking.options import Floats, Frame
 

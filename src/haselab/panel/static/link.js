@@ -1,9 +1,12 @@
 // The connection to the web server: frames in, commands out. It watches the age of the data.
+import { Requests } from "/static/requests.js";
+
 const SCHEMA = 1;
 const SILENT_MS = 900; // without a frame the connection is opened again
 
-export class Link {
+export class Link extends Requests {
   constructor(onFrame, onChange) {
+    super();
     this.onFrame = onFrame;
     this.onChange = onChange;
     this.view = { span_s: 10, end_s: null, columns: 600 };
@@ -13,9 +16,6 @@ export class Link {
     this.blockAge = 0; // when the last frame was sent, in s
     this.waiting = new Map();
     this.number = 0;
-    this.token = new URLSearchParams(location.search).get("token") || sessionStorage.getItem("token") || "";
-    sessionStorage.setItem("token", this.token);
-    history.replaceState(null, "", location.pathname); // the token does not stay in the address
     this.open();
     setInterval(() => this.watch(), 100);
     document.addEventListener("visibilitychange", () => this.watch());
@@ -119,18 +119,5 @@ export class Link {
     const id = this.number;
     this.send({ id, do: what, values });
     return new Promise((resolve) => this.waiting.set(id, resolve));
-  }
-
-  // An answer by HTTP, for what does not concern the bench itself.
-  async request(name, values = {}) {
-    try {
-      const answer = await fetch(`/request/${name}`, {
-        method: "POST", body: JSON.stringify(values),
-        headers: { "Content-Type": "application/json", "X-Panel-Token": this.token },
-      });
-      return await answer.json();
-    } catch {
-      return { error: "The web server of the panel does not answer. Read the messages in the terminal of haselab panel." };
-    }
   }
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,6 +35,7 @@ __all__ = [
     "choose_tracker",
     "find_points",
     "name_gauge",
+    "points_table",
     "read_points",
     "without_gauge",
 ]
@@ -150,13 +152,47 @@ def read_points(path: Path, frame: Frame) -> Points:
             f"A position in the table of points is not a number ({error}). Change it. {path}"
         ) from None
     names = [row["point"] for row in rows]
-    if len(set(names)) < len(names):
-        raise InputError(f"Two points in the table have the same name. Rename one of them. {path}")
-    _check_on_picture(names, place, frame, path)
+    _check_points(names, place, frame, path)
     return Points(names, place, _SUBSET_PX[0])
 
 
-def _check_on_picture(names: list[str], place: Floats, frame: Frame, path: Path) -> None:
+def points_table(points: Points, frame: Frame, path: Path) -> str:
+    """Make the table that `read_points` reads, to 0.001 px.
+
+    Args:
+        points: to be tracked.
+        frame: the first frame, which must contain all points.
+        path: where the table will be, for messages.
+
+    Returns:
+        CSV with the columns `point`, `x_px`, `y_px`.
+
+    Raises:
+        InputError: there is no point, a name is empty, used twice or not printable, or a point is
+            outside the frame or cannot be tracked.
+    """
+    if not points.names:
+        raise InputError("There is no point to save. Pick at least one point.")
+    for name in points.names:
+        if not name.strip() or not name.isprintable():
+            raise InputError(
+                f"A point has the name {name!r}. Give it a name of printable characters."
+            )
+    _check_points(points.names, points.place_px, frame, path)
+    PointTracker(points.place_px, TrackOptions(subset_px=points.subset_px)).init([frame])
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["point", "x_px", "y_px"])
+    for name, (x, y) in zip(points.names, points.place_px.tolist(), strict=True):
+        table.writerow([name, f"{x:.3f}", f"{y:.3f}"])
+    return text.getvalue()
+
+
+def _check_points(names: list[str], place: Floats, frame: Frame, path: Path) -> None:
+    """Refuse names that are used twice, and points outside the frame."""
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"Two points have the same name, {twice!r}. Rename one of them. {path}")
     height, width = frame.shape
     last = np.array([width, height]) - 0.5
     outside = ~((place >= -0.5) & (place <= last)).all(axis=1)

@@ -146,24 +146,25 @@ class CineReader(VideoReader):
 
     def timed(self) -> Iterator[tuple[float, Frame]]:
         """Time in s from the first frame, and the frame."""
-        layout = self._layout
+        return map(self._at, range(self._layout.count))
+
+    def _at(self, index: int) -> tuple[float, Frame]:
+        layout, offset = self._layout, self._offsets[index]
         pixels = layout.width * abs(layout.height)
         kind = np.dtype("<u2" if layout.bits == 16 else "u1")
-        word = struct.Struct("<I")
-        for index, offset in enumerate(self._offsets):
-            annotation = _unpack(self._file, offset, word, self.path)[0]
-            self._file.seek(offset + annotation)
-            raw = self._file.read(pixels * kind.itemsize)
-            if len(raw) < pixels * kind.itemsize:
-                raise broken(
-                    f"The .cine file ends within frame {index} of {layout.count}",
-                    "It is truncated. Copy it again.",
-                    self.path,
-                )
-            image = np.frombuffer(raw, kind).reshape(abs(layout.height), layout.width)
-            if layout.height > 0:  # a bitmap of positive height is stored from the bottom up
-                image = image[::-1]
-            yield self._times_s[index], np.ascontiguousarray(image)
+        annotation = _unpack(self._file, offset, struct.Struct("<I"), self.path)[0]
+        self._file.seek(offset + annotation)
+        raw = self._file.read(pixels * kind.itemsize)
+        if len(raw) < pixels * kind.itemsize:
+            raise broken(
+                f"The .cine file ends within frame {index} of {layout.count}",
+                "It is truncated. Copy it again.",
+                self.path,
+            )
+        image = np.frombuffer(raw, kind).reshape(abs(layout.height), layout.width)
+        if layout.height > 0:  # a bitmap of positive height is stored from the bottom up
+            image = image[::-1]
+        return self._times_s[index], np.ascontiguousarray(image)
 
     def close(self) -> None:
         """Close the file."""

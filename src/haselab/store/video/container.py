@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections.abc import Iterator
-from functools import cached_property
+from functools import lru_cache
 from pathlib import Path
 
 import av
@@ -36,6 +36,7 @@ _LOSSLESS = frozenset(
 )
 # with loss or without, and the stream does not say
 _EITHER = frozenset(("jpeg2000", "jpegls", "vp9", "av1", "webp", "jpegxl", "dirac", "cfhd"))
+_STORE_STAMPS = ("matroska,webm", "mov,mp4,m4a,3gp,3g2,mj2")
 _X264_LOSSLESS = re.compile(rb"x264 - core.{0,2000}?(?<![a-z_])(qp|crf)=0(\.0+)?[\s\0]", re.DOTALL)
 _COPY_AGAIN = "It is truncated or damaged. Copy it again."
 # Luma among other things in plane 0: first item and stride, in items of a sample.
@@ -95,10 +96,14 @@ class ContainerReader(VideoReader):
             )
         self._times_s = read_times(path.with_suffix(".csv"))
 
-    @cached_property
+    @property
+    def _stamps(self) -> tuple[int | None, ...]:
+        """Time stamps of all frames, in the order of the file."""
+        return _packet_stamps(self.path, self.path.stat().st_mtime_ns)
+
+    @property
     def _packets(self) -> int:
-        with _opened(self.path) as container:
-            return sum(packet.size > 0 for packet in container.demux(video=0))
+        return len(self._stamps)
 
     @property
     def frame_count(self) -> int:
@@ -128,6 +133,26 @@ class ContainerReader(VideoReader):
         """Time in s from the first frame, and the frame; decoded by all cores."""
         return alike(self._decoded(), self.path)
 
+    def _at(self, index: int) -> tuple[float, Frame]:
+        """A frame by its time stamp, from the key frame before it; else after all before it."""
+        stamps = sorted(stamp for stamp in self._stamps if stamp is not None)
+        if index == 0 or len(set(stamps)) < self._packets:
+            return super()._at(index)
+        with _opened(self.path) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            try:
+                container.seek(stamps[index], stream=stream)
+                for picture in container.decode(video=0):
+                    if picture.pts == stamps[index]:
+                        first_s = float(stamps[0] * (picture.time_base or 0))
+                        return self._time_s(index, picture, first_s), _luma(picture).copy()
+                    if picture.pts is None or picture.pts > stamps[index]:
+                        break
+            except av.error.FFmpegError:  # reported where the frames before it are read
+                pass
+        return super()._at(index)
+
     def _decoded(self) -> Iterator[tuple[float, Frame]]:
         count, first_s = 0, 0.0
         with _opened(self.path) as container:
@@ -150,6 +175,23 @@ class ContainerReader(VideoReader):
                 _COPY_AGAIN,
                 self.path,
             )
+
+
+@lru_cache(maxsize=4)
+def _packet_stamps(path: Path, modified_ns: int) -> tuple[int | None, ...]:
+    """Time stamps of all packets with a frame, without decoding them.
+
+    They are None where the container does not store them and the order of the frames is not that
+    of the packets.
+    """
+    with _opened(path) as container:
+        packets = [
+            (packet.pts, packet.is_keyframe)
+            for packet in container.demux(video=0)
+            if packet.size > 0
+        ]
+        stored = container.format.name in _STORE_STAMPS or all(key for _, key in packets)
+        return tuple(pts if stored else None for pts, _ in packets)
 
 
 def _frames_by_duration(container: av.container.InputContainer, rate: float | None) -> int:

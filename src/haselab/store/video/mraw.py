@@ -142,9 +142,16 @@ class MrawReader(VideoReader):
 
     def timed(self) -> Iterator[tuple[float, Frame]]:
         """Time in s from the first frame, and the frame."""
+        return self._from(0)
+
+    def _at(self, index: int) -> tuple[float, Frame]:
+        return next(self._from(index))
+
+    def _from(self, first: int) -> Iterator[tuple[float, Frame]]:
         shape = (self._header.height, self._header.width)
         with self.path.open("rb") as file:
-            for index in range(self._header.count):
+            file.seek(first * self._frame_bytes)
+            for index in range(first, self._header.count):
                 raw = file.read(self._frame_bytes)
                 if len(raw) < self._frame_bytes:
                     raise self._truncated()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,33 @@ class VideoReader(Closing, ABC):
     def __iter__(self) -> Iterator[Frame]:
         for _, frame in self.timed():
             yield frame
+
+    def frame(self, index: int) -> tuple[float, Frame]:
+        """One frame, without those before it where the format permits that.
+
+        Args:
+            index: of the frame in the file, from 0.
+
+        Returns:
+            Time in s from the first frame (NaN when unknown), and the frame.
+
+        Raises:
+            InputError: there is no such frame, or it cannot be read.
+        """
+        if not 0 <= index < self.frame_count:
+            raise broken(
+                f"Frame {index} does not exist: the video has {self.frame_count} frames, numbered "
+                "from 0",
+                "Use another one.",
+                self.path,
+            )
+        return self._at(index)
+
+    def _at(self, index: int) -> tuple[float, Frame]:
+        """A frame that should exist; read after all before it."""
+        for found in islice(self.timed(), index, None):
+            return found
+        raise broken(f"The video ends before frame {index}", "Copy it again.", self.path)
 
     def time_s(self, index: int) -> float:
         """Time of a frame at the constant rate, in s; NaN when the rate is not known."""

@@ -92,6 +92,7 @@ class _Run:
         self.count, *shape = series.shape
         self.shape = tuple(shape)
         self.kind = np.dtype(byte_order + series.dtype.char)
+        self.frame_bytes = math.prod(self.shape) * self.kind.itemsize
 
 
 def _run(file: tifffile.TiffFile) -> _Run | None:
@@ -149,21 +150,28 @@ class TiffReader(VideoReader):
 
     def timed(self) -> Iterator[tuple[float, Frame]]:
         """NaN (a TIFF file has no rate), and the page."""
-        frames = self._pages() if self._run is None else self._read_run(self._run)
-        return alike(((self.time_s(index), frame) for index, frame in enumerate(frames)), self.path)
+        return alike(
+            ((self.time_s(index), frame) for index, frame in enumerate(self._from(0))), self.path
+        )
 
-    def _read_run(self, run: _Run) -> Iterator[Frame]:
+    def _at(self, index: int) -> tuple[float, Frame]:
+        return self.time_s(index), next(self._from(index))
+
+    def _from(self, first: int) -> Iterator[Frame]:
+        return self._pages(first) if self._run is None else self._read_run(self._run, first)
+
+    def _read_run(self, run: _Run, first: int) -> Iterator[Frame]:
         with self.path.open("rb", buffering=0) as file:
-            file.seek(run.at)
-            for index in range(run.count):
+            file.seek(run.at + first * run.frame_bytes)
+            for index in range(first, run.count):
                 image = np.empty(run.shape, run.kind)
                 got = _fill(file, image)
                 if got < image.nbytes:
                     raise self._short(index, "the file ends there")
                 yield image if run.kind.isnative else image.astype(run.kind.newbyteorder("="))
 
-    def _pages(self) -> Iterator[Frame]:
-        for index in range(self.frame_count):
+    def _pages(self, first: int) -> Iterator[Frame]:
+        for index in range(first, self.frame_count):
             try:
                 page = self._file.pages[index]
                 _check_size(page.keyframe, self.path)
@@ -295,6 +303,16 @@ class FolderReader(VideoReader):
         """Time in s by `times.csv`, NaN without it, and the image."""
         return alike(self._images(), self.path)
 
+    def _at(self, index: int) -> tuple[float, Frame]:
+        return self._stated_s(index), _read_still(self._files[index])
+
+    def _stated_s(self, index: int) -> float:
+        """Time of an image by the table: of all recorded frames, or of the images that are left."""
+        whole = len(self._times_s) > self._numbers[-1]
+        row = self._numbers[index] if whole else index
+        known = row < len(self._times_s)
+        return self._times_s[row] - self._times_s[0] if known else self.time_s(index)
+
     def _images(self) -> Iterator[tuple[float, Frame]]:
         waiting: deque[Future[Frame]] = deque()
         left = iter(self._files)
@@ -303,12 +321,7 @@ class FolderReader(VideoReader):
                 for index in range(len(self._files)):
                     more = islice(left, 2 * _READERS - len(waiting))
                     waiting.extend(pool.submit(_read_still, file) for file in more)
-                    # a table of all recorded frames, or of the images that are left
-                    whole = len(self._times_s) > self._numbers[-1]
-                    row = self._numbers[index] if whole else index
-                    known = row < len(self._times_s)
-                    now = self._times_s[row] - self._times_s[0] if known else self.time_s(index)
-                    yield now, waiting.popleft().result()
+                    yield self._stated_s(index), waiting.popleft().result()
             finally:
                 for job in waiting:
                     job.cancel()

@@ -19,6 +19,7 @@ __all__ = [
     "DotProfile",
     "Particles",
     "Polarity",
+    "detect_dot_near",
     "detect_fiducials",
     "detect_particles",
     "find_profile",
@@ -38,6 +39,7 @@ _LEAST_ROUND = 0.5  # ratio of the two curvatures of a dot at its own scale
 _LEAST_COMPACT = 0.3  # the same for a particle, which may touch another; an edge has 0.1
 _SAME_SIZE = 0.6
 _NEIGHBOURS = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
+_AROUND_PX = 48  # seen around a place: to 4.5 standard deviations of a dot of 10 px
 _EVEN = 0.2  # largest unevenness around a fiducial, relative to its depth
 
 
@@ -406,3 +408,51 @@ def detect_fiducials(
         f"Found {len(order)} significant {polarity} dots, but not {count} of similar size and "
         "contrast. Give the points manually, or check focus and light."
     )
+
+
+def detect_dot_near(
+    image: NDArray[np.generic],
+    place_px: Floats,
+    *,
+    reach_px: float,
+    least_sigma_px: float,
+    polarity: Polarity = "dark",
+) -> Floats | None:
+    """Detect the large round dot nearest to a place, as `detect_fiducials` does.
+
+    Args:
+        image: grey levels. Shape `(H, W)`.
+        place_px: `[x, y]`, in px.
+        reach_px: largest distance of the dot's centre from the place, in px.
+        least_sigma_px: smallest standard deviation of the dot's profile, in px.
+        polarity: `"dark"` or `"bright"` dots.
+
+    Returns:
+        Its centre `[x, y]`, in px; `None`: there is none.
+
+    Raises:
+        InputError: not an image, or an unknown polarity.
+
+    Source: Lindeberg 1998 (scale selection by the normalised Laplacian).
+
+    Example:
+        >>> y, x = np.mgrid[:120, :120]
+        >>> image = 200 - 90 * np.exp(-((x - 60.3) ** 2 + (y - 49.8) ** 2) / (2 * 5.0**2))
+        >>> place = np.array([66.0, 46.0])
+        >>> detect_dot_near(image, place, reach_px=12, least_sigma_px=3).round(1).tolist()
+        [60.3, 49.8]
+    """
+    _check_image(image, polarity)
+    around = round(reach_px) + _AROUND_PX
+    low = np.maximum(np.rint(place_px).astype(int) - around, 0)
+    high = np.rint(place_px).astype(int) + around + 1
+    part = image[low[1] : max(high[1], 0), low[0] : max(high[0], 0)].astype(float)
+    if min(part.shape) < 16:
+        return None
+    points, sigmas, strengths = _candidates(part, polarity)
+    good = _is_isolated(part, points, sigmas, strengths) & (sigmas >= least_sigma_px)
+    away = np.linalg.norm(points + low - place_px, axis=1)
+    good &= away <= reach_px
+    if not good.any():
+        return None
+    return np.asarray(points[np.argmin(np.where(good, away, np.inf))] + low)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from haselab.tracking.options import Frame
+from haselab.store.video.reader import Frame
 
 __all__ = ["grey_range"]
 

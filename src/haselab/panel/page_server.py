@@ -1,0 +1,246 @@
+"""What the web servers of the panel share: who may connect, requests in JSON, and serving."""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import json
+import secrets
+import signal
+import socket
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import uvicorn
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from haselab.base import DeviceError, HaselabError, JsonObject, to_plain
+
+__all__ = [
+    "NO_TOKEN",
+    "STATIC",
+    "Access",
+    "OnlyOwnPages",
+    "Requests",
+    "WebServer",
+    "listening",
+    "routes_of",
+    "serve",
+]
+
+STATIC = Path(__file__).parent / "static"
+NO_TOKEN = "The token is missing or wrong. Open the address that haselab printed."
+_MOST_BODY_BYTES = 1 << 20  # of a request
+
+Requests = Mapping[str, Callable[[JsonObject], JsonObject]]
+"""By name: called in a thread of the web server. A `HaselabError` becomes the page's message."""
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may use a web server.
+
+    Args:
+        port: of the server on the loopback address.
+        token: that a page must send.
+    """
+
+    port: int
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+
+    @property
+    def address(self) -> str:
+        """Address for the browser, with the token."""
+        return f"http://127.0.0.1:{self.port}/?token={self.token}"
+
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """Values of Host that are accepted."""
+        return f"127.0.0.1:{self.port}", f"localhost:{self.port}"
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        """Values of Origin that are accepted."""
+        return tuple(f"http://{host}" for host in self.hosts)
+
+    def is_token(self, text: str) -> bool:
+        """Whether a page knows the token."""
+        return hmac.compare_digest(text.encode(), self.token.encode())
+
+    def is_known(self, request: Request) -> bool:
+        """Whether a request has the token."""
+        return self.is_token(request.headers.get("x-panel-token", ""))
+
+
+class OnlyOwnPages:
+    """Refuses requests with a foreign Host or Origin, and adds headers against embedding.
+
+    Args:
+        app: the application.
+        access: to it.
+        sources: addresses of other servers that its pages may request.
+    """
+
+    def __init__(
+        self, app: ASGIApp, access: Access, sources: Callable[[], str] = lambda: ""
+    ) -> None:
+        self._app, self._access, self._sources = app, access, sources
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
+        origin = headers.get("origin")
+        mine = headers.get("host") in self._access.hosts
+        mine = mine and (origin is None or origin in self._access.origins)
+        if scope["type"] == "websocket":
+            if not (mine and origin):
+                await send({"type": "websocket.close", "code": 1008})
+                return
+        elif not mine:
+            await Response("Only the panel's own page may use this server.", 403)(
+                scope, receive, send
+            )
+            return
+
+        async def with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                policy = (
+                    f"default-src 'self'; connect-src 'self' {self._sources()}; "
+                    "img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
+                    "frame-ancestors 'none'"
+                )
+                message["headers"] += [
+                    (b"content-security-policy", policy.encode()),
+                    (b"x-content-type-options", b"nosniff"),
+                    (b"referrer-policy", b"no-referrer"),
+                    (b"cache-control", b"no-store"),
+                ]
+            await send(message)
+
+        await self._app(scope, receive, with_headers)
+
+
+async def _body(request: Request) -> JsonObject:
+    """The JSON object of a request.
+
+    Raises:
+        ValueError: It is too long, of another type, or no JSON object.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        raise ValueError
+    data = bytearray()
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > _MOST_BODY_BYTES:
+            raise ValueError
+    try:
+        values = json.loads(data)
+    except RecursionError:
+        raise ValueError from None
+    if not isinstance(values, dict):
+        raise ValueError
+    return values
+
+
+def routes_of(
+    access: Access, requests: Requests, after: Callable[[str], None] = lambda name: None
+) -> list[BaseRoute]:
+    """Make the routes of the static files and of requests.
+
+    Args:
+        access: to the server.
+        requests: that are carried out in a thread and answered in JSON.
+        after: called with the name of a request that succeeded, once it has been answered.
+    Returns:
+        For Starlette.
+    """
+
+    async def answer(request: Request) -> Response:
+        if not access.is_known(request):
+            return JSONResponse({"error": NO_TOKEN}, 403)
+        name = request.path_params["name"]
+        carry_out = requests.get(name)
+        if carry_out is None:
+            return JSONResponse({"error": "There is no such request."}, 404)
+        try:
+            values = await _body(request)
+        except ValueError:
+            return JSONResponse({"error": "The request must hold one small JSON object."}, 400)
+        try:
+            found = await run_in_threadpool(carry_out, values)
+        except HaselabError as error:
+            return JSONResponse({"error": str(error)}, 422)
+        return JSONResponse(to_plain(found), background=BackgroundTask(after, name))
+
+    return [
+        Route("/request/{name}", answer, methods=["POST"]),
+        Mount("/static", StaticFiles(directory=STATIC)),
+    ]
+
+
+class WebServer(uvicorn.Server):
+    """A web server that leaves signals to its command."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Generator[None, None, None]:
+        """Change no signal handler."""
+        yield
+
+
+@contextlib.contextmanager
+def listening(port: int) -> Iterator[socket.socket]:
+    """Listen on the loopback address.
+
+    Args:
+        port: TCP port; 0: a free one.
+    Yields:
+        The socket of a web server.
+    Raises:
+        DeviceError: the port is in use.
+    """
+    with socket.socket() as listener:
+        try:
+            listener.bind(("127.0.0.1", port))
+            listener.listen(128)  # a browser that is early waits
+        except OSError as error:
+            raise DeviceError(
+                f"Port {port} cannot be used ({error.strerror}). Choose another one with "
+                "--page-port, or leave it out for a free one."
+            ) from None
+        yield listener
+
+
+def serve(server: uvicorn.Server, listener: socket.socket) -> int:
+    """Serve until the server should exit, or until Ctrl-C, SIGTERM or a closed terminal.
+
+    Args:
+        server: to run.
+        listener: its socket.
+    Returns:
+        Number of the signal; 0: there was none.
+    """
+    received: list[int] = []
+
+    def end(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        server.should_exit = True
+
+    with contextlib.ExitStack() as restored:
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                number = getattr(signal, name)
+                restored.callback(signal.signal, number, signal.signal(number, end))
+        server.run([listener])
+    return received[0] if received else 0

@@ -1,0 +1,20 @@
+// The token of this page, and answers by HTTP.
+export class Requests {
+  constructor() {
+    this.token = new URLSearchParams(location.search).get("token") || sessionStorage.getItem("token") || "";
+    sessionStorage.setItem("token", this.token);
+    history.replaceState(null, "", location.pathname); // the token does not stay in the address
+  }
+
+  async request(name, values = {}) {
+    try {
+      const answer = await fetch(`/request/${name}`, {
+        method: "POST", body: JSON.stringify(values),
+        headers: { "Content-Type": "application/json", "X-Panel-Token": this.token },
+      });
+      return await answer.json();
+    } catch {
+      return { error: "The web server does not answer. Read the messages in the terminal of haselab." };
+    }
+  }
+}

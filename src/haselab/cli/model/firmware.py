@@ -10,8 +10,9 @@ from typing import Any, Literal
 import click
 
 from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
+from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.common import REAL, SEED, answer_options, emit
-from haselab.cli.model.stated_margins import controller_doubt, model_doubt, warn_doubts
+from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
@@ -20,6 +21,7 @@ from haselab.control.reach import default_step
 from haselab.controllers import known_actuator
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
+from haselab.pipelines.design.stated_margins import controller_doubt, model_doubt
 from haselab.rig.chip import (
     ChipDesign,
     ChipFile,
@@ -115,6 +117,7 @@ def build(
     RUN is an actuator file or the folder of a run, with the maps, limits and gains to compile in.
     `haselab firmware simulate` measures how much stack and processor time the firmware uses.
     """
+    warn_misspelled_in(run)
     for doubt in (model_doubt(run), controller_doubt(run, structure)):
         if doubt:
             raise InputError(doubt)

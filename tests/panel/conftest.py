@@ -1,11 +1,26 @@
-"""Panels on the twin, and an actuator file with a loop."""
+"""Panels on the twin, a browser, and an actuator file with a loop."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser, sync_playwright
 
 from tests.panel.running import RunningPanel, ended, started
+
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
+
+
+@pytest.fixture(scope="module")
+def browser(installed: Callable[[str, str], str]) -> Iterator[Browser]:
+    """The distribution's Chromium."""
+    path = installed("chromium", "chromium")
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        try:
+            yield found
+        finally:
+            found.close()
 
 
 @pytest.fixture

@@ -5,29 +5,17 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
 from tests.panel.running import WAIT_S, RunningPanel
 
 STATIC = Path(__file__).parents[2] / "src" / "haselab" / "panel" / "static"
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
 WAIT_MS = 1e3 * WAIT_S
-
-
-@pytest.fixture(scope="module")
-def browser(installed: Callable[[str, str], str]) -> Iterator[Browser]:
-    path = installed("chromium", "chromium")
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        try:
-            yield found
-        finally:
-            found.close()
 
 
 @pytest.fixture

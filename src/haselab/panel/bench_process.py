@@ -34,6 +34,7 @@ from haselab.panel.live_bench import LiveBench
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig, opened_rig
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.scheduling import with_priority
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
@@ -132,6 +133,19 @@ def _opened(file: RigFile, path: Path, folder: Path) -> Iterator[tuple[Rig, Safe
         yield rig, safety
 
 
+def _loop_of(path: Path | None) -> LoopSettings | None:
+    """The loop of an actuator file; None without one, or if a map or the controller is missing.
+
+    Raises:
+        InputError: The file is not valid.
+    """
+    if path is None:
+        return None
+    found = Actuator.load(path)
+    known = (found.voltage_map, found.strain_map, found.controller)
+    return None if None in known else found.loop()
+
+
 def _run(bench: LiveBench, block_s: float, *, paced: bool, ended: threading.Event) -> None:
     next_s = time.monotonic()
     with with_priority():
@@ -163,7 +177,8 @@ def main(words: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the panel ends this process by its stdin
     threading.Thread(target=_watch_stdin, args=(ended,), daemon=True).start()
     try:
-        loop = Actuator.load(words[2]).loop() if len(words) > 2 else None
+        actuator = Path(words[2]) if len(words) > 2 else None
+        _loop_of(actuator)  # a file that is not valid is refused before the bench is opened
         file = load_rig(path)
         with _opened(file, path, folder) as (rig, safety):
             about = rig.description
@@ -173,7 +188,9 @@ def main(words: list[str]) -> int:
             )
             live = folder / "live"
             with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
-                bench = LiveBench(guard(rig, safety), writer, loop, folder / "camera.jpg")
+                bench = LiveBench(
+                    guard(rig, safety), writer, lambda: _loop_of(actuator), folder / "camera.jpg"
+                )
                 link = _Link(folder, bench)
                 threading.Thread(target=link.serve, daemon=True).start()
                 threading.Thread(target=_stops, args=(folder, bench), daemon=True).start()

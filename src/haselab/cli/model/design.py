@@ -15,7 +15,6 @@ from haselab.cli.actuator_file import load_actuator, save_section, warn_misspell
 from haselab.cli.common import REAL, SEED, Real, answer_options, emit
 from haselab.cli.model.charts import design_chart, loop_chart
 from haselab.cli.model.loop_options import loop_options
-from haselab.cli.model.margins import margins_answer
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import (
@@ -34,7 +33,7 @@ from haselab.controllers import (
     known_actuator,
 )
 from haselab.models.posterior import PlantPosterior
-from haselab.pipelines.design.answer import design_answer, plausible_sentence
+from haselab.pipelines.design.answer import design_answer, margins_answer, plausible_sentence
 from haselab.pipelines.design.feedback import feedback_of, read_controller
 from haselab.pipelines.design.model_file import (
     loop_of,

@@ -36,7 +36,14 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json, write_json
-from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
+from haselab.study.chip.loops import (
+    UPDATE_CYCLES,
+    LoopRun,
+    StepPlan,
+    loop_row,
+    section_of,
+    step_experiment,
+)
 from haselab.study.simulated.agreement import (
     Agreement,
     StepCase,
@@ -52,7 +59,6 @@ _BAUD = 115_200  # baud rate of the boot loader
 _BOARD = "atmega2560"
 _GAIN_TOLERANCE = 0.02  # of two statements of the same gain
 _FILLED = 0.8  # of the converter's range, by the current of the largest capacitance
-_UPDATE_CYCLES = 16_000
 _PREDICTED = ("rise_time_s", "overshoot", "settling_time_s", "steady_state_error")
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = shared_option(
@@ -265,7 +271,7 @@ def simulate(
         "stack_bytes": chip.stack_bytes,
         "load": chip.load,
         "longest_update_cycles": chip.busy_cycles,
-        "cycles_of_an_update": _UPDATE_CYCLES,
+        "cycles_of_an_update": UPDATE_CYCLES,
         "overruns": chip.overruns,
         "calibration": found.correction,
         "highest_code": chip.highest_code,

@@ -125,7 +125,7 @@ function Camera() {
 }
 
 // Each is a module with a default component, imported when it is first opened.
-const TABS = { Live: "", Doctor: "/static/doctor.js" };
+const TABS = { Live: "", Design: "/static/design.js", Doctor: "/static/doctor.js" };
 
 function Lazy({ from, ...rest }) {
   const [found, find] = useState({ part: null, error: "" });

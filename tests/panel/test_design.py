@@ -248,6 +248,8 @@ def test_the_name_and_the_kind_of_a_controller_are_kept(path: Path) -> None:
         (GAINS | {"kp": 0.0, "ki": 0.0}, "kp and ki are both 0"),
         (GAINS | {"kp": -1.0}, "kp = -1.0; it must be finite, 0 or more"),
         (GAINS | {"kd": "0.1"}, "kd is '0.1', but it must be a finite number"),
+        (GAINS | {"ki": 1e300}, "ki is 1e+300, but it must be 0, or 1e-12 to 1e+12"),
+        (GAINS | {"kd": 1e-300}, "kd is 1e-300, but it must be 0, or 1e-12 to 1e+12"),
         ({"kp": 0.1}, "ki is None, but it must be a finite number"),
     ],
 )

@@ -60,6 +60,7 @@ _SLOWEST = 0.03  # lowest frequency shown, relative to the slowest pole
 _SHOWN_CROSSOVERS = 20.0  # length of the step, in periods of the crossover divided by 2 pi
 _LONGEST_S = 30.0
 _MOST_SAMPLES = 4000
+_LEAST, _MOST = 1e-12, 1e12  # gains
 _NO_UNCERTAINTY = "no uncertainty: [model] has no covariance"
 
 
@@ -154,9 +155,13 @@ def gains_of(values: JsonObject) -> PidGains:
     Returns:
         The gains.
     Raises:
-        InputError: One is missing, or is not a number of 0 or more.
+        InputError: One is missing, is not a number of 0 or more, or is extreme.
     """
-    return PidGains(*(number(values, field.name) for field in fields(PidGains)))
+    gains = PidGains(*(number(values, field.name) for field in fields(PidGains)))
+    for name, value in asdict(gains).items():
+        if value and not _LEAST <= value <= _MOST:  # beyond, products of gains overflow
+            raise InputError(f"{name} is {value:g}, but it must be 0, or {_LEAST:g} to {_MOST:g}.")
+    return gains
 
 
 def _overview(files: PanelFiles, values: JsonObject) -> JsonObject:

@@ -25,6 +25,8 @@ const toGain = (position, highest) => (position <= 0 ? 0 : digits(highest * 10 *
 const toPosition = (gain, highest) => (gain > 0 ? Math.min(Math.max(Math.round(STEPS * (1 + Math.log10(gain / highest) / DECADES)), 1), STEPS) : 0);
 const same = (one, other) => one !== null && other !== null && GAINS.every(({ name }) => one[name] === other[name]);
 
+let unwritten = null; // gains that were changed here; they stay while another page is shown
+
 // One request at a time; of the wishes meanwhile, only the last one is sent.
 class Latest {
   constructor(send, done) { this.send = send; this.done = done; this.busy = false; this.next = null; }
@@ -127,15 +129,17 @@ export default function Design({ link, state }) {
   if (requests.current === null) {
     requests.current = {
       loop: new Latest((values) => link.request("design-loop", values), find),
-      demands: new Latest((values) => link.request("design-demands", values), setDemands),
+      demands: new Latest(async (values) => ({ ...(await link.request("design-demands", values)), gains: values }), setDemands),
     };
   }
+  const change = (next) => { unwritten = next; setGains(next); };
   async function open() {
     const answer = await link.request("design");
     see(answer);
     find(answer.found ?? null);
-    setGains(answer.gains ?? null);
+    setGains(answer.gains ? unwritten ?? answer.gains : null);
   }
+  const reopen = () => { unwritten = null; say({ text: "", bad: false }); return open(); };
   useEffect(() => { open(); }, []);
   useEffect(() => {
     if (gains === null) return undefined;
@@ -145,8 +149,8 @@ export default function Design({ link, state }) {
   }, [gains]);
 
   if (about === null) return html`<p role="status">Reading the actuator file …</p>`;
-  if (about.error) return html`<div class="card"><h2>Design</h2><p class="error" role="alert">${about.error}</p><button type="button" onClick=${open}>Read the file again</button></div>`;
-  const put = (name) => (value) => { say({ text: "", bad: false }); setGains({ ...gains, [name]: value }); };
+  if (about.error) return html`<div class="card"><h2>Design</h2><p class="error" role="alert">${about.error}</p><button type="button" onClick=${reopen}>Read the file again</button></div>`;
+  const put = (name) => (value) => { say({ text: "", bad: false }); change({ ...gains, [name]: value }); };
   const isShown = found !== null && !found.error;
   const isNew = isShown && (!about.is_pid || same(found.gains, gains));
   const during = async (name, request) => { setBusy(name); const answer = await request(); setBusy(""); return answer; };
@@ -155,12 +159,13 @@ export default function Design({ link, state }) {
     const answer = await during("compute", () => link.request("design-search"));
     if (answer.error) { say({ text: answer.error, bad: true }); return; }
     say({ text: "Computed as haselab design does. Not written yet.", bad: false });
-    setGains(answer.gains);
+    change(answer.gains);
   }
   async function write() {
     const answer = await during("write", () => link.request("design-write", { ...gains, sha256: found.sha256 }));
     if (answer.error) say({ text: answer.error, bad: true });
     else {
+      unwritten = null;
       const next = state?.holder ? "The bench is armed: it keeps the controller that it was armed with. Disarm and arm it again to use the new one." : "The bench reads the file when it is armed.";
       say({ text: `Written to ${answer.written}. ${next}`, bad: false });
     }
@@ -187,13 +192,13 @@ export default function Design({ link, state }) {
         ${gains !== null && GAINS.map((one) => html`<${Gain} key=${one.name} about=${one} value=${gains[one.name]} highest=${about.ranges[one.name]} put=${put(one.name)} />`)}
         ${gains !== null && html`<div class="row">
           <button type="button" disabled=${busy !== ""} onClick=${compute}>${busy === "compute" ? "Computing …" : "Compute gains"}</button>
-          <button type="button" disabled=${busy !== ""} onClick=${open}>Read the file again</button>
+          <button type="button" disabled=${busy !== ""} onClick=${reopen}>Read the file again</button>
           <button type="button" disabled=${busy !== "" || !isNew} onClick=${write}>Write to actuator.toml</button></div>`}
         <p role="status" class=${said.bad ? "error" : ""}>${said.text}</p>
       </div>
       ${isShown && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>Margins</h2>
         <${Margins} found=${found.margins} caption=${`At ${digits(found.margins.rate_hz)} Hz with a delay of ${digits(1e3 * found.margins.delay_s)} ms`} />
-        ${gains !== null && html`<div class=${same(demands?.gains ?? null, gains) || demands?.error ? "" : "old"}>
+        ${gains !== null && html`<div class=${same(demands?.gains ?? null, gains) ? "" : "old"}>
           ${demands === null ? html`<p>Checking the demands …</p>` : demands.error ? html`<p class="error">${demands.error}</p>` : html`
             ${demands.shortfalls.length ? html`<p class="error">Demands not met: ${demands.shortfalls.join("; ")}.</p>` : html`<p>All demands are met.</p>`}
             <p>${demands.plausible}.</p>`}</div>`}

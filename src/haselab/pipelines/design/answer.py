@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate
+from haselab.base import Estimate, JsonObject
 from haselab.control import Design, LoopSetting, Margins, PidGains, simulate_loop
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plants.general_loops import trace_general
@@ -126,7 +126,7 @@ def _posterior(found: PlausibleMargins) -> dict[str, Any]:
     }
 
 
-def design_answer(design: Design) -> dict[str, Any]:
+def design_answer(design: Design) -> JsonObject:
     """Collect the answer of `haselab design`.
 
     Args:

@@ -95,6 +95,8 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
     Args:
         path: of the model.
         given: on the command line.
+    Returns:
+        The range.
     Raises:
         InputError: the file has impossible values, or the model's input is a voltage and the limits
             or the map are those of a strain, or its output is a length and the maps are of strain.
@@ -180,6 +182,8 @@ def demands_of(model: Path, spec: Path | None = None) -> DesignSpec:
         model: file of the model.
         spec: a specification; None: that of the model's file, if it is an actuator file that has
             one, else the built-in one.
+    Returns:
+        The specification.
     Raises:
         InputError: an unknown demand, or an impossible value.
     """

@@ -143,7 +143,7 @@ def test_an_actuator_file_may_have_a_model_in_general_form(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text("[model]\nnumerator = [800.0]\ndenominator = [0.1, 3.0, 120.0, 1000.0]\n")
     plant = hl.Actuator.load(path).plant
-    assert isinstance(plant, RationalModel) and plant.denominator == (0.1, 3.0, 120.0, 1000.0)
+    assert isinstance(plant, RationalModel) and plant.denominator == (1.0, 30.0, 1200.0, 10000.0)
     path.write_text("[model]\nnumerator = [1000.0]\ndenominator = [1.0, 20.0, 1000.0]\n")
     plant = hl.Actuator.load(path).plant  # one resonance
     assert isinstance(plant, hl.Plant)

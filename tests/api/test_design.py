@@ -9,7 +9,7 @@ import haselab as hl
 from haselab.base import InputError
 from haselab.cli.main import main
 from haselab.controllers.builtin import pid_controller
-from haselab.models import VoltageMap
+from haselab.models import RationalModel, VoltageMap
 from haselab.models.actuator.strain_map import StrainMap
 from tests.cli.model.physical_files import ZERO_M, written
 
@@ -137,3 +137,14 @@ def test_a_file_without_what_its_controller_needs_says_what_is_missing(tmp_path)
     path = with_observer(tmp_path / "actuator.toml", high_v=None)
     with pytest.raises(InputError, match=r"needs drive\.high_v for a controller"):
         hl.Actuator.load(path)
+
+
+def test_an_actuator_file_may_have_a_model_in_general_form(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text("[model]\nnumerator = [800.0]\ndenominator = [0.1, 3.0, 120.0, 1000.0]\n")
+    plant = hl.Actuator.load(path).plant
+    assert isinstance(plant, RationalModel) and plant.denominator == (1.0, 30.0, 1200.0, 10000.0)
+    path.write_text("[model]\nnumerator = [1000.0]\ndenominator = [1.0, 20.0, 1000.0]\n")
+    plant = hl.Actuator.load(path).plant  # one resonance
+    assert isinstance(plant, hl.Plant)
+    assert plant.natural_frequency_rad_s == pytest.approx(1000.0**0.5)

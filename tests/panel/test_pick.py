@@ -22,7 +22,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect
 
 from haselab.base import InputError
-from haselab.panel.pick import PICK_REQUESTS, Videos
+from haselab.panel.pages.pick import PICK_REQUESTS, Videos
 from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 from haselab.store.video.writer import VideoWriter
 from tests.panel.running import WAIT_S, RunningPanel, ended, started

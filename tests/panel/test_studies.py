@@ -16,8 +16,8 @@ import pytest
 
 from haselab.base import InputError
 from haselab.panel.files import PanelFiles
-from haselab.panel.recordings import analyse, compare, listed, note, report
-from haselab.panel.study_job import available, check, chosen_study
+from haselab.panel.pages.recordings import analyse, compare, listed, note, report
+from haselab.panel.pages.study_job import available, check, chosen_study
 from haselab.store.session.reader import SessionReader
 from tests.panel.running import WAIT_S, Page, RunningPanel, connected, ended, started
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from haselab.base import InputError
-from haselab.cli.model.model_file import read_plant
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.model_tables import PlantTable
+from haselab.pipelines.design.model_file import read_plant
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_file import load_twin

@@ -22,8 +22,9 @@ from haselab.models import Plant, RationalModel, VoltageMap
 from haselab.models.actuator.sections import ActuatorTables, missing
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.posterior import PlantPosterior
+from haselab.pipelines.design.model_file import read_any_plant
 from haselab.runtime.loop import LoopSettings
-from haselab.store.actuator_file import read_run
+from haselab.store.actuator_file import ACTUATOR, read_run
 from haselab.store.toml import validated
 
 __all__ = ["Actuator", "design"]
@@ -86,7 +87,7 @@ class Actuator:
         controller: a design, or a controller of any registered kind; None: not known yet.
         saturation: limits of the controller's output, in strain. None: those of the design, else
             those of the reference study.
-        plant: the model; None: not known yet.
+        plant: the model, in general rational form if it is not one resonance; None: not known yet.
         physical: what controllers of the physical model use; None: not known yet.
     """
 
@@ -94,7 +95,7 @@ class Actuator:
     strain_map: StrainMap | None = None
     controller: Design | ChosenController | None = None
     saturation: Saturation | None = None
-    plant: Plant | None = None
+    plant: Plant | RationalModel | None = None
     physical: KnownActuator | None = None
 
     def __post_init__(self) -> None:
@@ -126,7 +127,7 @@ class Actuator:
             None if sensing.strain_map is None else sensing.strain_map.map(),
             chosen,
             limits,
-            None if model is None or not model.model_extra else model.plant(),
+            None if model is None or not model.model_extra else _plant(tables, Path(path)),
             _physical(tables, chosen, path),
         )
 
@@ -152,6 +153,12 @@ class Actuator:
         return LoopSettings(
             chosen, limits, self.voltage_map, self.strain_map, actuator=self.physical
         )
+
+
+def _plant(tables: ActuatorTables, path: Path) -> Plant | RationalModel:
+    """The model of a file in any form; older runs have one resonance in a file of its own."""
+    file = path / ACTUATOR if path.is_dir() else path
+    return read_any_plant(file) if file.exists() else tables.plant()
 
 
 def _physical(

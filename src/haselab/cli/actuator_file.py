@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
@@ -11,7 +12,7 @@ import click
 
 from haselab import __version__
 from haselab.actuators import ACTUATORS
-from haselab.base import Json, table_at
+from haselab.base import HaselabError, Json, table_at
 from haselab.cli.invocation import Invocation
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.spelling import misspelled_keys
@@ -28,11 +29,11 @@ from haselab.store.toml import validated
 
 __all__ = [
     "load_actuator",
-    "load_run",
     "mark_sections",
     "save_section",
     "unknown_kind",
     "warn_misspelled",
+    "warn_misspelled_in",
 ]
 
 _WARNED = "haselab.misspelled"  # in the context of the command
@@ -56,15 +57,15 @@ def load_actuator(path: Path, *, to_write: bool = False) -> ActuatorTables:
     return validated(ActuatorTables, sections, path)
 
 
-def load_run(path: Path) -> ActuatorTables:
-    """Read the sections of an actuator file or of the folder of a run, also of an older one.
+def warn_misspelled_in(path: Path) -> None:
+    """Warn of misspelled keys in a file of models, if it is an actuator file that can be read.
 
-    Raises:
-        InputError: no such file, or an impossible value.
+    Args:
+        path: of a model in any form, or of the folder of a run.
     """
-    sections = read_run(path)
-    warn_misspelled(sections, path)
-    return validated(ActuatorTables, sections, path)
+    if path.suffix.lower() == ".toml" or path.is_dir():
+        with contextlib.suppress(HaselabError):  # of a file that the command cannot read either
+            warn_misspelled(read_run(path), path)
 
 
 def warn_misspelled(sections: Mapping[str, Json], path: Path) -> None:

@@ -24,7 +24,15 @@ from haselab.control.stability.plausible import PlausibleMargins
 from haselab.control.step_metrics import StepNumbers, step_metrics
 from haselab.models.plant import Plant
 
-__all__ = ["Design", "Prediction", "design_pi", "design_pid", "design_task", "predict"]
+__all__ = [
+    "Design",
+    "Prediction",
+    "design_pi",
+    "design_pid",
+    "design_task",
+    "evaluate_gains",
+    "predict",
+]
 
 _NAME_WIDTH = 28
 _MEMBERS = 12  # candidates per generation and unknown
@@ -290,7 +298,18 @@ def _searched(task: Task, rng: np.random.Generator, space: _Space) -> Design:
         vectorized=True,
         updating="deferred",
     )
-    gains = space.gains(best.x)
+    return evaluate_gains(task, space.gains(best.x))
+
+
+def evaluate_gains(task: Task, gains: PidGains) -> Design:
+    """Predict what given gains achieve in a task.
+
+    Args:
+        task: plant, setting, specification.
+        gains: of the controller.
+    Returns:
+        The gains with their predictions, as those of a design.
+    """
     spread = tuple(
         predict(plant, gains, task.setting, step=task.step, record_s=task.horizon_s())
         for plant in task.plants()

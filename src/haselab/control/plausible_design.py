@@ -11,14 +11,21 @@ import numpy as np
 
 from haselab.base import InputError
 from haselab.control.candidates import Task
-from haselab.control.loop_shaping import Design, design_pi, design_pid, design_task
+from haselab.control.gains import PidGains
+from haselab.control.loop_shaping import (
+    Design,
+    design_pi,
+    design_pid,
+    design_task,
+    evaluate_gains,
+)
 from haselab.control.plants.general import AnyPlant
 from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
 from haselab.control.stability.plausible import Chance, plausible_margins
 from haselab.models.posterior import PlantPosterior
 
-__all__ = ["USUAL_STRUCTURE", "Structure", "design_controller"]
+__all__ = ["USUAL_STRUCTURE", "Structure", "design_controller", "evaluate_controller"]
 
 Structure = Literal["pi", "pid"]
 USUAL_STRUCTURE: Structure = "pid"
@@ -82,8 +89,7 @@ def design_controller(
                 "alone does not have. Give a fit, or leave the probability out."
             )
         return search(model, spec, setting, rng=rng)
-    if not _FEWEST <= draws <= _MOST:
-        raise InputError(f"draws = {draws}; it must be {_FEWEST} to {_MOST}.")
+    _check_draws(draws)
     most = 1.0 - 1.0 / min(draws, _SEARCHED)
     if probability is not None and not 0.0 < probability <= most:
         raise InputError(
@@ -111,6 +117,53 @@ def design_controller(
             return found
         share += 0.5 * error + max(probability - _share(other), 0.0)
     return _short(found, probability, reachable=True)
+
+
+def evaluate_controller(
+    model: PlantPosterior | AnyPlant,
+    gains: PidGains,
+    spec: DesignSpec,
+    setting: LoopSetting,
+    *,
+    rng: np.random.Generator,
+    draws: int = 400,
+    nominal: AnyPlant | None = None,
+) -> Design:
+    """Predict what given gains achieve, as `design_controller` does for those that it finds.
+
+    Args:
+        model: the parameters with their covariance, from which plausible plants are drawn; or a
+            plant alone.
+        gains: of the controller.
+        spec: specification.
+        setting: rate, measurement delay and saturation.
+        rng: random generator of the draws; with the same one, the plausible plants are those of
+            `design_controller`.
+        draws: number of plausible plants.
+        nominal: best plant, if it is not the posterior's nominal one.
+    Returns:
+        The gains with their predictions, and with `plausible` if the model has a covariance.
+    Raises:
+        InputError: a number of draws outside its range, or a rate outside that of a design.
+    Example:
+        >>> from haselab.models import Plant
+        >>> found = evaluate_controller(
+        ...     Plant(1.0, 32.0, 0.3), PidGains(0.0, 20.0), DesignSpec(), LoopSetting(),
+        ...     rng=np.random.default_rng(0))
+        >>> found.nominal.margins.stable
+        False
+    """
+    if not isinstance(model, PlantPosterior):
+        return evaluate_gains(Task(model, setting, spec), gains)
+    _check_draws(draws)
+    best_plant = model.nominal if nominal is None else nominal
+    plants = model.draw(draws, rng.spawn(2)[0])
+    return _judged(evaluate_gains(Task(best_plant, setting, spec), gains), plants)
+
+
+def _check_draws(draws: int) -> None:
+    if not _FEWEST <= draws <= _MOST:
+        raise InputError(f"draws = {draws}; it must be {_FEWEST} to {_MOST}.")
 
 
 def _short(design: Design, probability: float, *, reachable: bool) -> Design:

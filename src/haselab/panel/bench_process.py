@@ -32,13 +32,14 @@ from haselab.base import HaselabError, InputError, JsonObject
 from haselab.panel.columns import LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import CARRIER_HZ, LiveBench
-from haselab.panel.study_job import StudyJob, actuator_tables
+from haselab.panel.pages.study_job import StudyJob, actuator_tables
 from haselab.panel.study_player import StudyPlayer
 from haselab.pipelines.actuator_bench import prepare_bench
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.operator import WeightHandler
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig, opened_rig
+from haselab.runtime.loop import LoopSettings
 from haselab.runtime.scheduling import with_priority
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
@@ -139,6 +140,19 @@ def _opened(
         yield rig, safety
 
 
+def _loop_of(path: Path | None) -> LoopSettings | None:
+    """The loop of an actuator file; None without one, or if a map or the controller is missing.
+
+    Raises:
+        InputError: The file is not valid.
+    """
+    if path is None:
+        return None
+    found = Actuator.load(path)
+    known = (found.voltage_map, found.strain_map, found.controller)
+    return None if None in known else found.loop()
+
+
 def _run(bench: LiveBench, block_s: float, *, paced: bool, ended: threading.Event) -> None:
     next_s = time.monotonic()
     with with_priority():
@@ -178,7 +192,7 @@ def main(words: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the panel ends this process by its stdin
     threading.Thread(target=_watch_stdin, args=(ended,), daemon=True).start()
     try:
-        loop = None if actuator is None else Actuator.load(actuator).loop()
+        _loop_of(actuator)  # a file that is not valid is refused before the bench is opened
         file = load_rig(path)
         with _opened(file, path, folder, player.operator) as (rig, safety):
             if actuator is not None and (note := prepare_bench(
@@ -194,7 +208,7 @@ def main(words: list[str]) -> int:
             live = folder / "live"
             with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
                 bench = LiveBench(
-                    guard(rig, safety), writer, loop, folder / "camera.jpg",
+                    guard(rig, safety), writer, lambda: _loop_of(actuator), folder / "camera.jpg",
                     lambda chosen: StudyJob.of(files, file, chosen), player,
                 )  # fmt: skip
                 threading.Thread(target=_end_study_at, args=(ended, bench), daemon=True).start()

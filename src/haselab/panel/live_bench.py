@@ -20,11 +20,11 @@ from haselab.base import (
     JsonObject,
     LimitError,
     SafetyError,
-    is_real,
     shown,
 )
 from haselab.panel.columns import LiveWriter
-from haselab.panel.study_job import StudyJob
+from haselab.panel.pages.study_job import StudyJob
+from haselab.panel.pages.values import number
 from haselab.panel.study_player import StudyPlayer
 from haselab.runtime.closed_loop import ClosedLoop
 from haselab.runtime.lockin import lockin_of
@@ -115,7 +115,8 @@ class LiveBench:
     Args:
         rig: the bench behind its safety chain.
         writer: of the live signals.
-        loop: of the actuator file; None: no loop can be closed.
+        read_loop: reads the controller and the maps of the actuator file, at the start and before
+            each arming; it returns None if no loop can be closed.
         picture: JPEG file for the last camera frame while the bench is armed; None: no pictures.
         prepare: prepares the study that a page has chosen; None: no study can be played.
         player: plays it.
@@ -125,12 +126,13 @@ class LiveBench:
         self,
         rig: GuardedRig,
         writer: LiveWriter,
-        loop: LoopSettings | None = None,
+        read_loop: Callable[[], LoopSettings | None] = lambda: None,
         picture: Path | None = None,
         prepare: Callable[[JsonObject], StudyJob] | None = None,
         player: StudyPlayer | None = None,
     ) -> None:
-        self._rig, self._writer, self._loop, self._picture = rig, writer, loop, picture
+        self._rig, self._writer, self._picture = rig, writer, picture
+        self._read_loop, self._loop = read_loop, read_loop()
         about = rig.description
         self._lockin = lockin_of(about, CARRIER_HZ)
         self._mutex = threading.Lock()  # protects all below
@@ -192,7 +194,11 @@ class LiveBench:
                 f"There is no command {shown(what)}. Use one of: {', '.join(commands)}."
             )
         job = self._chosen(values) if what == "arm" else None  # which takes longer than a block
+        # The file is read here, so that no block waits for it.
+        found = self._read_loop() if what == "request" else None
         with self._mutex:
+            if what == "request" and not self._holder:
+                self._loop = found
             if self._holder and holder != self._holder and what not in ("disarm", "lease"):
                 raise SafetyError(
                     "Another page has armed the bench. It must disarm the bench first."
@@ -227,7 +233,7 @@ class LiveBench:
 
     def _arm(self, holder: str, values: JsonObject, job: StudyJob | None = None) -> JsonObject:
         self._require_idle()
-        limit_v, request = _number(values, "limit_v"), self._request
+        limit_v, request = number(values, "limit_v"), self._request
         limits = self._rig.description.drive_limits
         if not 0.0 < limit_v <= limits.high:
             raise LimitError(
@@ -280,7 +286,7 @@ class LiveBench:
 
     def _drive_to(self, holder: str, values: JsonObject) -> JsonObject:
         self._require_armed(holder)
-        target_v = _number(values, "value_v")
+        target_v = number(values, "value_v")
         low_v = max(self._rig.description.drive_limits.low, -self._limit_v)
         if not low_v <= target_v <= self._limit_v:
             raise LimitError(
@@ -299,7 +305,7 @@ class LiveBench:
                 "There is no controller. Start the panel with --actuator A.toml, an actuator file "
                 "with both maps and a controller (haselab design A.toml)."
             )
-        strain, limits = _number(values, "strain"), self._loop.saturation
+        strain, limits = number(values, "strain"), self._loop.saturation
         if not limits.low <= strain <= limits.high:
             raise LimitError(
                 f"The desired strain is {strain:g}, but the limits of the controller are "
@@ -473,10 +479,3 @@ class LiveBench:
         reference = math.nan if self._reference is None else self._reference
         values = (self._rig.present_drive_v, reference, sensed_f, strain, residual_v)
         self._writer.append(codes, time_s, values)
-
-
-def _number(values: JsonObject, name: str) -> float:
-    found: object = values.get(name)
-    if not is_real(found) or not math.isfinite(found):
-        raise InputError(f"{name} is {shown(found)}, but it must be a finite number.")
-    return float(found)

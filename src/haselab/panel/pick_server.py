@@ -24,7 +24,7 @@ from haselab.panel.page_server import (
     routes_of,
     serve,
 )
-from haselab.panel.pick import PICK_REQUESTS, Videos
+from haselab.panel.pages.pick import PICK_REQUESTS, Videos
 
 __all__ = ["pick_points"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 from haselab.base import HaselabError, Limits
-from haselab.panel.study_job import PageOperator, StudyJob
+from haselab.panel.pages.study_job import PageOperator, StudyJob
 from haselab.rig import Camera
 from haselab.rig.cameras.source import KnownCamera
 from haselab.rig.protocols import Frames

@@ -34,8 +34,8 @@ from haselab.base import HaselabError
 from haselab.panel.columns import SIGNALS, Columns, LiveReader
 from haselab.panel.files import PanelFiles
 from haselab.panel.page_server import NO_TOKEN, STATIC, Access, OnlyOwnPages, routes_of
-from haselab.panel.recordings import analyse_recorded
-from haselab.panel.requests import REQUESTS
+from haselab.panel.pages.recordings import analyse_recorded
+from haselab.panel.pages.requests import REQUESTS
 
 __all__ = ["SCHEMA", "WebSettings", "application"]
 

@@ -8,8 +8,8 @@ from click.testing import CliRunner
 
 from haselab.base import InputError, ResultError
 from haselab.cli.identify.group import command
-from haselab.cli.model.model_file import read_any_plant
 from haselab.models import Plant
+from haselab.pipelines.design.model_file import read_any_plant
 
 PLANT = Plant(0.5, 5.11, 0.09, 0.02)
 TIME_S = np.arange(4000) / 100.0

@@ -26,7 +26,8 @@ __all__ = ["command"]
 )
 @shared_option(
     "--actuator", type=click.Path(path_type=Path),
-    detail="With both maps and a controller, the panel can close the loop. Default: no loop.",
+    detail="With both maps and a controller, the panel can close the loop; with a model, its page "
+    "Design changes the gains. Default: none.",
 )  # fmt: skip
 @click.option(
     "--runs", type=click.Path(path_type=Path, file_okay=False), default=Path("out"),

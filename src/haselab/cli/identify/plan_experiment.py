@@ -14,7 +14,6 @@ from haselab.base import InputError, ResultError
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.identify.plan_for_actuator import plan_for_actuator
-from haselab.cli.model.model_file import read_plant
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.cli.study.run import rig_file
@@ -28,6 +27,7 @@ from haselab.identify.experiment_design.plan import (
 from haselab.models.actuator.model_tables import VoltagePlantTable
 from haselab.models.plant import Plant
 from haselab.models.voltage_plant import VoltagePlant
+from haselab.pipelines.design.model_file import read_plant
 from haselab.rig.twin.config import TwinConfig
 from haselab.store.folder import read_json, write_text
 from haselab.store.toml import validated

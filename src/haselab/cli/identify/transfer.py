@@ -24,7 +24,6 @@ from haselab.cli.identify.common import (
     read_recorded,
     unit_text,
 )
-from haselab.cli.model.sections import MODEL_KEYS, model_section
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
@@ -34,6 +33,7 @@ from haselab.identify.transfer.choice import TransferChoice, choose_transfer
 from haselab.identify.transfer.fit import TransferFit, fit_transfer
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.identify.transfer.nonlinear import NONLINEAR, fit_nonlinear
+from haselab.pipelines.design.sections import MODEL_KEYS, model_section
 from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["transfer"]

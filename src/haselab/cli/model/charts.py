@@ -7,12 +7,11 @@ from numpy.typing import NDArray
 
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.base.estimate import Z95
-from haselab.control import LinearController, LoopSetting, PidGains, simulate_loop
+from haselab.control import LinearController, LoopSetting, PidGains
 from haselab.control.plants.general import AnyPlant
-from haselab.control.plants.general_loops import trace_general
 from haselab.control.stability.margins import loop_response
 from haselab.identify.fit import Prediction
-from haselab.models import Plant
+from haselab.pipelines.design.answer import predicted_step
 
 __all__ = ["design_chart", "loop_chart", "prediction_chart"]
 
@@ -65,19 +64,11 @@ def design_chart(
     Returns:
         The chart.
     """
-    count = max(50, min(round(span_s * setting.rate_hz), 20_000))
-    reference = np.full(count, step)
-    time_s = np.arange(count) / setting.rate_hz
-    if isinstance(plant, Plant):
-        trace = simulate_loop(plant, gains, reference, setting)
-        measured, u = trace.measured, trace.u
-    else:
-        rows = trace_general(plant, [gains], reference, setting)
-        measured, u = rows[0][0], rows[1][0]
+    found = predicted_step(plant, gains, setting, step, span_s)
     return Chart("Predicted step", (
-        Panel("Time (s)", "Output", (Curve(time_s, measured, "measured by the loop"),
-                                     Curve(time_s, reference, "reference"))),
-        Panel("Time (s)", "Controller", (Curve(time_s, u, "", "steps"),)),
+        Panel("Time (s)", "Output", (Curve(found.time_s, found.measured, "measured by the loop"),
+                                     Curve(found.time_s, found.reference, "reference"))),
+        Panel("Time (s)", "Controller", (Curve(found.time_s, found.u, "", "steps"),)),
     ))  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from click.core import ParameterSource
 from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
+from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.columns import column_options
 from haselab.cli.common import POSITIVE, REAL, SEED, answer_options, emit, unverified_option
 from haselab.cli.identify.common import (
@@ -26,7 +27,6 @@ from haselab.cli.identify.common import (
 )
 from haselab.cli.identify.recorded_motion import TableOptions
 from haselab.cli.model.charts import prediction_chart
-from haselab.cli.model.model_file import read_any_plant, read_origin, read_posterior
 from haselab.cli.model.physical_comparison import (
     PhysicalOptions,
     compare_physical,
@@ -40,6 +40,7 @@ from haselab.identify.prediction import predict
 from haselab.identify.record import Record
 from haselab.identify.training_output import TrainingOutput, is_comparable
 from haselab.models.actuator.model_tables import OriginTable
+from haselab.pipelines.design.model_file import read_any_plant, read_origin, read_posterior
 from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["command"]
@@ -139,6 +140,7 @@ def command(
         compare_physical(model, files, options, as_json=as_json, out=out, plot=plot)
         return
     refuse_for_linear(options)
+    warn_misspelled_in(model)
     plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
     through = model if through_voltage_map else None
     records = []

@@ -3,34 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
-from haselab.base import Estimate, InputError, ResultError, table_at
-from haselab.cli.actuator_file import load_actuator, save_section
+from haselab.base import InputError, ResultError
+from haselab.cli.actuator_file import load_actuator, save_section, warn_misspelled_in
 from haselab.cli.common import REAL, SEED, Real, answer_options, emit
 from haselab.cli.model.charts import design_chart, loop_chart
-from haselab.cli.model.feedback import feedback_of, read_controller
-from haselab.cli.model.margins import margins_answer
-from haselab.cli.model.model_file import (
-    loop_of,
-    loop_options,
-    read_any_plant,
-    read_loop,
-    read_origin,
-    read_posterior,
-)
-from haselab.cli.model.sections import (
-    CONTROLLER_KEYS,
-    MODEL_KEYS,
-    controller_section,
-    limits_of,
-)
-from haselab.cli.model.stated_margins import model_doubt
+from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import (
@@ -42,7 +26,6 @@ from haselab.control import (
 )
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
-from haselab.control.stability.plausible import PlausibleMargins, binomial_proportion
 from haselab.controllers import (
     CONTROLLERS,
     ControllerKind,
@@ -50,10 +33,26 @@ from haselab.controllers import (
     known_actuator,
 )
 from haselab.models.posterior import PlantPosterior
-from haselab.store.actuator_file import read_actuator
+from haselab.pipelines.design.answer import design_answer, margins_answer, plausible_sentence
+from haselab.pipelines.design.feedback import feedback_of, read_controller
+from haselab.pipelines.design.model_file import (
+    loop_of,
+    read_any_plant,
+    read_loop,
+    read_origin,
+    read_posterior,
+)
+from haselab.pipelines.design.sections import (
+    CONTROLLER_KEYS,
+    MODEL_KEYS,
+    controller_section,
+    demands_of,
+    limits_of,
+    other_controllers,
+)
+from haselab.pipelines.design.stated_margins import model_doubt
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
-from haselab.store.toml import read_toml
 
 __all__ = ["command"]
 
@@ -112,6 +111,7 @@ def command(
     The margins include the delay of the loop. If the model has a covariance, plausible plants are
     drawn from it, and the share of them that keeps the margins is reported.
     """
+    warn_misspelled_in(model)
     if out is None and model.suffix.lower() == ".toml":
         load_actuator(model, to_write=True)
     if loop["structure"] not in ("pi", "pid"):
@@ -125,7 +125,7 @@ def command(
         click.echo(f"haselab: warning: {doubt}", err=True)
     posterior = read_posterior(model)
     plant = read_any_plant(model)
-    demands = _demands(model, spec)
+    demands = demands_of(model, spec)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
     setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
     if posterior is None and loop["probability"] is not None:
@@ -142,16 +142,16 @@ def command(
             f"{'; '.join(design.shortfalls)}. Relax the demands in --spec, shorten --delay-s, "
             f"{lower}or accept it with --accept-shortfalls: {model}"
         )
-    answer = _answer(design)
-    _save(model, out, controller_section(design, loop["structure"], answer), spec)
+    answer = design_answer(design)
+    _save(model, out, controller_section(design, loop["structure"]), spec)
     if design.plausible is None:
         answer["uncertainty"] = "no uncertainty: the model has no covariance"
     else:
         if not as_json:
-            answer["posterior"] = _sentence(design.plausible)
+            answer["posterior"] = plausible_sentence(design.plausible)
         if loop["probability"] is None and design.plausible.share.value < _FEW:
             click.echo(
-                f"haselab: warning: only {_sentence(design.plausible)}. Use --probability "
+                f"haselab: warning: only {plausible_sentence(design.plausible)}. Use --probability "
                 f"{_FEW:g} for more robust gains: {model}",
                 err=True,
             )
@@ -265,19 +265,6 @@ def _judge(
     save_plot(plot, lambda: loop_chart(plant, feedback, setting, found.crossover_rad_s))
 
 
-def _demands(model: Path, spec: Path | None) -> DesignSpec:
-    """The demands of --spec, else those of the actuator file, else the built-in ones."""
-    table: Mapping[str, object] = {}
-    if spec is not None:
-        table = read_toml(spec, "specification")
-    elif model.suffix.lower() == ".toml" and (typed := load_actuator(model).controller):
-        table = typed.demands
-    try:
-        return DesignSpec.from_mapping(table)
-    except InputError as error:
-        raise InputError(f"{error} {spec or model}") from None
-
-
 def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path | None) -> None:
     """Write [controller] into the actuator file of the model, or both into a new one."""
     own = model.suffix.lower() == ".toml"
@@ -291,22 +278,8 @@ def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path 
     if target is not None:
         inputs = [model] if spec is None else [model, spec]
         name = str(section.get("name") or section["kind"])
-        section["alternatives"] = _other_controllers(target, name) or None
+        section["alternatives"] = other_controllers(target, name) or None
         save_section(target, "controller", section, inputs, CONTROLLER_KEYS)
-
-
-def _other_controllers(path: Path, name: str) -> list[dict[str, object]]:
-    """Controllers in the file that a design with this name keeps, besides its own."""
-    typed = load_actuator(path).controller
-    if typed is None:
-        return []
-    table = table_at(read_actuator(path), "controller")
-    others = table.get("alternatives", ())
-    held = [{key: table[key] for key in table if key not in ("alternatives", "demands")}]
-    if isinstance(others, Sequence):
-        held += [dict(other) for other in others if isinstance(other, Mapping)]
-    every = zip((typed, *typed.alternatives), held, strict=True)
-    return [dict(raw) for one, raw in every if one.is_known and (one.name or one.kind) != name]
 
 
 def _loop_and_covariance(model: Path) -> dict[str, object]:
@@ -334,62 +307,3 @@ def _designed(
         draws=loop["draws"],
         nominal=plant,
     )
-
-
-def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
-    """Shares of the plausible plants: stable, phase margin kept, gain margin kept, both kept."""
-    return {
-        "stable": binomial_proportion(found.stable),
-        "phase_margin": binomial_proportion(found.keeps_phase),
-        "gain_margin": binomial_proportion(found.keeps_gain),
-        "margins": found.share,
-    }
-
-
-def _sentence(found: PlausibleMargins) -> str:
-    """The shares as a sentence."""
-    shares = {name: f"{100.0 * share.value:.4g} %" for name, share in _shares(found).items()}
-    low, high = (100.0 * end for end in found.share.ci95)
-    return (
-        f"{shares['margins']} of {found.stable.size} plausible plants (95 % interval: {low:.3g} to "
-        f"{high:.3g} %) keep {found.least_phase_deg:g} deg and {found.least_gain_db:g} dB; "
-        f"{shares['stable']} are stable, {shares['phase_margin']} keep the phase margin, "
-        f"{shares['gain_margin']} the gain margin"
-    )
-
-
-def _posterior(found: PlausibleMargins) -> dict[str, Any]:
-    """The shares as JSON."""
-    return {
-        "draws": found.stable.size,
-        "least_phase_margin_deg": found.least_phase_deg,
-        "least_gain_margin_db": found.least_gain_db,
-        **_shares(found),
-    }
-
-
-def _answer(design: Design) -> dict[str, Any]:
-    gains, margin, step = design.gains, design.nominal.margins, design.nominal.step
-    more = {} if design.plausible is None else {"posterior": _posterior(design.plausible)}
-    worst = [item.margins for item in design.spread]
-    return {
-        "kp": gains.kp,
-        "ki": gains.ki,
-        "kd": gains.kd,
-        "derivative_filter_s": gains.derivative_filter_s,
-        "phase_margin_deg": margin.phase_margin_deg,
-        "gain_margin_db": margin.gain_margin_db,
-        "delay_margin_s": margin.delay_margin_s,
-        "peak_sensitivity": margin.peak_sensitivity,
-        "crossover_rad_s": margin.crossover_rad_s,
-        "rise_time_s": step.rise_time_s,
-        "overshoot": step.overshoot,
-        "settling_time_s": step.settling_time_s,
-        "steady_state_error": step.steady_state_error,
-        "worst_phase_margin_deg": min(item.phase_margin_deg for item in worst),
-        "worst_gain_margin_db": min(item.gain_margin_db for item in worst),
-        "worst_overshoot": max(item.step.overshoot for item in design.spread),
-        "frequency_spread": design.spec.frequency_spread,
-        "shortfalls": list(design.shortfalls),
-        **more,
-    }

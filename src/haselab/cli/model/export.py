@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 
 from haselab.base import InputError
+from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.common import answer_options, emit
-from haselab.cli.model.model_file import MAT_NAME, read_model, read_origin
 from haselab.cli.options import shared_option
+from haselab.pipelines.design.model_file import MAT_NAME, read_model, read_origin
 from haselab.store.columns.mat_struct import write_mat_struct
 
 __all__ = ["command"]
@@ -41,6 +42,7 @@ def command(
 
     MODEL is a model.json, an actuator file, or a .json or .mat file that this command has written.
     """
+    warn_misspelled_in(model)
     rational = read_model(model)
     names = {
         "input": input_name or rational.input_name,

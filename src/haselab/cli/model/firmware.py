@@ -10,8 +10,9 @@ from typing import Any, Literal
 import click
 
 from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
+from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.common import REAL, SEED, answer_options, emit
-from haselab.cli.model.stated_margins import controller_doubt, model_doubt, warn_doubts
+from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
@@ -20,6 +21,7 @@ from haselab.control.reach import default_step
 from haselab.controllers import known_actuator
 from haselab.firmware import ChipSettings, FrontEnd
 from haselab.models.plant import Plant
+from haselab.pipelines.design.stated_margins import controller_doubt, model_doubt
 from haselab.rig.chip import (
     ChipDesign,
     ChipFile,
@@ -34,7 +36,14 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json, write_json
-from haselab.study.chip.loops import LoopRun, StepPlan, loop_row, section_of, step_experiment
+from haselab.study.chip.loops import (
+    UPDATE_CYCLES,
+    LoopRun,
+    StepPlan,
+    loop_row,
+    section_of,
+    step_experiment,
+)
 from haselab.study.simulated.agreement import (
     Agreement,
     StepCase,
@@ -50,7 +59,6 @@ _BAUD = 115_200  # baud rate of the boot loader
 _BOARD = "atmega2560"
 _GAIN_TOLERANCE = 0.02  # of two statements of the same gain
 _FILLED = 0.8  # of the converter's range, by the current of the largest capacitance
-_UPDATE_CYCLES = 16_000
 _PREDICTED = ("rise_time_s", "overshoot", "settling_time_s", "steady_state_error")
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = shared_option(
@@ -115,6 +123,7 @@ def build(
     RUN is an actuator file or the folder of a run, with the maps, limits and gains to compile in.
     `haselab firmware simulate` measures how much stack and processor time the firmware uses.
     """
+    warn_misspelled_in(run)
     for doubt in (model_doubt(run), controller_doubt(run, structure)):
         if doubt:
             raise InputError(doubt)
@@ -262,7 +271,7 @@ def simulate(
         "stack_bytes": chip.stack_bytes,
         "load": chip.load,
         "longest_update_cycles": chip.busy_cycles,
-        "cycles_of_an_update": _UPDATE_CYCLES,
+        "cycles_of_an_update": UPDATE_CYCLES,
         "overruns": chip.overruns,
         "calibration": found.correction,
         "highest_code": chip.highest_code,

@@ -6,36 +6,18 @@ from pathlib import Path
 
 import click
 
+from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.common import REAL, answer_options, emit
 from haselab.cli.model.charts import loop_chart
-from haselab.cli.model.feedback import feedback_of, read_controller
-from haselab.cli.model.model_file import loop_of, loop_options, read_any_plant
+from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.control import LinearController, LoopSetting, Margins, PidGains, margins
+from haselab.control import LinearController, LoopSetting, PidGains, margins
+from haselab.pipelines.design.answer import margins_answer
+from haselab.pipelines.design.feedback import feedback_of, read_controller
+from haselab.pipelines.design.model_file import loop_of, read_any_plant
 
-__all__ = ["command", "margins_answer"]
-
-
-def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bool]:
-    """Collect the margins for an answer.
-
-    Args:
-        found: the margins.
-        setting: rate and delay that they were computed with.
-    Returns:
-        Names and numbers.
-    """
-    return {
-        "stable": found.stable,
-        "phase_margin_deg": found.phase_margin_deg,
-        "gain_margin_db": found.gain_margin_db,
-        "delay_margin_s": found.delay_margin_s,
-        "peak_sensitivity": found.peak_sensitivity,
-        "crossover_rad_s": found.crossover_rad_s,
-        "rate_hz": setting.rate_hz,
-        "delay_s": setting.measurement_delay_s,
-    }
+__all__ = ["command"]
 
 
 @click.command("margins")
@@ -78,6 +60,7 @@ def command(
     controller is the PID of --kp and --ki, or one of the actuator file: PI, PID, or any kind whose
     controller has the method linear_feedback.
     """
+    warn_misspelled_in(model)
     given, held = (kp, ki, kd, derivative_filter_s), None
     if model.suffix.lower() == ".toml" and all(value is None for value in given):
         held = read_controller(model, kind)

@@ -11,11 +11,15 @@ import click
 from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.common import answer_options, emit
-from haselab.cli.model.model_file import read_any_plant, read_posterior
-from haselab.cli.model.stated_margins import controller_doubt, delay_doubt, model_doubt
 from haselab.cli.output import OutputRule
 from haselab.cli.study.analyse import check_ends
 from haselab.models.actuator import ActuatorTables
+from haselab.pipelines.design.model_file import read_any_plant, read_posterior
+from haselab.pipelines.design.stated_margins import (
+    controller_doubt,
+    delay_doubt,
+    model_doubt,
+)
 from haselab.report import compose_page, read_folder, save_page
 from haselab.report.actuator_page import ActuatorReport, actuator_page, missing_sections
 from haselab.store.actuator_file import read_actuator

@@ -10,7 +10,7 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.bench.arming import Operator, armed_rig, arming_options, gated_rig
 from haselab.cli.common import actuator_option, answer_options
-from haselab.cli.model.stated_margins import warn_doubts
+from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import play_on_chip

@@ -1,5 +1,5 @@
 // Charts of the live signals. Each column shows its smallest and its largest value.
-const resolved = (name) => { // light-dark() is resolved by the browser, not by the canvas
+export const resolved = (name) => { // light-dark() is resolved by the browser, not by the canvas
   const probe = document.createElement("span");
   probe.style.color = `var(${name})`;
   document.body.append(probe);

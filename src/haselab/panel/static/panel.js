@@ -95,7 +95,9 @@ function Camera() {
 }
 
 // Each is a module with a default component, imported when it is first opened.
-const TABS = { Live: "", Studies: "/static/studies.js", Pick: "/static/pick.js", Doctor: "/static/doctor.js" };
+const TABS = {
+  Live: "", Studies: "/static/studies.js", Pick: "/static/pick.js", Design: "/static/design.js", Doctor: "/static/doctor.js",
+};
 
 function Lazy({ from, ...rest }) {
   const [found, find] = useState({ part: null, error: "" });

@@ -28,7 +28,7 @@ from haselab.firmware import UPDATE_DELAY_S as CHIP_DELAY_S
 from haselab.firmware import ChipSettings
 from haselab.firmware.messages import Run, SetReference, Status
 from haselab.models.plant import Plant
-from haselab.rig.chip import REFERENCE, CoSim, Firmware, calibrated_firmware
+from haselab.rig.chip import REFERENCE, Calibrated, CoSim, Firmware, calibrated_firmware
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import TwinBench, describe
@@ -39,10 +39,12 @@ __all__ = [
     "CHIP_DELAY_S",
     "FAST",
     "SLOW",
+    "UPDATE_CYCLES",
     "ChipRun",
     "LoopRun",
     "StepExperiment",
     "StepPlan",
+    "chip_experiment",
     "chip_loop",
     "controller_of",
     "desktop_loop",
@@ -51,6 +53,7 @@ __all__ = [
     "step_experiment",
 ]
 
+UPDATE_CYCLES = 16_000  # of the processor, from one update to the next
 _CARRIER_V = 0.05
 _REFERENCE_BLOCKS = 50
 _SETTLED = 10  # of them, before the carrier has settled
@@ -387,6 +390,28 @@ class StepExperiment:
     correction: float
 
 
+def chip_experiment(
+    settings: ChipSettings, config: TwinConfig, seed: int, plan: StepPlan
+) -> tuple[ChipRun, Calibrated]:
+    """Build and calibrate the chip's program, and play one step with it.
+
+    Args:
+        settings: gains and maps.
+        config: of the twin.
+        seed: of its noise.
+        plan: of the step.
+    Returns:
+        The response with the use of the processor; the firmware, whose files are deleted.
+    Raises:
+        InputError: a compiler or libsimavr is missing, or the twin is of another actuator.
+        DeviceError: the chip refused a command.
+    """
+    _check_capacitance(settings, _sheet(config, seed, plan))
+    with tempfile.TemporaryDirectory() as folder:
+        made = calibrated_firmware(settings, config, seed, Path(folder))
+        return chip_loop(made.program, made.firmware.elf, config, seed, plan), made
+
+
 def step_experiment(
     settings: ChipSettings, config: TwinConfig, seed: int, plan: StepPlan
 ) -> StepExperiment:
@@ -403,10 +428,7 @@ def step_experiment(
         InputError: a compiler or libsimavr is missing, or the twin is of another actuator.
         DeviceError: the chip refused a command.
     """
-    _check_capacitance(settings, _sheet(config, seed, plan))
-    with tempfile.TemporaryDirectory() as folder:
-        made = calibrated_firmware(settings, config, seed, Path(folder))
-        chip = chip_loop(made.program, made.firmware.elf, config, seed, plan)
+    chip, made = chip_experiment(settings, config, seed, plan)
     alone = settings.own is not None and settings.own.kind not in CONTROLLERS.packages()
     fast_only = settings.own is not None and settings.own.in_volts  # designed for the chip's rate
     desks = [

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from haselab.base import InputError
-from haselab.cli.actuator_file import warn_misspelled
-from haselab.cli.common import REAL
-from haselab.cli.options import shared_option
 from haselab.control import LoopSetting
+from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.model_tables import (
     CovarianceTable,
     LoopTable,
@@ -25,7 +23,7 @@ from haselab.models.actuator.sections import missing
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
-from haselab.store.actuator_file import read_actuator
+from haselab.store.actuator_file import read_actuator, read_run
 from haselab.store.columns.mat_struct import read_mat_struct
 from haselab.store.folder import read_json
 from haselab.store.toml import validated
@@ -33,13 +31,13 @@ from haselab.store.toml import validated
 __all__ = [
     "MAT_NAME",
     "loop_of",
-    "loop_options",
     "read_any_plant",
     "read_loop",
     "read_model",
     "read_origin",
     "read_plant",
     "read_posterior",
+    "read_tables",
 ]
 
 MAT_NAME = "model"
@@ -47,6 +45,19 @@ MAT_NAME = "model"
 _Checked = TypeVar("_Checked", bound=PolesTable)
 _USUAL = LoopSetting()
 _SAME = 1e-3  # relative difference of responses: a file rounded by hand has fewer digits
+
+
+def read_tables(path: Path) -> ActuatorTables:
+    """Read the sections of an actuator file, or of the folder of a run.
+
+    Args:
+        path: of the file or the folder.
+    Returns:
+        The checked sections.
+    Raises:
+        InputError: no such file, or an impossible value.
+    """
+    return validated(ActuatorTables, read_run(path), path)
 
 
 def read_model(path: Path) -> RationalModel:
@@ -79,7 +90,6 @@ def _data(path: Path) -> Any:
     if path.suffix.lower() != ".toml":
         return read_json(path)
     sections = read_actuator(path)
-    warn_misspelled(sections, path)
     model = sections.get("model")
     table = model if isinstance(model, dict) else {}
     if not table.keys() & {"gain", "numerator"}:
@@ -199,24 +209,6 @@ def read_origin(path: Path) -> OriginTable:
         return OriginTable()
     data = _data(path)
     return validated(OriginTable, {**data, **data.get("plant", {})}, path)
-
-
-def loop_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add `--delay-s` and `--rate-hz`, which describe the control loop."""
-    for option in (
-        shared_option(
-            "--delay-s", type=REAL,
-            show_default=f"the delay in the model file, else {_USUAL.measurement_delay_s:g}",
-            detail="Half the sampling period is added for the hold.",
-        ),
-        shared_option(
-            "--rate-hz", type=REAL,
-            show_default=f"the rate in the model file, else {_USUAL.rate_hz:g}",
-            detail="It is the rate of the control loop.",
-        ),
-    ):  # fmt: skip
-        command = option(command)
-    return command
 
 
 def loop_of(

@@ -6,18 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import click
-
 from haselab.base import InputError
-from haselab.cli.actuator_file import load_run
-from haselab.cli.model.feedback import feedback_of
-from haselab.cli.model.model_file import loop_of, read_any_plant, read_origin
 from haselab.control import DesignSpec, margins
 from haselab.control.plants.general import frequency_variants
 from haselab.models.actuator import ControllerSection
+from haselab.pipelines.design.feedback import feedback_of
+from haselab.pipelines.design.model_file import loop_of, read_any_plant, read_origin, read_tables
 from haselab.store.actuator_file import ACTUATOR
 
-__all__ = ["controller_doubt", "delay_doubt", "model_doubt", "warn_doubts"]
+__all__ = ["controller_doubt", "delay_doubt", "model_doubt"]
 
 _SAME = 1e-6  # relative difference of a map's coefficients, and of delays
 _WORST = "worst_"  # prefix of a margin over the plants that the design covers
@@ -46,7 +43,7 @@ def controller_doubt(path: Path, kind: str | None = None) -> str:
     Returns:
         What is wrong and what to do; empty if the margins are right, or if none are stated.
     """
-    section = load_run(path).controller
+    section = read_tables(path).controller
     held = section if kind is None or section is None else section.all_kinds.get(kind)
     file = path / ACTUATOR if path.is_dir() else path
     if held is None or not held.margins or not file.exists():  # an older run states no margins
@@ -77,7 +74,7 @@ def delay_doubt(path: Path, kind: str | None = None) -> str:
     Returns:
         What is wrong and what to do; empty if the delays or the margins are the same.
     """
-    section = load_run(path).controller
+    section = read_tables(path).controller
     held = section if kind is None or section is None else section.all_kinds.get(kind)
     file = path / ACTUATOR if path.is_dir() else path
     if held is None or held.loop is None or not file.exists():
@@ -155,7 +152,7 @@ def model_doubt(path: Path) -> str:
         What is wrong and what to do; empty if the model was identified through this map, or if
         the file does not say through which one.
     """
-    tables = load_run(path)
+    tables = read_tables(path)
     file, table = path / ACTUATOR if path.is_dir() else path, tables.drive.voltage_map
     if table is None or tables.model is None or not tables.model.model_extra or not file.exists():
         return ""
@@ -167,15 +164,3 @@ def model_doubt(path: Path) -> str:
         "Identify it again with: haselab identify transfer FILE --through-voltage-map --actuator "
         f"{file}"
     )
-
-
-def warn_doubts(path: Path, kind: str | None = None) -> None:
-    """Warn of margins and a delay that are not those of the model, and of a model for another map.
-
-    Args:
-        path: an actuator file, or the folder of a run.
-        kind: kind or name of the controller; None: that of `[controller]`.
-    """
-    for doubt in (model_doubt(path), controller_doubt(path, kind), delay_doubt(path, kind)):
-        if doubt:
-            click.echo(f"haselab: warning: {doubt}", err=True)

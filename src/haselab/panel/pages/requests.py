@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from haselab.base import JsonObject
-from haselab.panel.doctor import examine
 from haselab.panel.files import PanelFiles
-from haselab.panel.pick import PICK_REQUESTS, Videos
-from haselab.panel.recordings import analyse, compare, listed, note, report
-from haselab.panel.study_job import available, check
+from haselab.panel.pages.chip_budget import chip_budget
+from haselab.panel.pages.design import DESIGN_REQUESTS
+from haselab.panel.pages.doctor import examine
+from haselab.panel.pages.pick import PICK_REQUESTS, Videos
+from haselab.panel.pages.recordings import analyse, compare, listed, note, report
+from haselab.panel.pages.study_job import available, check
 
 __all__ = ["REQUESTS"]
 
@@ -31,5 +33,7 @@ REQUESTS: Mapping[str, _Request] = {
     "compare": compare,
     "doctor": lambda files, values: examine(files.rig),
     **{name: _on_videos(carry_out) for name, carry_out in PICK_REQUESTS.items()},
+    **DESIGN_REQUESTS,
+    "design-budget": chip_budget,
 }
 """By name: called in a thread of the web server. A `HaselabError` becomes the page's message."""

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from haselab.base import Estimate, InputError, ResultError
-from haselab.cli.actuator_file import load_actuator
-from haselab.cli.model.model_file import read_origin
-from haselab.control import Design, Saturation
+from haselab.base import Estimate, InputError, ResultError, table_at
+from haselab.control import Design, DesignSpec, Saturation
 from haselab.control.reach import reachable_range
 from haselab.control.stability.plausible import PlausibleMargins
 from haselab.identify.transfer.fit import TransferFit
 from haselab.models.actuator import ActuatorTables
+from haselab.pipelines.design.answer import design_answer
+from haselab.pipelines.design.model_file import read_origin, read_tables
+from haselab.store.actuator_file import read_actuator
+from haselab.store.toml import read_toml
 
-__all__ = ["CONTROLLER_KEYS", "MODEL_KEYS", "controller_section", "limits_of", "model_section"]
+__all__ = [
+    "CONTROLLER_KEYS",
+    "MODEL_KEYS",
+    "controller_section",
+    "demands_of",
+    "limits_of",
+    "model_section",
+    "other_controllers",
+]
 
 MODEL_KEYS = (
     "gain", "natural_frequency_rad_s", "damping_ratio", "delay_s", "slow_modes", "poles", "zeros",
@@ -85,6 +95,8 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
     Args:
         path: of the model.
         given: on the command line.
+    Returns:
+        The range.
     Raises:
         InputError: the file has impossible values, or the model's input is a voltage and the limits
             or the map are those of a strain, or its output is a length and the maps are of strain.
@@ -93,7 +105,7 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
     origin = read_origin(path)
     in_volts = origin.input_unit == "V"
     own = path.suffix.lower() == ".toml"
-    known = load_actuator(path) if own else ActuatorTables()
+    known = read_tables(path) if own else ActuatorTables()
     typed = None if known.controller is None else known.controller.limits
     drive, ends_v = known.drive, known.drive_ends_v()
     if in_volts and drive.voltage_map is not None:
@@ -121,19 +133,16 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
     return reachable_range(wanted, drive.voltage_map.map(), *ends_v)
 
 
-def controller_section(
-    design: Design, kind: str, answer: Mapping[str, object]
-) -> dict[str, object]:
+def controller_section(design: Design, kind: str) -> dict[str, object]:
     """`[controller]` of a design.
 
     Args:
         design: what was found.
         kind: of the controller.
-        answer: of `haselab design`: gains, margins, predicted step.
     Returns:
         The keys of the section.
     """
-    limits, setting = design.setting.saturation, design.setting
+    limits, setting, answer = design.setting.saturation, design.setting, design_answer(design)
     margins = ("phase_margin_deg", "gain_margin_db", "delay_margin_s", "peak_sensitivity",
                "crossover_rad_s", "worst_phase_margin_deg", "worst_gain_margin_db")  # fmt: skip
     step = ("rise_time_s", "overshoot", "settling_time_s", "steady_state_error", "worst_overshoot")
@@ -164,3 +173,47 @@ def _plausible(found: PlausibleMargins, answer: Mapping[str, object]) -> dict[st
         if isinstance(value, Estimate):
             values |= {name: value.value, f"{name}_std": value.std}
     return values
+
+
+def demands_of(model: Path, spec: Path | None = None) -> DesignSpec:
+    """Read the demands on a loop.
+
+    Args:
+        model: file of the model.
+        spec: a specification; None: that of the model's file, if it is an actuator file that has
+            one, else the built-in one.
+    Returns:
+        The specification.
+    Raises:
+        InputError: an unknown demand, or an impossible value.
+    """
+    table: Mapping[str, object] = {}
+    if spec is not None:
+        table = read_toml(spec, "specification")
+    elif model.suffix.lower() == ".toml" and (typed := read_tables(model).controller):
+        table = typed.demands
+    try:
+        return DesignSpec.from_mapping(table)
+    except InputError as error:
+        raise InputError(f"{error} {spec or model}") from None
+
+
+def other_controllers(path: Path, name: str) -> list[dict[str, object]]:
+    """Read the controllers of an actuator file that a design keeps as alternatives.
+
+    Args:
+        path: of the actuator file.
+        name: name or kind of the new design, which replaces one of the same name.
+    Returns:
+        Their tables as they are in the file.
+    """
+    typed = read_tables(path).controller
+    if typed is None:
+        return []
+    table = table_at(read_actuator(path), "controller")
+    others = table.get("alternatives", ())
+    held = [{key: table[key] for key in table if key not in ("alternatives", "demands")}]
+    if isinstance(others, Sequence):
+        held += [dict(other) for other in others if isinstance(other, Mapping)]
+    every = zip((typed, *typed.alternatives), held, strict=True)
+    return [dict(raw) for one, raw in every if one.is_known and (one.name or one.kind) != name]

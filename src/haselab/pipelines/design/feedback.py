@@ -9,10 +9,10 @@ from pathlib import Path
 
 from haselab.base import HaselabError, InputError, described
 from haselab.base.exits import no_exit
-from haselab.cli.actuator_file import load_actuator
 from haselab.control import LinearController, PidGains
 from haselab.controllers import CONTROLLERS, LinearisableController
 from haselab.models.actuator import ControllerSection
+from haselab.pipelines.design.model_file import read_tables
 
 __all__ = ["feedback_of", "read_controller"]
 
@@ -28,7 +28,7 @@ def read_controller(path: Path, kind: str | None) -> ControllerSection:
     Raises:
         InputError: the file has no such controller, and no such kind is registered.
     """
-    tables = load_actuator(path)
+    tables = read_tables(path)
     held = {} if tables.controller is None else tables.controller.all_kinds
     if kind is not None and kind not in held and kind not in ("pi", "pid"):
         return ControllerSection(kind=CONTROLLERS.find(kind).name)

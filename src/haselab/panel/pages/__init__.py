@@ -1,0 +1,1 @@
+"""What the pages of the panel show and do: studies, recordings, design, picking, doctor."""

@@ -32,6 +32,16 @@ def panel() -> Iterator[RunningPanel]:
         ended(found)
 
 
+@pytest.fixture
+def impatient_panel() -> Iterator[RunningPanel]:
+    """A panel with the default lease."""
+    found = started(lease_s=1.5)
+    try:
+        yield found
+    finally:
+        ended(found)
+
+
 @pytest.fixture(scope="module")
 def shared_panel() -> Iterator[RunningPanel]:
     """One panel for the tests that leave it as it was."""

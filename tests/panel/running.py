@@ -113,9 +113,10 @@ async def connected(panel: RunningPanel, **changes: str) -> AsyncIterator[Page]:
         yield page
 
 
-def started(*words: str) -> RunningPanel:
-    """Start a panel that opens no browser."""
+def started(*words: str, lease_s: float = 10.0) -> RunningPanel:
+    """Start a panel that opens no browser; a page on a busy machine may be late."""
     command = [sys.executable, "-m", "haselab.cli", "panel", "--no-browser", *words]
+    command += ["--lease-s", str(lease_s)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdout is not None
     return RunningPanel(process, process.stdout.readline().strip())

@@ -83,10 +83,10 @@ def test_stop_works_while_another_process_is_frozen(panel: RunningPanel, frozen:
     asyncio.run(armed())
 
 
-def test_a_lost_page_ends_its_lease_and_nobody_else_takes_it(panel: RunningPanel) -> None:
+def test_a_lost_page_ends_its_lease_and_nobody_else_takes_it(impatient_panel: RunningPanel) -> None:
     async def play() -> None:
-        async with connected(panel) as second:
-            async with connected(panel) as first:
+        async with connected(impatient_panel) as second:
+            async with connected(impatient_panel) as first:
                 await first.arm()
                 await first.ask("drive", value_v=1.0)
                 await second.until(lambda state: state["drive_v"] > 0.1)
@@ -101,9 +101,11 @@ def test_a_lost_page_ends_its_lease_and_nobody_else_takes_it(panel: RunningPanel
     asyncio.run(play())
 
 
-def test_a_frozen_page_gets_no_more_frames_and_loses_its_lease(panel: RunningPanel) -> None:
+def test_a_frozen_page_gets_no_more_frames_and_loses_its_lease(
+    impatient_panel: RunningPanel,
+) -> None:
     async def play() -> None:
-        async with connected(panel) as watching, connected(panel) as frozen:
+        async with connected(impatient_panel) as watching, connected(impatient_panel) as frozen:
             await frozen.arm()
             frozen.acknowledges = False
             await watching.until(lambda state: state["holder"] == frozen.holder)

@@ -122,7 +122,7 @@ def test_a_study_from_a_page_is_recorded_and_analysed_like_one_of_haselab_run(
 def test_every_end_of_a_study_is_at_zero_with_the_reason_and_the_data(
     folder: Path, how: str
 ) -> None:
-    panel = started()
+    panel = started(lease_s=1.5 if how == "lost page" else 10.0)
     said = {
         "end": "The study was ended from a page", "stop": "STOP", "signal": "The panel has ended",
         "lost page": "No message from the page",

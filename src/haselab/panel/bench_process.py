@@ -1,4 +1,4 @@
-"""`python -m haselab.panel.bench_process RIG.toml FOLDER RUNS [A.toml]`: has the bench.
+"""`python -m haselab.panel.bench_process RIG.toml FOLDER RUNS LEASE_S [A.toml]`: has the bench.
 
 It reads the bench block by block into shared memory, answers commands, and plays studies, whose
 recordings are new folders in RUNS. FOLDER is private to one panel and holds
@@ -179,12 +179,13 @@ def main(words: list[str]) -> int:
     """Run the bench process.
 
     Args:
-        words: rig file, folder, folder of recordings, and optionally the actuator file.
+        words: rig file, folder, folder of recordings, lease in s, and optionally the actuator
+            file.
     Returns:
         0, or 1 if the bench cannot be used; the reason is printed after `failed`.
     """
-    path, folder, runs = (Path(word) for word in words[:3])
-    actuator = Path(words[3]) if len(words) > 3 else None
+    path, folder, runs, lease_s = *(Path(word) for word in words[:3]), float(words[3])
+    actuator = Path(words[4]) if len(words) > 4 else None
     files, player = PanelFiles(path, actuator, runs), StudyPlayer()
     ended = threading.Event()
     for name in (signal.SIGTERM, signal.SIGHUP):
@@ -209,7 +210,7 @@ def main(words: list[str]) -> int:
             with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
                 bench = LiveBench(
                     guard(rig, safety), writer, lambda: _loop_of(actuator), folder / "camera.jpg",
-                    lambda chosen: StudyJob.of(files, file, chosen), player,
+                    lambda chosen: StudyJob.of(files, file, chosen), player, lease_s,
                 )  # fmt: skip
                 threading.Thread(target=_end_study_at, args=(ended, bench), daemon=True).start()
                 link = _Link(folder, bench)

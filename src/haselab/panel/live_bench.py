@@ -36,7 +36,6 @@ from haselab.safety.state_machine import ArmingRequest, Stage
 __all__ = ["BenchState", "LiveBench"]
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # of the reference study
-LEASE_S = 1.5  # longest time without a message from the page that armed the bench
 _RAMP_V_PER_S = 1.0  # at the amplifier's input: 5 kV/s with a gain of 5000
 _HEARTBEAT_S = 0.5
 _PICTURES_HZ = 5.0
@@ -120,6 +119,7 @@ class LiveBench:
         picture: JPEG file for the last camera frame while the bench is armed; None: no pictures.
         prepare: prepares the study that a page has chosen; None: no study can be played.
         player: plays it.
+        lease_s: longest time without a message from the page that armed the bench, in s.
     """
 
     def __init__(
@@ -130,7 +130,9 @@ class LiveBench:
         picture: Path | None = None,
         prepare: Callable[[JsonObject], StudyJob] | None = None,
         player: StudyPlayer | None = None,
+        lease_s: float = 1.5,
     ) -> None:
+        self._lease_s = lease_s
         self._rig, self._writer, self._picture = rig, writer, picture
         self._read_loop, self._loop = read_loop, read_loop()
         about = rig.description
@@ -422,18 +424,18 @@ class LiveBench:
 
     def _why_not(self) -> str:
         """Why the study must end; empty while it may go on."""
-        if time.monotonic() > self._seen_s + LEASE_S:
+        if time.monotonic() > self._seen_s + self._lease_s:
             time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
-        if time.monotonic() > self._seen_s + LEASE_S:
-            return f"No message from the page that started the study for {LEASE_S:g} s."
+        if time.monotonic() > self._seen_s + self._lease_s:
+            return f"No message from the page that started the study for {self._lease_s:g} s."
         return self._end_study
 
     def _block(self) -> None:
         rig = self._rig
         if self._holder:
             now_s = time.monotonic()
-            if now_s > self._seen_s + LEASE_S:
-                self._end(f"No message from the page that armed the bench for {LEASE_S:g} s.")
+            if now_s > self._seen_s + self._lease_s:
+                self._end(f"No message from the page that armed the bench for {self._lease_s:g} s.")
             elif now_s > self._beat_s + _HEARTBEAT_S:
                 self._beat_s = now_s
                 rig.safety.heartbeat(0.0)

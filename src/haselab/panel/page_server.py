@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hmac
 import json
@@ -182,6 +183,8 @@ def routes_of(
             found = await run_in_threadpool(carry_out, values)
         except HaselabError as error:
             return JSONResponse({"error": str(error)}, 422)
+        except asyncio.CancelledError:
+            return JSONResponse({"error": "The panel has ended."}, 503)
         return JSONResponse(to_plain(found), background=BackgroundTask(after, name))
 
     return [

@@ -84,12 +84,13 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 @contextlib.contextmanager
-def running_panel(files: PanelFiles, port: int = 0) -> Iterator[Panel]:
+def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Iterator[Panel]:
     """Start the bench process and the stop process; on exit, go to 0 V and end them.
 
     Args:
         files: rig, actuator and recordings.
         port: of the web server on the loopback address; 0: a free one.
+        lease_s: longest time without a message from the page that armed the bench, in s.
     Yields:
         The panel; the caller runs its server.
     Raises:
@@ -103,7 +104,7 @@ def running_panel(files: PanelFiles, port: int = 0) -> Iterator[Panel]:
         )
         listener = opened.enter_context(listening(port))
         access = Access(listener.getsockname()[1])
-        words = [str(files.rig), str(folder), str(files.runs)]
+        words = [str(files.rig), str(folder), str(files.runs), str(lease_s)]
         words += [] if files.actuator is None else [str(files.actuator)]
         bench, key = _started(["haselab.panel.bench_process", *words], "bench process")
         opened.callback(_end, bench)

@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from haselab.base import DeviceError
+from haselab.cli.common import Real
 from haselab.cli.options import shared_option
 from haselab.panel.files import PanelFiles
 from haselab.panel.page_server import serve
@@ -37,14 +38,25 @@ __all__ = ["command"]
     "--page-port", type=click.IntRange(0, 65535), default=0, show_default=True,
     help="Set the TCP port of the page. 0 uses a free one.",
 )  # fmt: skip
+@click.option(
+    "--lease-s", type=Real(0.5, 10.0), default=1.5, show_default=True,
+    help="Set the longest time without a message from the page that armed the bench, in s. Then "
+    "the output goes to 0 V. Raise it for a slow tablet or computer.",
+)  # fmt: skip
 @shared_option("--no-browser", is_flag=True)
 def command(
-    rig: Path | None, actuator: Path | None, runs: Path, page_port: int, no_browser: bool
+    rig: Path | None,
+    actuator: Path | None,
+    runs: Path,
+    page_port: int,
+    lease_s: float,
+    no_browser: bool,
 ) -> None:
     """Show and drive a bench in a browser.
 
     HIGH VOLTAGE WILL BE APPLIED on a real bench when a page arms and drives it. Keep clear. The
-    page has live signals, STOP, arming, a drive by hand and, with --actuator, a closed loop. It is
+    page has live signals, STOP, arming, a drive by hand and, with --actuator, a closed loop. Other
+    pages play studies, pick points in videos, change the gains and examine the computer. They are
     served on this computer only. Ctrl-C takes the output to 0 V and ends the panel.
     """
     with contextlib.ExitStack() as opened:
@@ -52,7 +64,9 @@ def command(
             folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
             rig = folder / "twin.toml"
             write_new(rig, 'kind = "twin"\n')
-        panel = opened.enter_context(running_panel(PanelFiles(rig, actuator, runs), page_port))
+        panel = opened.enter_context(
+            running_panel(PanelFiles(rig, actuator, runs), page_port, lease_s)
+        )
         click.echo(panel.address)
         if not no_browser:
             webbrowser.open(panel.address)

@@ -186,7 +186,7 @@ def test_a_study_is_checked_armed_played_and_reported_by_keyboard_alone(
             page.locator(".tab").get_by_label("Highest drive of this run").focus()
             page.keyboard.type("1.8")
             page.keyboard.press("Enter")
-            expect(page.locator(".tab").get_by_text("A study is played")).to_be_visible(
+            expect(page.locator(".tab").get_by_text("Playing a study")).to_be_visible(
                 timeout=WAIT_MS
             )
             ending = page.locator(".tab").get_by_text("The study has ended")

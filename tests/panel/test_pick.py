@@ -151,7 +151,7 @@ def test_picked_points_are_those_that_track_finds_and_give_its_strain(
 ) -> None:
     picking.click(UPPER[1][0] - 5, UPPER[1][1] + 4)
     picking.click(LOWER[1][0] + 6, LOWER[1][1] + 3)
-    picking.page.get_by_role("button", name="Ruler", exact=True).click()
+    picking.page.get_by_role("button", name="Scale", exact=True).click()
     picking.click(UPPER[0][0] + 4, UPPER[0][1] - 5)
     picking.click(UPPER[1][0] + 2, UPPER[1][1] + 2)  # where a point is; the third click begins anew
     picking.page.get_by_role("button", name="Undo").click()
@@ -258,7 +258,7 @@ def test_every_task_is_possible_by_keyboard(picking: Picking, tmp_path: Path) ->
     add(UPPER[1][0] + 4, UPPER[1][1] - 4)
     expect(page.locator(".marks button")).to_contain_text(["255.5, 60.0"], timeout=WAIT_MS)
     type_in("Name", "top")
-    tab_to("Ruler")
+    tab_to("Scale")
     page.keyboard.press("Space")
     add(UPPER[0][0] + 2, UPPER[0][1] - 4)
     add(UPPER[2][0] + 2, UPPER[2][1] - 4)
@@ -349,7 +349,7 @@ def test_points_belong_to_the_first_frame_and_a_ruler_to_any(picking: Picking) -
     page.mouse.click(*picking.place(200, 150))
     expect(page.get_by_role("alert")).to_contain_text("go to frame 0", timeout=WAIT_MS)
     assert picking.marks() == []
-    page.get_by_role("button", name="Ruler", exact=True).click()
+    page.get_by_role("button", name="Scale", exact=True).click()
     picking.click(200, 150)
 
 
@@ -366,7 +366,7 @@ def test_axe_finds_nothing_and_a_tablet_is_wide_enough(
             page.set_default_timeout(WAIT_MS)
             page.goto(panel.address)
             page.get_by_role("button", name="Pick").click()
-            page.get_by_label("Video or recording").select_option("run 1/clip.mkv")
+            page.get_by_label("Video").select_option("run 1/clip.mkv")
             picking = Picking(panel.process, page)
             expect(page.get_by_role("application")).to_be_visible(timeout=WAIT_MS)
             page.touchscreen.tap(*picking.place(UPPER[0][0] + 5, UPPER[0][1] + 5))
@@ -378,7 +378,7 @@ def test_axe_finds_nothing_and_a_tablet_is_wide_enough(
             page.get_by_role("button", name="Live").click()
             page.get_by_role("button", name="Pick").click()
             expect(page.locator(".marks button")).to_contain_text(["upper1"], timeout=WAIT_MS)
-            page.get_by_label("File beside the video").fill(f"{scheme}.csv")
+            page.get_by_label("File name of the table").fill(f"{scheme}.csv")
             page.get_by_role("button", name=re.compile("Save")).click()
             expect(page.get_by_role("heading", name="Saved")).to_be_visible(timeout=WAIT_MS)
             assert len(table(video.with_name(f"{scheme}.csv"))) == 1
@@ -451,7 +451,7 @@ def test_no_video_outside_of_the_recordings_is_read(tmp_path: Path, name: str) -
     (runs / "run 1").mkdir(parents=True)
     (tmp_path / "secret.mkv").write_bytes(b"secret")
     (runs / "link").symlink_to(tmp_path)
-    refused = "is not one of this page|contains no image"
+    refused = "is not in the list of this page|contains no image"
     with pytest.raises(InputError, match=refused):
         asked(Videos(runs), "pick-frame", video=name, frame=0)
     assert asked(Videos(runs), "pick-videos")["videos"] == []

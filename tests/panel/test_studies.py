@@ -162,8 +162,8 @@ REFUSED = [
     (STUDY, 1.5, "The study needs 1.8 V, but the typed limit is 1.5 V"),
     ({"study": "../triangle.toml"}, 1.8, "There is no study '../triangle.toml'"),
     ({"study": 7}, 1.8, "There is no study 7"),
-    ({**STUDY, "experiments": ["chirp"]}, 1.8, "there is no 'chirp'"),
-    ({**STUDY, "experiments": []}, 1.8, "Choose at least one of the experiments triangle"),
+    ({**STUDY, "experiments": ["chirp"]}, 1.8, "The study has no experiment 'chirp'"),
+    ({**STUDY, "experiments": []}, 1.8, "None is chosen. Choose from its experiments: triangle"),
     ({"study": "high.toml"}, 2.0, "1) highest drive voltage is 2.5 V in triangle (limit 2 V)"),
     ("triangle.toml", 1.8, "This panel cannot play a study"),
 ]

@@ -24,7 +24,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from haselab.api.design import Actuator
@@ -196,12 +196,26 @@ def main(words: list[str]) -> int:
         _loop_of(actuator)  # a file that is not valid is refused before the bench is opened
         file = load_rig(path)
         with _opened(file, path, folder, player.operator) as (rig, safety):
-            if actuator is not None and (note := prepare_bench(
-                rig, actuator_tables(actuator), actuator, CARRIER_HZ,
-                file.configuration(path) if isinstance(file, TwinFile) else None,
-            )):  # fmt: skip
-                print(f"haselab: {note}", file=sys.stderr)
+            bare, twin = rig.description, None
+            if isinstance(file, TwinFile):
+                twin = file.configuration(path)
+            if actuator is not None:
+                tables = actuator_tables(actuator)
+                if note := prepare_bench(rig, tables, actuator, CARRIER_HZ, twin):
+                    print(f"haselab: {note}", file=sys.stderr)
             about = rig.description
+
+            def read_loop() -> LoopSettings | None:
+                if actuator is not None:
+                    now = replace(rig, description=bare)
+                    prepare_bench(now, actuator_tables(actuator), actuator, CARRIER_HZ, twin)
+                    if now.description != about:
+                        raise InputError(
+                            "The limits in [drive] or the calibration have changed since the "
+                            f"panel was started. Start it again. {actuator}"
+                        )
+                return _loop_of(actuator)
+
             scales = (
                 about.volt_per_code / about.v_monitor_v_per_v,
                 about.volt_per_code / about.i_monitor_v_per_a,
@@ -209,7 +223,7 @@ def main(words: list[str]) -> int:
             live = folder / "live"
             with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
                 bench = LiveBench(
-                    guard(rig, safety), writer, lambda: _loop_of(actuator), folder / "camera.jpg",
+                    guard(rig, safety), writer, read_loop, folder / "camera.jpg",
                     lambda chosen: StudyJob.of(files, file, chosen), player, lease_s,
                 )  # fmt: skip
                 threading.Thread(target=_end_study_at, args=(ended, bench), daemon=True).start()

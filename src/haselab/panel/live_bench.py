@@ -39,7 +39,8 @@ CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # of the reference study
 _RAMP_V_PER_S = 1.0  # at the amplifier's input: 5 kV/s with a gain of 5000
 _HEARTBEAT_S = 0.5
 _PICTURES_HZ = 5.0
-_CATCH_UP_S = 0.2
+_CATCH_UP_S, _WATCH_S = 0.2, 0.1
+_COMPUTES_S = 0.5  # without a block, after which a study does not look whether it must end
 _MOST_EVENTS = 40  # that a page shows
 
 
@@ -148,6 +149,7 @@ class LiveBench:
         self._prepare, self._player = prepare, player or StudyPlayer()
         self._player.note = self._note
         self._job: StudyJob | None = None
+        self._block_s = 0.0  # when the last block was read
         self._recorded = ""  # folder of the last study that was played to its end
         self._end_study = ""  # why the study must end; empty: it may go on
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
@@ -409,7 +411,8 @@ class LiveBench:
         """Play a study. Pages get answers meanwhile: only `_lease`, `_confirm` and `_disarm`."""
         about, folder = self._rig.description, job.options.folder
         self._lockin = lockin_of(about, job.study.sensing.carrier_hz)
-        reason = f"The study has ended. Its recording is in {folder}."
+        reason, over = f"The study has ended. Its recording is in {folder}.", threading.Event()
+        threading.Thread(target=self._watch_study, args=(over,), daemon=True).start()
         try:
             self._player.play(job, self._rig, self._limit_v, self._why_not, self._picture)
             self._recorded = folder.name
@@ -417,10 +420,18 @@ class LiveBench:
             kept = f" The data recorded so far are in {folder}." if folder.is_dir() else ""
             reason = f"{error}{kept}"
         finally:
+            over.set()
             self._lockin = lockin_of(about, CARRIER_HZ)
             with self._mutex:
                 self._job = None
                 self._end(reason)
+
+    def _watch_study(self, over: threading.Event) -> None:
+        """End a study that must end while no block is read: it computes, with its last output."""
+        while not over.wait(_WATCH_S):
+            idle = time.monotonic() > self._block_s + _COMPUTES_S
+            if idle and self._rig.safety.live and (reason := self._why_not()):
+                self._rig.safety.trip(reason)
 
     def _why_not(self) -> str:
         """Why the study must end; empty while it may go on."""
@@ -467,6 +478,7 @@ class LiveBench:
     def _on_block(self, codes: NDArray[np.int16]) -> None:
         """Write the live signals of each block that is read, and end a study that must end."""
         about, time_s = self._rig.description, self._rig.bench.time_s
+        self._block_s = time.monotonic()
         if self._job is not None:
             self._drive_v = self._rig.present_drive_v
             if self._rig.safety.live:

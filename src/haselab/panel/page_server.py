@@ -178,7 +178,7 @@ def routes_of(
         try:
             values = await _body(request)
         except ValueError:
-            return JSONResponse({"error": "The request must hold one small JSON object."}, 400)
+            return JSONResponse({"error": "The request must be one JSON object of at most 1 MB, sent as application/json."}, 400)
         try:
             found = await run_in_threadpool(carry_out, values)
         except HaselabError as error:

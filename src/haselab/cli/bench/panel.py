@@ -27,7 +27,7 @@ __all__ = ["command"]
 )
 @shared_option(
     "--actuator", type=click.Path(path_type=Path),
-    detail="With both maps and a controller, the panel can close the loop; with a model, its page "
+    detail="With both maps and a controller, the panel can close the loop. With a model, its page "
     "Design changes the gains. Default: none.",
 )  # fmt: skip
 @click.option(
@@ -40,8 +40,8 @@ __all__ = ["command"]
 )  # fmt: skip
 @click.option(
     "--lease-s", type=Real(0.5, 10.0), default=1.5, show_default=True,
-    help="Set the longest time without a message from the page that armed the bench, in s. Then "
-    "the output goes to 0 V. Raise it for a slow tablet or computer.",
+    help="Set how long the page that armed the bench may be silent, in s, before the output goes to "
+    "0 V. A larger value suits a slow tablet, but a lost page keeps its voltage longer.",
 )  # fmt: skip
 @shared_option("--no-browser", is_flag=True)
 def command(
@@ -55,8 +55,8 @@ def command(
     """Show and drive a bench in a browser.
 
     HIGH VOLTAGE WILL BE APPLIED on a real bench when a page arms and drives it. Keep clear. The
-    page has live signals, STOP, arming, a drive by hand and, with --actuator, a closed loop. Other
-    pages play studies, pick points in videos, change the gains and examine the computer. They are
+    page Live has signals, STOP, arming, a manual drive and, with --actuator, a closed loop. Other
+    pages play studies, pick points in videos, change the gains and check the computer. The panel is
     served on this computer only. Ctrl-C takes the output to 0 V and ends the panel.
     """
     with contextlib.ExitStack() as opened:

@@ -24,7 +24,7 @@ def _refuse_others() -> None:
         source = context.get_parameter_source(parameter.name or "")
         if source is click.core.ParameterSource.COMMANDLINE and parameter.name not in _WITH_PICK:
             raise click.UsageError(
-                f"--pick excludes {parameter.opts[0]}. Give it to the command that --pick prints."
+                f"--pick excludes {parameter.opts[0]}. Add it to the command that --pick prints."
             )
 
 

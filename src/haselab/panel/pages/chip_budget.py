@@ -38,8 +38,8 @@ def chip_budget(files: PanelFiles, values: JsonObject) -> JsonObject:
     if not loop.margins(gains, CHIP).stable:
         raise ResultError(
             f"Not measured: with these gains the loop is unstable on the microcontroller, at "
-            f"{CHIP.rate_hz:g} Hz with a delay of {1e3 * CHIP.measurement_delay_s:.3g} ms. Lower "
-            "the gains."
+            f"{CHIP.rate_hz:g} Hz with a delay of {1e3 * CHIP.measurement_delay_s:.3g} ms. "
+            "Change the gains until it is stable."
         )
     design = read_design(loop.path, None, load_board(_BOARD).front_end)
     settings = replace(design.settings, **asdict(gains))

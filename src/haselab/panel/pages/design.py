@@ -113,8 +113,8 @@ class DesignedLoop:
         """Refuse to change the gains of a controller that has none."""
         if self.held is not None and not self.is_pid:
             raise InputError(
-                f"The controller of the file is of kind {self.held.kind!r}. This page changes the "
-                f"gains of a PI or PID only. Change the parameters in the file: {self.path}"
+                f"The controller of the file has kind = {self.held.kind!r}, but this page changes "
+                f"only the gains of a PI or PID. Edit its parameters in the file: {self.path}"
             )
 
 
@@ -269,7 +269,8 @@ def _design(loop: DesignedLoop, gains: PidGains) -> Design:
     loop.require_limits()
     if not (gains.kp or gains.ki):
         raise InputError(
-            "kp and ki are both 0, so the controller does not follow the reference. Raise one."
+            "kp and ki are both 0, so the controller does not follow the reference. Set at "
+            "least one above 0."
         )
     posterior = read_posterior(loop.path)
     return evaluate_controller(
@@ -326,7 +327,7 @@ def _write(files: PanelFiles, values: JsonObject) -> JsonObject:
         raise ResultError(
             "Not written: with these gains the loop is unstable at "
             f"{loop.setting.rate_hz:g} Hz with a delay of {loop.setting.measurement_delay_s:g} s. "
-            "Lower the gains."
+            "Change the gains until it is stable."
         )
     design, held = _design(loop, gains), loop.held
     kind = "pi" if held is not None and held.kind == "pi" and not gains.kd else "pid"

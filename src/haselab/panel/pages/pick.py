@@ -73,8 +73,8 @@ class Videos:
             below = False
         if self.only is not None or not below:
             raise InputError(
-                f"The video {name[:_LONGEST_NAME]!r} is not one of this page. Choose one from its "
-                "list."
+                f"The video {name[:_LONGEST_NAME]!r} is not in the list of this page. "
+                "Choose one from the list."
             )
         return path
 
@@ -115,7 +115,7 @@ def _value(values: Mapping[str, Any], name: str, kind: type[T]) -> T:
     """
     found = values.get(name)
     if not isinstance(found, kind) or (isinstance(found, bool) and kind is not bool):
-        raise InputError(f"The request has no valid {name!r}. Load this page again.")
+        raise InputError(f"The value of {name!r} is not valid. Correct it, or reload this page.")
     return found
 
 
@@ -259,8 +259,8 @@ def _region(videos: Videos, values: JsonObject) -> JsonObject:
     size = high - low + 1
     if size.min() < 16:
         raise InputError(
-            f"The region has {max(size[0], 0)} x {max(size[1], 0)} px of the picture. Use at "
-            "least 16 x 16 px."
+            f"The region is {max(size[0], 0)} x {max(size[1], 0)} px. Draw one of at least "
+            "16 x 16 px inside the picture."
         )
     part = frame[low[1] : high[1] + 1, low[0] : high[0] + 1]
     found = find_points(part, count, None)

@@ -63,8 +63,11 @@ def _described(folder: Path) -> dict[str, Any]:
     except InputError as error:
         manifest, state = {}, " ".join(str(error).split())
     else:
-        ended = str(manifest.get("ended", ""))
-        state = ended if manifest.get("state") == "SEALED" else "not ended: run haselab recover"
+        state = str(manifest.get("ended", ""))
+        if manifest.get("state") == "OPEN":
+            state = "being recorded, or interrupted. If nothing records it, run haselab recover"
+        elif manifest.get("state") == "RECOVERED":
+            state = f"{state}, recovered".lstrip(", ")
     running = _running.get(folder)
     study, when = manifest.get("study"), recorded_when(manifest) if manifest else {}
     return {
@@ -88,7 +91,7 @@ def _read(path: Path) -> str:
 
 
 def note(files: PanelFiles, values: JsonObject) -> JsonObject:
-    """Keep a note about a recording in a text file beside it.
+    """Save a note about a recording in `notes.txt` in its folder.
 
     Args:
         files: of the panel.
@@ -100,7 +103,7 @@ def note(files: PanelFiles, values: JsonObject) -> JsonObject:
     """
     folder, text = _recording(files, values.get("name")), values.get("text")
     if not isinstance(text, str) or len(text) > _MOST_LETTERS:
-        raise InputError(f"A note must be a text of at most {_MOST_LETTERS} characters.")
+        raise InputError(f"A note must be a text of at most {_MOST_LETTERS} characters. Shorten it.")
     write_text(folder / _NOTES, text)
     return {}
 
@@ -123,7 +126,7 @@ def report(files: PanelFiles, values: JsonObject) -> JsonObject:
         why = " ".join(_read(folder / _LOG).split())
         raise InputError(
             f"There is no report of {folder.name} yet."
-            + (f" The last analysis said: {why}" if why else " Press Analyse.")
+            + (f" Messages of the last analysis: {why}" if why else " Press Analyse.")
         ) from None
 
 

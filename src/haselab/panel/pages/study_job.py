@@ -160,7 +160,7 @@ def chosen_study(files: PanelFiles, values: JsonObject) -> Study:
     elif name in [str(path) for path in _study_files(files)]:
         study = load_study(Path(str(name)), quick=quick)
     else:
-        raise InputError(f"There is no study {shown(name)} in this folder. Choose one of the list.")
+        raise InputError(f"There is no study {shown(name)} in this folder. Choose one from the list.")
     study = _reduced(study, values.get("experiments"))
     if (tables := _tables(files)) is not None:
         study = with_actuator_tables(study, tables)
@@ -175,10 +175,8 @@ def _reduced(study: Study, wanted: object) -> Study:
         return study
     unknown = [one for one in wanted if one not in played]
     if unknown or not wanted:
-        raise InputError(
-            f"Choose at least one of the experiments {', '.join(played)}"
-            + (f"; there is no {shown(unknown[0])}." if unknown else ".")
-        )
+        fault = f"The study has no experiment {shown(unknown[0])}" if unknown else "None is chosen"
+        raise InputError(f"{fault}. Choose from its experiments: {', '.join(played)}.")
     content = study.model_dump(mode="json")
     content["name"] = f"{study.name}: {', '.join(wanted)}"
     kept = {name: table for name, table in content.items() if name not in set(played) - set(wanted)}

@@ -44,8 +44,8 @@ export function Playing({ state, link, say }) {
   const ask = (what) => link.ask(what).then((found) => say(found.error || ""));
   const share = Math.round(100 * state.done);
   return html`
-    <p class="badge live">A study is played, up to ${kilo(state.limit_v, state.gain)}</p>
-    <p role="status">${state.task || "starting"}</p>
+    <p class="badge live">Playing a study, up to ${kilo(state.limit_v, state.gain)}</p>
+    <p role="status">${state.task || "Starting"}</p>
     <progress max="100" value=${share} aria-label="Progress of the study">${share} %</progress> ${share} %
     ${state.prompt && html`<div class="card warning" role="alert"><p>${state.prompt}</p>
       <button type="button" onClick=${() => ask("confirm")}>Done</button></div>`}

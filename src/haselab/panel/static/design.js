@@ -158,7 +158,7 @@ export default function Design({ link, state }) {
   async function compute() {
     const answer = await during("compute", () => link.request("design-search"));
     if (answer.error) { say({ text: answer.error, bad: true }); return; }
-    say({ text: "Computed as haselab design does. Not written yet.", bad: false });
+    say({ text: "Gains computed. They are not written to the file yet.", bad: false });
     change(answer.gains);
   }
   async function write() {
@@ -166,7 +166,7 @@ export default function Design({ link, state }) {
     if (answer.error) say({ text: answer.error, bad: true });
     else {
       unwritten = null;
-      const next = state?.holder ? "The bench is armed: it keeps the controller that it was armed with. Disarm and arm it again to use the new one." : "The bench reads the file when it is armed.";
+      const next = state?.holder ? "The armed bench keeps its present controller. Disarm it and arm it again to use the new one." : "Press Arm the bench on the page Live to use it.";
       say({ text: `Written to ${answer.written}. ${next}`, bad: false });
     }
     requests.current.loop.want(gains); // of the file as it is now
@@ -188,12 +188,12 @@ export default function Design({ link, state }) {
       <div class="card"><h2>Gains</h2>
         <p>${about.file}</p>
         ${about.kind === null && html`<p>The file has no controller yet. Compute gains, or move the sliders.</p>`}
-        ${gains === null && html`<p>The controller is of kind ${about.kind}. Its parameters are changed in the file; this page changes the gains of a PI or PID.</p>`}
+        ${gains === null && html`<p>The controller has kind = ${about.kind}, but this page changes only the gains of a PI or PID. Edit its parameters in the file.</p>`}
         ${gains !== null && GAINS.map((one) => html`<${Gain} key=${one.name} about=${one} value=${gains[one.name]} highest=${about.ranges[one.name]} put=${put(one.name)} />`)}
         ${gains !== null && html`<div class="row">
           <button type="button" disabled=${busy !== ""} onClick=${compute}>${busy === "compute" ? "Computing …" : "Compute gains"}</button>
           <button type="button" disabled=${busy !== ""} onClick=${reopen}>Read the file again</button>
-          <button type="button" disabled=${busy !== "" || !isNew} onClick=${write}>Write to actuator.toml</button></div>`}
+          <button type="button" disabled=${busy !== "" || !isNew} onClick=${write}>Write to the actuator file</button></div>`}
         <p role="status" class=${said.bad ? "error" : ""}>${said.text}</p>
       </div>
       ${isShown && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>Margins</h2>

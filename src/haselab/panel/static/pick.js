@@ -3,7 +3,7 @@ import { html, useState, useEffect, useLayoutEffect, useMemo, useRef } from "/st
 
 const REACH = { mouse: 12, touch: 24, pen: 16 }; // to a mark, in px of the screen
 const SNAP = 24; // to a dot, in px of the screen
-const PAIRS = { ruler: "Ruler", region: "Region" };
+const PAIRS = { ruler: "Scale", region: "Region" };
 const EMPTY = { marks: [], length: "", number: 0 };
 const kept = { video: "", work: { past: [], now: EMPTY, future: [] } }; // while another page is shown
 
@@ -341,14 +341,14 @@ function Picker({ link }) {
       <p>${done.scale_mm_per_px ? `Scale: ${done.scale}. ` : "No scale: lengths stay in pixels. "}Track the points with this command:</p><p><code>${done.command}</code></p></div>`;
   if (done && list.only) return html`${saved}<p>haselab track --pick has ended. Close this page.</p>`;
   return html`
-    ${!list.only && html`<label>Video or recording <select value=${video} onChange=${(e) => open(e.target.value)}>
+    ${!list.only && html`<label>Video <select value=${video} onChange=${(e) => open(e.target.value)}>
       <option value="">Choose one of ${list.more ? "the first " : ""}${list.videos.length} below ${list.folder}</option>
       ${list.videos.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>`}
     ${!list.only && !list.videos.length && html`<p>There is no video below ${list.folder}. Start haselab panel with --runs DIR, or use haselab track --pick VIDEO.</p>`}
     ${picture === null ? message : html`<div class="layout pick">
       <section aria-label="Picture">
         <div class="row" role="group" aria-label="What to pick">
-          ${[["point", "Points"], ["ruler", "Ruler"], ["region", "Region"]].map(([kind, name]) => html`<button type="button" aria-pressed=${mode === kind} onClick=${() => setMode(kind)}>${name}</button>`)}
+          ${[["point", "Points"], ["ruler", "Scale"], ["region", "Region"]].map(([kind, name]) => html`<button type="button" aria-pressed=${mode === kind} onClick=${() => setMode(kind)}>${name}</button>`)}
           <label><input type="checkbox" checked=${snaps} onChange=${(e) => setSnaps(e.target.checked)} /> Snap to dots</label>
           <button type="button" disabled=${!work.canUndo} onClick=${work.undo}>Undo</button>
           <button type="button" disabled=${!work.canRedo} onClick=${work.redo}>Redo</button>
@@ -369,7 +369,7 @@ function Picker({ link }) {
           <p>Points whose names begin with upper and lower give the strain.</p>
           <div class="marks">${work.marks.map((one) => html`<button type="button" aria-pressed=${one.id === chosen} onClick=${() => choose(one.id)}>${one.name} <small>${one.x.toFixed(1)}, ${one.y.toFixed(1)}</small></button>`)}</div></div>
         <div class="card"><h2>Scale</h2>
-          <p>Press Ruler and pick two points at a known distance.</p>
+          <p>Press Scale and pick two points at a known distance.</p>
           <label>Distance, in mm <input type="number" min="0" step="any" value=${work.length} onInput=${(e) => work.change((old) => ({ ...old, length: e.target.value }))} /></label>
           <p role="status">${scale || (ends.length < 2 ? `${ends.length} of 2 points picked.` : "Type the distance.")}</p></div>
         <div class="card"><h2>Region</h2>
@@ -377,7 +377,7 @@ function Picker({ link }) {
           <label>At most this many <input type="number" min="1" max="5000" value=${count} onInput=${(e) => setCount(e.target.value)} /></label>
           <button type="button" disabled=${pair("region").length < 2} onClick=${find}>Find the dots in the region</button></div>
         <div class="card"><h2>Save</h2>
-          ${list.only ? html`<p><code>${table}</code></p>` : html`<label>File beside the video <input type="text" value=${table} onInput=${(e) => setTable(e.target.value)} /></label>`}
+          ${list.only ? html`<p><code>${table}</code></p>` : html`<label>File name of the table <input type="text" value=${table} onInput=${(e) => setTable(e.target.value)} /></label>`}
           <label><input type="checkbox" checked=${moveAside} onChange=${(e) => setMoveAside(e.target.checked)} /> Move an existing file to NAME.previous-1</label>
           <button type="button" disabled=${!points.length} onClick=${save}>Save ${points.length} points</button></div>
         ${saved}

@@ -14,7 +14,7 @@ export class Requests {
       });
       return await answer.json();
     } catch {
-      return { error: "The web server does not answer. Read the messages in the terminal of haselab." };
+      return { error: "The web server does not answer, or its answer is not valid. Look at the terminal in which haselab runs." };
     }
   }
 }

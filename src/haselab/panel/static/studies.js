@@ -52,7 +52,7 @@ function Chooser({ link, state, mine, onEnd }) {
       ${checked.checks.length > 0 && html`<table><thead><tr><th scope="col">Check</th><th scope="col">Where</th><th scope="col">Needed</th><th scope="col">Limit</th><th scope="col">What to do</th></tr></thead>
         <tbody>${checked.checks.map((one) => html`<tr><td>${one.name}</td><td>${one.where}</td><td class=${one.ok ? "" : "error"}>${number(one.requested)} ${one.unit}</td>
           <td>${number(one.limit)} ${one.unit}</td><td>${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}
-      ${checked.ok && (busy ? html`<p>The bench is armed. Disarm it on the Live page before you play a study.</p>`
+      ${checked.ok && (busy ? html`<p>${mine ? "The bench is armed. Disarm it on the page Live before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."}</p>`
         : state && html`<${Arming} state=${state} link=${link} say=${say} study=${chosen} onArmed=${() => setChecked(null)} />`)}`}
   </div>`;
 }
@@ -63,7 +63,7 @@ function Comparison({ link, names, close }) {
   if (found === null) return html`<p role="status">Comparing …</p>`;
   if (found.error) return html`<p class="error" role="alert">${found.error}</p>`;
   const cell = (one) => (one === null ? "–" : html`${number(one.value)} <small>[${number(one.ci95[0])}, ${number(one.ci95[1])}]</small>`);
-  return html`<div class="card"><h2>Comparison</h2><p>Difference: second minus first, in standard deviations of both together.</p>
+  return html`<div class="card"><h2>Comparison</h2><p>Difference: second minus first, divided by their combined standard deviation. Values beyond 3 are red.</p>
     <button type="button" onClick=${close}>Close</button>
     <table><thead><tr><th scope="col">Row</th><th scope="col">Name</th><th scope="col">Unit</th><th scope="col">${names[0]}</th><th scope="col">${names[1]}</th><th scope="col">Difference</th></tr></thead>
     <tbody>${found.rows.map((one) => html`<tr><td>${one.id}</td><td>${one.name}</td><td>${one.unit}</td><td>${cell(one.first)}</td><td>${cell(one.second)}</td>

@@ -45,7 +45,7 @@ def bench(tmp_path: Path) -> Iterator[tuple[LiveBench, GuardedRig]]:
 def test_a_study_that_computes_with_an_output_is_taken_to_zero_when_it_must_end(
     bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    live, rig = bench
+    live, _ = bench
     seen: list[float] = []
 
     def computing(study: Any, rig: GuardedRig, options: Any, progress: Any) -> None:

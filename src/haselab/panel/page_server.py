@@ -39,6 +39,7 @@ __all__ = [
 ]
 
 STATIC = Path(__file__).parent / "static"
+_NO_OBJECT = "The request must be one JSON object of at most 1 MB, sent as application/json."
 NO_TOKEN = "The token is missing or wrong. Open the address that haselab printed."
 _MOST_BODY_BYTES = 1 << 20  # of a request
 
@@ -178,7 +179,7 @@ def routes_of(
         try:
             values = await _body(request)
         except ValueError:
-            return JSONResponse({"error": "The request must be one JSON object of at most 1 MB, sent as application/json."}, 400)
+            return JSONResponse({"error": _NO_OBJECT}, 400)
         try:
             found = await run_in_threadpool(carry_out, values)
         except HaselabError as error:

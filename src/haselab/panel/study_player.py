@@ -99,10 +99,10 @@ class StudyPlayer:
             HaselabError: see `run_study`; the recorded data are kept.
         """
         self._why_not, self._passed, self._total = why_not, 0.0, 0.0
-        full, played = rig.description, rig
+        full, played = rig.description, replace(rig)
         narrowed = replace(full, drive_limits=_within(full.drive_limits, limit_v))
         if picture is not None:
-            played = replace(rig, camera=FilmedCamera(rig.camera, picture))
+            played.camera = FilmedCamera(rig.camera, picture)
         rig.plain.description = played.description = narrowed  # both are asked
         try:
             job.begin()

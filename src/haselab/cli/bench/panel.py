@@ -40,8 +40,8 @@ __all__ = ["command"]
 )  # fmt: skip
 @click.option(
     "--lease-s", type=Real(0.5, 10.0), default=1.5, show_default=True,
-    help="Set how long the page that armed the bench may be silent, in s, before the output goes to "
-    "0 V. A larger value suits a slow tablet, but a lost page keeps its voltage longer.",
+    help="Set how long the page that armed the bench may be silent, in s, before the output goes "
+    "to 0 V. A larger value suits a slow tablet, but a lost page keeps its voltage longer.",
 )  # fmt: skip
 @shared_option("--no-browser", is_flag=True)
 def command(

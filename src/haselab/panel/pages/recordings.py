@@ -103,7 +103,9 @@ def note(files: PanelFiles, values: JsonObject) -> JsonObject:
     """
     folder, text = _recording(files, values.get("name")), values.get("text")
     if not isinstance(text, str) or len(text) > _MOST_LETTERS:
-        raise InputError(f"A note must be a text of at most {_MOST_LETTERS} characters. Shorten it.")
+        raise InputError(
+            f"A note must be a text of at most {_MOST_LETTERS} characters. Shorten it."
+        )
     write_text(folder / _NOTES, text)
     return {}
 

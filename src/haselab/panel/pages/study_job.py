@@ -160,7 +160,9 @@ def chosen_study(files: PanelFiles, values: JsonObject) -> Study:
     elif name in [str(path) for path in _study_files(files)]:
         study = load_study(Path(str(name)), quick=quick)
     else:
-        raise InputError(f"There is no study {shown(name)} in this folder. Choose one from the list.")
+        raise InputError(
+            f"There is no study {shown(name)} in this folder. Choose one from the list."
+        )
     study = _reduced(study, values.get("experiments"))
     if (tables := _tables(files)) is not None:
         study = with_actuator_tables(study, tables)

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import re
 import signal
 import subprocess
@@ -91,6 +92,13 @@ def test_a_study_from_a_page_is_recorded_and_analysed_like_one_of_haselab_run(
             assert page.state["stage"] == "off" and page.state["drive_v"] == 0.0
             assert "The study has ended." in page.state["reason"]
             assert "triangle" in [text for _, text in page.state["events"]]
+            await page.arm(1.5)  # the bench works as before, and so does STOP
+            await page.ask("drive", value_v=1.0)
+            await page.until(lambda state: state["drive_v"] > 0.2)
+            stopped = await asyncio.to_thread(panel.stop, Origin=f"http://{panel.host}")
+            assert stopped["commanded"]
+            await page.until(lambda state: state["stage"] == "tripped" and not state["holder"])
+            assert "answer" in await page.arm(1.5)
 
     try:
         asyncio.run(through_the_page())
@@ -163,6 +171,8 @@ REFUSED = [
     ({"study": "../triangle.toml"}, 1.8, "There is no study '../triangle.toml'"),
     ({"study": 7}, 1.8, "There is no study 7"),
     ({**STUDY, "experiments": ["chirp"]}, 1.8, "The study has no experiment 'chirp'"),
+    ({**STUDY, "experiments": [[]]}, 1.8, "The study has no experiment []"),
+    ({**STUDY, "sha256": "0"}, 1.8, "The study has changed since it was checked"),
     ({**STUDY, "experiments": []}, 1.8, "None is chosen. Choose from its experiments: triangle"),
     ({"study": "high.toml"}, 2.0, "1) highest drive voltage is 2.5 V in triangle (limit 2 V)"),
     ("triangle.toml", 1.8, "This panel cannot play a study"),
@@ -171,6 +181,7 @@ REFUSED = [
 
 def test_a_study_that_cannot_be_played_leaves_the_bench_off(folder: Path) -> None:
     (folder / "high.toml").write_text(TRIANGLE.replace("1.8", "2.5"))
+    (folder / ".#triangle.toml").symlink_to("user@host.1:2")  # as an editor leaves it
     panel = started()
 
     async def attempt() -> None:
@@ -185,6 +196,28 @@ def test_a_study_that_cannot_be_played_leaves_the_bench_off(folder: Path) -> Non
     finally:
         ended(panel)
     assert not (folder / "out").exists()
+
+
+def test_a_study_of_another_page_does_not_disturb_the_one_that_has_armed(folder: Path) -> None:
+    """It was checked for seconds, and meanwhile no message that renews the lease was read."""
+    panel = started(lease_s=1.5)
+
+    async def attempt() -> None:
+        async with connected(panel) as first, connected(panel) as second:
+            number = (await second.ask("request"))["answer"]["number"]
+            await first.arm(1.5)
+            await first.ask("drive", value_v=1.0)
+            receiving = asyncio.create_task(first.until(lambda state: not state["holder"]))
+            for _ in range(3):
+                values = {"number": number, "limit_v": 2.0, "study": LONG}
+                assert "Another page" in (await second.ask("arm", **values))["error"]
+            assert second.state["holder"] == first.holder
+            receiving.cancel()
+
+    try:
+        asyncio.run(attempt())
+    finally:
+        ended(panel)
 
 
 def test_the_limits_of_the_actuator_file_are_those_of_the_panel(
@@ -284,6 +317,36 @@ def test_the_difference_of_two_recordings_is_in_deviations_of_both(files: PanelF
     (files.runs / "b" / "results.json").write_text("{}")
     with pytest.raises(InputError, match="b has no results"):
         compare(files, {"first": "a", "second": "b"})
+
+
+@pytest.mark.parametrize(
+    "row",
+    [{"value": "x", "std": 1, "ci95": [0, 1]}, {"value": 1, "ci95": [0, 1]}, 1,
+     {"value": 1, "std": 1, "ci95": 1}],
+)  # fmt: skip
+def test_results_that_are_not_of_haselab_are_refused(files: PanelFiles, row: Any) -> None:
+    recording(files, "a", {})
+    (files.runs / "a" / "results.json").write_text(
+        json.dumps({"quantities": [{"id": "x", "name": "x", "unit": "", "measured": row}]})
+    )
+    with pytest.raises(InputError, match="a has no results that can be read"):
+        compare(files, {"first": "a", "second": "a"})
+
+
+def test_odd_folders_do_not_empty_the_list_of_recordings(files: PanelFiles) -> None:
+    recording(files, "a", {})
+    odd = files.runs / "b"
+    odd.mkdir()
+    (odd / "session.h5").touch()
+    (odd / "manifest.json").write_text('{"state": "SEALED", "study": {"name": {"x": Infinity}}}')
+    undecoded = Path(os.fsdecode(os.fsencode(files.runs) + b"/\xff"))
+    undecoded.mkdir()
+    (undecoded / "session.h5").touch()
+    found = listed(files, {})["recordings"]
+    assert {one["name"] for one in found} == {"a", "b"}
+    assert all(isinstance(one["study"], str) for one in found)
+    with pytest.raises(InputError, match="A note must be a text"):
+        note(files, {"name": "a", "text": "\ud800"})
 
 
 def test_a_note_stays_with_its_recording(files: PanelFiles) -> None:

@@ -23,6 +23,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -59,6 +60,7 @@ class _Link:
 
     def __init__(self, folder: Path, bench: LiveBench) -> None:
         self._bench = bench
+        self._sending = threading.Lock()
         self._server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._server.bind(str(folder / "bench.sock"))
         self._server.listen(4)
@@ -85,8 +87,16 @@ class _Link:
             if not data or len(text) > _MOST_BYTES:
                 return
             *lines, text = (text + data).split(b"\n")
-            for line in lines:
-                self._send(client, self._answer(json.loads(line)))
+            for command in map(json.loads, lines):
+                if command.get("do") == "arm":  # a study is checked first, which takes a second
+                    job = threading.Thread(target=self._reply, args=(client, command), daemon=True)
+                    job.start()
+                else:
+                    self._reply(client, command)
+
+    def _reply(self, client: socket.socket, command: JsonObject) -> None:
+        with contextlib.suppress(OSError):  # the web server has gone
+            self._send(client, self._answer(command))
 
     def _answer(self, command: JsonObject) -> JsonObject:
         number = command.get("id")
@@ -96,13 +106,16 @@ class _Link:
             answer = self._bench.do(str(command.get("do")), str(command.get("holder")), values)
         except HaselabError as error:
             return {"id": number, "error": str(error)}
+        except Exception as error:  # other commands must still be answered
+            traceback.print_exc()
+            return {"id": number, "error": f"The command failed: {error!r}. See the terminal."}
         return {"id": number, "answer": answer, "state": asdict(self._bench.state)}
 
-    @staticmethod
-    def _send(client: socket.socket, message: JsonObject) -> None:
-        client.settimeout(1.0)
-        client.sendall(json.dumps(message).encode() + b"\n")
-        client.setblocking(False)
+    def _send(self, client: socket.socket, message: JsonObject) -> None:
+        with self._sending:
+            client.settimeout(1.0)
+            client.sendall(json.dumps(message).encode() + b"\n")
+            client.setblocking(False)
 
 
 def _stops(folder: Path, bench: LiveBench) -> None:

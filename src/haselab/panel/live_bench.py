@@ -197,16 +197,18 @@ class LiveBench:
             raise InputError(
                 f"There is no command {shown(what)}. Use one of: {', '.join(commands)}."
             )
-        job = self._chosen(values) if what == "arm" else None  # which takes longer than a block
+        job = None
+        if what == "arm" and values.get("study") is not None:
+            with self._mutex:
+                self._check_turn(what, holder)
+                self._find_request(values)
+            job = self._chosen(values)  # which takes longer than a block
         # The file is read here, so that no block waits for it.
         found = self._read_loop() if what == "request" else None
         with self._mutex:
             if what == "request" and not self._holder:
                 self._loop = found
-            if self._holder and holder != self._holder and what not in ("disarm", "lease"):
-                raise SafetyError(
-                    "Another page has armed the bench. It must disarm the bench first."
-                )
+            self._check_turn(what, holder)
             return self._arm(holder, values, job) if job else commands[what](holder, values)
 
     def stop(self, reason: str) -> None:
@@ -237,15 +239,13 @@ class LiveBench:
 
     def _arm(self, holder: str, values: JsonObject, job: StudyJob | None = None) -> JsonObject:
         self._require_idle()
-        limit_v, request = number(values, "limit_v"), self._request
+        limit_v, request = number(values, "limit_v"), self._find_request(values)
         limits = self._rig.description.drive_limits
         if not 0.0 < limit_v <= limits.high:
             raise LimitError(
                 f"The typed limit is {limit_v:g} V, but it must be above 0 and at most "
                 f"{limits.high:g} V. Type another one."
             )
-        if request is None or request.number != values.get("number"):
-            raise SafetyError("This request is no longer valid. Press 'Arm the bench' again.")
         highest_v = 0.0 if job is None else job.highest_v(self._rig.description)
         if highest_v > limit_v:
             raise LimitError(
@@ -272,6 +272,16 @@ class LiveBench:
         self._drive_v = self._target_v = 0.0
         self._seen_s = self._beat_s = time.monotonic()
         return {}
+
+    def _check_turn(self, what: str, holder: str) -> None:
+        """Refuse a command of a page while another one has armed the bench."""
+        if self._holder and holder != self._holder and what not in ("disarm", "lease"):
+            raise SafetyError("Another page has armed the bench. It must disarm the bench first.")
+
+    def _find_request(self, values: JsonObject) -> ArmingRequest:
+        if self._request is None or self._request.number != values.get("number"):
+            raise SafetyError("This request is no longer valid. Press 'Arm the bench' again.")
+        return self._request
 
     def _chosen(self, values: JsonObject) -> StudyJob | None:
         """The study that the bench is to be armed for, if there is one."""
@@ -421,6 +431,7 @@ class LiveBench:
             reason = f"{error}{kept}"
         finally:
             over.set()
+            self._rig.safety.record_with(lambda what: None)  # the recording is closed
             self._lockin = lockin_of(about, CARRIER_HZ)
             with self._mutex:
                 self._job = None

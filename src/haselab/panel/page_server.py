@@ -184,6 +184,9 @@ def routes_of(
             found = await run_in_threadpool(carry_out, values)
         except HaselabError as error:
             return JSONResponse({"error": str(error)}, 422)
+        except OSError as error:  # a disk that is full or read-only, a name that is too long
+            text = f"{error.strerror or error}: {str(error.filename or '')[:200]}".rstrip(": ")
+            return JSONResponse({"error": f"{text}. Check the folder."}, 422)
         except asyncio.CancelledError:
             return JSONResponse({"error": "The panel has ended."}, 503)
         return JSONResponse(to_plain(found), background=BackgroundTask(after, name))

@@ -14,7 +14,7 @@ from haselab.base import InputError, JsonObject
 __all__ = ["check_regular", "decode_json", "parse_json", "parse_toml", "read_text"]
 
 # The parser's time grows with the square of the parts of a dotted key: 20,000 take a minute.
-_DOTTED = re.compile(r"(?:[\w-]+[ \t]*\.[ \t]*){64}")
+_DOTTED = re.compile(r"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){64}")
 _MOST_BYTES = 64 << 20
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # one alone is no character
 _KINDS = {

@@ -237,3 +237,17 @@ def test_a_growing_dataset_takes_rows_of_its_own_kind_only(tmp_path: Path) -> No
             growing.extend(np.zeros((1, 3), kind))
         assert len(growing) == 5
         np.testing.assert_array_equal(file["rows"][:], np.concatenate([rows[:3], rows[::-1][:2]]))
+
+
+def test_a_job_for_a_closed_queue_is_refused_at_once() -> None:
+    """It waited forever: STOP after a study hung, because its trip was to be recorded."""
+    done: list[int] = []
+    queue = JobQueue(QueueRule(), lambda: DeviceError("full"))
+    queue.put(lambda: done.append(1))
+    queue.close()
+    assert done == [1]
+    for always in (False, True):
+        with pytest.raises(DeviceError, match="The recording is closed"):
+            queue.put(lambda: done.append(2), always=always)
+    queue.settle()
+    assert done == [1]

@@ -20,6 +20,7 @@ __all__ = ["analyse", "analyse_recorded", "compare", "listed", "note", "report"]
 _NOTES, _LOG = "notes.txt", "analysis.log"
 _MOST_LETTERS = 10_000
 _MOST_FOLDERS = 2000
+_NUMBERS = ("value", "std")  # of a result
 _running: dict[Path, subprocess.Popen[bytes]] = {}  # analyses by folder
 _starting = threading.Lock()
 
@@ -39,7 +40,16 @@ def _recording(files: PanelFiles, name: object) -> Path:
 def _folders(files: PanelFiles) -> list[Path]:
     if not files.runs.is_dir():
         return []
-    return sorted(path.parent for path in files.runs.glob("*/session.h5"))[-_MOST_FOLDERS:]
+    found = sorted(path.parent for path in files.runs.glob("*/session.h5"))
+    return [path for path in found if _is_text(path.name)][-_MOST_FOLDERS:]
+
+
+def _is_text(text: str) -> bool:
+    """Whether a name can be sent; one that is not UTF-8 on the disk cannot."""
+    try:
+        return bool(text.encode())
+    except UnicodeEncodeError:
+        return False
 
 
 def listed(files: PanelFiles, values: JsonObject) -> JsonObject:
@@ -72,7 +82,7 @@ def _described(folder: Path) -> dict[str, Any]:
     study, when = manifest.get("study"), recorded_when(manifest) if manifest else {}
     return {
         "name": folder.name,
-        "study": study.get("name", "") if isinstance(study, dict) else "",
+        "study": str(study.get("name", "")) if isinstance(study, dict) else "",
         "opened": str(manifest.get("opened", "")),
         "seconds": when.get("duration_s"),
         "state": state,
@@ -102,7 +112,7 @@ def note(files: PanelFiles, values: JsonObject) -> JsonObject:
         InputError: there is no such recording, or the note is no text or too long.
     """
     folder, text = _recording(files, values.get("name")), values.get("text")
-    if not isinstance(text, str) or len(text) > _MOST_LETTERS:
+    if not isinstance(text, str) or len(text) > _MOST_LETTERS or not _is_text(text + " "):
         raise InputError(
             f"A note must be a text of at most {_MOST_LETTERS} characters. Shorten it."
         )
@@ -192,7 +202,11 @@ def _results(files: PanelFiles, name: object) -> dict[str, Any]:
     folder = _recording(files, name)
     try:
         content = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-        return {row["id"]: row for row in content["quantities"] if row["measured"]}
+        found = {str(row["id"]): row for row in content["quantities"] if row["measured"]}
+        for row in found.values():
+            _ = str(row["name"]), str(row["unit"]), [float(row["measured"][k]) for k in _NUMBERS]
+            _ = [float(end) for end in row["measured"]["ci95"]]
+        return found
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(
             f"{folder.name} has no results that can be read. Press Analyse first."

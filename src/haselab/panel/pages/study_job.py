@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -68,6 +71,8 @@ class StudyJob:
             LimitError: the bench cannot play it.
         """
         study = chosen_study(files, values)
+        if "sha256" in values and values["sha256"] != _hash_of(study):
+            raise InputError("The study has changed since it was checked. Press Check again.")
         feasible = check_study_on_rig(file, study, files.rig)
         if feasible is not None:
             feasible.require()
@@ -114,10 +119,12 @@ def _study_files(files: PanelFiles) -> list[Path]:
     """TOML files in the folder from which the panel was started that may be studies."""
     places = sorted([*Path().glob("*.toml"), *Path("studies").glob("*.toml")])[:_MOST_FILES]
     others = {files.rig.resolve(), files.actuator.resolve() if files.actuator else None}
-    return [
-        path for path in places
-        if path.resolve() not in others and path.stat().st_size <= _MOST_BYTES
-    ]  # fmt: skip
+    found = []
+    for path in places:
+        with contextlib.suppress(OSError):  # a link to nothing
+            if path.resolve() not in others and path.stat().st_size <= _MOST_BYTES:
+                found.append(path)
+    return [path for path in found if not path.name.startswith(".")]
 
 
 def available(files: PanelFiles) -> JsonObject:
@@ -173,12 +180,14 @@ def chosen_study(files: PanelFiles, values: JsonObject) -> Study:
 def _reduced(study: Study, wanted: object) -> Study:
     """The study with some of its experiments; what is not played is kept, such as [control]."""
     played = {str(one["table"]): one for one in _experiments(study)}
-    if not isinstance(wanted, Sequence) or isinstance(wanted, str) or set(wanted) == set(played):
+    if not isinstance(wanted, Sequence) or isinstance(wanted, str):
         return study
-    unknown = [one for one in wanted if one not in played]
+    unknown = [one for one in wanted if not isinstance(one, str) or one not in played]
     if unknown or not wanted:
         fault = f"The study has no experiment {shown(unknown[0])}" if unknown else "None is chosen"
         raise InputError(f"{fault}. Choose from its experiments: {', '.join(played)}.")
+    if set(wanted) == set(played):
+        return study
     content = study.model_dump(mode="json")
     content["name"] = f"{study.name}: {', '.join(wanted)}"
     kept = {name: table for name, table in content.items() if name not in set(played) - set(wanted)}
@@ -193,14 +202,18 @@ def check(files: PanelFiles, values: JsonObject) -> JsonObject:
         values: as in `chosen_study`.
     Returns:
         `checks`, each with the number and its limit; `ok`; `rated`: whether the rating of the bench
-        is known; `seconds` on the clock of the bench; and `highest_v`, of the drive.
+        is known; `seconds` on the clock of the bench; `highest_v`, of the drive; and `sha256` of
+        the study, with which a page arms the bench for this study alone.
     Raises:
         InputError: as `chosen_study`.
     """
     study, file = chosen_study(files, values), load_rig(files.rig)
     rated = rated_rig(file, study, files.rig)
     if rated is None:
-        return {"checks": [], "ok": True, "rated": False, "seconds": None, "highest_v": None}
+        return {
+            "checks": [], "ok": True, "rated": False, "seconds": None, "highest_v": None,
+            "sha256": _hash_of(study),
+        }  # fmt: skip
     found = check_study(study, *rated)
     drives = study_drives(study, rated[0])
     return {
@@ -212,9 +225,15 @@ def check(files: PanelFiles, values: JsonObject) -> JsonObject:
         ],
         "ok": found.ok,
         "rated": True,
+        "sha256": _hash_of(study),
         "seconds": sum(float(one.seconds(rated[0])) for one in experiments_of(study)),
         "highest_v": max((float(abs(d.values_v).max()) for d in drives), default=0.0),
     }  # fmt: skip
+
+
+def _hash_of(study: Study) -> str:
+    content = json.dumps(study.model_dump(mode="json"), sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 class _Replies:

@@ -56,11 +56,11 @@ function Live({ state, say }) {
   return html`
     <p class="badge live">Armed by this page up to ${kilo(state.limit_v, state.gain)}</p>
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
-      about=${`now ${kilo(state.drive_v, state.gain)}, changes by 1 V/s`} send=${(v) => ask("drive", { value_v: v })} />
+      about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : "changes by 1 V/s"}`} send=${(v) => ask("drive", { value_v: v })} />
     ${state.loop === null
       ? html`<p>The loop cannot be closed. Start the panel with --actuator A.toml, a file with both maps and a controller.</p>`
       : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
-          value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; moving this slider closes it"}
+          value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; moving this slider closes it, and the drive jumps to what the controller puts out"}
           send=${(v) => ask("loop", { strain: v / 100 })} />`}
     <div class="row">
       <button type="button" onClick=${() => ask("drive", { value_v: 0 })}>Ramp to 0 V</button>
@@ -151,7 +151,7 @@ function Panel() {
           <h2>Bench</h2>
           ${link.problem && html`<p class="error" role="alert">${link.problem}</p>`}
           ${error && html`<p class="error" role="alert">${error}</p>`}
-          ${state?.reason && html`<p class="error">Last message of the bench: ${state.reason}</p>`}
+          ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}</p>`}
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
             : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>`

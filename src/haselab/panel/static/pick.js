@@ -114,7 +114,7 @@ function Picture({ picture, index, work, chosen, choose, mode, add, drawn, settl
   }
   function down(event) {
     if (event.button > 0) return;
-    frame.current.focus();
+    frame.current.focus({ preventScroll: true });
     frame.current.setPointerCapture(event.pointerId);
     pointers.current.set(event.pointerId, event);
     if (pointers.current.size > 1) { action.current = { what: "pinch" }; return; }

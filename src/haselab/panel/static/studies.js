@@ -5,19 +5,22 @@ import { Arming, Playing, kilo } from "/static/bench.js";
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
 const when = (s) => (s === null ? "unknown" : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
 
+let remembered = null; // the choice, while another page of the panel is shown
+
 function Chooser({ link, state, mine, onEnd }) {
   const [list, setList] = useState(null);
-  const [chosen, choose] = useState({ study: "", quick: false, experiments: [], keep_video: "sample" });
+  const [chosen, choose] = useState(remembered ?? { study: "", quick: false, experiments: [], keep_video: "sample" });
   const [checked, setChecked] = useState(null);
   const [error, say] = useState("");
   useEffect(() => {
     link.request("studies").then((found) => {
       if (found.error) { say(found.error); return; }
       setList(found.studies);
-      pick(found.studies, found.studies[0].name);
+      const kept = found.studies.some((one) => one.name === remembered?.study);
+      if (!kept) pick(found.studies, found.studies[0].name);
     });
   }, []);
-  function change(part) { choose({ ...chosen, ...part }); setChecked(null); say(""); }
+  function change(part) { remembered = { ...chosen, ...part }; choose(remembered); setChecked(null); say(""); }
   function pick(studies, name) {
     const found = studies.find((one) => one.name === name);
     change({ study: name, experiments: found.experiments.map((one) => one.table) });
@@ -53,7 +56,7 @@ function Chooser({ link, state, mine, onEnd }) {
         <tbody>${checked.checks.map((one) => html`<tr><td>${one.name}</td><td>${one.where}</td><td class=${one.ok ? "" : "error"}>${number(one.requested)} ${one.unit}</td>
           <td>${number(one.limit)} ${one.unit}</td><td>${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}
       ${checked.ok && (busy ? html`<p>${mine ? "The bench is armed. Disarm it on the page Live before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."}</p>`
-        : state && html`<${Arming} state=${state} link=${link} say=${say} study=${chosen} onArmed=${() => setChecked(null)} />`)}`}
+        : state && html`<${Arming} state=${state} link=${link} say=${say} study=${{ ...chosen, sha256: checked.sha256 }} onArmed=${() => setChecked(null)} />`)}`}
   </div>`;
 }
 

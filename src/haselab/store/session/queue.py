@@ -60,9 +60,11 @@ class JobQueue:
             job: done after all that came before it.
             always: do it even after another job has failed.
         Raises:
-            DeviceError: there is no room in time.
+            DeviceError: there is no room in time, or the queue was closed.
         """
         with self._changed:
+            if self._ending:  # nobody would do the job, and who waits for it would wait forever
+                raise DeviceError("The recording is closed, so nothing can be added to it.")
             if not always:
                 self._raise_failure()
             if not (self._changed.wait_for(self._has_room, self._rule.patience_s) or always):

@@ -360,7 +360,9 @@ def test_another_kind_has_margins_but_no_sliders(
     stated = command(capsys, "margins", path)
     assert about["found"]["margins"] == {name: stated[name] for name in MARGINS}
     for name in ("design-loop", "design-search", "design-demands", "design-write", "design-budget"):
-        with pytest.raises(HaselabError, match=r"of kind 'integral'\. This page changes the gains"):
+        with pytest.raises(
+            HaselabError, match=r"has kind = 'integral', but this page changes only"
+        ):
             ask(path, name, **GAINS, sha256=about["found"]["sha256"])
     path.write_text(MODEL + '\n[controller]\nkind = "silent"\n')
     with pytest.raises(InputError, match="no method linear_feedback, so their margins cannot"):

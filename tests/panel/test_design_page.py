@@ -131,7 +131,7 @@ def test_gains_are_changed_and_written_by_keyboard_alone(page: Page, path: Path)
     expect(write).to_be_enabled(timeout=WAIT_MS)
     tab_to(page, "Write to the actuator file", "button")
     page.keyboard.press("Enter")
-    said = page.get_by_text("The bench reads the file when it is armed.")
+    said = page.get_by_text("Press Arm the bench on the page Live to use it.")
     expect(said).to_be_visible(timeout=WAIT_MS)
     held = tomllib.loads(path.read_text())
     assert held["controller"]["parameters"] == gains and gains["ki"] == 6.25

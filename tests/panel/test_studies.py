@@ -319,6 +319,20 @@ def test_the_difference_of_two_recordings_is_in_deviations_of_both(files: PanelF
         compare(files, {"first": "a", "second": "b"})
 
 
+def test_a_number_that_is_not_known_does_not_prevent_a_comparison(files: PanelFiles) -> None:
+    """A reference study has such a row: a settling time of a trial that does not settle."""
+    unknown = {"value": None, "std": None, "ci95": [None, None]}
+    for name, last in (("a", unknown), ("b", {"value": 1.0, "std": 0.1, "ci95": [0.8, 1.2]})):
+        recording(files, name, {"x": (1.0, 0.3)})
+        rows = [{"id": "x", "name": "x", "unit": "V",
+                 "measured": {"value": 1.0, "std": 0.3, "ci95": [0.4, 1.6]}},
+                {"id": "s", "name": "s", "unit": "s", "measured": last}]  # fmt: skip
+        (files.runs / name / "results.json").write_text(json.dumps({"quantities": rows}))
+    found = {row["id"]: row for row in compare(files, {"first": "a", "second": "b"})["rows"]}
+    assert found["x"]["deviations"] == 0.0
+    assert found["s"]["first"] == unknown and found["s"]["deviations"] is None
+
+
 @pytest.mark.parametrize(
     "row",
     [{"value": "x", "std": 1, "ci95": [0, 1]}, {"value": 1, "ci95": [0, 1]}, 1,

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from haselab.base import (
     HaselabError,
@@ -25,7 +24,7 @@ from haselab.base import (
 from haselab.panel.columns import LiveWriter
 from haselab.panel.pages.study_job import StudyJob
 from haselab.panel.pages.values import number
-from haselab.panel.study_player import StudyPlayer
+from haselab.panel.study_player import StudyPlayer, save_last
 from haselab.runtime.closed_loop import ClosedLoop
 from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
@@ -202,7 +201,7 @@ class LiveBench:
             with self._mutex:
                 self._check_turn(what, holder)
                 self._find_request(values)
-            job = self._chosen(values)  # which takes longer than a block
+            job = self._chosen(values["study"])  # which takes longer than a block
         # The file is read here, so that no block waits for it.
         found = self._read_loop() if what == "request" else None
         with self._mutex:
@@ -283,11 +282,8 @@ class LiveBench:
             raise SafetyError("This request is no longer valid. Press 'Arm the bench' again.")
         return self._request
 
-    def _chosen(self, values: JsonObject) -> StudyJob | None:
-        """The study that the bench is to be armed for, if there is one."""
-        wanted = values.get("study")
-        if wanted is None:
-            return None
+    def _chosen(self, wanted: object) -> StudyJob:
+        """The study that the bench is to be armed for."""
         if self._prepare is None or not isinstance(wanted, dict):
             raise InputError("This panel cannot play a study. Use haselab run.")
         return self._prepare(wanted)
@@ -476,9 +472,7 @@ class LiveBench:
             self._failed(error)
             return
         if frames is not None and len(frames.time_s):
-            new = path.with_suffix(".new")
-            Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
-            new.replace(path)
+            save_last(frames, path)
 
     def _next_v(self) -> float:
         if self._closed is not None:

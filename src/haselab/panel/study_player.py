@@ -18,7 +18,7 @@ from haselab.rig.protocols import Frames
 from haselab.safety.guarded import GuardedRig
 from haselab.study.run import run_study
 
-__all__ = ["FilmedCamera", "StudyEndedError", "StudyPlayer"]
+__all__ = ["FilmedCamera", "StudyEndedError", "StudyPlayer", "save_last"]
 
 _POLL_S = 0.1
 _PICTURE_S = 0.2
@@ -26,6 +26,18 @@ _PICTURE_S = 0.2
 
 class StudyEndedError(HaselabError):
     """Somebody ended a study: no fault, so the bench is not tripped."""
+
+
+def save_last(frames: Frames, path: Path) -> None:
+    """Save the last frame as a JPEG file, which a reader never sees half-written.
+
+    Args:
+        frames: at least one.
+        path: of the file.
+    """
+    new = path.with_suffix(".new")
+    Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
+    new.replace(path)
 
 
 class FilmedCamera:
@@ -58,9 +70,7 @@ class FilmedCamera:
         frames = self._camera.take()
         if frames is not None and len(frames.time_s) and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _PICTURE_S
-            new = self._path.with_suffix(".new")
-            Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
-            new.replace(self._path)
+            save_last(frames, self._path)
         return frames
 
     def stop(self) -> None:

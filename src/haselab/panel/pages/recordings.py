@@ -10,7 +10,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from haselab.base import InputError, JsonObject, shown
+from haselab.base import InputError, JsonObject, is_real, shown
 from haselab.panel.files import PanelFiles
 from haselab.store.folder import write_text
 from haselab.store.manifest import read_manifest, recorded_when
@@ -20,7 +20,6 @@ __all__ = ["analyse", "analyse_recorded", "compare", "listed", "note", "report"]
 _NOTES, _LOG = "notes.txt", "analysis.log"
 _MOST_LETTERS = 10_000
 _MOST_FOLDERS = 2000
-_NUMBERS = ("value", "std")  # of a result
 _running: dict[Path, subprocess.Popen[bytes]] = {}  # analyses by folder
 _starting = threading.Lock()
 
@@ -203,9 +202,8 @@ def _results(files: PanelFiles, name: object) -> dict[str, Any]:
     try:
         content = json.loads((folder / "results.json").read_text(encoding="utf-8"))
         found = {str(row["id"]): row for row in content["quantities"] if row["measured"]}
-        for row in found.values():
-            _ = str(row["name"]), str(row["unit"]), [float(row["measured"][k]) for k in _NUMBERS]
-            _ = [float(end) for end in row["measured"]["ci95"]]
+        if not all(_is_result(row) for row in found.values()):
+            raise ValueError
         return found
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(
@@ -213,12 +211,22 @@ def _results(files: PanelFiles, name: object) -> dict[str, Any]:
         ) from None
 
 
+def _is_result(row: dict[str, Any]) -> bool:
+    """Whether a row can be shown; a number that is not known is null."""
+    measured = row["measured"]
+    numbers = (measured["value"], measured["std"], *measured["ci95"])
+    texts = (row["name"], row["unit"])
+    return all(one is None or is_real(one) for one in numbers) and all(
+        isinstance(one, str) for one in texts
+    )
+
+
 def _row(key: str, first: dict[str, Any] | None, second: dict[str, Any] | None) -> dict[str, Any]:
     one, other = (None if row is None else row["measured"] for row in (first, second))
     deviations = None
     if one and other:
         together = math.hypot(one["std"] or math.nan, other["std"] or math.nan)
-        if together > 0.0:
+        if together > 0.0 and None not in (one["value"], other["value"]):
             deviations = (other["value"] - one["value"]) / together
     about = first or second or {}
     return {

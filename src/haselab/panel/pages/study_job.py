@@ -93,9 +93,7 @@ class StudyJob:
 
     def highest_v(self, rig: RigDescription) -> float:
         """Highest drive that its experiments declare, in V."""
-        return max(
-            (float(abs(d.values_v).max()) for d in study_drives(self.study, rig)), default=0.0
-        )
+        return _highest_v(self.study, rig)
 
 
 def actuator_tables(path: Path) -> ActuatorTables:
@@ -215,7 +213,6 @@ def check(files: PanelFiles, values: JsonObject) -> JsonObject:
             "sha256": _hash_of(study),
         }  # fmt: skip
     found = check_study(study, *rated)
-    drives = study_drives(study, rated[0])
     return {
         "checks": [
             {"name": one.name, "where": one.where, "requested": one.requested,
@@ -227,8 +224,12 @@ def check(files: PanelFiles, values: JsonObject) -> JsonObject:
         "rated": True,
         "sha256": _hash_of(study),
         "seconds": sum(float(one.seconds(rated[0])) for one in experiments_of(study)),
-        "highest_v": max((float(abs(d.values_v).max()) for d in drives), default=0.0),
+        "highest_v": _highest_v(study, rated[0]),
     }  # fmt: skip
+
+
+def _highest_v(study: Study, rig: RigDescription) -> float:
+    return max((float(abs(one.values_v).max()) for one in study_drives(study, rig)), default=0.0)
 
 
 def _hash_of(study: Study) -> str:

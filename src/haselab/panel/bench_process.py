@@ -33,9 +33,10 @@ from haselab.base import HaselabError, InputError, JsonObject
 from haselab.panel.columns import LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import CARRIER_HZ, LiveBench
-from haselab.panel.pages.study_job import StudyJob, actuator_tables
+from haselab.panel.pages.study_job import StudyJob
 from haselab.panel.study_player import StudyPlayer
 from haselab.pipelines.actuator_bench import prepare_bench
+from haselab.pipelines.design.model_file import read_tables
 from haselab.rig import Rig
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.operator import WeightHandler
@@ -213,7 +214,7 @@ def main(words: list[str]) -> int:
             if isinstance(file, TwinFile):
                 twin = file.configuration(path)
             if actuator is not None:
-                tables = actuator_tables(actuator)
+                tables = read_tables(actuator)
                 if note := prepare_bench(rig, tables, actuator, CARRIER_HZ, twin):
                     print(f"haselab: {note}", file=sys.stderr)
             about = rig.description
@@ -221,7 +222,7 @@ def main(words: list[str]) -> int:
             def read_loop() -> LoopSettings | None:
                 if actuator is not None:
                     now = replace(rig, description=bare)
-                    prepare_bench(now, actuator_tables(actuator), actuator, CARRIER_HZ, twin)
+                    prepare_bench(now, read_tables(actuator), actuator, CARRIER_HZ, twin)
                     if now.description != about:
                         raise InputError(
                             "The limits in [drive] or the calibration have changed since the "

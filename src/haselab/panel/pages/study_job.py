@@ -14,14 +14,14 @@ from pathlib import Path
 from haselab.base import InputError, JsonObject, shown
 from haselab.models.actuator import ActuatorTables
 from haselab.panel.files import PanelFiles
+from haselab.pipelines.design.model_file import read_tables
 from haselab.rig import RigDescription
 from haselab.rig.operator import OperatorWeights
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig
 from haselab.runtime.camera_recorder import KeepVideo
-from haselab.store.actuator_file import ACTUATOR, read_actuator
+from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
-from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study, builtin_study, load_study
 from haselab.study.feasibility import (
@@ -35,7 +35,7 @@ from haselab.study.known import with_actuator_tables
 from haselab.study.run import RunOptions
 
 __all__ = [
-    "PageOperator", "StudyJob", "actuator_tables", "available", "check", "chosen_study",
+    "PageOperator", "StudyJob", "available", "check", "chosen_study",
 ]  # fmt: skip
 
 _REFERENCE = "reference study"
@@ -96,21 +96,8 @@ class StudyJob:
         return _highest_v(self.study, rig)
 
 
-def actuator_tables(path: Path) -> ActuatorTables:
-    """The checked sections of an actuator file.
-
-    Args:
-        path: of the file.
-    Returns:
-        Its sections.
-    Raises:
-        InputError: no such file, or an impossible value.
-    """
-    return validated(ActuatorTables, read_actuator(path), path)
-
-
 def _tables(files: PanelFiles) -> ActuatorTables | None:
-    return None if files.actuator is None else actuator_tables(files.actuator)
+    return None if files.actuator is None else read_tables(files.actuator)
 
 
 def _study_files(files: PanelFiles) -> list[Path]:

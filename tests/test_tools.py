@@ -46,7 +46,7 @@ def install(tmp_path: Path) -> Install:
         }
         return subprocess.run(
             [str(SCRIPT), *packages],
-            env=environment, capture_output=True, text=True, timeout=60, check=False,
+            env=environment, capture_output=True, text=True, timeout=300, check=False,
         )  # fmt: skip
 
     return run

@@ -165,7 +165,7 @@ def test_a_closed_output_pipe_ends_the_command_silently(arguments: list[str], bo
         stderr=end if both else subprocess.PIPE, text=True,
     )  # fmt: skip
     os.close(end)
-    _, said = program.communicate(timeout=120)
+    _, said = program.communicate(timeout=300)
     assert (program.returncode, said or "") == (141, "")
 
 

@@ -206,7 +206,7 @@ def test_of_two_commands_that_write_one_name_the_second_is_refused(tmp_path, cap
     with first:
         done = subprocess.run(
             [*HASELAB, *map(str, line), "--out", str(out), *more], capture_output=True, text=True,
-            timeout=120, check=False,
+            timeout=300, check=False,
         )  # fmt: skip
         assert done.returncode == 2
         assert "--out" in done.stderr or "Another program is writing to this" in done.stderr
@@ -247,7 +247,7 @@ def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
     command = [*HASELAB, *tiny_study(tmp_path), "--keep-video", "none", "--out", str(out)]
 
     def second(*more: str) -> str:
-        done = subprocess.run([*command, *more], capture_output=True, text=True, timeout=120,
+        done = subprocess.run([*command, *more], capture_output=True, text=True, timeout=300,
                               check=False)  # fmt: skip
         assert done.returncode == 2
         return done.stderr
@@ -262,7 +262,7 @@ def test_a_run_onto_a_recording_is_refused_whatever_state_it_is_in(tmp_path):
         assert bytes_of(out) == before
         first.send_signal(signal.SIGCONT)
         first.send_signal(signal.SIGINT)
-        first.communicate(timeout=60)
+        first.communicate(timeout=300)
     manifest = json.loads((out / "manifest.json").read_text())
     digest = hashlib.sha256((out / "session.h5").read_bytes()).hexdigest()
     assert manifest["state"] == "SEALED"
@@ -298,7 +298,7 @@ def test_of_two_runs_that_start_together_one_records(tmp_path):
     command = [*HASELAB, *tiny_study(tmp_path), "--keep-video", "none", "--out", str(out)]
     both = [subprocess.Popen(command, stderr=subprocess.PIPE) for _ in range(2)]
     try:
-        until = time.monotonic() + 60.0
+        until = time.monotonic() + 300.0
         while all(process.poll() is None for process in both):
             assert time.monotonic() < until
             time.sleep(0.05)
@@ -307,7 +307,7 @@ def test_of_two_runs_that_start_together_one_records(tmp_path):
         assert loser.returncode == 2
         started(out / "session.h5", winner, UNDER_WAY)
         winner.send_signal(signal.SIGINT)
-        winner.communicate(timeout=60)
+        winner.communicate(timeout=300)
         assert json.loads((out / "manifest.json").read_text())["state"] == "SEALED"
     finally:
         for process in both:

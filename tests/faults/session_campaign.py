@@ -83,7 +83,7 @@ def make_sessions(folder: Path) -> dict[str, Path]:
     found = {state: folder / state.replace(" ", "-") for state in STATES}
     for state in ("sealed", "killed"):  # in processes of their own: this one must stay fit to fork
         command = [sys.executable, str(Path(__file__).resolve()), f"--{state}", str(found[state])]
-        subprocess.run(command, check=False, timeout=120)
+        subprocess.run(command, check=False, timeout=300)
         assert (found[state] / "session.h5").is_file()
     found["lone copy"].mkdir()
     shutil.copy(found["sealed"] / "session.h5", found["lone copy"])

@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 
-from tests.panel.running import RunningPanel, ended, started
+from tests.panel.running import WAIT_S, RunningPanel, ended, started
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
 
@@ -15,6 +15,7 @@ FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--
 def browser(installed: Callable[[str, str], str]) -> Iterator[Browser]:
     """The distribution's Chromium."""
     path = installed("chromium", "chromium")
+    expect.set_options(timeout=1e3 * WAIT_S)
     with sync_playwright() as playwright:
         found = playwright.chromium.launch(executable_path=path, args=FLAGS)
         try:

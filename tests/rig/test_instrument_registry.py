@@ -190,7 +190,7 @@ def test_a_guardian_does_not_start_with_a_driver_that_has_no_shutdown(packages: 
         [sys.executable, "-m", "haselab.safety.guardian.process", str(packages.rig()), "0",
          str(packages.folder / "log")],
         env=os.environ | {"PYTHONPATH": str(packages.folder)}, stdin=subprocess.DEVNULL,
-        capture_output=True, text=True, check=False, timeout=120.0,
+        capture_output=True, text=True, check=False, timeout=300.0,
     )  # fmt: skip
     assert done.returncode == 1
     assert done.stdout.startswith("failed The instrument 'mine' of package plug_in 1.0 ")

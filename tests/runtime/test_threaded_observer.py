@@ -11,7 +11,7 @@ from haselab.base import DeviceError
 from haselab.runtime.observer import Seen
 from haselab.runtime.threaded_observer import ThreadedObserver
 
-WAIT_S = 20.0  # for another thread, on a busy computer
+WAIT_S = 300.0  # for another thread, on a busy computer
 
 
 class Scripted:

@@ -28,7 +28,7 @@ from haselab.safety.guardian.make_safe import make_safe
 for needed in ("pty", "serial", "pymeasure", "pyvisa_py", "nidaqmx", "grpc"):
     pytest.importorskip(needed, reason="the served twin's drivers")
 
-GUARD_S = 60.0
+GUARD_S = 300.0
 EXTERNAL = SupplyFaults(
     left_by=("SVset 3000", "SSwSrc 1", "SSwMode 1"), external_high=True, external_v=3000.0
 )

@@ -36,7 +36,7 @@ _OTHER = """
 def other_process(folder: Path) -> str:
     code = "\n".join(line[4:] for line in _OTHER.splitlines())
     done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True,
-                          check=True, timeout=60)  # fmt: skip
+                          check=True, timeout=300)  # fmt: skip
     return done.stdout
 
 

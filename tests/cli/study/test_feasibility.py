@@ -316,7 +316,7 @@ def test_the_carrier_of_the_printed_chain_is_judged_too() -> None:
 def test_a_guardian_that_cannot_act_is_never_ready(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "rig.toml").write_text(text)
     command = [*guardian_command(tmp_path / "rig.toml"), "0", str(tmp_path / "log")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 1
     assert done.stdout.startswith("failed ") and words in done.stdout
 

@@ -30,7 +30,7 @@ pytest.importorskip("pymeasure")
 pytest.importorskip("pyvisa_py")
 
 HZ, VOLT = 2000.0, 0.02
-GUARD_S = 60.0
+GUARD_S = 300.0
 
 
 class Wire:

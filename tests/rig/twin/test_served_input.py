@@ -25,7 +25,7 @@ from haselab.rig.twin.serve.server import ServedTwin
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
 LINUX = pytest.mark.skipif(not can_tell_users(), reason="the system does not list owners")
-GUARD_S = 60.0  # against a test that never ends
+GUARD_S = 300.0  # against a test that never ends
 MANY = settings(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

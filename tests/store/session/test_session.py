@@ -266,7 +266,7 @@ def test_a_truncated_copy_of_a_killed_session_is_read_or_refused_in_time(tmp_pat
         (tmp_path / f"cut-{k:02d}.h5").write_bytes(data[:cut])
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(_READ_ALL), str(tmp_path)],
-        capture_output=True, text=True, timeout=240, check=False,
+        capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == len(cuts)

@@ -60,7 +60,7 @@ def sealed(tmp_path: Path) -> Path:
 def killed(tmp_path: Path) -> Path:
     path = tmp_path / "session.h5"
     command = [sys.executable, "-c", _KILLED, str(Path(__file__).parent), str(path)]
-    done = subprocess.run(command, check=False, timeout=60)
+    done = subprocess.run(command, check=False, timeout=300)
     assert done.returncode == -signal.SIGKILL
     return path
 

@@ -73,7 +73,7 @@ def test_stock_hdf5_prints_the_codes(path, installed):
         "1,400,2",
         str(path),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     numbers = [
         int(number)

@@ -114,7 +114,7 @@ def recorded_calls(factory: pytest.TempPathFactory, *arguments: float) -> list[C
                 "RECORDED_LOG": str(folder / "log")}  # fmt: skip
     subprocess.run(
         [sys.executable, "-c", textwrap.dedent(_WRITER), path, *map(str, arguments)],
-        check=True, env=os.environ | recorded, stdout=subprocess.DEVNULL, timeout=120,
+        check=True, env=os.environ | recorded, stdout=subprocess.DEVNULL, timeout=300,
     )  # fmt: skip
     found = list(parsed((folder / "log").read_bytes()))
     image = bytearray()

@@ -81,7 +81,7 @@ def test_stock_hdf5_opens_what_was_mended(tmp_path, installed):
     killed(tmp_path, 37)
     command = [installed("h5dump", "hdf5-tools"), "-H", str(tmp_path / "session.h5")]
     recover(tmp_path)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0 and "( 37, 400, 2 )" in done.stdout
 
 

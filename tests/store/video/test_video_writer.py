@@ -111,7 +111,7 @@ def test_a_disk_that_fills_up_is_reported_and_the_recorded_data_can_be_read(tmp_
     path = tmp_path / "a.mkv"
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(_FULL), str(path)],
-        capture_output=True, text=True, timeout=60, check=True,
+        capture_output=True, text=True, timeout=300, check=True,
     )  # fmt: skip
     lines = done.stdout.splitlines()
     assert done.stderr == ""

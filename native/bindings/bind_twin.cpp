@@ -139,6 +139,15 @@ NB_MODULE(_twin, m)
 {
     nb::set_leak_warnings(false); // objects that exist until the interpreter ends are not leaks
     m.doc() = "Stepping of the simulated bench";
+    // Where numbers lie in twin_parameters, by the names of their values; motion: its record.
+    nb::dict offsets;
+    const twin_parameters *none = nullptr;
+    for (const Value &value : kValues) {
+        offsets[value.name] = reinterpret_cast<uintptr_t>(&(none->*(value.member)));
+    }
+    offsets["motion"] = offsetof(twin_parameters, motion);
+    m.attr("OFFSETS") = offsets;
+    m.attr("SIZES") = std::make_tuple(sizeof(twin_parameters), sizeof(twin_state));
     nb::class_<Bench>(m, "Bench")
         .def(nb::init<const nb::dict &, nb::handle, double, uint64_t, double, double, double, Values,
                       Values, Rows, Rows>())

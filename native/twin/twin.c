@@ -26,7 +26,7 @@ static double changed(double share, double time_s, double constant_s)
     return share != 0.0 ? 1.0 - share * expm1(-time_s / constant_s) : 1.0;
 }
 
-static double permittivity(const twin_parameters *p, double time_s)
+double twin_permittivity(const twin_parameters *p, double time_s)
 {
     return changed(p->capacitance_rise, fmax(time_s - p->begins_s, 0.0), p->warming_s);
 }
@@ -36,7 +36,7 @@ static double permittivity(const twin_parameters *p, double time_s)
 static void move_further(const twin_parameters *p, twin_state *s, const motion_input *in,
                          double time_s, double dt)
 {
-    const double share = permittivity(p, time_s), before_m_s = s->motion.speed_m_s;
+    const double share = twin_permittivity(p, time_s), before_m_s = s->motion.speed_m_s;
     const double spring = p->second_kg * p->second_rad_s * p->second_rad_s;
     const double damper = 2.0 * p->second_damping * p->second_kg * p->second_rad_s;
     const double force = spring * s->second_m + damper * s->second_m_s;
@@ -183,7 +183,7 @@ double twin_update(const twin_parameters *p, twin_state *s, const twin_update_in
         const double weight = k == in->first || k == in->last ? 0.5 : 1.0;
         sum += weight * motion_capacitance(&p->law, lengths[at - 1 + k], volt);
     }
-    return sum / (double)(in->last - in->first) * permittivity(p, before_s);
+    return sum / (double)(in->last - in->first) * twin_permittivity(p, before_s);
 }
 
 /* ---- electricity ---- */
@@ -477,7 +477,7 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
     const double dt = TWIN_SUB * p->sample_s, drive_v[2] = {before_v, after_v};
     const double turned = p->carrier_rad_s * p->sample_s, turn[2] = {cos(turned), sin(turned)};
     const double phase = fmod(p->carrier_rad_s * s->time_s, 6.283185307179586);
-    const double warm = permittivity(p, s->time_s);
+    const double warm = twin_permittivity(p, s->time_s);
     double carrier[2] = {cos(phase), sin(phase)};
     samples x = {0};
     int32_t step;

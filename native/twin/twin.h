@@ -67,6 +67,9 @@ void twin_acquire(const twin_parameters *p, twin_state *s, double before_v, doub
                   int32_t switch_at, double load_n, int32_t n_samples, int16_t *codes,
                   double *lengths);
 
+/* Factor on the permittivity at a time, see capacitance_rise. */
+double twin_permittivity(const twin_parameters *p, double time_s);
+
 /* A reference of `farad` with `series_ohm` in the actuator's place; 0 F puts the actuator back. The
  * output must be at 0 V without a carrier. */
 void twin_connect(twin_state *s, double farad, double series_ohm);

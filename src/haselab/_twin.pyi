@@ -3,6 +3,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+OFFSETS: dict[str, int]
+SIZES: tuple[int, int]
+
 class Bench:
     inertia_kg: float
     carrier_v: float

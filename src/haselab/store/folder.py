@@ -15,7 +15,15 @@ from haselab.base import DeviceError, to_plain
 from haselab.store.claim import create_exclusively
 from haselab.store.text_file import parse_json, read_text
 
-__all__ = ["drafted", "json_text", "read_json", "write_json", "write_new", "write_text"]
+__all__ = [
+    "drafted",
+    "json_text",
+    "read_json",
+    "write_bytes",
+    "write_json",
+    "write_new",
+    "write_text",
+]
 
 _LONGEST_ENDING = 16
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
@@ -50,8 +58,8 @@ def drafted(path: Path) -> Iterator[Path]:
         raise
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file; replace an older one atomically.
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file; replace an older one atomically.
 
     Nothing else in the folder is touched. A link in the place of the file is replaced; a pipe or a
     device is written to.
@@ -62,11 +70,16 @@ def write_text(path: Path, text: str) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with drafted(path) as draft:
-            draft.write_text(text, encoding="utf-8", newline="\n")
+            draft.write_bytes(content)
     except OSError as error:
         raise DeviceError(
             f"Cannot write ({error.strerror}). Free disk space, or choose another folder. {path}"
         ) from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8; see `write_bytes`."""
+    write_bytes(path, text.encode("utf-8"))
 
 
 def write_new(path: Path, text: str) -> None:

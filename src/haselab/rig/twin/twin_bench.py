@@ -18,10 +18,20 @@ from haselab.rig.twin.camera import TwinCamera
 from haselab.rig.twin.config import SETTLE_S, TwinConfig
 from haselab.rig.twin.frames import DrawnFrames
 
-__all__ = ["GRAVITY_M_S2", "TwinBench", "describe", "make_twin", "native_bench", "rig_of"]
+__all__ = [
+    "CARRIER_HIGH_V",
+    "CLAMP_KG",
+    "GRAVITY_M_S2",
+    "TwinBench",
+    "describe",
+    "instrument_values",
+    "make_twin",
+    "native_bench",
+    "rig_of",
+]
 
-_CARRIER_HIGH_V = 1.0  # at the input of the amplifier
-_CLAMP_KG = 0.02  # the lower clamp itself
+CARRIER_HIGH_V = 1.0  # at the input of the amplifier
+CLAMP_KG = 0.02  # the lower clamp itself
 _SLOWEST_FRAMES_HZ = 0.01  # a lower frame rate is a mistake
 _SUB = 20  # samples in one mechanical step, TWIN_SUB of native/twin/twin.h
 _THREADS = os.cpu_count() or 1
@@ -53,19 +63,19 @@ def native_bench(
     law, daq, amplifier = config.law, config.acquisition, config.amplifier
     circuit = law.circuit
     values = {
-        **_instruments(config, noise),
+        **instrument_values(config, noise),
         "series_ohm": circuit.series_ohm,
         "leakage_ohm": circuit.leakage_ohm,
         "breakdown_v_m": breakdown_v_per_m or circuit.breakdown_v_per_m,
     }
-    highest_v = max(daq.drive_high_v, -daq.drive_low_v) + _CARRIER_HIGH_V
+    highest_v = max(daq.drive_high_v, -daq.drive_low_v) + CARRIER_HIGH_V
     table = law_table(law, amplifier.gain * (1.0 + amplifier.gain_error) * highest_v)
     motion = motion_parameters(law)
     motion["inertia_kg"] += config.load.mass_kg + config.load.added_inertia_kg
     return _twin.Bench(values, motion, law.free_length_m, seed, *table.arrays())
 
 
-def _instruments(config: TwinConfig, noise: bool) -> dict[str, float]:
+def instrument_values(config: TwinConfig, noise: bool) -> dict[str, float]:
     """Parameters of generator, amplifier, monitors, converters and of what no law has."""
     daq, amplifier, extra = config.acquisition, config.amplifier, config.unmodelled
     return {
@@ -247,7 +257,7 @@ class TwinBench:
             )
         self._mass_kg = mass_kg
         added_kg = self._config.load.added_inertia_kg
-        self._native.inertia_kg = max(mass_kg, _CLAMP_KG) + added_kg + self._law.moving_mass_kg
+        self._native.inertia_kg = max(mass_kg, CLAMP_KG) + added_kg + self._law.moving_mass_kg
 
     @property
     def length_m(self) -> float:

@@ -13,7 +13,7 @@ import pytest
 
 from haselab.base import Estimate, InputError, LimitError, ResultError
 from haselab.cli.main import main
-from haselab.rig.twin.config import TwinConfig
+from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_bench import describe
 from haselab.safety.feasibility import Drive
 from haselab.store.toml import Section
@@ -266,3 +266,16 @@ def test_steps_without_a_plant_are_played_in_open_loop_alone(
     assert "S24.rise_closed" not in found
     reasons = {key: item["reason"] for item in results["not_played"] for key in item["ids"]}
     assert "needs [control]" in reasons["S24.rise_closed"]
+
+
+def test_the_experiments_know_how_long_the_study_takes(recorded: Any) -> None:
+    """On the clock of the bench, from the first event to the end of the last experiment."""
+    study, bench = builtin_study(quick=True), describe(twin_of_reading("hz"))
+    known_s = sum(one.seconds(bench) for one in experiments_of(study))
+    events = recorded.file["events"][()]
+    ends_s = [time_s for time_s, what, *_ in events if what.startswith(b"end ")]
+    static, lifts = study.static_load, study.free_response.trials
+    hung = len(static.masses_kg) + 1 + lifts  # each takes the person of the twin 1 s
+    frames_s = len(static.masses_kg) * 41 / static.frame_rate_hz
+    more_s = hung * 1.0 + frames_s + lifts * 0.1  # what no experiment counts
+    assert max(ends_s) - events[0][0] == pytest.approx(known_s + more_s, abs=0.1)

@@ -64,7 +64,7 @@ def test_the_trials_are_planned_and_counted(tmp_path):
     (without,) = (one for one in experiments_of(builtin_study()) if one.table == "steps")
     bench = describe(twin_of_reading("hz"))
     more_s = step_test.seconds(bench) - without.seconds(bench)
-    assert more_s == pytest.approx(3 * (steps.zero_s + steps.step_s))
+    assert more_s == pytest.approx(3 * (steps.rest_s + steps.zero_s + steps.step_s))
 
 
 def test_a_study_without_a_kind_plays_none():

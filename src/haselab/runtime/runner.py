@@ -23,6 +23,7 @@ from haselab.safety.watchdog.loop_watchdog import OutputWatchdog
 
 __all__ = ["Recorder", "Runner"]
 
+_SETTLING = "settling"  # for the progress bar
 _LOOK_EVERY = 20  # blocks between two calls of the camera recorder
 _STATIC_FRAMES = 40  # for each static load
 _SETUP_S = 30.0  # longest time for disk and camera between experiments
@@ -386,6 +387,7 @@ class Runner:
         with self._conditions.lifting():
             self._rig.stand.lift()
         self._rig.stand.wait(settle_s)
+        self._progress.advance(settle_s, name)
         self._camera_recorder.start(name, frame_rate_hz, mass_kg)
         rest = round(0.1 / self._rig.description.block_s)
         blocks = rest + round(record_s / self._rig.description.block_s)
@@ -409,7 +411,9 @@ class Runner:
         """
         self._rig.source.write(drive_v)
         self._conditions.drive(drive_v)
+        self._progress.advance(0.0, _SETTLING)
         self._rig.stand.wait(duration_s)
+        self._progress.advance(duration_s, _SETTLING)
 
     def rest(self) -> None:
         """Set the drive to 0 V at once; the sensing signal stays on."""

@@ -165,7 +165,10 @@ class Experiment(ABC, Generic[Settings]):
         return ()
 
     def seconds(self, rig: RigDescription) -> float:
-        """Duration of the recorded part in s, for the progress bar."""
+        """Duration on the bench's clock in s, waits included, for the check and the progress bar.
+
+        This default is the duration of the declared drives, without waits.
+        """
         return rig.block_s * sum(len(drive.values_v) for drive in self.drives(rig))
 
     @abstractmethod

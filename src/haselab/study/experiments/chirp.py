@@ -57,7 +57,7 @@ class ChirpTest(Experiment[Chirp]):
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
-        return self.settings.duration_s
+        return self.settings.hold_s + _LEAD_S + self.settings.duration_s
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""

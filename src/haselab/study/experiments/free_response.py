@@ -44,7 +44,7 @@ class FreeResponseTest(Experiment[FreeResponse]):
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
-        return self.settings.trials * self.settings.record_s
+        return self.settings.trials * (self.settings.settle_s + self.settings.record_s)
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""

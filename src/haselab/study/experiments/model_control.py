@@ -75,8 +75,10 @@ class ModelControlTest(Experiment[ModelControl]):
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
         settings = self.settings
-        steps_s = len(_STEPS) * settings.trials * (settings.zero_s + settings.step_s)
-        return steps_s + 3.0 * settings.hold_s
+        trial_s = settings.rest_s + settings.zero_s + settings.step_s
+        outer_s = settings.rest_s + 3.0 * settings.hold_s if settings.outer_mass_kg else 0.0
+        rest_s = settings.rest_s + _REST_FRAMES / settings.frame_rate_hz
+        return rest_s + len(_STEPS) * settings.trials * trial_s + outer_s
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""

@@ -91,7 +91,8 @@ class OperatingPointTest(Experiment[OperatingPoint]):
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
-        return len(self._names()) * _HOLD_S
+        settle_s = self.study.static_load.settle_s
+        return len(self._names()) * (settle_s + _HOLD_S) + settle_s
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""

@@ -44,7 +44,7 @@ class StaticLoadTest(Experiment[StaticLoad]):
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
-        return len(self.settings.masses_kg) * self.settings.settle_s
+        return (len(self.settings.masses_kg) + 1) * self.settings.settle_s
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""

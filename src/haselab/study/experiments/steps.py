@@ -106,7 +106,8 @@ class StepTest(Experiment[Steps]):
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
-        return len(self.recordings()) * (self.settings.zero_s + self.settings.step_s)
+        s = self.settings
+        return len(self.recordings()) * (s.rest_s + s.zero_s + s.step_s)
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""

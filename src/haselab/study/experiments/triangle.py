@@ -76,7 +76,7 @@ class TriangleTest(Experiment[Triangle]):
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""
-        return self.settings.cycles / self.settings.frequency_hz
+        return _LEAD_S + self.settings.cycles / self.settings.frequency_hz
 
     def play(self, player: Player) -> None:
         """See `Experiment`."""

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,34 @@ from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.guarded import GuardedRig, guard
+from tests.panel.running import WAIT_S
 
 LIMIT_V = 2.0
+
+
+class HangingCall:
+    """One call of the bench that hangs, as that of an instrument which does not answer."""
+
+    def __init__(self) -> None:
+        self.hangs, self.entered, self.released = (threading.Event() for _ in range(3))
+
+    def of(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        """The method; while `hangs` is set, it begins when `released` is set."""
+
+        def hanging(*given: Any) -> Any:
+            if self.hangs.is_set():
+                self.entered.set()
+                assert self.released.wait(WAIT_S)
+            return method(*given)
+
+        return hanging
+
+
+@pytest.fixture
+def call() -> Iterator[HangingCall]:
+    found = HangingCall()
+    yield found
+    found.released.set()
 
 
 @pytest.fixture
@@ -87,3 +113,68 @@ def test_the_typed_limit_is_that_of_every_output_of_a_study(
     assert high == [(1.25, 1.25)]
     assert live.state.high_v == 2.0, "the next run has the limits of the rig"
     assert "enough" in live.state.reason
+
+
+# Calls in which a bench can be while somebody presses STOP.
+HANGING = [
+    "reading the actuator file", "checking a study", "beginning a run", "starting the camera",
+    "reading a block", "taking a frame",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("where", HANGING)
+def test_stop_commands_zero_while_a_call_hangs_and_nothing_undoes_it(
+    tmp_path: Path, call: HangingCall, where: str
+) -> None:
+    twin = make_twin(twin_of_reading("hz"), 1)
+    bench: Any = twin.acquisition
+    if where == "starting the camera":
+        bench.start = call.of(bench.start)
+    elif where == "reading a block":
+        bench.read = call.of(bench.read)
+    elif where == "taking a frame":
+        bench.take = call.of(bench.take)
+    rig = guard(twin)
+    if where == "beginning a run":
+        rig.begin = call.of(rig.begin)  # type: ignore[method-assign]
+    read_loop = prepare = lambda *_: None
+    if where == "reading the actuator file":
+        read_loop = call.of(read_loop)
+    elif where == "checking a study":
+        prepare = call.of(prepare)
+    about, refused = rig.description, []
+    with LiveWriter(tmp_path / "live", about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
+        live = LiveBench(rig, writer, read_loop, tmp_path / "camera.jpg", prepare)
+
+        def arm() -> None:
+            study = {"study": {}} if where == "checking a study" else {}
+            try:
+                number = live.do("request", "page", {})["number"]
+                live.do("arm", "page", {"number": number, "limit_v": 1.5, **study})
+            except SafetyError as error:
+                refused.append(str(error))
+
+        driving = where in ("reading a block", "taking a frame")
+        if driving:
+            arm()
+            live.do("drive", "page", {"value_v": 1.0})
+            while rig.bench.requested_v < 0.5:
+                live.step()
+        call.hangs.set()
+        job = threading.Thread(target=live.step if driving else arm)
+        job.start()
+        assert call.entered.wait(WAIT_S)
+        live.stop("STOP was pressed")
+        assert job.is_alive()
+        assert rig.bench.requested_v == 0.0 and not rig.safety.live
+        assert live.state.stage == "tripped"
+        call.released.set()
+        job.join(WAIT_S)
+        live.step()
+        assert rig.bench.requested_v == 0.0 and not rig.safety.live
+        is_requested = where == "reading the actuator file"  # which the first step of arming does
+        assert live.state.stage == ("requested" if is_requested else "tripped")
+        assert live.state.mode == "idle"
+        assert live.state.reason.startswith("STOP was pressed")
+        assert driving or refused, "what was being armed is refused"
+        live.close()

@@ -4,8 +4,9 @@ A small process with a port of its own, so that STOP waits for nothing: not for 
 plot, a command or a blocking call. `POST /stop` revokes the permission in the interlock KEY, so
 that no haselab program can energise the bench, and then makes the bench process command 0 V
 (`stop.sock` in FOLDER). On a real bench it also starts `haselab rig safe RIG.toml`, which uses
-connections of its own. STOP needs no token; pages of other origins are refused. `GET /ready`
-keeps the connection of a page open.
+connections of its own; and if the bench process does not answer, it ends the lease in the
+interlock, so that the guardians act at once. STOP needs no token; pages of other origins are
+refused. `GET /ready` keeps the connection of a page open.
 
 This module uses only the standard library and the interlock, so it starts quickly.
 """
@@ -31,6 +32,7 @@ __all__ = ["StopServer", "main"]
 _REASON = "STOP was pressed on the panel"
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
+_PROMPT_S = 0.5  # after which the guardians are called
 
 
 class StopServer(ThreadingHTTPServer):
@@ -118,19 +120,22 @@ class _Stop:
         begun_s = time.perf_counter()
         self._interlock.revoke(_REASON)
         revoked_s = time.perf_counter() - begun_s
-        confirmed = self._tell_bench()
         if self._rig:
-            self._rig_safe()
+            threading.Thread(target=self._rig_safe, daemon=True).start()
+        confirmed = self._tell_bench(_PROMPT_S)
+        if not confirmed:
+            self._interlock.lease(0.0)  # a guardian looks every 20 ms
+            confirmed = self._tell_bench(_ANSWER_S - _PROMPT_S)
         return {"revoked_ms": 1e3 * revoked_s, "commanded": confirmed,
                 "commanded_ms": 1e3 * (time.perf_counter() - begun_s)}  # fmt: skip
 
-    def _tell_bench(self) -> bool:
-        """Send the bench process to 0 V; whether it answered."""
+    def _tell_bench(self, wait_s: float) -> bool:
+        """Send the bench process to 0 V; whether it answered in time."""
         own = self._folder / f"stop-{os.getpid()}-{threading.get_ident()}"
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as box:
             try:
                 box.bind(str(own))
-                box.settimeout(_ANSWER_S)
+                box.settimeout(wait_s)
                 box.sendto(_REASON.encode(), str(self._folder / "stop.sock"))
                 return bool(box.recv(64))
             finally:

@@ -536,6 +536,19 @@ def test_points_that_cannot_be_tracked_are_not_saved(
     assert "\n" not in str(refused.value) and not out.exists()
 
 
+def test_points_on_noise_alone_are_saved_and_named(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:120, :160]
+    dots = sum(100.0 * np.exp(-((x - c) ** 2 + (y - 60) ** 2) / 18.0) for c in (40, 120))
+    frames = rng.normal(160.0 - dots, 2.0, (2, *y.shape)).round().astype(np.uint8)
+    tifffile.imwrite(tmp_path / "two.tif", frames, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "one.tif", frames[:1], photometric="minisblack")
+    points = [["dot", 40.0, 60.0], ["nothing", 80.0, 60.0], ["other dot", 120.0, 60.0]]
+    for video, lost in (("two.tif", ["nothing"]), ("one.tif", [])):
+        found = asked(Videos(tmp_path), "pick-save", video=video, points=points)
+        assert found["lost"] == lost and found["points"] == 3
+
+
 def test_an_existing_table_is_only_moved_when_that_is_requested(
     video: Path, tmp_path: Path
 ) -> None:
@@ -543,8 +556,9 @@ def test_an_existing_table_is_only_moved_when_that_is_requested(
     out.write_text("mine")
     given: dict[str, Any] = {"video": str(video), "points": [['a, "b"', 155.5, 60.0]]}
     videos = Videos(video.parent, video, out)
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match=r"exists already.*tick 'Move an existing file") as refused:
         asked(videos, "pick-save", **given)
+    assert "--force" not in str(refused.value)
     assert out.read_text() == "mine"
     asked(videos, "pick-save", move=True, **given)
     assert (tmp_path / "points.csv.previous-1").read_text() == "mine"

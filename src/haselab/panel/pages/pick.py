@@ -24,6 +24,7 @@ from haselab.store.manifest import MANIFEST
 from haselab.store.video.grey_range import grey_range
 from haselab.store.video.listing import list_videos
 from haselab.store.video.opening import open_video
+from haselab.tracking import PointTracker, TrackOptions
 from haselab.tracking.options import Floats, Frame
 from haselab.tracking.particles.detect import DotProfile, detect_dot_near, find_profile
 
@@ -301,15 +302,33 @@ def _save(videos: Videos, values: JsonObject) -> JsonObject:
     table = videos.table(name, str(values.get("table") or ""))
     text = points_table(points, frame, table)
     scale = _scale(videos, values)
-    if values.get("move") is True and is_occupied(table):
+    if is_occupied(table):
+        if values.get("move") is not True:
+            raise InputError(
+                f"This file exists already; it was not changed: {table}. Type another name, or "
+                "tick 'Move an existing file to NAME.previous-1'."
+            )
         move_aside(table)
     write_new(table, text)
+    lost = _lost(path, stamp, points, frame)
     ruler = _ruler(values)
     words = ["haselab", "track", str(path), "--points", str(table)]
     words += ["--subset-px", str(points.subset_px)]
     words += ["--scale-points", ruler] if ruler else []
     words += ["--out", str(table.with_name(f"{table.stem.removesuffix('-points')}-tracks.csv"))]
-    return {"path": str(table), "points": len(names), "command": shlex.join(words), **scale}
+    saved = {"path": str(table), "points": len(names), "command": shlex.join(words)}
+    return {**saved, "lost": lost, **scale}
+
+
+def _lost(path: Path, stamp: tuple[int, int], points: Points, frame: Frame) -> list[str]:
+    """Names of the points that are lost in the next frame, such as those on noise alone."""
+    try:
+        following = _frame(path, stamp, 1)[0]
+    except InputError:  # there is but one frame
+        return []
+    tracker = PointTracker(points.place_px, TrackOptions(subset_px=points.subset_px))
+    _, found = tracker.step(tracker.init([frame]), following)
+    return [name for name, valid in zip(points.names, found.valid, strict=True) if not valid]
 
 
 PICK_REQUESTS: Mapping[str, Callable[[Videos, JsonObject], JsonObject]] = {

@@ -338,6 +338,7 @@ function Picker({ link }) {
   const points = work.marks.filter((one) => one.kind === "point");
   const saved = done && done.marks === work.marks && html`<div class="card" role="status" ref=${card}><h2>Saved</h2>
       <p>${done.points} points: <code>${done.path}</code></p>
+      ${done.lost.length > 0 && html`<p class="error">Lost already in the next frame: ${done.lost.slice(0, 10).join(", ")}${done.lost.length > 10 ? ` and ${done.lost.length - 10} others` : ""}. Pick them on a dot, or leave them out.</p>`}
       <p>${done.scale_mm_per_px ? `Scale: ${done.scale}. ` : "No scale: lengths stay in pixels. "}Track the points with this command:</p><p><code>${done.command}</code></p></div>`;
   if (done && list.only) return html`${saved}<p>haselab track --pick has ended. Close this page.</p>`;
   return html`

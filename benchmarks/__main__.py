@@ -74,7 +74,11 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     ),
     "safety": (Measurement("rig.safety", quick={"twin": 50, "wire": 10, "trials": 1}),),
     "panel": (
-        Measurement("rig.panel", quick={"presses": 100, "seconds": 10.0}, full={"seconds": 1800.0}),
+        Measurement(
+            "rig.panel",
+            quick={"presses": 100, "seconds": 10.0, "armed_presses": 20},
+            full={"seconds": 1800.0},
+        ),
     ),
     "command": (Measurement("command"),),
 }

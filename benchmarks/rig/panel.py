@@ -1,12 +1,13 @@
-"""The panel on the twin: STOP, latency of the traces, and what its web server uses.
+"""The panel on the twin: STOP, latency of the traces, and the processor time that it uses.
 
-`python -m benchmarks.rig.panel [--presses 100] [--seconds 10]`
+`python -m benchmarks.rig.panel [--presses 100] [--seconds 10] [--armed-presses 20]`
 
 The pages are clients without a browser, in this process, on the same computer. A press of STOP is
 timed from before its request is sent until the answer has arrived that 0 V was commanded; it
-includes the connection. The age of a block is from the moment at which the bench process has
-written the newest block of a frame until a page has received that frame. Frames are sent 30 times a
-second, so a block waits for up to 33 ms more; drawing is not part of it either.
+includes the connection. It is pressed on an idle bench, on one that is armed and driving, and while
+a study is played. The age of a block is from the moment at which the bench process has written the
+newest block of a frame until a page has received that frame. Frames are sent 30 times a second, so
+a block waits for up to 33 ms more; drawing is not part of it either.
 """
 
 import argparse
@@ -15,11 +16,14 @@ import contextlib
 import http.client
 import json
 import os
+import random
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import websockets
@@ -28,43 +32,84 @@ from benchmarks.rows import Row
 
 TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 PAGES = 8
+STUDY = {"study": "reference study", "experiments": ["triangle"], "keep_video": "none"}
 
 
 @contextlib.contextmanager
 def panel() -> Iterator[tuple[subprocess.Popen[str], str, str]]:
     """A panel on the twin: its process, host and token."""
-    command = [sys.executable, "-m", "haselab.cli", "panel", "--no-browser"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    address = process.stdout.readline().strip()
-    try:
-        yield process, address.split("/")[2], address.partition("token=")[2]
-    finally:
-        process.terminate()
-        process.wait()
+    with tempfile.TemporaryDirectory() as runs:
+        command = [sys.executable, "-m", "haselab.cli", "panel", "--no-browser", "--runs", runs]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        try:
+            yield process, address.split("/")[2], address.partition("token=")[2]
+        finally:
+            process.terminate()
+            process.wait()
+
+
+class Page:
+    """A connected page that acknowledges each frame and notes the age of its last block."""
+
+    def __init__(self, socket: websockets.ClientConnection, ages_s: list[float]) -> None:
+        self._socket, self._ages_s = socket, ages_s
+        self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._framed, self._number = asyncio.Event(), 0
+        self.state: dict[str, Any] = {}
+
+    async def receive(self) -> None:
+        """Receive frames and answers until it is cancelled."""
+        while True:
+            message = await self._socket.recv()
+            if isinstance(message, str):
+                answer = json.loads(message)
+                if "id" in answer:
+                    self._answers.pop(answer["id"]).set_result(answer)
+                continue
+            size = int.from_bytes(message[40:44], "little")
+            about = json.loads(message[48 : 48 + size])
+            if about["written_s"] is not None:
+                self._ages_s.append(time.monotonic() - about["written_s"])
+            await self._socket.send(json.dumps({"ack": int.from_bytes(message[4:8], "little")}))
+            self.state = about["state"]
+            self._framed.set()
+
+    async def ask(self, what: str, **values: object) -> dict[str, Any]:
+        """Send a command and return its answer."""
+        self._number += 1
+        number = self._number
+        answer = self._answers[number] = asyncio.get_running_loop().create_future()
+        await self._socket.send(json.dumps({"id": number, "do": what, "values": values}))
+        found = await answer
+        if "error" in found:
+            raise RuntimeError(found["error"])
+        return dict(found["answer"])
+
+    async def arm(self, **values: object) -> None:
+        """Arm the bench for up to 2 V, and acknowledge why it was stopped."""
+        found = await self.ask("request")
+        known = {"number": found["number"], "acknowledged": found["reason"]}
+        await self.ask("arm", limit_v=2.0, **known, **values)
+
+    async def until(self, ready: Callable[[dict[str, Any]], bool]) -> None:
+        """Wait for a state of the bench."""
+        while not (self.state and ready(self.state)):
+            self._framed.clear()
+            await self._framed.wait()
 
 
 @contextlib.asynccontextmanager
-async def page(host: str, token: str, ages_s: list[float]) -> AsyncIterator[None]:
-    """A connected page that acknowledges each frame and notes the age of its last block."""
+async def page(host: str, token: str, ages_s: list[float]) -> AsyncIterator[Page]:
+    """Connect a page."""
     async with websockets.connect(f"ws://{host}/live", origin=f"http://{host}") as socket:  # type: ignore[arg-type]
         await socket.send(json.dumps({"token": token}))
         await socket.recv()
-
-        async def receive() -> None:
-            while True:
-                frame = await socket.recv()
-                if isinstance(frame, bytes):
-                    size = int.from_bytes(frame[40:44], "little")
-                    written_s = json.loads(frame[48 : 48 + size])["written_s"]
-                    if written_s is not None:
-                        ages_s.append(time.monotonic() - written_s)
-                    number = int.from_bytes(frame[4:8], "little")
-                    await socket.send(json.dumps({"ack": number}))
-
-        receiver = asyncio.create_task(receive())
+        found = Page(socket, ages_s)
+        receiver = asyncio.create_task(found.receive())
         try:
-            yield
+            yield found
         finally:
             receiver.cancel()
 
@@ -81,79 +126,140 @@ def memory_mb(process: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def presses(host: str, count: int) -> tuple[list[float], int]:
-    """Times of presses of STOP, in s, and how many were answered with 0 V commanded."""
+def child(process: int, name: str) -> int:
+    """Process number of a child by its module."""
+    words = ["ps", "-o", "pid=,args=", "--ppid", str(process)]
+    listed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    return next(int(line.split()[0]) for line in listed.splitlines() if name in line)
+
+
+def stop_port(host: str) -> int:
+    """Port of the stop process."""
     about = http.client.HTTPConnection(host)
     about.request("GET", "/about")
-    port = json.loads(about.getresponse().read())["stop_port"]
-    times_s, commanded = [], 0
-    for _ in range(count):
-        begun_s = time.perf_counter()
-        stop = http.client.HTTPConnection("127.0.0.1", port)
-        stop.request("POST", "/stop", headers={"Origin": f"http://{host}"})
-        commanded += bool(json.loads(stop.getresponse().read())["commanded"])
-        times_s.append(time.perf_counter() - begun_s)
-        stop.close()
-        time.sleep(0.01)
-    return times_s, commanded
+    return int(json.loads(about.getresponse().read())["stop_port"])
 
 
-async def connected(
-    process: int, host: str, token: str, pages: int, seconds: float, count: int
-) -> tuple[list[float], float, float, list[float], int]:
-    """Ages of blocks at the pages, processor share and growth of the server, presses of STOP."""
+def press(host: str, port: int) -> tuple[float, bool]:
+    """Press STOP: time until the answer in s, and whether 0 V was commanded."""
+    begun_s = time.perf_counter()
+    stop = http.client.HTTPConnection("127.0.0.1", port)
+    stop.request("POST", "/stop", headers={"Origin": f"http://{host}"})
+    commanded = bool(json.loads(stop.getresponse().read())["commanded"])
+    stop.close()
+    return time.perf_counter() - begun_s, commanded
+
+
+class Measured(NamedTuple):
+    """What was measured with a number of pages.
+
+    Args:
+        ages_s: of blocks at the pages.
+        server: share of a core of the web server.
+        bench: share of a core of the bench process.
+        growth: of the web server's memory, relative.
+        idle: presses of STOP on an idle bench.
+        driving: while it drives.
+        study: while it plays a study.
+    """
+
+    ages_s: list[float]
+    server: float
+    bench: float
+    growth: float
+    idle: list[tuple[float, bool]]
+    driving: list[tuple[float, bool]]
+    study: list[tuple[float, bool]]
+
+
+async def measured(
+    process: int, host: str, token: str, pages: int, seconds: float, count: int, armed: int
+) -> Measured:
+    """Measure a panel with some pages."""
     ages_s: list[float] = []
+    bench, port = child(process, "bench_process"), stop_port(host)
     async with contextlib.AsyncExitStack() as opened:
-        for _ in range(pages):
-            await opened.enter_async_context(page(host, token, ages_s))
+        first, *_ = [
+            await opened.enter_async_context(page(host, token, ages_s)) for _ in range(pages)
+        ]
         await asyncio.sleep(2.0)
         ages_s.clear()
-        used_s, grown_mb, begun_s = cpu_s(process), memory_mb(process), time.monotonic()
+        used_s, grown_mb, begun_s = (
+            (cpu_s(process), cpu_s(bench)),
+            memory_mb(process),
+            time.monotonic(),
+        )
         await asyncio.sleep(seconds)
-        share = (cpu_s(process) - used_s) / (time.monotonic() - begun_s)
-        growth = memory_mb(process) / grown_mb - 1.0
-        seen_s = list(ages_s)
-        times_s, commanded = await asyncio.to_thread(presses, host, count)
-    return seen_s, share, growth, times_s, commanded
+        duration_s = time.monotonic() - begun_s
+        server, worker = (
+            (cpu_s(one) - before) / duration_s
+            for one, before in zip((process, bench), used_s, strict=True)
+        )
+        growth, seen_s = memory_mb(process) / grown_mb - 1.0, list(ages_s)
+
+        async def stopped() -> tuple[float, bool]:
+            await asyncio.sleep(0.05 * random.random())  # at any moment of a block and a frame
+            return await asyncio.to_thread(press, host, port)
+
+        idle, driving, study = [await stopped() for _ in range(count)], [], []
+        for _ in range(armed):
+            await first.arm()
+            await first.ask("drive", value_v=1.0)
+            await first.until(lambda state: state["drive_v"] > 0.1)
+            driving.append(await stopped())
+            await first.until(lambda state: not state["holder"])
+        for _ in range(armed):
+            await first.arm(study=STUDY)
+            await first.until(lambda state: state["drive_v"] > 0.1)
+            await asyncio.sleep(random.random())
+            study.append(await stopped())
+            await first.until(lambda state: not state["holder"])
+    return Measured(seen_s, server, worker, growth, idle, driving, study)
 
 
-def rows(presses: int = 1000, seconds: float = 60.0) -> Iterator[Row]:
+def rows(presses: int = 1000, seconds: float = 60.0, armed_presses: int = 100) -> Iterator[Row]:
     """Measure one page, then eight.
 
     Args:
-        presses: of STOP, with each number of pages.
+        presses: of STOP on an idle bench, with each number of pages.
         seconds: for which frames are received.
+        armed_presses: of STOP while the bench drives, and as many while it plays a study.
     """
     if sys.platform != "linux":
         return
-    with panel() as (process, host, token):
-        for pages, stop_ms, median_ms, tail_ms in (
-            (1, 20.0, 10.0, 30.0),
-            (PAGES, 50.0, None, 60.0),
-        ):
-            ages_s, share, growth, times_s, commanded = asyncio.run(
-                connected(process.pid, host, token, pages, seconds, presses)
+    for pages, stop_ms, median_ms, tail_ms in ((1, 20.0, 10.0, 30.0), (PAGES, 50.0, None, 60.0)):
+        with panel() as (process, host, token):
+            found = asyncio.run(
+                measured(process.pid, host, token, pages, seconds, presses, armed_presses)
             )
-            with_pages = f"{pages} page{'s' * (pages > 1)}"
-            yield Row(f"STOP to 0 V commanded, p99, {with_pages}",
-                      1e3 * float(np.percentile(times_s, 99)), "ms", stop_ms, False)  # fmt: skip
-            yield Row(
-                f"presses of STOP answered, {with_pages}", commanded, f"of {presses}", presses
-            )
-            yield Row(f"age of a block at a page, median, {with_pages}",
-                      1e3 * float(np.median(ages_s)), "ms", median_ms, False)  # fmt: skip
-            yield Row(f"age of a block at a page, p95, {with_pages}",
-                      1e3 * float(np.percentile(ages_s, 95)), "ms", tail_ms, False)  # fmt: skip
-            yield Row(f"web server's share of a core, {with_pages}", 100.0 * share, "%",
-                      10.0 if pages == PAGES else None, False)  # fmt: skip
-            yield Row(f"growth of its memory in {seconds:g} s, {with_pages}", 100.0 * growth, "%",
-                      5.0, False)  # fmt: skip
+        with_pages = f"{pages} page{'s' * (pages > 1)}"
+        for what, pressed in (
+            ("", found.idle), (" while driving", found.driving), (" during a study", found.study)
+        ):  # fmt: skip
+            times_s, commanded = zip(*pressed, strict=True)
+            yield Row(f"STOP to 0 V commanded{what}, p99, {with_pages}",
+                      1e3 * float(np.percentile(times_s, 99)), "ms", stop_ms, False,
+                      f"median {1e3 * float(np.median(times_s)):.2g} ms")  # fmt: skip
+            yield Row(f"presses of STOP answered{what}, {with_pages}", sum(commanded),
+                      f"of {len(pressed)}", len(pressed))  # fmt: skip
+        yield Row(f"age of a block at a page, median, {with_pages}",
+                  1e3 * float(np.median(found.ages_s)), "ms", median_ms, False)  # fmt: skip
+        yield Row(f"age of a block at a page, p95, {with_pages}",
+                  1e3 * float(np.percentile(found.ages_s, 95)), "ms", tail_ms, False)  # fmt: skip
+        rate_hz = len(found.ages_s) / pages / seconds
+        yield Row(f"web server's share of a core, {with_pages}", 100.0 * found.server, "%",
+                  10.0 if pages == PAGES else None, False,
+                  f"{rate_hz:.3g} frames/s at each page")  # fmt: skip
+        yield Row(f"bench process's share of a core, {with_pages}", 100.0 * found.bench, "%")
+        yield Row(f"growth of the web server's memory in {seconds:g} s, {with_pages}",
+                  100.0 * found.growth, "%", 5.0, False)  # fmt: skip
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--presses", type=int, default=100)
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--armed-presses", type=int, default=20)
     options = parser.parse_args()
-    for row in rows(options.presses, options.seconds):
+    for row in rows(options.presses, options.seconds, options.armed_presses):
         print(row, flush=True)

@@ -73,17 +73,19 @@ def test_columns_are_the_extremes_of_their_samples(
 def test_signals_skip_missing_values_and_end_at_a_gap(tmp_path: Path) -> None:
     with LiveWriter(tmp_path / "live", RATE_HZ, BLOCK, (1.0, 1.0)) as writer:
         codes = blocks(1)[0]
+        reader = LiveReader(tmp_path / "live")
         for k in range(10):
             writer.append(codes, (k + 1) * BLOCK_S, NOTHING)
+            assert math.isnan(reader.gap_s)
         for k in range(20):  # after a gap of 5 s
             value = math.nan if k % 2 else float(k)
             writer.append(codes, 5.0 + (k + 1) * BLOCK_S, (value, *NOTHING[1:]))
-        reader = LiveReader(tmp_path / "live")
         seen = reader.signals(0.0, 5.2, 10)
         assert seen.start_s == pytest.approx(5.0)  # what was before the gap is not shown
         assert seen.low[:, 0].tolist() == seen.high[:, 0].tolist() == list(range(0, 20, 2))
         assert np.isnan(seen.low[:, 1]).all()
         assert reader.monitors(0.0, 5.2, 400).start_s >= 5.0
+        assert reader.gap_s == pytest.approx(5.0)
         assert reader.end_s == pytest.approx(5.2)
         reader.close()
 

@@ -296,8 +296,10 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path, text: str | None, s
     if path is not None:
         path.write_text(str(text))
     with pytest.raises(InputError, match=said) as refused:
-        ask(path, "design")
+        ask(path, "design" if path else "design-loop", **GAINS)
     assert "\n" not in str(refused.value)
+    if path is None:  # the page is no fault then: the browser reports none
+        assert re.match(said, ask(path, "design")["none"])
 
 
 def test_limits_that_are_not_known_leave_the_margins_but_no_step(tmp_path: Path) -> None:

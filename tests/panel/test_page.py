@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 from tests.panel.running import WAIT_S, RunningPanel, ended, started
 
@@ -28,7 +28,9 @@ frame_rate_hz = 200.0
 
 STATIC = Path(__file__).parents[2] / "src" / "haselab" / "panel" / "static"
 WAIT_MS = 1e3 * WAIT_S
-PAGES = {"Studies": "Keep no camera frames", "Doctor": "checks"}  # a text of each, once it is there
+PAGES = {  # a text of each, once it is there
+    "Studies": "Keep no camera frames", "Doctor": "checks", "Design": "without an actuator file",
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -62,6 +64,7 @@ def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
     expect(page.locator("header")).to_contain_text(
         re.compile(r"running, 1\.000 V"), timeout=WAIT_MS
     )
+    expect(page.locator(".seen .mark circle")).to_have_count(6)  # in the camera picture
     box = page.locator("#emergency").bounding_box()
     assert box is not None
     page.mouse.move(box["x"] + 20, box["y"] + 20)
@@ -148,7 +151,10 @@ def test_a_drag_zooms_into_the_recorded_samples(page: Page) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing(browser: Browser, shared_panel: RunningPanel, scheme: str) -> None:
     with browser.new_context(color_scheme=scheme) as context:  # type: ignore[arg-type]
-        page = context.new_page()
+        page, problems = context.new_page(), []
+        page.on(
+            "console", lambda said: problems.append(said.text) if said.type == "error" else None
+        )
         page.set_default_timeout(WAIT_MS)
         page.goto(shared_panel.address)
         expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
@@ -162,6 +168,7 @@ def test_axe_finds_nothing(browser: Browser, shared_panel: RunningPanel, scheme:
             expect(page.get_by_text(content).first).to_be_visible(timeout=WAIT_MS)
             found = Axe().run(page)
             assert found.violations_count == 0, f"{name}: {found.generate_report()}"
+    assert not problems
 
 
 def test_a_study_is_checked_armed_played_and_reported_by_keyboard_alone(
@@ -189,6 +196,7 @@ def test_a_study_is_checked_armed_played_and_reported_by_keyboard_alone(
             expect(page.locator(".tab").get_by_text("Playing a study")).to_be_visible(
                 timeout=WAIT_MS
             )
+            check_another_page(context, panel)
             ending = page.locator(".tab").get_by_text("The study has ended")
             expect(ending).to_be_visible(timeout=4 * WAIT_MS)
             expect(page.get_by_role("button", name="Report")).to_be_visible(timeout=4 * WAIT_MS)
@@ -207,6 +215,24 @@ def test_a_study_is_checked_armed_played_and_reported_by_keyboard_alone(
             assert note.read_text() == "first one"
     finally:
         ended(panel)
+
+
+def check_another_page(context: BrowserContext, panel: RunningPanel) -> None:
+    """Another page says that a study is played, and does not analyse what is being recorded."""
+    page, bench = context.new_page(), panel.child("bench_process")
+    page.goto(panel.address)
+    expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
+    os.kill(bench, signal.SIGSTOP)  # so that the study does not end meanwhile
+    try:
+        expect(page.get_by_text("It plays a study")).to_be_visible(timeout=WAIT_MS)
+        press(page, "Studies")
+        said = page.get_by_text("Another page plays a study, up to 1.800 V")
+        expect(said).to_be_visible(timeout=WAIT_MS)
+        expect(page.get_by_role("cell", name="being recorded")).to_be_visible(timeout=WAIT_MS)
+        expect(page.get_by_role("button", name="Analyse")).to_be_disabled(timeout=WAIT_MS)
+    finally:
+        os.kill(bench, signal.SIGCONT)
+        page.close()
 
 
 def press(page: Page, name: str) -> None:

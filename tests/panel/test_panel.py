@@ -1,6 +1,7 @@
 """A panel on the twin: arming, drive, loop, STOP, lost pages, and whoever may not connect."""
 
 import asyncio
+import contextlib
 import io
 import json
 import os
@@ -10,11 +11,12 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
 import websockets
 from PIL import Image
 
-from tests.panel.running import WAIT_S, RunningPanel, connected, ended, started
+from tests.panel.running import WAIT_S, Page, RunningPanel, connected, ended, started
 
 CLOSED = (websockets.InvalidStatus, websockets.ConnectionClosed)
 # of HTTP, of the handshake, and of the web server's own closing frames
@@ -122,6 +124,55 @@ def test_a_frozen_page_gets_no_more_frames_and_loses_its_lease(
     asyncio.run(play())
 
 
+def test_pages_with_the_same_view_get_the_same_frames(shared_panel: RunningPanel) -> None:
+    frames: list[dict[int, bytes]] = [{}, {}, {}]
+
+    async def receive(page: Page, into: dict[int, bytes]) -> None:
+        while len(into) < 20:
+            message = await page._socket.recv()
+            if isinstance(message, bytes):
+                number = int.from_bytes(message[4:8], "little")
+                into[number] = message
+                await page.send({"ack": number})
+
+    async def play() -> None:
+        async with contextlib.AsyncExitStack() as opened:
+            pages = [await opened.enter_async_context(connected(shared_panel)) for _ in frames]
+            await pages[2].send({"view": {"span_s": 1.0, "end_s": None, "columns": 300}})
+            async with asyncio.timeout(WAIT_S):
+                await asyncio.gather(*map(receive, pages, frames))
+
+    asyncio.run(play())
+    first, second, other = frames
+    both = first.keys() & second.keys()
+    assert both and all(first[number] == second[number] for number in both)
+    assert all(other[number] != first[number] for number in [*other][2:] if number in first)
+
+
+def test_the_arming_request_of_a_page_that_has_gone_is_withdrawn(panel: RunningPanel) -> None:
+    async def play() -> None:
+        async with connected(panel) as staying:
+            async with connected(panel) as leaving:
+                await leaving.ask("request")
+                await staying.until(lambda state: state["stage"] == "requested")
+            await staying.until(lambda state: state["stage"] == "off")
+            await asyncio.to_thread(panel.stop)
+            number = (await staying.ask("request"))["answer"]["number"]
+            async with connected(panel) as leaving:  # it has requested nothing
+                await leaving.ask("lease")
+            await staying.until(lambda state: state["stage"] == "requested")
+            await staying.ask("cancel")
+            state = await staying.until(lambda state: state["stage"] != "requested")
+            assert state["stage"] == "tripped" and state["reason"].startswith("STOP was pressed")
+            refused = await staying.ask("arm", number=number, limit_v=1.0)
+            assert "no longer valid" in refused["error"]
+            assert "error" not in await staying.arm()
+            assert "error" not in await staying.ask("cancel")  # armed: there is no request
+            assert (await staying.until(lambda state: state["holder"]))["stage"] == "running"
+
+    asyncio.run(play())
+
+
 def test_the_loop_of_an_actuator_file_follows_the_desired_strain(actuator_file: Path) -> None:
     panel = started("--actuator", str(actuator_file))
 
@@ -183,6 +234,19 @@ def test_the_camera_picture_is_new_while_the_bench_is_armed(panel: RunningPanel)
         with urllib.request.urlopen(request, timeout=WAIT_S) as answer:
             return answer.read(), float(answer.headers.get("X-Age-S", "nan"))
 
+    def fiducials() -> dict[str, list[list[float]]]:
+        """Those of the first picture that shows the lower clamp lower than before."""
+        end_s = time.monotonic() + WAIT_S
+        while time.monotonic() < end_s:
+            headers = {"X-Panel-Token": panel.token}
+            request = urllib.request.Request(f"http://{panel.host}/camera", headers=headers)
+            with urllib.request.urlopen(request, timeout=WAIT_S) as answer:
+                found = json.loads(answer.headers["X-Fiducials"])
+            if any(y - y0 > 3.0 for _, y, _, y0 in found["points"]):
+                return found
+            time.sleep(0.1)
+        pytest.fail("no motion in the pictures")
+
     async def play() -> None:
         async with connected(panel) as page:
             assert (await asyncio.to_thread(picture, panel.token))[0] == b""
@@ -194,6 +258,13 @@ def test_the_camera_picture_is_new_while_the_bench_is_armed(panel: RunningPanel)
                     seen |= {(await asyncio.to_thread(picture, panel.token))[0]} - {b""}
             image = Image.open(io.BytesIO(seen.pop()))
             assert image.format == "JPEG" and min(image.size) > 100
+            await page.ask("drive", value_v=1.5)
+            await page.until(lambda state: state["drive_v"] == 1.5)
+            marks = await asyncio.to_thread(fiducials)
+            points = np.array(marks["points"]).reshape(2, 3, 4)  # upper and lower row
+            assert marks["size"] == list(image.size)
+            motion = (points[:, :, :2] - points[:, :, 2:])[:, :, 1].mean(axis=1)
+            assert motion[1] > 3.0 and abs(motion[0]) < 0.3  # the lower clamp has sunk
             await page.ask("disarm")
             begun_s = time.monotonic()
             while time.monotonic() < begun_s + 1.5:

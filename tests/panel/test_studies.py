@@ -211,7 +211,7 @@ def test_a_study_of_another_page_does_not_disturb_the_one_that_has_armed(folder:
             for _ in range(3):
                 values = {"number": number, "limit_v": 2.0, "study": LONG}
                 assert "Another page" in (await second.ask("arm", **values))["error"]
-            assert second.state["holder"] == first.holder
+            assert second.state["holder"] == first.holder, second.state["reason"]
             receiving.cancel()
 
     try:
@@ -292,7 +292,8 @@ def test_a_study_beyond_the_bench_is_found_by_the_check(files: PanelFiles) -> No
     assert (bad["requested"], bad["limit"], bad["ok"]) == (2.5, 2.0, False)
     assert bad["advice"]
     fine = check(files, {"study": "triangle.toml"})
-    assert fine["ok"] and fine["highest_v"] == 1.8 and fine["seconds"] == pytest.approx(8.0)
+    assert fine["ok"] and fine["highest_v"] == 1.8
+    assert fine["seconds"] == pytest.approx(0.2 + 8.0)  # what is recorded before the first rise
 
 
 def recording(files: PanelFiles, name: str, rows: dict[str, tuple[float, float]]) -> None:
@@ -361,6 +362,28 @@ def test_odd_folders_do_not_empty_the_list_of_recordings(files: PanelFiles) -> N
     assert all(isinstance(one["study"], str) for one in found)
     with pytest.raises(InputError, match="A note must be a text"):
         note(files, {"name": "a", "text": "\ud800"})
+
+
+@pytest.mark.parametrize(
+    ("manifest", "shown", "is_open"),
+    [
+        ({"state": "SEALED", "ended": "complete"}, "complete", False),
+        ({"state": "SEALED", "ended": "StudyEndedError: The study was ended from a page."},
+         "The study was ended from a page.", False),
+        ({"state": "SEALED", "ended": "SafetyError: Lost: 3 blocks."}, "Lost: 3 blocks.", False),
+        ({"state": "SEALED", "ended": "KeyboardInterrupt"}, "ended with Ctrl-C", False),
+        ({"state": "OPEN"}, "Not closed. If no program records it, run: haselab recover", True),
+        ({"state": "RECOVERED"}, "recovered", False),
+    ],
+)  # fmt: skip
+def test_the_list_says_how_a_recording_ended_without_names_of_classes(
+    files: PanelFiles, manifest: dict[str, str], shown: str, is_open: bool
+) -> None:
+    recording(files, "a", {})
+    text = json.dumps({"format": "haselab manifest 1", **manifest})
+    (files.runs / "a" / "manifest.json").write_text(text)
+    (found,) = listed(files, {})["recordings"]
+    assert found["state"].startswith(shown) and found["open"] is is_open
 
 
 def test_a_note_stays_with_its_recording(files: PanelFiles) -> None:

@@ -183,6 +183,17 @@ class LiveReader:
         return float(self._memory.rows[(count - 1) % _BLOCKS, 0]) if count else float("nan")
 
     @property
+    def gap_s(self) -> float:
+        """When the time of the rig last jumped, on its clock; NaN: never, or too long ago.
+
+        Earlier data are not shown.
+        """
+        count, first = self._memory.counters
+        if first == 0 or count - first > _BLOCKS - _MARGIN:
+            return float("nan")
+        return float(self._memory.rows[first % _BLOCKS, 0]) - self._block / self._rate_hz
+
+    @property
     def written_s(self) -> float:
         """When the last block was written, on the monotonic clock of the computer; NaN: never."""
         count = self.blocks

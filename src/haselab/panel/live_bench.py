@@ -1,4 +1,4 @@
-"""The bench of the panel: reads blocks, drives by hand or in a closed loop, and stops."""
+"""The bench of the panel: reads blocks, drives manually or in a closed loop, and stops."""
 
 from __future__ import annotations
 
@@ -48,8 +48,9 @@ class BenchState:
     """What the pages show of the bench.
 
     Args:
-        stage: of the safety chain: off, requested, armed, running or tripped.
-        mode: `idle`, `drive` (by hand), `loop` or `study`.
+        stage: of the safety chain: off, requested, armed, running or tripped. It is tripped until
+            somebody arms the bench and acknowledges the reason.
+        mode: `idle`, `drive` (manual), `loop` or `study`.
         drive_v: drive of the last block, in V.
         target_v: drive to which the ramp leads, in V.
         reference: desired strain; None: the loop is open.
@@ -67,6 +68,7 @@ class BenchState:
         prompt: step that a person must do and confirm; empty: none.
         events: the last ones, each with its time on the clock of the rig, in s.
         recorded: folder of the last study that was played to its end; empty: none.
+        recording: folder of the study that is being played; empty: none.
     """
 
     stage: str
@@ -88,6 +90,7 @@ class BenchState:
     prompt: str
     events: tuple[tuple[float, str], ...]
     recorded: str
+    recording: str
 
 
 class _NoCamera:
@@ -139,6 +142,7 @@ class LiveBench:
         self._lockin = lockin_of(about, CARRIER_HZ)
         self._mutex = threading.Lock()  # protects all below
         self._request: ArmingRequest | None = None
+        self._requester = ""  # page of the last request
         self._mode, self._reason, self._holder = "idle", "", ""
         self._drive_v = self._target_v = 0.0
         self._reference: float | None = None
@@ -161,23 +165,27 @@ class LiveBench:
     def state(self) -> BenchState:
         """What the pages show."""
         safety, about = self._rig.safety, self._rig.description
+        stage, latched = safety.stage, safety.gate.interlock.reason
+        if stage is Stage.OFF and latched:  # a request was withdrawn
+            stage = Stage.TRIPPED
         low, high = about.drive_limits.low, about.drive_limits.high
         limits = None
         if self._loop is not None:
             limits = (self._loop.saturation.low, self._loop.saturation.high)
         return BenchState(
-            safety.stage.value, self._mode, self._drive_v, self._target_v, self._reference,
-            self._limit_v, self._holder, safety.gate.interlock.reason or self._reason, low, high,
+            stage.value, self._mode, self._drive_v, self._target_v, self._reference,
+            self._limit_v, self._holder, latched or self._reason, low, high,
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, tuple(self._events),
-            self._recorded,
+            self._recorded, "" if self._job is None else self._job.options.folder.name,
         )  # fmt: skip
 
     def do(self, what: str, holder: str, values: JsonObject) -> JsonObject:
         """Carry out a command of a page.
 
         Args:
-            what: `request`, `arm`, `drive`, `loop`, `open`, `confirm`, `disarm` or `lease`.
+            what: `request`, `cancel`, `arm`, `drive`, `loop`, `open`, `confirm`, `disarm` or
+                `lease`.
             holder: the page.
             values: arguments of the command.
         Returns:
@@ -188,7 +196,8 @@ class LiveBench:
             SafetyError: Another page has armed the bench, or it is not armed.
         """
         commands = {
-            "request": self._request_arming, "arm": self._arm, "drive": self._drive_to,
+            "request": self._request_arming, "cancel": self._cancel_request, "arm": self._arm,
+            "drive": self._drive_to,
             "loop": self._close_loop, "open": self._open_loop, "disarm": self._disarm,
             "lease": self._lease, "confirm": self._confirm,
         }  # fmt: skip
@@ -232,9 +241,20 @@ class LiveBench:
 
     def _request_arming(self, holder: str, values: JsonObject) -> JsonObject:
         self._require_idle()
-        self._request = self._rig.safety.request()
-        return {"number": self._request.number, "limits": self._request.limits,
+        self._request, self._requester = self._rig.safety.request(), holder
+        output_v_per_s = _RAMP_V_PER_S * self._rig.description.amplifier_gain
+        manual = (
+            f"Manual drive changes by {_RAMP_V_PER_S:g} V/s ({1e-3 * output_v_per_s:g} kV/s at the "
+            "output)."
+        )
+        return {"number": self._request.number, "limits": f"{self._request.limits} {manual}",
                 "reason": self._request.reason}  # fmt: skip
+
+    def _cancel_request(self, holder: str, values: JsonObject) -> JsonObject:
+        if holder == self._requester and self._rig.safety.stage is Stage.REQUESTED:
+            self._request = None
+            self._rig.safety.end_run()
+        return {}
 
     def _arm(self, holder: str, values: JsonObject, job: StudyJob | None = None) -> JsonObject:
         self._require_idle()
@@ -264,6 +284,8 @@ class LiveBench:
             self._rig.generator.sine(CARRIER_HZ, CARRIER_V)
             if self._picture is not None:
                 self._rig.camera.start(_PICTURES_HZ)
+            if not self._rig.safety.live:  # STOP, while an instrument was slow
+                raise self._rig.safety.refusal()
         except HaselabError:
             self._end()
             raise
@@ -274,7 +296,7 @@ class LiveBench:
 
     def _check_turn(self, what: str, holder: str) -> None:
         """Refuse a command of a page while another one has armed the bench."""
-        if self._holder and holder != self._holder and what not in ("disarm", "lease"):
+        if self._holder and holder != self._holder and what not in ("disarm", "lease", "cancel"):
             raise SafetyError("Another page has armed the bench. It must disarm the bench first.")
 
     def _find_request(self, values: JsonObject) -> ArmingRequest:

@@ -109,8 +109,10 @@ class OnlyOwnPages:
         if scope["type"] == "websocket":
             if not (mine and origin):
                 await send({"type": "websocket.close", "code": 1008})
-                return
-        elif not mine:
+            else:
+                await self._app(scope, receive, send)
+            return
+        if not mine:
             await Response("Only the panel's own page may use this server.", 403)(
                 scope, receive, send
             )

@@ -19,7 +19,7 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from starlette.applications import Starlette
@@ -34,6 +34,7 @@ from haselab.base import HaselabError
 from haselab.panel.columns import SIGNALS, Columns, LiveReader
 from haselab.panel.files import PanelFiles
 from haselab.panel.page_server import NO_TOKEN, STATIC, Access, OnlyOwnPages, routes_of
+from haselab.panel.pages.camera import CameraPicture
 from haselab.panel.pages.recordings import analyse_recorded
 from haselab.panel.pages.requests import REQUESTS
 
@@ -46,6 +47,7 @@ _TOKEN_S = 3.0  # for the first message of a page
 _MOST_PAGES = 32
 _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
+_COLUMN_STEP = 100  # so that windows of almost the same width share their frames
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
 _HEAD = struct.Struct("<HHIddddII")
 
@@ -152,17 +154,22 @@ class _Bench:
             return {"error": f"No answer from the bench process for {_BENCH_S:g} s. Press STOP."}
 
 
+class _View(NamedTuple):
+    """What a page shows: pages with the same view get the same frame."""
+
+    span_s: float
+    end_s: float | None  # None: the present
+    columns: int
+
+
 @dataclass
 class _Page:
     """One connected page."""
 
     socket: WebSocket
     holder: str = field(default_factory=lambda: secrets.token_hex(8))
-    span_s: float = 10.0
-    end_s: float | None = None  # None: the present
-    columns: int = 600
-    sent: int = 0
-    acknowledged: int = 0
+    view: _View = field(default_factory=lambda: _View(10.0, None, 600))
+    unacknowledged: list[int] = field(default_factory=list)  # frames
 
 
 class _Server:
@@ -171,8 +178,10 @@ class _Server:
     def __init__(self, settings: WebSettings) -> None:
         self._settings = settings
         self._bench = _Bench(settings.folder, settings.files)
+        self._picture = CameraPicture(settings.folder / "camera.jpg")
         self._pages: set[int] = set()
         self._tasks: set[asyncio.Task[None]] = set()  # so that none is collected while it runs
+        self._made: tuple[int, dict[_View, bytes]] = (0, {})  # frames of one tick
 
     @contextlib.asynccontextmanager
     async def lifespan(self, app: Starlette) -> Any:
@@ -191,15 +200,14 @@ class _Server:
         )
 
     async def camera(self, request: Request) -> Response:
-        """The last frame with its age, for a page with the token."""
+        """The last frame with its age and its fiducials, for a page with the token."""
         if not self._settings.access.is_known(request):
             return Response(NO_TOKEN, 403)
-        try:
-            path = self._settings.folder / "camera.jpg"
-            age_s = max(time.time() - path.stat().st_mtime, 0.0)
-            return Response(path.read_bytes(), 200, {"x-age-s": f"{age_s:.3f}"}, "image/jpeg")
-        except OSError:
+        found = await run_in_threadpool(self._picture.read)
+        if found is None:
             return Response(None, 204)  # no picture yet
+        headers = {"x-age-s": f"{found.age_s:.3f}", "x-fiducials": found.fiducials}
+        return Response(found.jpeg, 200, headers, "image/jpeg")
 
     async def live(self, socket: WebSocket) -> None:
         if len(self._pages) >= _MOST_PAGES:
@@ -222,6 +230,8 @@ class _Server:
             self._pages.discard(id(page))
             for task in tasks:
                 task.cancel()
+            if tasks:
+                self._start(self._leave(page))
 
     async def _known(self, socket: WebSocket) -> bool:
         try:
@@ -239,9 +249,10 @@ class _Server:
                 message = json.loads(text) if len(text) <= _MOST_BYTES else None
                 assert isinstance(message, dict)
                 if "ack" in message:
-                    page.acknowledged = int(message["ack"])
+                    last = int(message["ack"])
+                    page.unacknowledged = [one for one in page.unacknowledged if one > last]
                 elif "view" in message:
-                    self._set_view(page, message["view"])
+                    page.view = self._view(message["view"])
                 elif "do" in message:
                     self._start(self._command(page, message))
                 else:
@@ -251,12 +262,14 @@ class _Server:
                 return
 
     @staticmethod
-    def _set_view(page: _Page, view: dict[str, Any]) -> None:
+    def _view(view: dict[str, Any]) -> _View:
         span_s, end_s = float(view["span_s"]), view.get("end_s")
         if not (1e-5 <= span_s <= 1e5 and math.isfinite(float(end_s or 0.0))):
             raise ValueError
-        page.span_s, page.end_s = span_s, None if end_s is None else float(end_s)
-        page.columns = min(max(int(view["columns"]), 16), _MOST_COLUMNS)
+        columns = -(-int(view["columns"]) // _COLUMN_STEP) * _COLUMN_STEP
+        return _View(
+            span_s, None if end_s is None else float(end_s), min(max(columns, 16), _MOST_COLUMNS)
+        )
 
     async def _command(self, page: _Page, message: dict[str, Any]) -> None:
         values = message.get("values")
@@ -268,13 +281,17 @@ class _Server:
             await page.socket.send_text(json.dumps(answer))
 
     async def _frames(self, page: _Page) -> None:
-        """Send frames to one page, each after the last one was acknowledged."""
-        lease_s, loop = 0.0, asyncio.get_running_loop()
+        """Send frames to one page, each after the last one was acknowledged.
+
+        All pages send at the same ticks, so that those with the same view share a frame.
+        """
+        lease_s, tick, loop = 0.0, 0, asyncio.get_running_loop()
         last: tuple[object, ...] = ()
         with contextlib.suppress(RuntimeError, OSError, WebSocketDisconnect):
             while True:
-                await asyncio.sleep(_FRAME_S)
-                if page.sent - page.acknowledged > 1:
+                tick = max(tick, int(loop.time() / _FRAME_S)) + 1
+                await asyncio.sleep(tick * _FRAME_S - loop.time())
+                if len(page.unacknowledged) > 1:
                     continue
                 state = self._bench.state or {}
                 if state.get("holder") == page.holder and loop.time() > lease_s:
@@ -284,14 +301,12 @@ class _Server:
                 age_s = self._bench.age_s()
                 answers = loop.time() < self._bench.state_s + _REPEAT_S
                 repeats = int(age_s / _REPEAT_S) if answers and age_s < math.inf else 0
-                now = (
-                    blocks, page.span_s, page.end_s, page.columns, self._bench.state_text, repeats
-                )  # fmt: skip
+                now = (blocks, page.view, self._bench.state_text, repeats)
                 if now == last:
                     continue
                 last = now
-                page.sent += 1
-                await page.socket.send_bytes(self._frame(page))
+                page.unacknowledged.append(tick)
+                await page.socket.send_bytes(self._frame(tick, page.view))
 
     def _start(self, job: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(job)
@@ -301,25 +316,40 @@ class _Server:
     async def _renew(self, page: _Page) -> None:
         await self._bench.ask("lease", page.holder, {})
 
-    def _frame(self, page: _Page) -> bytes:
+    async def _leave(self, page: _Page) -> None:
+        """Withdraw the arming request of a page that has gone."""
+        await self._bench.ask("cancel", page.holder, {})
+
+    def _frame(self, tick: int, view: _View) -> bytes:
+        """The frame of a view at a tick, made once for all pages that show it."""
+        if self._made[0] != tick:
+            self._made = (tick, {})
+        frames = self._made[1]
+        if view not in frames:
+            frames[view] = self._encode(tick, view)
+        return frames[view]
+
+    def _encode(self, tick: int, view: _View) -> bytes:
         """A binary frame: numbers, the state as JSON, then columns as 32-bit floats."""
         reader = self._bench.reader
         end_s = reader.end_s if reader is not None else math.nan
-        shown_s = end_s if page.end_s is None else page.end_s
+        shown_s = end_s if view.end_s is None else view.end_s
         empty = Columns(0.0, 1.0, np.empty((0, 2)), np.empty((0, 2)))
         monitors, signals = empty, Columns(0.0, 1.0, np.empty((0, 5)), np.empty((0, 5)))
         if reader is not None and not math.isnan(shown_s):
-            monitors = reader.monitors(shown_s - page.span_s, shown_s, page.columns)
-            signals = reader.signals(shown_s - page.span_s, shown_s, page.columns)
+            monitors = reader.monitors(shown_s - view.span_s, shown_s, view.columns)
+            signals = reader.signals(shown_s - view.span_s, shown_s, view.columns)
+        gap_s = reader.gap_s if reader is not None else math.nan
         times = {
             "end_s": None if math.isnan(end_s) else end_s,
+            "gap_s": None if math.isnan(gap_s) else gap_s,
             "age_s": min(self._bench.age_s(), 1e9),
             "written_s": None if reader is None or math.isnan(end_s) else reader.written_s,
         }
         text = f'{{"state": {self._bench.state_text}, {json.dumps(times)[1:]}'.encode()
         text += b" " * (-len(text) % 8)
         head = _HEAD.pack(
-            SCHEMA, 0, page.sent, monitors.start_s, monitors.step_s, signals.start_s,
+            SCHEMA, 0, tick, monitors.start_s, monitors.step_s, signals.start_s,
             signals.step_s, len(text), len(monitors.low),
         )  # fmt: skip
         arrays = [

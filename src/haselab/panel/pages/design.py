@@ -61,6 +61,10 @@ _SHOWN_CROSSOVERS = 20.0  # length of the step, in periods of the crossover divi
 _LONGEST_S = 30.0
 _MOST_SAMPLES = 4000
 _LEAST, _MOST = 1e-12, 1e12  # gains
+_NO_FILE = (
+    "The panel was started without an actuator file. Start it with: haselab panel --actuator "
+    "ACTUATOR.toml"
+)
 _NO_UNCERTAINTY = "no uncertainty: [model] has no covariance"
 
 
@@ -129,10 +133,7 @@ def opened(files: PanelFiles) -> DesignedLoop:
         InputError: There is no file, it has no model, or a value in it is not valid.
     """
     if files.actuator is None:
-        raise InputError(
-            "The panel was started without an actuator file. Start it with: haselab panel "
-            "--actuator ACTUATOR.toml"
-        )
+        raise InputError(_NO_FILE)
     path = files.actuator / ACTUATOR if files.actuator.is_dir() else files.actuator
     tables, (sha256, *_) = read_tables(path), [*hashed([path]).values(), ""]
     plant, section = read_any_plant(path), tables.controller
@@ -166,6 +167,8 @@ def gains_of(values: JsonObject) -> PidGains:
 
 def _overview(files: PanelFiles, values: JsonObject) -> JsonObject:
     """What the page shows first: the controller of the file, and what its gains may be."""
+    if files.actuator is None:
+        return {"none": _NO_FILE}
     loop = opened(files)
     held, gains, origin = loop.held, loop.feedback(), read_origin(loop.path)
     warnings = [model_doubt(loop.path), loop.no_limits]

@@ -58,8 +58,9 @@ def listed(files: PanelFiles, values: JsonObject) -> JsonObject:
         files: of the panel.
         values: none.
     Returns:
-        `folder` and `recordings`: name, study, date, seconds, state, note, whether it is being
-        analysed, what the last analysis failed with, and whether there is a report.
+        `folder` and `recordings`: name, study, date, seconds, state, whether it is open (being
+        recorded, or interrupted), note, whether it is being analysed, what the last analysis failed
+        with, and whether there is a report.
     """
     found = [_described(path) for path in _folders(files)]
     found.sort(key=lambda one: str(one["opened"]), reverse=True)
@@ -72,9 +73,9 @@ def _described(folder: Path) -> dict[str, Any]:
     except InputError as error:
         manifest, state = {}, " ".join(str(error).split())
     else:
-        state = str(manifest.get("ended", ""))
+        state = _ended(str(manifest.get("ended", "")))
         if manifest.get("state") == "OPEN":
-            state = "being recorded, or interrupted. If nothing records it, run haselab recover"
+            state = f"Not closed. If no program records it, run: haselab recover {folder}"
         elif manifest.get("state") == "RECOVERED":
             state = f"{state}, recovered".lstrip(", ")
     running = _running.get(folder)
@@ -85,11 +86,20 @@ def _described(folder: Path) -> dict[str, Any]:
         "opened": str(manifest.get("opened", "")),
         "seconds": when.get("duration_s"),
         "state": state,
+        "open": manifest.get("state") == "OPEN",
         "note": _read(folder / _NOTES),
         "analysing": running is not None and running.poll() is None,
         "problem": " ".join(_read(folder / _LOG).split()) if running and running.poll() else "",
         "report": (folder / "report.html").is_file(),
     }
+
+
+def _ended(text: str) -> str:
+    """How a recording ended, without the class of the error that ended it."""
+    name, colon, reason = text.partition(": ")
+    if text == KeyboardInterrupt.__name__:
+        return "ended with Ctrl-C"
+    return reason if colon and name.isidentifier() else text
 
 
 def _read(path: Path) -> str:

@@ -1,5 +1,5 @@
 // Arming, and the progress of a study: for the live page and the page of the studies.
-import { html, useState } from "/static/vendor/htm-preact.js";
+import { html, useState, useEffect, useRef } from "/static/vendor/htm-preact.js";
 
 export const kilo = (v, gain) => `${v.toFixed(3)} V (${(v * gain / 1000).toFixed(2)} kV)`;
 
@@ -9,6 +9,10 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
   const [limit, setLimit] = useState("");
   const [known, setKnown] = useState(false);
   const [sent, setSent] = useState(false);
+  const open = useRef(false); // whether a request waits for the second step
+  open.current = request !== null && !sent;
+  const cancel = () => { setRequest(null); link.ask("cancel"); };
+  useEffect(() => () => { if (open.current) link.ask("cancel"); }, []);
   async function ask() {
     const found = await link.ask("request");
     if (found.error) { say(found.error); return; }
@@ -23,7 +27,8 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
     setSent(false);
     setRequest(null);
     say(found.error || "");
-    if (!found.error) onArmed(found.answer);
+    if (found.error) link.ask("cancel");
+    else onArmed(found.answer);
   }
   if (request === null) return html`<button type="button" onClick=${ask}>${study === null ? "Arm the bench …" : "Arm the bench and play …"}</button>`;
   return html`<form onSubmit=${arm}>
@@ -35,18 +40,24 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
       <input type="number" step="any" min="0" max=${state.high_v} required value=${limit} onInput=${(e) => setLimit(e.target.value)} />
     </label>
     <div class="row"><button class="danger" type="submit" disabled=${sent || !limit || (request.reason && !known)}>${sent ? "Checking …" : study === null ? "Arm" : "Arm and play"}</button>
-    <button type="button" onClick=${() => setRequest(null)}>Cancel</button></div>
+    <button type="button" onClick=${cancel}>Cancel</button></div>
   </form>`;
+}
+
+// What a study does now, on each page.
+export function Progress({ state }) {
+  const share = Math.round(100 * state.done);
+  return html`
+    <p role="status">${state.task || "Starting"}</p>
+    <progress max="100" value=${share} aria-label="Progress of the study">${share} %</progress> ${share} %`;
 }
 
 // A study that this page has started: what it does, what a person must do, and how to end it.
 export function Playing({ state, link, say }) {
   const ask = (what) => link.ask(what).then((found) => say(found.error || ""));
-  const share = Math.round(100 * state.done);
   return html`
     <p class="badge live">Playing a study, up to ${kilo(state.limit_v, state.gain)}</p>
-    <p role="status">${state.task || "Starting"}</p>
-    <progress max="100" value=${share} aria-label="Progress of the study">${share} %</progress> ${share} %
+    <${Progress} state=${state} />
     ${state.prompt && html`<div class="card warning" role="alert"><p>${state.prompt}</p>
       <button type="button" onClick=${() => ask("confirm")}>Done</button></div>`}
     <div class="row"><button type="button" onClick=${() => ask("disarm")}>End the study</button></div>

@@ -23,6 +23,9 @@ const range = (low, high, unit) => {
   return digits(low) === digits(high) ? `${digits(high)} ${unit}` : `${digits(low)} to ${digits(high)} ${unit}`;
 };
 
+// Ticks of the time axis: as many decimals as their distance needs.
+const seconds = (u, ticks, axis, space, step) => ticks.map((v) => `${v.toFixed(Math.max(0, Math.ceil(-Math.log10(step) - 1e-9)))} s`);
+
 export class Charts {
   constructor(root, onZoom, onResize) {
     this.onZoom = onZoom;
@@ -58,7 +61,7 @@ export class Charts {
     const plot = new uPlot({
       width: Math.max(card.clientWidth - 24, 200), height: HEIGHT, series, bands, legend: { show: false },
       scales: { x: { time: false } },
-      axes: [{ ...axis }, { ...axis, size: 70, label: about.unit, labelSize: 20 }],
+      axes: [{ ...axis, values: seconds }, { ...axis, size: 70, label: about.unit, labelSize: 20 }],
       cursor: { sync: { key: "haselab" }, drag: { x: true, y: false, setScale: false } },
       hooks: {
         draw: [(u) => this.mark(u, text)],

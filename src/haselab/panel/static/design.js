@@ -149,6 +149,7 @@ export default function Design({ link, state }) {
   }, [gains]);
 
   if (about === null) return html`<p role="status">Reading the actuator file …</p>`;
+  if (about.none) return html`<div class="card"><h2>Design</h2><p role="status">${about.none}</p></div>`;
   if (about.error) return html`<div class="card"><h2>Design</h2><p class="error" role="alert">${about.error}</p><button type="button" onClick=${reopen}>Read the file again</button></div>`;
   const put = (name) => (value) => { say({ text: "", bad: false }); change({ ...gains, [name]: value }); };
   const isShown = found !== null && !found.error;

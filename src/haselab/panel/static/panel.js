@@ -1,7 +1,7 @@
 import { html, render, useState, useEffect, useReducer } from "/static/vendor/htm-preact.js";
 import { Charts } from "/static/charts.js";
 import { Link } from "/static/link.js";
-import { Arming, Playing, kilo } from "/static/bench.js";
+import { Arming, Playing, Progress, kilo } from "/static/bench.js";
 
 const STALE_MS = 450;
 let frame = null;
@@ -56,7 +56,7 @@ function Live({ state, say }) {
   return html`
     <p class="badge live">Armed by this page up to ${kilo(state.limit_v, state.gain)}</p>
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
-      about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : "changes by 1 V/s"}`} send=${(v) => ask("drive", { value_v: v })} />
+      about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : `changes by 1 V/s (${Number((state.gain / 1000).toPrecision(3))} kV/s at the output)`}`} send=${(v) => ask("drive", { value_v: v })} />
     ${state.loop === null
       ? html`<p>The loop cannot be closed. Start the panel with --actuator A.toml, a file with both maps and a controller.</p>`
       : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
@@ -70,7 +70,7 @@ function Live({ state, say }) {
 }
 
 function Camera() {
-  const [seen, see] = useState({ url: "", age_s: null });
+  const [seen, see] = useState({ url: "", age_s: null, size: [1, 1], points: [] });
   useEffect(() => {
     let url = "";
     async function look() {
@@ -79,18 +79,22 @@ function Camera() {
         if (answer.status === 200) {
           const old = url;
           url = URL.createObjectURL(await answer.blob());
-          see({ url, age_s: Number(answer.headers.get("x-age-s")) });
+          see({ url, age_s: Number(answer.headers.get("x-age-s")), ...JSON.parse(answer.headers.get("x-fiducials")) });
           if (old) setTimeout(() => URL.revokeObjectURL(old), 1000);
-        } else see({ url: "", age_s: null });
+        } else see({ url: "", age_s: null, size: [1, 1], points: [] });
       } catch { see((last) => ({ ...last, age_s: Infinity })); }
       setTimeout(look, 200); // one request at a time
     }
     look();
   }, []);
-  const old = !(seen.age_s < 1);
+  const old = !(seen.age_s < 1), { points, size } = seen;
+  const moved = Math.max(...points.map(([x, y, x0, y0]) => Math.hypot(x - x0, y - y0)));
   return html`<div class="card"><h2>Camera</h2>
-    ${seen.url ? html`<img class=${old ? "old" : ""} src=${seen.url} alt="Actuator in the last frame of the camera" />
-      <p class=${old ? "error" : ""}>${old ? "OLD PICTURE. The camera only films while the bench is armed." : "5 frames/s"}</p>`
+    ${seen.url ? html`<div class=${`frame seen ${old ? "old" : ""}`}><img src=${seen.url} alt="Actuator in the last frame of the camera" />
+        <svg viewBox=${`-0.5 -0.5 ${size[0]} ${size[1]}`} aria-hidden="true">${points.map(([x, y, x0, y0]) => ["halo", "mark"].map((layer) => html`<g class=${layer}>
+          <circle cx=${x} cy=${y} r=${size[1] / 50} /><line x1=${x0} y1=${y0} x2=${x} y2=${y} /></g>`))}</svg></div>
+      <p class=${old ? "error" : ""}>${old ? "OLD PICTURE. The camera only films while the bench is armed." : "5 frames/s"}</p>
+      <p>${points.length ? `${points.length} fiducials found. The largest motion since the camera was started is ${moved.toFixed(1)} px.` : "The fiducials are not found in this picture."}</p>`
       : html`<p>No picture. The camera starts when the bench is armed.</p>`}</div>`;
 }
 
@@ -126,6 +130,7 @@ function Panel() {
   const live = state !== null && state.holder !== "";
   const mine = live && state.holder === link.holder;
   const paused = link.view.end_s !== null;
+  const jumped = typeof frame?.gap_s === "number" && frame.gap_s > (link.view.end_s ?? frame.end_s) - link.view.span_s;
   return html`
     <header>
       <h1>${state ? state.name : "haselab panel"}</h1>
@@ -142,6 +147,7 @@ function Panel() {
         <div class="row" role="group" aria-label="View">
           <button type="button" aria-pressed=${paused} onClick=${() => link.setView(paused ? { end_s: null } : { end_s: frame?.end_s ?? null })}>${paused ? "Resume" : "Pause"}</button>
           ${[1, 10, 60, 600].map((s) => html`<button type="button" onClick=${() => link.setView({ span_s: s })}>${s} s</button>`)}
+          ${jumped && html`<span class="error" role="status">The time of the bench jumped at ${frame.gap_s.toFixed(2)} s. Earlier data are not shown.</span>`}
           <span>${Number(link.view.span_s.toPrecision(3))} s shown. Drag over a plot to zoom. Double-click a plot to return to live data.</span>
         </div>
         <div id="charts"></div>
@@ -154,7 +160,8 @@ function Panel() {
           ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}</p>`}
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
-            : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>`
+            : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>
+              ${state.mode === "study" && html`<p>It plays a study.</p><${Progress} state=${state} />`}`
             : html`<${Arming} state=${state} link=${link} say=${say} />`}
         </div>
         <${Camera} />

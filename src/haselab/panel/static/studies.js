@@ -1,6 +1,6 @@
 // Choose, check and play a study; the list of recordings.
 import { html, useState, useEffect } from "/static/vendor/htm-preact.js";
-import { Arming, Playing, kilo } from "/static/bench.js";
+import { Arming, Playing, Progress, kilo } from "/static/bench.js";
 
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
 const when = (s) => (s === null ? "unknown" : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
@@ -34,6 +34,8 @@ function Chooser({ link, state, mine, onEnd }) {
   const busy = state !== null && state.holder !== "";
   if (busy && state.mode === "study" && mine) return html`<div class="card warning"><h2>Study</h2>
     ${error && html`<p class="error" role="alert">${error}</p>`}<${Playing} state=${state} link=${link} say=${say} /></div>`;
+  if (busy && state.mode === "study") return html`<div class="card warning"><h2>Study</h2>
+    <p class="badge live">Another page plays a study, up to ${kilo(state.limit_v, state.gain)}</p><${Progress} state=${state} /></div>`;
   if (list === null) return html`<div class="card"><h2>Study</h2><p class=${error ? "error" : ""} role="status">${error || "Reading the studies …"}</p></div>`;
   const titles = list.find((one) => one.name === chosen.study)?.experiments ?? [];
   const toggle = (table, on) => change({ experiments: titles.map((one) => one.table).filter((one) => (one === table ? on : chosen.experiments.includes(one))) });
@@ -110,10 +112,10 @@ function Recordings({ link, state }) {
     <table><thead><tr><th scope="col">Mark</th><th scope="col">Recording</th><th scope="col">Study</th><th scope="col">Ended</th><th scope="col">Note</th><th scope="col">Results</th></tr></thead>
     <tbody>${shown.map((one) => html`<tr key=${one.name}>
       <td><input type="checkbox" aria-label=${`Mark ${one.name}`} checked=${marked.includes(one.name)} onChange=${(e) => toggle(one.name, e.target.checked)} /></td>
-      <td>${one.name}<br /><small>${one.opened.slice(0, 19).replace("T", " ")}</small></td><td>${one.study}</td><td>${one.state}</td>
+      <td>${one.name}<br /><small>${one.opened.slice(0, 19).replace("T", " ")}</small></td><td>${one.study}</td><td>${one.name === state?.recording ? "being recorded" : one.state}</td>
       <td><textarea aria-label=${`Note about ${one.name}`} rows="2" defaultValue=${one.note} onBlur=${(e) => e.target.value !== one.note && keep(one.name, e.target.value)}></textarea></td>
       <td>${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
-        <button type="button" disabled=${one.analysing} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button>
+        <button type="button" disabled=${one.analysing || one.open} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button>
         ${one.problem && html`<p class="error">${one.problem}</p>`}</td></tr>`)}</tbody></table></div>`;
 }
 

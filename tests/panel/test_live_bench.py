@@ -115,6 +115,37 @@ def test_the_typed_limit_is_that_of_every_output_of_a_study(
     assert "enough" in live.state.reason
 
 
+def test_a_command_is_carried_out_before_the_next_block(tmp_path: Path) -> None:
+    """Else a bench that is behind would read hundreds of blocks before it obeys."""
+    twin = make_twin(twin_of_reading("hz"), 1)
+    bench: Any = twin.acquisition
+    read, entered, allowed = bench.read, threading.Event(), threading.Semaphore(0)
+
+    def waiting() -> Any:
+        entered.set()
+        assert allowed.acquire(timeout=WAIT_S)
+        return read()
+
+    bench.read = waiting
+    rig = guard(twin)
+    about = rig.description
+    with LiveWriter(tmp_path / "live", about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
+        live = LiveBench(rig, writer)
+        stepping = threading.Thread(target=lambda: [live.step() for _ in range(2)])
+        stepping.start()
+        assert entered.wait(WAIT_S)
+        command = threading.Thread(target=live.do, args=("lease", "page", {}))
+        command.start()
+        while not live._turn.locked():
+            time.sleep(1e-3)
+        allowed.release()  # one block, and no other
+        command.join(WAIT_S)
+        assert not command.is_alive()
+        allowed.release(100)  # also those of the end
+        stepping.join(WAIT_S)
+        live.close()
+
+
 # Calls in which a bench can be while somebody presses STOP.
 HANGING = [
     "reading the actuator file", "checking a study", "beginning a run", "starting the camera",

@@ -141,6 +141,7 @@ class LiveBench:
         about = rig.description
         self._lockin = lockin_of(about, CARRIER_HZ)
         self._mutex = threading.Lock()  # protects all below
+        self._turn = threading.Lock()  # held by a command until it ends; the next block waits
         self._request: ArmingRequest | None = None
         self._requester = ""  # page of the last request
         self._mode, self._reason, self._holder = "idle", "", ""
@@ -207,13 +208,13 @@ class LiveBench:
             )
         job = None
         if what == "arm" and values.get("study") is not None:
-            with self._mutex:
+            with self._turn, self._mutex:
                 self._check_turn(what, holder)
                 self._find_request(values)
             job = self._chosen(values["study"])  # which takes longer than a block
         # The file is read here, so that no block waits for it.
         found = self._read_loop() if what == "request" else None
-        with self._mutex:
+        with self._turn, self._mutex:
             if what == "request" and not self._holder:
                 self._loop = found
             self._check_turn(what, holder)
@@ -408,6 +409,8 @@ class LiveBench:
         if self._job is not None:
             self._play(self._job)
             return
+        with self._turn:  # a thread that releases a lock and takes it again keeps others waiting
+            pass
         with self._mutex:
             try:
                 self._block()

@@ -316,8 +316,8 @@ def _save(videos: Videos, values: JsonObject) -> JsonObject:
     words += ["--subset-px", str(points.subset_px)]
     words += ["--scale-points", ruler] if ruler else []
     words += ["--out", str(table.with_name(f"{table.stem.removesuffix('-points')}-tracks.csv"))]
-    saved = {"path": str(table), "points": len(names), "command": shlex.join(words)}
-    return {**saved, "lost": lost, **scale}
+    command = shlex.join(words)
+    return {"path": str(table), "points": len(names), "command": command, "lost": lost, **scale}
 
 
 def _lost(path: Path, stamp: tuple[int, int], points: Points, frame: Frame) -> list[str]:

@@ -14,7 +14,7 @@ import os
 import struct
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,7 +222,7 @@ class LiveReader:
         begin, end, zero_s = self._span(level, from_s, to_s)
         begin += -begin % per
         end = begin + max(end - begin, 0) // per * per
-        copy = ring[np.arange(begin, end) % len(ring)]
+        copy = _copied(ring, begin, end)
         lost = self._first(level) - begin  # overwritten while they were copied
         if lost > 0:
             lost += -lost % per
@@ -283,11 +283,16 @@ class LiveReader:
         per = max(-(-(end - begin) // max(most, 1)), 1)
         begin += -begin % per
         end = begin + max(end - begin, 0) // per * per
-        rows = self._memory.rows[np.arange(begin, end) % _BLOCKS][:, 1:-1]
+        rows = _copied(self._memory.rows[:, 1:-1], begin, end)
         parts = rows.reshape(-1, per, len(SIGNALS))
-        absent = np.isnan(parts)
-        low = np.where(absent, np.inf, parts).min(axis=1, initial=np.inf)
-        high = np.where(absent, -np.inf, parts).max(axis=1, initial=-np.inf)
-        none = absent.all(axis=1)
-        low[none], high[none] = np.nan, np.nan
+        low, high = np.fmin.reduce(parts, axis=1), np.fmax.reduce(parts, axis=1)
         return Columns(zero_s + begin * block_s, per * block_s, low, high)
+
+
+def _copied(ring: NDArray[Any], begin: int, end: int) -> NDArray[Any]:
+    """Copy rows of a ring, counted since its first one."""
+    first, count = begin % len(ring), end - begin
+    head = ring[first : first + count]
+    if len(head) == count:
+        return head.copy()
+    return np.concatenate([head, ring[: count - len(head)]])

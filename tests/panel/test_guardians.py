@@ -1,0 +1,58 @@
+"""STOP on a bench with guardians: the served twin, over the drivers of a real bench."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.serve.server import ServedTwin
+from haselab.safety.interlock import Interlock
+from tests.panel.running import WAIT_S, RunningPanel, connected, ended, started
+
+pytest.importorskip("grpc")
+
+
+def interlock_of(panel: RunningPanel) -> Interlock:
+    """The interlock of its bench, whose key is an argument of the stop process."""
+    words = ["ps", "-ww", "-o", "args=", "-p", str(panel.child("stop_process"))]
+    listed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    return Interlock(listed.partition("/haselab-panel-")[2].split(" http")[0].partition(" ")[2])
+
+
+def test_the_guardians_act_when_the_bench_process_does_not_answer_stop(tmp_path: Path) -> None:
+    rig = tmp_path / "served.toml"
+    with ServedTwin(twin_of_reading("hz"), 1, 0.0) as served:
+        rig.write_text(served.rig_file(ahead_blocks=1))
+        panel = started("--rig", str(rig))
+        bench, interlock = panel.child("bench_process"), interlock_of(panel)
+
+        async def play() -> None:
+            async with connected(panel) as page:
+                assert "answer" in await page.arm(1.5)
+                await page.ask("drive", value_v=1.0)
+                await page.until(lambda state: state["drive_v"] == 1.0)
+                assert abs(served.hub.output_v) > 4000.0 and interlock.live
+                rig.unlink()  # so that `haselab rig safe` cannot help
+                os.kill(bench, signal.SIGSTOP)
+                found = await asyncio.to_thread(panel.stop)
+                assert found["commanded"] is False
+                assert interlock.lease_end_s <= time.monotonic()
+                assert interlock.reason.startswith("STOP was pressed")
+
+        try:
+            asyncio.run(play())
+            end_s = time.monotonic() + WAIT_S
+            while abs(served.hub.output_v) > 50.0 and time.monotonic() < end_s:
+                time.sleep(0.02)
+            assert abs(served.hub.output_v) < 50.0
+        finally:
+            interlock.close()
+            with contextlib.suppress(ProcessLookupError):  # a guardian kills one that is in a call
+                os.kill(bench, signal.SIGCONT)
+            ended(panel)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import threading
 import time
 from pathlib import Path
@@ -11,14 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from haselab.base import ResultError
+from haselab.base import InputError, ResultError
 from haselab.runtime.observer import FIDUCIALS
-from haselab.tracking import detect_fiducials
-from haselab.tracking.options import Floats
+from haselab.tracking import PointTracker, TrackOptions, TrackState, detect_fiducials
+from haselab.tracking.options import Floats, Frame
 
 __all__ = ["CameraPicture", "Picture"]
 
-_SAME_S = 1.0  # longest time between two frames that are compared
+_PAUSE_S = 5.0  # longest time between two frames that are compared
+_SEARCH_S = 2.0  # between two searches, each of which takes longer than a frame
+_OPTIONS = TrackOptions(subset_px=21, search_px=40, sloped_light=True)
 
 
 class Picture(NamedTuple):
@@ -28,7 +32,7 @@ class Picture(NamedTuple):
         jpeg: the frame.
         age_s: since it was taken.
         fiducials: `size` of the frame in px, and `points` with the position `x, y` of each fiducial
-            and its position in the first frame; no points if the fiducials are not found. As JSON.
+            and its position in the first frame, without those that are lost. As JSON.
     """
 
     jpeg: bytes
@@ -37,7 +41,7 @@ class Picture(NamedTuple):
 
 
 class CameraPicture:
-    """Reads the last frame and finds the fiducials in it, once for all pages.
+    """Reads the last frame and tracks the fiducials in it, once for all pages.
 
     Args:
         path: of the JPEG file that the bench process writes.
@@ -46,7 +50,10 @@ class CameraPicture:
     def __init__(self, path: Path) -> None:
         self._path, self._mutex = path, threading.Lock()
         self._taken_s, self._jpeg, self._found = 0.0, b"", ""
-        self._first: Floats | None = None
+        self._searched_s = -math.inf
+        self._tracker: PointTracker | None = None
+        self._state: TrackState | None = None
+        self._first: Floats = np.empty((0, 2))
 
     def read(self) -> Picture | None:
         """Read the frame; may be called from several threads.
@@ -59,23 +66,41 @@ class CameraPicture:
                 taken_s = self._path.stat().st_mtime
                 if taken_s != self._taken_s:
                     self._jpeg = self._path.read_bytes()
-                    self._find(taken_s - self._taken_s)
+                    self._follow(taken_s - self._taken_s)
                     self._taken_s = taken_s
             except OSError:
                 return None
             return Picture(self._jpeg, max(time.time() - taken_s, 0.0), self._found)
 
-    def _find(self, later_s: float) -> None:
-        """Find the fiducials; the first frame after a pause is the one to compare with."""
+    def _follow(self, later_s: float) -> None:
+        """Track the fiducials; the first frame after a pause is the one to compare with."""
         with Image.open(self._path) as opened:
             frame = np.asarray(opened.convert("L"))
-        if later_s > _SAME_S:
-            self._first = None
-        try:
-            points = detect_fiducials(frame, FIDUCIALS)
-        except ResultError:
-            points = np.empty((0, 2))
-        if self._first is None and len(points):
-            self._first = points
-        both = np.hstack([points, points if self._first is None else self._first[: len(points)]])
+        if later_s > _PAUSE_S:
+            self._tracker, self._searched_s = None, -math.inf
+        points, valid = np.empty((0, 2)), np.zeros(0, bool)
+        if self._tracker is not None and self._state is not None:
+            self._state, found = self._tracker.step(self._state, frame)
+            points, valid = np.stack([found.x_px, found.y_px], axis=1), found.valid
+        if not (len(valid) and valid.all()) and time.monotonic() > self._searched_s + _SEARCH_S:
+            with contextlib.suppress(ResultError):  # not all of them are in view
+                points = detect_fiducials(frame, FIDUCIALS)
+                valid = np.ones(len(points), bool)
+                self._place(frame, points)
+            self._searched_s = time.monotonic()
+        both = np.empty((0, 4))
+        if self._tracker is not None and len(points):
+            both = np.hstack([points, self._first])[valid]
         self._found = json.dumps({"size": frame.shape[::-1], "points": both.round(2).tolist()})
+
+    def _place(self, frame: Frame, points: Floats) -> None:
+        """Track from these positions on; the first ones are those to compare with."""
+        if self._tracker is None or self._state is None:
+            try:
+                tracker = PointTracker(points, _OPTIONS)
+                self._state = tracker.init([frame])
+            except InputError:  # too close to the edge
+                return
+            self._tracker, self._first = tracker, points
+        else:
+            self._state = self._tracker.placed(self._state, points)

@@ -94,7 +94,7 @@ function Camera() {
         <svg viewBox=${`-0.5 -0.5 ${size[0]} ${size[1]}`} aria-hidden="true">${points.map(([x, y, x0, y0]) => ["halo", "mark"].map((layer) => html`<g class=${layer}>
           <circle cx=${x} cy=${y} r=${size[1] / 50} /><line x1=${x0} y1=${y0} x2=${x} y2=${y} /></g>`))}</svg></div>
       <p class=${old ? "error" : ""}>${old ? "OLD PICTURE. The camera only films while the bench is armed." : "5 frames/s"}</p>
-      <p>${points.length ? `${points.length} fiducials found. The largest motion since the camera was started is ${moved.toFixed(1)} px.` : "The fiducials are not found in this picture."}</p>`
+      <p>${points.length ? `${points.length} fiducials found. The largest motion since the first picture is ${moved.toFixed(1)} px.` : "The fiducials are not found in this picture."}</p>`
       : html`<p>No picture. The camera starts when the bench is armed.</p>`}</div>`;
 }
 

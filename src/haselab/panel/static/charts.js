@@ -107,9 +107,12 @@ export class Charts {
 
   columns() { return Math.round((this.plots[0].plot.bbox.width || 800) / 2) || 400; }
 
-  draw(frame, from, to) {
+  // One plot after the other: STOP waits for one of them at most.
+  async draw(frame, from, to) {
     this.events = frame.state.events ?? [];
     for (const { about, plot, values } of this.plots) {
+      await new Promise((resolve) => setTimeout(resolve));
+      if (this.dragged) return;
       const { start, step, low, high } = frame[about.of];
       const count = low[0].length, x = new Float64Array(count);
       for (let k = 0; k < count; k++) x[k] = start + (k + 0.5) * step;

@@ -13,14 +13,14 @@ const link = new Link((found) => {
   frame = found;
   if (pending) return; // only the newest frame is drawn
   pending = true;
-  requestAnimationFrame(() => { pending = false; draw(); });
+  requestAnimationFrame(async () => { try { await draw(); } finally { pending = false; } });
 }, () => redraw());
 
-function draw() {
+async function draw() {
   redraw();
   if (frame === null || charts === null || frame.end_s === null || charts.dragged) return;
   const end = link.view.end_s ?? frame.end_s;
-  charts.draw(frame, end - link.view.span_s, end);
+  await charts.draw(frame, end - link.view.span_s, end);
 }
 
 function zoom({ from, to, key, event }) {

@@ -26,6 +26,7 @@ __all__ = [
     "POSITIVE",
     "REAL",
     "SEED",
+    "WORKERS",
     "Real",
     "actuator_option",
     "answer_options",
@@ -80,6 +81,7 @@ LIMIT = _Limit(0.0, min_open=True)
 POSITIVE = Real(0.0, min_open=True)
 INTEGER = _Integer(-(10**9), 10**9)
 SEED = click.IntRange(0, 2**63 - 1)
+WORKERS = click.IntRange(1, 256)
 
 
 def answer_options(

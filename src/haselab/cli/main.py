@@ -44,6 +44,10 @@ _COMMANDS = {
         "haselab.cli.study.scoreboard",
         "Compare controllers with the physical limits.",
     ),
+    "campaign": (
+        "haselab.cli.campaign.command",
+        "Compute many cases over parameters and seeds.",
+    ),
     "export": ("haselab.cli.model.export", "Convert a model for another tool."),
     "session": ("haselab.cli.data.session", "Export a recording for another tool, or import one."),
     "example": ("haselab.cli.data.example", "Write example data and the commands that use it."),

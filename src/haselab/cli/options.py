@@ -76,6 +76,7 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     ),
     "--v": ("COLUMN", "Name the column of the voltage monitor, in V."),
     "--volt-per-monitor-volt": (None, "Set the scale of the voltage monitor in V/V."),
+    "--workers": (None, "Use this many processes. Default: one for each processor."),
     "--yes": (None, "Skip the confirmation."),
     "--zero-length-m": (None, "State the length at zero strain in m."),
 }

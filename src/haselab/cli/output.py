@@ -15,6 +15,7 @@ from haselab.store.claim import (
     claimed_file,
     claimed_folder,
     is_occupied,
+    joined_folder,
     move_aside,
     shared_folder,
 )
@@ -22,7 +23,7 @@ from haselab.store.text_file import parse_toml, read_text
 
 __all__ = ["OutputKind", "OutputRule", "reserved"]
 
-OutputKind = Literal["file", "folder", "late", "last"]
+OutputKind = Literal["file", "folder", "joined", "late", "last"]
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,10 @@ class OutputRule:
 
     Args:
         kind: of `out`, or a function of the parameters that returns it. `file` must not exist and
-            is created at once; `folder` is new or empty, and locked until the command ends; `late`
-            is a file that must not exist and is created when it is complete; `last` is a file that
-            is checked only when it is written, because the command has more urgent work.
+            is created at once; `folder` is new or empty, and locked until the command ends;
+            `joined` is a folder that the command continues, with other programs; `late` is a file
+            that must not exist and is created when it is complete; `last` is a file that is checked
+            only when it is written, because the command has more urgent work.
         options: names of parameters besides `out` that name a file.
         built: names of parameters that name a folder whose files are rewritten each time.
         beside: endings of the files that are written beside `out`, in place of its own ending.
@@ -96,11 +98,24 @@ def reserved(rule: OutputRule, parameters: Mapping[str, Any], *, force: bool) ->
                 aside = opened.enter_context(claimed_folder(path, force=force))
                 if aside is not None:
                     _report_move(path, aside)
+            elif kind == "joined":
+                _join(opened, path, force)
             elif kind != "last":
                 _reserve_file(opened, option, path, kind, force)
         for name in rule.built:
             opened.enter_context(shared_folder(parameters[name]))
         yield
+
+
+def _join(opened: contextlib.ExitStack, path: Path, force: bool) -> None:
+    """Continue a folder, or move it aside and begin anew."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"--out names a file, not a folder. Name a folder. {path}")
+    if force and is_occupied(path):
+        with claimed_folder(path, force=True) as aside:
+            assert aside is not None
+            _report_move(path, aside)
+    opened.enter_context(joined_folder(path))
 
 
 def _reserve_file(

@@ -18,6 +18,7 @@ __all__ = [
     "claimed_folder",
     "create_exclusively",
     "is_occupied",
+    "joined_folder",
     "move_aside",
     "refuse_linked_folders",
     "shared_folder",
@@ -341,7 +342,25 @@ def shared_folder(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[contextlib.ExitStack]:
+def joined_folder(folder: Path) -> Iterator[None]:
+    """Use a folder together with other programs that join it; no program may claim or move it.
+
+    Args:
+        folder: new or existing.
+    Raises:
+        InputError: the path is a file, or another program has claimed the folder.
+        DeviceError: the disk refuses.
+    """
+    made = _make_parents(folder)
+    try:
+        with _locked(folder, together=True):
+            yield
+    finally:
+        _remove_empty(made)
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, *, together: bool = False) -> Iterator[contextlib.ExitStack]:
     """Lock the folder, if the system supports it; the yielded stack can release it early."""
     with contextlib.ExitStack() as held:
         if sys.platform != "win32":
@@ -350,7 +369,8 @@ def _locked(folder: Path) -> Iterator[contextlib.ExitStack]:
             descriptor = os.open(folder, os.O_RDONLY)
             held.callback(os.close, descriptor)
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                kind = fcntl.LOCK_SH if together else fcntl.LOCK_EX
+                fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise _in_use(folder) from None
             except OSError:  # a file system without such locks; files are made exclusively there

@@ -10,11 +10,12 @@ from haselab.base import InputError
 __all__ = ["library"]
 
 
-def library(name: str) -> ModuleType:
-    """Import pandas or xarray.
+def library(name: str, extra: str = "haselab[frames]") -> ModuleType:
+    """Import a library such as pandas.
 
     Args:
-        name: of the library.
+        name: of its module.
+        extra: what to install if it is missing.
     Returns:
         The module.
     Raises:
@@ -24,5 +25,5 @@ def library(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         raise InputError(
-            f"This needs {name}, which is not installed. Install haselab[frames]."
+            f"This needs {name.partition('.')[0]}, which is not installed. Install {extra}."
         ) from None

@@ -10,7 +10,7 @@ import click
 
 from haselab import __version__
 from haselab.base import InputError, JsonObject, to_plain
-from haselab.cli.common import SEED, answer_options, progress_bar
+from haselab.cli.common import SEED, WORKERS, answer_options, progress_bar
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.report.scoreboard_page import scoreboard_page
@@ -32,7 +32,6 @@ __all__ = ["command"]
 _QUICK_TASKS = ("T1", "T2", "T3", "T4")
 _QUICK_CLASSES = ("host-100hz",)
 _USUAL_CLASSES = ("host-100hz", "chip-1khz", "oracle")
-_MOST_WORKERS = 256
 
 
 @click.command("scoreboard")
@@ -55,10 +54,7 @@ _MOST_WORKERS = 256
     help="Play each task with this many seeds. Default: 5, with --quick 1.",
 )  # fmt: skip
 @shared_option("--quick", is_flag=True, detail="It has T1 to T4 at 100 Hz and one seed.")
-@click.option(
-    "--workers", type=click.IntRange(1, _MOST_WORKERS),
-    help="Use this many processes. Default: one for each processor.",
-)  # fmt: skip
+@shared_option("--workers", type=WORKERS)
 @answer_options(
     OutputRule("folder"), "It is a folder for scoreboard.json and scoreboard.html.  [required]"
 )

@@ -1,0 +1,1 @@
+"""Where cases are computed: processes of this computer, or Dask."""

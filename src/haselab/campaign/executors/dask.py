@@ -1,0 +1,151 @@
+"""Compute cases by Dask: on the workers of a scheduler, or of a local cluster.
+
+Dask only computes. What it returns is written by the program that submitted it, so a scheduler or a
+worker that vanishes costs the cases in work and nothing else.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+from typing import Any
+
+from haselab.base import DeviceError, HaselabError, InputError, text_of
+from haselab.campaign.executors.executor import Chunk, Outcome
+from haselab.campaign.plan import Problem
+from haselab.campaign.work import compute_cases
+from haselab.store.optional import library
+
+__all__ = ["LOCAL", "DaskExecutor"]
+
+LOCAL = "local"  # in place of an address
+_EXTRA = "haselab[dask]"
+_CONNECT_S = 20.0
+_LEAST_SLOTS = 2  # while workers are still coming, so that an adaptive cluster sees work
+_GRACE_S = 5.0
+
+
+class DaskExecutor:
+    """An executor of Dask tasks.
+
+    Args:
+        problem: what all cases share.
+        address: of the scheduler; `local`: start a cluster on this computer.
+        workers: processes of a local cluster.
+    Raises:
+        InputError: Dask is not installed, or there is no scheduler at the address.
+    """
+
+    def __init__(self, problem: Problem, address: str, workers: int) -> None:
+        distributed = library("distributed", _EXTRA)
+        # its messages on a lost connection; this program reports it in one line
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        self._problem, self._address = problem, address
+        self._cluster: Any = None
+        try:
+            if address == LOCAL:
+                self._cluster = distributed.LocalCluster(
+                    n_workers=workers, threads_per_worker=1, dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )  # fmt: skip
+            self._client = distributed.Client(
+                self._cluster or address, timeout=_CONNECT_S, set_as_default=False
+            )
+        except (OSError, ValueError, RuntimeError) as error:
+            self._close_cluster()
+            raise InputError(
+                f"No Dask scheduler answers at {address} ({text_of(error)}). Start one with 'dask "
+                "scheduler', or check the address."
+            ) from None
+        self._futures: dict[Any, Chunk] = {}
+        self._ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._slots = max(len(self._threads()), _LEAST_SLOTS)
+
+    def _threads(self) -> list[str]:
+        counts = self._client.nthreads()
+        return [name for name, count in counts.items() for _ in range(count)]
+
+    @property
+    def workers(self) -> int:
+        """Threads of all workers."""
+        return self._slots
+
+    def submit(self, chunk: Chunk) -> None:
+        """Submit a chunk as one task.
+
+        Raises:
+            DeviceError: the scheduler has gone.
+        """
+        try:
+            future = self._client.submit(
+                compute_cases, self._problem, chunk.jobs, pure=False,
+                key=f"haselab-{os.getpid()}-{id(self)}-{chunk.number}",
+            )  # fmt: skip
+        except Exception as error:  # Dask raises many kinds when the connection closes
+            raise self._gone() from error
+        self._futures[future] = chunk
+        future.add_done_callback(self._ended.put)
+
+    def wait(self, longest_s: float) -> list[Outcome]:
+        """Wait for outcomes.
+
+        Raises:
+            DeviceError: the scheduler has gone, or a worker cannot compute any case.
+        """
+        try:
+            futures = [self._ended.get(timeout=longest_s)]
+        except queue.Empty:
+            futures = []
+        while not self._ended.empty():
+            futures.append(self._ended.get())
+        if self._client.status != "running":
+            raise self._gone()
+        if not futures:
+            self._count_workers()
+        return [self._outcome(future) for future in futures]
+
+    def _count_workers(self) -> None:
+        try:
+            self._slots = max(len(self._threads()), _LEAST_SLOTS)
+        except Exception as error:
+            raise self._gone() from error
+
+    def _outcome(self, future: Any) -> Outcome:
+        chunk = self._futures.pop(future)
+        if future.status == "finished":
+            return Outcome(chunk, self._result(future))
+        if future.status == "error":
+            error = future.exception()
+            if isinstance(error, HaselabError):
+                raise error
+            return Outcome(chunk, None)
+        if self._client.status != "running":
+            raise self._gone()
+        return Outcome(chunk, None, blamed=False)
+
+    def _result(self, future: Any) -> Any:
+        try:
+            return future.result(timeout=_CONNECT_S)
+        except Exception as error:  # Dask raises many kinds when the connection closes
+            raise self._gone() from error
+
+    def _gone(self) -> DeviceError:
+        return DeviceError(
+            f"The connection to the Dask scheduler at {self._address} is lost. Start it again, "
+            "then this command."
+        )
+
+    def close(self) -> None:
+        """Give up what is in work, and leave the scheduler; a local cluster ends."""
+        try:
+            if self._client.status == "running":
+                self._client.cancel(list(self._futures))
+            self._client.close(timeout=_GRACE_S)
+        except Exception:
+            pass
+        self._close_cluster()
+
+    def _close_cluster(self) -> None:
+        if self._cluster is not None:
+            self._cluster.close(timeout=_GRACE_S)

@@ -1,0 +1,126 @@
+"""The folder of a campaign: what it is, and the final table."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from haselab.base import DeviceError, InputError, Json
+from haselab.campaign.plan import Plan
+from haselab.store.campaign.shards import CaseRow, Shards
+from haselab.store.claim import is_occupied
+from haselab.store.folder import drafted, json_text, read_json, write_new, write_text
+
+__all__ = ["CAMPAIGN", "FAILED", "TABLE", "finished_rows", "open_folder", "write_table"]
+
+CAMPAIGN, TABLE, FAILED = "campaign.json", "results.parquet", "failed.txt"
+_MOST_SHOWN = 3
+_ROWS_IN_GROUP = 50_000
+
+
+def open_folder(plan: Plan, folder: Path) -> None:
+    """Begin or continue a folder.
+
+    Args:
+        plan: of the campaign.
+        folder: new, empty, or of the same campaign.
+    Raises:
+        InputError: it holds something else.
+        DeviceError: the disk refuses.
+    """
+    described = plan.campaign.described()
+    if not (folder / CAMPAIGN).exists():
+        if is_occupied(folder) and any(not each.name.startswith(".") for each in folder.iterdir()):
+            raise InputError(
+                "--out names a folder that is not empty and holds no campaign; it was not changed. "
+                f"Name a new folder, or add --force to move this one aside. {folder}"
+            )
+        with contextlib.suppress(InputError):  # another program has just begun it
+            write_new(folder / CAMPAIGN, json_text(described))
+    found = read_json(folder / CAMPAIGN)
+    changes = list(_changes("", found, described))
+    if changes:
+        shown = "; ".join(changes[:_MOST_SHOWN])
+        more = f"; and {len(changes) - _MOST_SHOWN} more" if len(changes) > _MOST_SHOWN else ""
+        raise InputError(
+            f"--out holds another campaign, which was not changed: {shown}{more}. Name a new "
+            f"folder, or add --force to move this one aside. {folder}"
+        )
+
+
+def _changes(path: str, old: Json, new: Json) -> list[str]:
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        names = dict.fromkeys([*new, *old])
+        inner = [(f"{path}.{name}" if path else name, name) for name in names]
+        return [
+            change for where, name in inner
+            for change in _changes(where, old.get(name), new.get(name))
+        ]  # fmt: skip
+    return [] if old == new else [f"{path} is {_short(old)} there and {_short(new)} here"]
+
+
+def _short(value: Json) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def finished_rows(plan: Plan, folder: Path) -> list[CaseRow]:
+    """Rows of the finished cases in the order of their indices, with parameters and results.
+
+    Args:
+        plan: of the campaign.
+        folder: with the shards.
+    Returns:
+        The rows.
+    Raises:
+        InputError: a shard is damaged.
+    """
+    return Shards(folder, "").rows(plan.hashes(), plan.paths)
+
+
+def write_table(plan: Plan, rows: Sequence[CaseRow], folder: Path) -> None:
+    """Write the final table and the list of failed cases.
+
+    The bytes of both depend on the campaign alone: not on the order in which the cases were
+    computed, nor on where.
+
+    Args:
+        plan: of the campaign.
+        rows: of all its cases.
+        folder: of the campaign.
+    Raises:
+        DeviceError: the disk refuses.
+    """
+    arrow: Any = importlib.import_module("pyarrow")
+    parquet: Any = importlib.import_module("pyarrow.parquet")
+    columns: dict[str, list[Json]] = {
+        "case": [row.case for row in rows],
+        "index": [row.index for row in rows],
+        **{path: [row.values[path] for row in rows] for path in plan.paths},
+        "status": [row.status for row in rows],
+        "error": [row.error for row in rows],
+    }
+    for name in sorted({name for row in rows for name in row.results}):
+        columns[name] = [row.results.get(name) for row in rows]
+    try:
+        with drafted(folder / TABLE) as draft:
+            parquet.write_table(
+                arrow.table(columns), draft, compression="zstd", row_group_size=_ROWS_IN_GROUP
+            )
+    except OSError as error:
+        raise DeviceError(
+            f"Cannot write ({error.strerror or error}). Free disk space. {folder / TABLE}"
+        ) from None
+    write_text(folder / FAILED, "\n".join(_failures(rows)))
+
+
+def _failures(rows: Sequence[CaseRow]) -> list[str]:
+    lines = []
+    for row in rows:
+        if row.error:
+            values = ", ".join(f"{path} = {value!r}" for path, value in row.values.items())
+            lines += [f"case {row.index} ({row.case}): {values}", row.traceback.rstrip(), ""]
+    return lines

@@ -1,0 +1,108 @@
+"""Case kind `controller`: a task of the scoreboard on a device that the controller does not know.
+
+The controller is designed from the model of the public device of the task, as on the scoreboard.
+The twin that is played may differ from it in every parameter.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from haselab.base import HaselabError, InputError, ResultError
+from haselab.campaign.kinds.base_files import TWIN, twin_of
+from haselab.campaign.kinds.case_kind import CaseKind, Inputs, Results
+from haselab.controllers import CONTROLLERS, KnownActuator
+from haselab.scoreboard.board import known_in_class
+from haselab.scoreboard.devices import find_device
+from haselab.scoreboard.entrants import Designed, designed, entering_kinds
+from haselab.scoreboard.knowledge import identified, known_by
+from haselab.scoreboard.loop_class import CLASSES
+from haselab.scoreboard.play import play
+from haselab.scoreboard.tasks import TASKS
+from haselab.store.toml import Section
+
+__all__ = ["CONTROLLER", "ControllerSettings"]
+
+_OVER_FIELD = 1.02  # of the permitted field: what a sensed length may miss, as on the scoreboard
+
+
+class ControllerSettings(Section):
+    """The task, and what plays it."""
+
+    task: str = Field("T1", description="of the scoreboard", examples=["T3"])
+    controller: str = Field("pi", description="kind of controller", examples=["observer"])
+    loop: str = Field("host-100hz", description="class of the loop", examples=["chip-1khz"])
+
+
+class _Controller(CaseKind):
+    name = "controller"
+    files = (TWIN,)
+    settings = ControllerSettings
+
+    def check(self, inputs: Inputs) -> None:
+        case, twin = inputs.settings(ControllerSettings), twin_of(inputs)
+        for what, name, names in (("task", case.task, TASKS), ("loop", case.loop, CLASSES)):
+            if name not in names:
+                raise InputError(
+                    f"case.{what} is {name!r}, but must be one of {', '.join(names)}. Change it."
+                )
+        task, loop = TASKS[case.task], CLASSES[case.loop]
+        (kind,) = entering_kinds((case.controller,))
+        if task.drawn:
+            raise InputError(
+                f"The task {task.name} draws its own devices, so the twin of the campaign would "
+                "have no effect. Choose another case.task."
+            )
+        if case.loop not in task.classes or not loop.suits(kind):
+            raise InputError(
+                f"The controller {kind.name!r} does not play {task.name} in the loop {case.loop}. "
+                "Change case.loop."
+            )
+        needed = find_device(task.device).config.kind
+        if twin.kind != needed:
+            raise InputError(
+                f"The twin has kind = {twin.kind!r}, but the task {task.name} is played on a "
+                f"{needed}. Change base.twin or case.task."
+            )
+
+    def compute(self, inputs: Inputs, rng: np.random.Generator) -> Results:
+        self.check(inputs)
+        case = inputs.settings(ControllerSettings)
+        task, loop = TASKS[case.task], CLASSES[case.loop]
+        known = known_in_class(_known(task.device), find_device(task.device), loop)
+        design = _design(case.controller, case.loop, task.device)
+        if design.chosen is None:
+            raise ResultError(f"The controller has no design: {design.reason}")
+        scenario = task.scenario(known, rng)
+        scenario = replace(scenario, device=replace(scenario.device, config=twin_of(inputs)))
+        trace = play(scenario, design.chosen, loop, known, rng)
+        done = {} if trace.failure else dict(task.score(trace, scenario))
+        too_high = trace.peak_field_v_per_m > _OVER_FIELD * scenario.device.field_v_per_m
+        return {
+            **{metric.name: done.get(metric.name, math.nan) for metric in task.metrics},
+            "violates": float(bool(trace.failure) or too_high),
+        }
+
+
+@functools.cache
+def _known(device: str) -> KnownActuator:
+    """What controllers know of a public device; the same in every process."""
+    public = find_device(device)
+    return known_by(public, identified(public))
+
+
+@functools.cache
+def _design(controller: str, loop: str, device: str) -> Designed:
+    known = known_in_class(_known(device), find_device(device), CLASSES[loop])
+    try:
+        return designed(CONTROLLERS.find(controller), CLASSES[loop], known)
+    except HaselabError as error:
+        return Designed(None, str(error))
+
+
+CONTROLLER = _Controller()

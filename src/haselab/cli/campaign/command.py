@@ -1,0 +1,109 @@
+"""`haselab campaign`: compute many cases over parameters and seeds."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import click
+
+from haselab.base import JsonObject, ResultError, to_plain
+from haselab.campaign.definition import load_campaign
+from haselab.campaign.executors.executor import Executor
+from haselab.campaign.executors.processes import ProcessExecutor
+from haselab.campaign.folder import finished_rows, open_folder, write_table
+from haselab.campaign.plan import Plan, Problem
+from haselab.campaign.run import Progressed, run_cases
+from haselab.cli.common import WORKERS, answer_options, progress_bar
+from haselab.cli.interrupt import Interruptible
+from haselab.cli.options import shared_option
+from haselab.cli.output import OutputRule
+
+__all__ = ["command"]
+
+
+@click.command("campaign")
+@click.argument("campaign", type=click.Path(path_type=Path))
+@shared_option("--workers", type=WORKERS)
+@click.option(
+    "--scheduler", metavar="ADDRESS",
+    help="Use the workers of this Dask scheduler. With 'local', a Dask cluster starts on this "
+    "computer. Default: processes without Dask.",
+)  # fmt: skip
+@click.option(
+    "--retry-failed", is_flag=True, help="Compute failed cases again, and no finished ones."
+)
+@answer_options(
+    OutputRule("joined"),
+    "It is a folder for the finished cases and the results; a campaign in it continues.  "
+    "[required]",
+)
+def command(
+    campaign: Path,
+    workers: int | None,
+    scheduler: str | None,
+    *,
+    retry_failed: bool,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Compute many cases over parameters and seeds.
+
+    CAMPAIGN is a TOML file: what a case computes, from which twin and study, and which parameters
+    are varied how. Each finished case is kept in --out. After Ctrl-C, a failure of the computer or
+    a lost scheduler, the same command continues. Several programs with the same --out share the
+    work.
+    """
+    if out is None:
+        raise click.UsageError("Missing option '--out': the folder of the campaign.")
+    plan = Plan(load_campaign(campaign))
+    open_folder(plan, out)
+    count = workers or os.cpu_count() or 1
+
+    def executor(problem: Problem, waiting: int) -> Executor:
+        if scheduler is None:
+            return ProcessExecutor(problem, min(count, waiting))
+        from haselab.campaign.executors.dask import DaskExecutor  # an optional package
+
+        return DaskExecutor(problem, scheduler, count)
+
+    progress = Interruptible(progress_bar())
+    found = run_cases(plan, out, executor, progress, retry_failed=retry_failed)
+    if found.outdated:
+        click.echo(
+            f"haselab: {found.outdated:,} finished cases in {out} are of another version of "
+            "haselab and were not used", err=True,
+        )  # fmt: skip
+    if found.is_complete:
+        rows = finished_rows(plan, out)
+        write_table(plan, rows, out)
+    answer = _answer(found)
+    click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(_lines(found, out)))
+    if found.is_complete and found.failed == found.cases:
+        raise ResultError(f"All {found.cases:,} cases failed. See {out / 'failed.txt'}.")
+
+
+def _answer(found: Progressed) -> JsonObject:
+    return {
+        "cases": found.cases,
+        "done": found.done,
+        "failed": found.failed,
+        "wall_s": found.wall_s,
+        "efficiency": found.efficiency,
+        "computed": found.computed,
+        "elsewhere": found.elsewhere,
+        "workers": found.workers,
+    }
+
+
+def _lines(found: Progressed, out: Path) -> list[str]:
+    lines = [f"{found.done:,} of {found.cases:,} cases have a result, {found.failed:,} failed"]
+    if found.computed:
+        lines.append(
+            f"{found.computed:,} computed in {found.wall_s:.1f} s by {found.workers} workers, "
+            f"busy for {100.0 * (found.efficiency or 0.0):.0f} % of the time"
+        )
+    if found.elsewhere:
+        lines.append(f"{found.elsewhere:,} are being computed by another program")
+    return [*lines, f"written to {out}"]

@@ -1,0 +1,1 @@
+"""The folder of a campaign: finished cases as Parquet shards, and claims on cases."""

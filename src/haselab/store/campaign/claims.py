@@ -1,0 +1,129 @@
+"""Claims on blocks of cases, so that several programs share a campaign without a server.
+
+A claim only saves work: if two programs compute the same case, their rows are equal. It is a file
+with the name of the program that made it. It expires when that program has ended: on the same
+computer or with locks on the shared file system at once, otherwise after `EXPIRES_S` without a sign
+of life.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import socket
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from haselab.base import DeviceError
+from haselab.store.session.lock import CAN_TELL, hold, is_held
+
+__all__ = ["EXPIRES_S", "Claims"]
+
+EXPIRES_S = 120.0
+_SIGN_S = 15.0  # between two signs of life
+_FOLDER, _PROGRAMS = "claims", "programs"
+
+
+class Claims:
+    """This program's claims. Use as a context: they end with it.
+
+    Args:
+        folder: of the campaign.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.writer = f"{socket.gethostname()[:40]}-{os.getpid()}-{secrets.token_hex(4)}"
+        self._claims, self._programs = folder / _FOLDER, folder / _PROGRAMS
+        self._own = self._programs / self.writer
+        self._held: set[int] = set()
+        self._ended = threading.Event()
+
+    def __enter__(self) -> Self:
+        try:
+            self._claims.mkdir(parents=True, exist_ok=True)
+            self._programs.mkdir(exist_ok=True)
+            self._file = self._own.open("x+b")
+        except OSError as error:
+            raise DeviceError(
+                f"Cannot write ({error.strerror}). Free disk space, or change the permissions. "
+                f"{self._programs}"
+            ) from None
+        with contextlib.suppress(OSError):  # a file system without locks
+            hold(self._file.fileno())
+        threading.Thread(target=self._sign, daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        self._ended.set()
+        for block in tuple(self._held):
+            self.release(block)
+        self._file.close()
+        self._own.unlink(missing_ok=True)
+
+    def _sign(self) -> None:
+        while not self._ended.wait(_SIGN_S):
+            with contextlib.suppress(OSError):
+                os.utime(self._own)
+
+    def take(self, block: int) -> bool:
+        """Claim a block.
+
+        Args:
+            block: number.
+        Returns:
+            False: a program that is alive has claimed it.
+        Raises:
+            DeviceError: the disk is full, or refuses.
+        """
+        path = self._claims / str(block)
+        for _ in range(2):
+            try:
+                with path.open("x", encoding="utf-8") as file:
+                    file.write(self.writer)
+            except FileExistsError:
+                if self._is_alive(path):
+                    return False
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                continue
+            except OSError as error:
+                path.unlink(missing_ok=True)
+                raise DeviceError(
+                    f"Cannot write ({error.strerror}). Free disk space. {path}"
+                ) from None
+            self._held.add(block)
+            return True
+        return False
+
+    def release(self, block: int) -> None:
+        """End a claim.
+
+        Args:
+            block: number.
+        """
+        self._held.discard(block)
+        with contextlib.suppress(OSError):
+            (self._claims / str(block)).unlink()
+
+    def _is_alive(self, claim: Path) -> bool:
+        """Whether the program of a claim still works on it."""
+        try:
+            name = claim.read_text(encoding="utf-8")
+            own = self._programs / name
+            if not name:  # just created, or its program ended in between
+                return time.time() - claim.stat().st_mtime < EXPIRES_S
+            if is_held(own):
+                return True
+            here = name.startswith(f"{socket.gethostname()[:40]}-")
+            if here and CAN_TELL:
+                return False
+            return time.time() - own.stat().st_mtime < EXPIRES_S
+        except OSError:  # either file has gone
+            return False

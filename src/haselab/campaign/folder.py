@@ -8,13 +8,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from haselab.base import DeviceError, InputError, Json
 from haselab.campaign.plan import Plan
 from haselab.store.campaign.shards import CaseRow, Shards
 from haselab.store.claim import is_occupied
 from haselab.store.folder import drafted, json_text, read_json, write_new, write_text
 
-__all__ = ["CAMPAIGN", "FAILED", "TABLE", "finished_rows", "open_folder", "write_table"]
+__all__ = [
+    "CAMPAIGN", "FAILED", "TABLE", "finished_rows", "open_folder", "read_results", "write_table",
+]  # fmt: skip
 
 CAMPAIGN, TABLE, FAILED = "campaign.json", "results.parquet", "failed.txt"
 _MOST_SHOWN = 3
@@ -115,6 +120,35 @@ def write_table(plan: Plan, rows: Sequence[CaseRow], folder: Path) -> None:
             f"Cannot write ({error.strerror or error}). Free disk space. {folder / TABLE}"
         ) from None
     write_text(folder / FAILED, "\n".join(_failures(rows)))
+
+
+def read_results(folder: Path) -> dict[str, NDArray[np.float64]]:
+    """Read the numbers of a finished campaign.
+
+    Args:
+        folder: of the campaign.
+    Returns:
+        Results of all its cases by name; NaN where a case has none.
+    Raises:
+        InputError: the folder has no table of results, or a damaged one.
+    """
+    path = folder / TABLE
+    if not path.is_file():
+        raise InputError(
+            f"This folder has no {TABLE}, so there is no finished campaign to compare with. Name "
+            f"the folder of one. {folder}"
+        )
+    arrow: Any = importlib.import_module("pyarrow")
+    parquet: Any = importlib.import_module("pyarrow.parquet")
+    try:
+        table = parquet.read_table(path)
+    except (arrow.ArrowException, OSError) as error:
+        text = " ".join(str(error).split())[:200]
+        raise InputError(f"Not a table of a campaign ({text}). {path}") from None
+    return {
+        name: table.column(name).to_numpy(zero_copy_only=False).astype(np.float64)
+        for name in table.column_names if table.schema.field(name).type == arrow.float64()
+    }  # fmt: skip
 
 
 def _failures(rows: Sequence[CaseRow]) -> list[str]:

@@ -7,18 +7,23 @@ import os
 from pathlib import Path
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 
 from haselab.base import JsonObject, ResultError, to_plain
 from haselab.campaign.definition import load_campaign
 from haselab.campaign.executors.executor import Executor
 from haselab.campaign.executors.processes import ProcessExecutor
-from haselab.campaign.folder import finished_rows, open_folder, write_table
+from haselab.campaign.folder import finished_rows, open_folder, read_results, write_table
 from haselab.campaign.plan import Plan, Problem
 from haselab.campaign.run import Progressed, run_cases
+from haselab.campaign.summary import compared, groups_of, result_names, summarised
 from haselab.cli.common import WORKERS, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
+from haselab.store.campaign.shards import CaseRow
+from haselab.store.folder import write_json, write_text
 
 __all__ = ["command"]
 
@@ -34,6 +39,10 @@ __all__ = ["command"]
 @click.option(
     "--retry-failed", is_flag=True, help="Compute failed cases again, and no finished ones."
 )
+@click.option(
+    "--compare", "other", type=click.Path(path_type=Path), metavar="DIR",
+    help="Compare the results with those of the campaign in this folder. Default: none.",
+)  # fmt: skip
 @answer_options(
     OutputRule("joined"),
     "It is a folder for the finished cases and the results; a campaign in it continues.  "
@@ -45,6 +54,7 @@ def command(
     scheduler: str | None,
     *,
     retry_failed: bool,
+    other: Path | None,
     as_json: bool,
     out: Path | None,
 ) -> None:
@@ -58,6 +68,7 @@ def command(
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the campaign.")
     plan = Plan(load_campaign(campaign))
+    there = None if other is None else read_results(other)
     open_folder(plan, out)
     count = workers or os.cpu_count() or 1
 
@@ -75,13 +86,28 @@ def command(
             f"haselab: {found.outdated:,} finished cases in {out} are of another version of "
             "haselab and were not used", err=True,
         )  # fmt: skip
+    answer = _answer(found)
     if found.is_complete:
+        from haselab.report.campaign_page import campaign_page  # matplotlib is slow to import
+
         rows = finished_rows(plan, out)
         write_table(plan, rows, out)
-    answer = _answer(found)
+        summary = summarised(plan, rows)
+        if there is not None:
+            summary |= {"comparison": compared(rows, there), "compared_with": str(other)}
+        write_text(out / "report.html", campaign_page(to_plain(summary), _values(plan, rows)))
+        answer["summary"] = summary
+        write_json(out / "summary.json", summary)
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(_lines(found, out)))
     if found.is_complete and found.failed == found.cases:
         raise ResultError(f"All {found.cases:,} cases failed. See {out / 'failed.txt'}.")
+
+
+def _values(plan: Plan, rows: list[CaseRow]) -> dict[str, dict[str, NDArray[np.float64]]]:
+    groups = groups_of(plan.campaign, rows)
+    return {
+        name: {group.label: group.finite(name) for group in groups} for name in result_names(rows)
+    }
 
 
 def _answer(found: Progressed) -> JsonObject:

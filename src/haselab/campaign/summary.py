@@ -1,0 +1,304 @@
+"""What a finished campaign says: distributions, coverage, sensitivities, failed cases.
+
+All intervals are of 95 %. Those of quantiles are distribution-free (order statistics), those of
+shares are exact (Clopper and Pearson); both take the cases as independent draws.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import Json, JsonObject
+from haselab.campaign.definition import Campaign
+from haselab.campaign.plan import Plan
+from haselab.store.campaign.shards import CaseRow
+from haselab.store.optional import library
+
+__all__ = ["Group", "compared", "groups_of", "median_interval", "result_names", "summarised"]
+
+Floats = NDArray[np.float64]
+_QUANTILES = {"p05": 0.05, "median": 0.5, "p95": 0.95}
+_SIDE = 0.025
+_OF_ESTIMATES = (".std", ".low", ".high", ".true")
+_MOST_GROUPS = 24
+_RESAMPLED = 1000
+_SEED = 1  # of resampling: the same rows give the same intervals
+_LEAST_CASES = 8
+
+
+@dataclass(frozen=True)
+class Group:
+    """Cases at one point of the axes.
+
+    Args:
+        label: values of the axes, in words; empty: all cases.
+        rows: of the cases.
+    """
+
+    label: str
+    rows: tuple[CaseRow, ...]
+
+    def values(self, name: str) -> Floats:
+        """A result of all cases; NaN where there is none. Shape `(N,)`."""
+        return np.array([_number(row.results.get(name)) for row in self.rows])
+
+    def finite(self, name: str) -> Floats:
+        """A result of the cases that have it. Shape `(N,)`."""
+        found = self.values(name)
+        return found[np.isfinite(found)]
+
+
+def _number(value: Json) -> float:
+    return float(value) if isinstance(value, (int, float)) else math.nan
+
+
+def result_names(rows: Sequence[CaseRow]) -> list[str]:
+    """Names of the results, without what belongs to an estimate.
+
+    Args:
+        rows: of cases.
+    Returns:
+        The names in alphabetical order.
+    """
+    found = dict.fromkeys(name for row in rows for name in row.results)
+    return [name for name in sorted(found) if not name.endswith(_OF_ESTIMATES)]
+
+
+def groups_of(campaign: Campaign, rows: Sequence[CaseRow]) -> list[Group]:
+    """The cases at each point of the axes; all together if there is little at each, or too many.
+
+    Args:
+        campaign: of the rows.
+        rows: in the order of their indices.
+    Returns:
+        The groups.
+    """
+    many = math.prod(len(axis.values) for axis in campaign.axes)
+    each = campaign.count // many
+    if many == 1 or many > _MOST_GROUPS or each < _LEAST_CASES:
+        return [Group("", tuple(rows))]
+    found: dict[str, list[CaseRow]] = {}
+    for row in rows:
+        label = ", ".join(f"{_last(axis.path)} = {row.values[axis.path]}" for axis in campaign.axes)
+        found.setdefault(label, []).append(row)
+    return [Group(label, tuple(part)) for label, part in found.items()]
+
+
+def _last(path: str) -> str:
+    return path.rpartition(".")[2]
+
+
+def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
+    """Summarise a finished campaign.
+
+    Args:
+        plan: of it.
+        rows: of all its cases.
+    Returns:
+        Distributions, coverage, sensitivities and failures, as JSON types.
+    """
+    campaign, groups = plan.campaign, groups_of(plan.campaign, rows)
+    names = result_names(rows)
+    return {
+        "name": campaign.name,
+        "kind": campaign.kind,
+        "code": plan.code,
+        "design": campaign.design.model_dump(mode="json"),
+        "cases": len(rows),
+        "failed": sum(bool(row.error) for row in rows),
+        "is_random": bool(campaign.distributions) or campaign.design.repeats > 1,
+        "distributions": [_distribution(group, name) for name in names for group in groups],
+        "coverage": [
+            found for name in names for group in groups if (found := _coverage(group, name))
+        ],
+        "sensitivities": list(_sensitivities(campaign, groups, names)),
+        "failures": _failures(rows),
+    }
+
+
+# ---- distributions -----------------------------------------------------------------------------
+
+
+def _distribution(group: Group, name: str) -> JsonObject:
+    values = np.sort(group.finite(name))
+    answer: JsonObject = {
+        "result": name, "group": group.label, "count": values.size,
+        "without_value": len(group.rows) - values.size,
+    }  # fmt: skip
+    if values.size == 0:
+        return answer
+    quantiles: JsonObject = {
+        key: {"value": float(np.quantile(values, share)), "ci95": _order_interval(values, share)}
+        for key, share in _QUANTILES.items()
+    }
+    ends = {"least": float(values[0]), "mean": float(values.mean()), "largest": float(values[-1])}
+    return {**answer, **quantiles, **ends}
+
+
+def median_interval(values: Floats) -> Json:
+    """Interval of 95 % of a median, from order statistics; None: too few values.
+
+    Args:
+        values: independent. Shape `(N,)`.
+    Returns:
+        Low and high end.
+    Source: David and Nagaraja, Order Statistics, section 7.1.
+    """
+    return _order_interval(np.sort(values), 0.5)
+
+
+def _order_interval(ordered: Floats, share: float) -> Json:
+    from scipy.stats import binom  # slow to import
+
+    low = int(binom.ppf(_SIDE, ordered.size, share))
+    high = int(binom.ppf(1.0 - _SIDE, ordered.size, share)) + 1
+    if low < 1 or high > ordered.size:
+        return None
+    return [float(ordered[low - 1]), float(ordered[high - 1])]
+
+
+def _coverage(group: Group, name: str) -> JsonObject | None:
+    """How often the interval of an estimate contains the true value; None: it has none."""
+    true = group.values(f"{name}.true")
+    if not np.isfinite(true).any():
+        return None
+    low, high = group.values(f"{name}.low"), group.values(f"{name}.high")
+    known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
+    inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
+    return {
+        "result": name, "group": group.label, "count": count, "inside": inside,
+        "share": {"value": inside / count, "ci95": _share_interval(inside, count)},
+    }  # fmt: skip
+
+
+def _share_interval(inside: int, count: int) -> list[float]:
+    from scipy.stats import beta  # slow to import
+
+    low = beta.ppf(_SIDE, inside, count - inside + 1) if inside else 0.0
+    high = beta.ppf(1.0 - _SIDE, inside + 1, count - inside) if inside < count else 1.0
+    return [float(low), float(high)]
+
+
+# ---- sensitivities -----------------------------------------------------------------------------
+
+
+def _sensitivities(
+    campaign: Campaign, groups: Sequence[Group], names: Sequence[str]
+) -> Iterator[JsonObject]:
+    paths = [one.path for one in campaign.distributions if one.shape != "choice"]
+    for name in names:
+        for group in groups:
+            if campaign.design.kind == "saltelli":
+                found = _sobol_indices(group, name, paths) if _is_whole(campaign, groups) else []
+            else:
+                found = _rank_correlations(group, name, paths)
+            for one in found:
+                yield {"result": name, "group": group.label, **one}
+
+
+def _is_whole(campaign: Campaign, groups: Sequence[Group]) -> bool:
+    """Whether each group is one sample of the design, which indices need."""
+    return all(len(group.rows) == campaign.points for group in groups)
+
+
+def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonObject]:
+    """First-order and total indices by SALib, without sample blocks in which a case failed."""
+    blocks = group.values(name).reshape(-1, len(paths) + 2)
+    whole = blocks[np.isfinite(blocks).all(axis=1)]
+    if whole.shape[0] < _LEAST_CASES or np.ptp(whole) == 0.0:
+        return []
+    analyse = library("SALib.analyze.sobol", "haselab[campaign]").analyze
+    bounds = {"num_vars": len(paths), "names": list(paths), "bounds": [[0.0, 1.0]] * len(paths)}
+    found = analyse(
+        bounds, whole.reshape(-1), calc_second_order=False, num_resamples=200, seed=_SEED
+    )
+    return [
+        {
+            "parameter": path, "method": "Sobol indices", "blocks": whole.shape[0],
+            "first": _around(found["S1"][k], found["S1_conf"][k]),
+            "total": _around(found["ST"][k], found["ST_conf"][k]),
+        }
+        for k, path in enumerate(paths)
+    ]  # fmt: skip
+
+
+def _around(value: float, half: float) -> JsonObject:
+    return {"value": float(value), "ci95": [float(value - half), float(value + half)]}
+
+
+def _rank_correlations(group: Group, name: str, paths: Sequence[str]) -> list[JsonObject]:
+    r"""Spearman's $\rho$ between each parameter and a result, with Fisher's interval.
+
+    The standard error of $\mathrm{artanh}\,\rho$ is $\sqrt{(1 + \rho^2/2)/(n - 3)}$ (Bonett and
+    Wright, 2000).
+    """
+    from scipy.stats import spearmanr  # slow to import
+
+    values = group.values(name)
+    good = np.isfinite(values)
+    count = int(good.sum())
+    if count < _LEAST_CASES or np.ptp(values[good]) == 0.0:
+        return []
+    found: list[JsonObject] = []
+    for path in paths:
+        x = np.array([_number(row.values[path]) for row in group.rows])[good]
+        rho = float(spearmanr(x, values[good]).statistic)
+        middle = np.arctanh(np.clip(rho, -1.0 + 1e-12, 1.0 - 1e-12))
+        half = 1.959964 * math.sqrt((1.0 + 0.5 * rho * rho) / (count - 3.0))
+        ends = np.tanh([middle - half, middle + half])
+        found.append({
+            "parameter": path, "method": "rank correlation", "count": count,
+            "correlation": {"value": rho, "ci95": [float(end) for end in ends]},
+        })  # fmt: skip
+    return found
+
+
+# ---- failures and comparison -------------------------------------------------------------------
+
+
+def _failures(rows: Sequence[CaseRow]) -> list[Json]:
+    """Errors with the number of cases and the first of them, the most frequent first."""
+    counts = Counter(row.error for row in rows if row.error)
+    first = {row.error: row for row in reversed(rows) if row.error}
+    return [
+        {"error": error, "count": count, "index": first[error].index,
+         "values": dict(first[error].values)}
+        for error, count in counts.most_common()
+    ]  # fmt: skip
+
+
+def compared(here: Sequence[CaseRow], there: Mapping[str, Floats]) -> list[Json]:
+    """Compare the results of two campaigns.
+
+    Args:
+        here: rows of this one.
+        there: results of the other one, by name.
+    Returns:
+        For each result of both: the medians, and their difference with its bootstrap interval.
+    """
+    rng = np.random.default_rng(_SEED)
+    group, found = Group("", tuple(here)), list[Json]()
+    for name in result_names(here):
+        first = group.finite(name)
+        second = there.get(name, np.zeros(0))
+        second = second[np.isfinite(second)]
+        if min(first.size, second.size) < _LEAST_CASES:
+            continue
+        drawn = [np.median(rng.choice(part, (_RESAMPLED, part.size)), axis=1)
+                 for part in (first, second)]  # fmt: skip
+        ends = np.quantile(drawn[0] - drawn[1], [_SIDE, 1.0 - _SIDE])
+        found.append({
+            "result": name,
+            "here": {"value": float(np.median(first)), "ci95": median_interval(first)},
+            "there": {"value": float(np.median(second)), "ci95": median_interval(second)},
+            "difference": {
+                "value": float(np.median(first) - np.median(second)), "ci95": ends.tolist(),
+            },
+        })  # fmt: skip
+    return found

@@ -1,0 +1,174 @@
+"""The page of a campaign: distributions, coverage, sensitivities, failures, and a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import jinja2
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base.chart import Chart, Curve, Panel
+from haselab.report.chart_file import draw_chart
+from haselab.report.numbers import ABSENT, number_text
+from haselab.report.style import figure_style, inline_svg, to_svg
+
+__all__ = ["campaign_page"]
+
+Floats = NDArray[np.float64]
+_MOST_FIGURES = 12
+_MOST_CURVES = 6
+_MOST_CHARACTERS = 160
+
+#: Results of the cases, by name and by group.
+Values = Mapping[str, Mapping[str, Floats]]
+
+
+@dataclass(frozen=True)
+class _Table:
+    title: str
+    about: str
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+def campaign_page(summary: Mapping[str, Any], values: Values) -> str:
+    """Compose one self-contained HTML document.
+
+    Args:
+        summary: of the campaign, see `haselab.campaign`.
+        values: results of the cases.
+    Returns:
+        The page; the same campaign gives the same bytes.
+    """
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    design = summary["design"]
+    repeats = f", {design['repeats']} times each" if design["repeats"] > 1 else ""
+    return environment.from_string(_packaged("campaign.html.j2")).render(
+        title=f"SIMULATED: campaign {summary['name']}",
+        style=_packaged("style.css"),
+        lead=f"{summary['cases']:,} cases of the kind {summary['kind']}, {summary['failed']:,} of "
+        f"them failed. Design: {design['kind']}{repeats}. haselab {summary['code']}.",
+        about=_about(summary),
+        figures=list(_figures(values)),
+        tables=[table for table in _tables(summary) if table.rows],
+    )
+
+
+def _packaged(name: str) -> str:
+    return resources.files("haselab.report").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+def _about(summary: Mapping[str, Any]) -> str:
+    if not summary["is_random"]:
+        return (
+            "All points of a grid, computed once each. The curves show which values the results "
+            "take on the grid; they are not probabilities."
+        )
+    return (
+        "Share of cases at or below a value. Intervals are of 95 %, from order statistics; a dash "
+        "means that there are too few cases. They take the cases as independent draws; points of "
+        "a Sobol or Latin hypercube design are spread more evenly, which makes them too wide."
+    )
+
+
+def _figures(values: Values) -> Iterator[str]:
+    for number, (name, groups) in enumerate(values.items()):
+        if number == _MOST_FIGURES:
+            return
+        curves = [
+            Curve(np.sort(part), np.arange(1, part.size + 1) / part.size, label, "steps")
+            for label, part in list(groups.items())[:_MOST_CURVES] if part.size
+        ]  # fmt: skip
+        if curves:
+            chart = Chart(name, (Panel(name, "Share of cases", curves),))
+            with figure_style():
+                yield inline_svg(to_svg(draw_chart(chart), f"campaign-{number}", name))
+
+
+def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
+    yield _Table(
+        "Results", "Numbers in brackets are intervals of 95 %.",
+        ("Result", "Axes", "Cases", "Without a value", "Smallest", "5 %", "Median", "95 %",
+         "Largest"),
+        [
+            (one["result"], one["group"], str(one["count"]), str(one["without_value"]),
+             number_text(one.get("least")), *(_with_interval(one.get(key)) for key in
+             ("p05", "median", "p95")), number_text(one.get("largest")))
+            for one in summary["distributions"]
+        ],
+    )  # fmt: skip
+    yield _Table(
+        "Coverage of the intervals",
+        "How often the stated interval of 95 % contains the true value, which the simulation knows "
+        "and the analysis does not. Good intervals contain it in 95 % of the cases.",
+        ("Estimate", "Axes", "Cases", "Inside", "Share"),
+        [
+            (one["result"], one["group"], str(one["count"]), str(one["inside"]),
+             _with_interval(one["share"]))
+            for one in summary["coverage"]
+        ],
+    )  # fmt: skip
+    yield from _sensitivities(summary["sensitivities"])
+    yield _Table(
+        "Failed cases",
+        "Errors, the most frequent first, with the first case of each. failed.txt has all "
+        "tracebacks. Add --retry-failed to compute these cases again.",
+        ("Error", "Cases", "First case", "Its parameters"),
+        [
+            (one["error"][:_MOST_CHARACTERS], str(one["count"]), str(one["index"]),
+             ", ".join(f"{path} = {_shown(value)}" for path, value in one["values"].items()))
+            for one in summary["failures"]
+        ],
+    )  # fmt: skip
+    yield _Table(
+        "Comparison",
+        f"This campaign against that in {summary.get('compared_with', '')}. The interval of the "
+        "difference is from resampling both.",
+        ("Result", "Median here", "Median there", "Difference"),
+        [
+            (one["result"], *(_with_interval(one[key]) for key in ("here", "there", "difference")))
+            for one in summary.get("comparison", ())
+        ],
+    )
+
+
+def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
+    yield _Table(
+        "Sensitivity: Sobol indices",
+        "First-order index: share of the variance that a parameter causes alone. Total index: "
+        "together with all others. Intervals of 95 % from resampling.",
+        ("Result", "Axes", "Parameter", "First-order index", "Total index"),
+        [
+            (one["result"], one["group"], one["parameter"], _with_interval(one["first"]),
+             _with_interval(one["total"]))
+            for one in found if "first" in one
+        ],
+    )  # fmt: skip
+    yield _Table(
+        "Sensitivity: rank correlation",
+        "Spearman's correlation of a parameter and a result: 1 and −1 for a monotone relation, 0 "
+        "also for one that rises and falls.",
+        ("Result", "Axes", "Parameter", "Correlation"),
+        [
+            (one["result"], one["group"], one["parameter"], _with_interval(one["correlation"]))
+            for one in found if "correlation" in one
+        ],
+    )  # fmt: skip
+
+
+def _with_interval(number: Mapping[str, Any] | None) -> str:
+    if number is None:
+        return ABSENT
+    ends = number["ci95"]
+    shown = ABSENT if ends is None else f"{number_text(ends[0])} to {number_text(ends[1])}"
+    return f"{number_text(number['value'])} ({shown})"
+
+
+def _shown(value: object) -> str:
+    return number_text(value) if isinstance(value, float) else str(value)

@@ -48,10 +48,10 @@ class Group:
         """A result of all cases; NaN where there is none. Shape `(N,)`."""
         return np.array([_number(row.results.get(name)) for row in self.rows])
 
-    def finite(self, name: str) -> Floats:
-        """A result of the cases that have it. Shape `(N,)`."""
+    def present(self, name: str) -> Floats:
+        """A result of the cases that have it, infinite where it was not reached. Shape `(N,)`."""
         found = self.values(name)
-        return found[np.isfinite(found)]
+        return found[~np.isnan(found)]
 
 
 def _number(value: Json) -> float:
@@ -113,7 +113,11 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         "cases": len(rows),
         "failed": sum(bool(row.error) for row in rows),
         "is_random": bool(campaign.distributions) or campaign.design.repeats > 1,
-        "distributions": [_distribution(group, name) for name in names for group in groups],
+        "distributions": [
+            _distribution(group, name, independent=_draws_are_independent(campaign))
+            for name in names
+            for group in groups
+        ],
         "coverage": [
             found for name in names for group in groups if (found := _coverage(group, name))
         ],
@@ -125,8 +129,14 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
 # ---- distributions -----------------------------------------------------------------------------
 
 
-def _distribution(group: Group, name: str) -> JsonObject:
-    values = np.sort(group.finite(name))
+def _draws_are_independent(campaign: Campaign) -> bool:
+    """Whether no two cases have drawn values in common."""
+    design = campaign.design
+    return design.kind != "saltelli" and not (campaign.distributions and design.repeats > 1)
+
+
+def _distribution(group: Group, name: str, *, independent: bool) -> JsonObject:
+    values = np.sort(group.present(name))
     answer: JsonObject = {
         "result": name, "group": group.label, "count": values.size,
         "without_value": len(group.rows) - values.size,
@@ -134,11 +144,21 @@ def _distribution(group: Group, name: str) -> JsonObject:
     if values.size == 0:
         return answer
     quantiles: JsonObject = {
-        key: {"value": float(np.quantile(values, share)), "ci95": _order_interval(values, share)}
+        key: {
+            "value": _quantile(values, share),
+            "ci95": _order_interval(values, share) if independent else None,
+        }
         for key, share in _QUANTILES.items()
     }
     ends = {"least": float(values[0]), "mean": float(values.mean()), "largest": float(values[-1])}
     return {**answer, **quantiles, **ends}
+
+
+def _quantile(ordered: Floats, share: float) -> float:
+    """Quantile of ordered values, of which the last may be infinite."""
+    place = share * (ordered.size - 1)
+    low, high = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
+    return low if low == high else low + (place % 1.0) * (high - low)
 
 
 def median_interval(values: Floats) -> Json:
@@ -285,11 +305,13 @@ def compared(here: Sequence[CaseRow], there: Mapping[str, Floats]) -> list[Json]
     rng = np.random.default_rng(_SEED)
     group, found = Group("", tuple(here)), list[Json]()
     for name in result_names(here):
-        first = group.finite(name)
+        first = group.present(name)
         second = there.get(name, np.zeros(0))
-        second = second[np.isfinite(second)]
+        second = second[~np.isnan(second)]
         if min(first.size, second.size) < _LEAST_CASES:
             continue
+        if not (np.isfinite(first).all() and np.isfinite(second).all()):
+            continue  # medians that were not reached have no difference
         drawn = [np.median(rng.choice(part, (_RESAMPLED, part.size)), axis=1)
                  for part in (first, second)]  # fmt: skip
         ends = np.quantile(drawn[0] - drawn[1], [_SIDE, 1.0 - _SIDE])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 import traceback
@@ -90,5 +89,4 @@ def _columns(name: str, value: Any) -> dict[str, Json]:
             name: float(value.value), f"{name}.std": float(value.std),
             f"{name}.low": float(low), f"{name}.high": float(high),
         }  # fmt: skip
-    number = float(value)
-    return {name: number if math.isfinite(number) else math.nan}
+    return {name: float(value)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -72,7 +73,7 @@ def _about(summary: Mapping[str, Any]) -> str:
         )
     return (
         "Share of cases at or below a value. Intervals are of 95 %, from order statistics; a dash "
-        "means that there are too few cases. They take the cases as independent draws; points of "
+        "means that there are too few cases, or that cases share drawn values. They take the cases as independent draws; points of "
         "a Sobol or Latin hypercube design are spread more evenly, which makes them too wide."
     )
 
@@ -82,13 +83,19 @@ def _figures(values: Values) -> Iterator[str]:
         if number == _MOST_FIGURES:
             return
         curves = [
-            Curve(np.sort(part), np.arange(1, part.size + 1) / part.size, label, "steps")
-            for label, part in list(groups.items())[:_MOST_CURVES] if part.size
+            _shares(part, label) for label, part in list(groups.items())[:_MOST_CURVES]
+            if np.isfinite(part).any()
         ]  # fmt: skip
         if curves:
             chart = Chart(name, (Panel(name, "Share of cases", curves),))
             with figure_style():
                 yield inline_svg(to_svg(draw_chart(chart), f"campaign-{number}", name))
+
+
+def _shares(values: Floats, label: str) -> Curve:
+    """Share of the cases at or below each value; below 1 at the end if some were not reached."""
+    reached = np.sort(values[np.isfinite(values)])
+    return Curve(reached, np.arange(1, reached.size + 1) / values.size, label, "steps")
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
@@ -98,8 +105,8 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
          "Largest"),
         [
             (one["result"], one["group"], str(one["count"]), str(one["without_value"]),
-             number_text(one.get("least")), *(_with_interval(one.get(key)) for key in
-             ("p05", "median", "p95")), number_text(one.get("largest")))
+             _text(one.get("least")), *(_with_interval(one.get(key)) for key in
+             ("p05", "median", "p95")), _text(one.get("largest")))
             for one in summary["distributions"]
         ],
     )  # fmt: skip
@@ -166,8 +173,12 @@ def _with_interval(number: Mapping[str, Any] | None) -> str:
     if number is None:
         return ABSENT
     ends = number["ci95"]
-    shown = ABSENT if ends is None else f"{number_text(ends[0])} to {number_text(ends[1])}"
-    return f"{number_text(number['value'])} ({shown})"
+    shown = ABSENT if ends is None else f"{_text(ends[0])} to {_text(ends[1])}"
+    return f"{_text(number['value'])} ({shown})"
+
+
+def _text(value: float | None) -> str:
+    return "not reached" if value == math.inf else number_text(value)
 
 
 def _shown(value: object) -> str:

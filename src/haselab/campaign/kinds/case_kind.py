@@ -86,8 +86,9 @@ class CaseKind(abc.ABC):
             inputs: of the case.
             rng: random numbers of the case.
         Returns:
-            Results by name, SI, the unit last in the name of a bare number. `NAME.true` is the true
-            value of the estimate `NAME`, from which the report computes the coverage.
+            Results by name, SI, the unit last in the name of a bare number. NaN: the case has no
+            such number. Infinity: it was not reached, which is larger than any number. `NAME.true`
+            is the true value of the estimate `NAME`, from which the report computes the coverage.
         """
 
 

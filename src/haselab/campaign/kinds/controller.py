@@ -84,9 +84,14 @@ class _Controller(CaseKind):
         done = {} if trace.failure else dict(task.score(trace, scenario))
         too_high = trace.peak_field_v_per_m > _OVER_FIELD * scenario.device.field_v_per_m
         return {
-            **{metric.name: done.get(metric.name, math.nan) for metric in task.metrics},
+            **{metric.name: _or_worst(done.get(metric.name, math.nan)) for metric in task.metrics},
             "violates": float(bool(trace.failure) or too_high),
         }
+
+
+def _or_worst(number: float) -> float:
+    """A number of a task; what was not done is worse than any number."""
+    return math.inf if math.isnan(number) else number
 
 
 @functools.cache

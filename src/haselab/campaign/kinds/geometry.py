@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from haselab.actuators import GRAVITY_M_S2, OperatingPoint, equilibrium_m, linearise
-from haselab.base import InputError
+from haselab.base import ResultError
 from haselab.base.root import root
 from haselab.campaign.kinds.base_files import TWIN, twin_of
 from haselab.campaign.kinds.case_kind import CaseKind, Inputs, Results
@@ -52,6 +52,11 @@ class _Geometry(CaseKind):
         point = linearise(law, case.bias_share * case.voltage_v, load_n, inertia_kg)
         fastest = point.poles[np.argmax(np.abs(point.poles.imag))]
         field = case.voltage_v / min(float(law.gap_m(low_m)), float(law.gap_m(high_m)))
+        if field >= law.circuit.breakdown_v_per_m:
+            raise ResultError(
+                f"The field is {field:.4g} V/m, but the dielectric breaks down at "
+                f"{law.circuit.breakdown_v_per_m:.4g} V/m. Lower the voltage."
+            )
         return {
             "stroke_m": stroke_m,
             "relative_stroke": stroke_m / low_m,
@@ -71,7 +76,7 @@ def _bandwidth_hz(point: OperatingPoint) -> float:
     excess = np.array([_excess(point, omega_rad_s) for omega_rad_s in grid])
     above = np.flatnonzero(excess > 0.0)
     if above.size == 0 or above[-1] == _GRID - 1:
-        raise InputError(
+        raise ResultError(
             f"The gain does not cross -3 dB between {grid[0]:.3g} and {grid[-1]:.3g} rad/s, so "
             "there is no bandwidth. Change the bias or the losses."
         )

@@ -95,7 +95,7 @@ def command(
         summary = summarised(plan, rows)
         if there is not None:
             summary |= {"comparison": compared(rows, there), "compared_with": str(other)}
-        write_text(out / "report.html", campaign_page(to_plain(summary), _values(plan, rows)))
+        write_text(out / "report.html", campaign_page(summary, _values(plan, rows)))
         answer["summary"] = summary
         write_json(out / "summary.json", summary)
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(_lines(found, out)))
@@ -106,7 +106,7 @@ def command(
 def _values(plan: Plan, rows: list[CaseRow]) -> dict[str, dict[str, NDArray[np.float64]]]:
     groups = groups_of(plan.campaign, rows)
     return {
-        name: {group.label: group.finite(name) for group in groups} for name in result_names(rows)
+        name: {group.label: group.present(name) for group in groups} for name in result_names(rows)
     }
 
 

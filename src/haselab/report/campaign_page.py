@@ -73,8 +73,9 @@ def _about(summary: Mapping[str, Any]) -> str:
         )
     return (
         "Share of cases at or below a value. Intervals are of 95 %, from order statistics; a dash "
-        "means that there are too few cases, or that cases share drawn values. They take the cases as independent draws; points of "
-        "a Sobol or Latin hypercube design are spread more evenly, which makes them too wide."
+        "means that there are too few cases, or that cases share drawn values. They take the cases "
+        "as independent draws; points of a Sobol or Latin hypercube design are spread more evenly, "
+        "which makes them too wide."
     )
 
 

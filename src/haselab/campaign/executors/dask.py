@@ -26,6 +26,13 @@ _LEAST_SLOTS = 2  # while workers are still coming, so that an adaptive cluster 
 _GRACE_S = 5.0
 
 
+def _silence() -> None:
+    """Suppress what Dask prints on a lost connection, which this program reports in one line."""
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
 class DaskExecutor:
     """An executor of Dask tasks.
 
@@ -39,8 +46,7 @@ class DaskExecutor:
 
     def __init__(self, problem: Problem, address: str, workers: int) -> None:
         distributed = library("distributed", _EXTRA)
-        # its messages on a lost connection; this program reports it in one line
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        _silence()
         self._problem, self._address = problem, address
         self._cluster: Any = None
         try:

@@ -1,0 +1,202 @@
+"""What the built-in kinds of cases compute, compared with other ways to the same numbers."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from haselab.actuators import GRAVITY_M_S2
+from haselab.base import HaselabError, InputError
+from haselab.base.registry import Registry
+from haselab.campaign.kinds.case_kind import CASE_KINDS, CaseKind, Inputs
+from haselab.campaign.kinds.geometry import GEOMETRY, GeometrySettings
+from haselab.campaign.work import compute_cases
+from haselab.rig.twin.config import twin_of_reading
+
+HZ = {"twin": twin_of_reading("hz").model_dump(mode="json")}
+
+
+def computed(plan: Any) -> list[Any]:
+    hashes = plan.hashes()
+    rows = compute_cases(plan.problem, [plan.job(k, hashes[k]) for k in range(plan.count)])
+    assert not any(row.error for row in rows), rows[0].traceback
+    return rows
+
+
+def test_the_intervals_of_quick_devices_contain_the_truth_in_95_percent(campaigns: Any) -> None:
+    """Of 200 devices, within four standard deviations of the share."""
+    text = campaigns.quick.replace("[0.01, 0.02]", "[0.02]").replace('"sobol"', '"random"')
+    rows = computed(campaigns.plan(text.replace("samples = 8", "samples = 200")))
+    spread = 4.0 * math.sqrt(0.95 * 0.05 / 200.0)
+    for name in ("gain", "natural_frequency_rad_s", "damping_ratio", "delay_s"):
+        found = [(row.results[f"{name}.low"], row.results[f"{name}.true"],
+                  row.results[f"{name}.high"]) for row in rows]  # fmt: skip
+        share = np.mean([low <= true <= high for low, true, high in found])
+        assert abs(share - 0.95) < spread, name
+
+
+def test_a_geometry_has_stroke_force_and_field_of_its_energy() -> None:
+    """At the stroke's ends the total energy is least; the force is a difference of energies."""
+    inputs = Inputs({**HZ, "case": GeometrySettings().model_dump()})
+    found = GEOMETRY.compute(inputs, np.random.default_rng(0))
+    law, load_n = twin_of_reading("hz").law, GRAVITY_M_S2 * 0.25
+    lengths_m = np.linspace(0.04, 0.08, 40_001)  # 1 um apart
+    elastic_j = np.array(law.elastic_energy_j(lengths_m))
+    softened = law.losses.softening(np.maximum.accumulate(lengths_m) / law.free_length_m)
+    ends = []
+    for voltage_v in (0.0, 8000.0):
+        force_n = load_n - np.gradient(elastic_j, lengths_m) * softened
+        if voltage_v:
+            force_n = force_n + np.gradient(law.coenergy_j(lengths_m, voltage_v), lengths_m)
+        ends.append(lengths_m[np.flatnonzero(force_n > 0.0)[-1]])
+    assert found["stroke_m"] == pytest.approx(ends[1] - ends[0], abs=3e-6)
+    step = 1e-5
+    pull_j = law.coenergy_j(ends[0] + step * np.array([-1.0, 1.0]), 8000.0)
+    assert found["blocked_force_n"] == pytest.approx((pull_j[1] - pull_j[0]) / (2 * step), rel=1e-3)
+    assert found["peak_field_v_per_m"] == pytest.approx(8000.0 / law.gap_m(ends[1]), rel=1e-3)
+
+
+def test_the_bandwidth_is_where_the_sampled_model_has_fallen_by_3_db() -> None:
+    from haselab.actuators import linearise
+
+    found = GEOMETRY.compute(
+        Inputs({**HZ, "case": GeometrySettings().model_dump()}), np.random.default_rng(0)
+    )
+    point = linearise(twin_of_reading("hz").law, 5600.0, GRAVITY_M_S2 * 0.25, 0.25)
+    at_hz = float(found["bandwidth_hz"])
+    # the phasor of a sine that is held between 2000 steps of a period, exact by the exponential
+    period_s, count = 1.0 / at_hz / 2000.0, 2000
+    step = expm(np.block([[point.a, point.b[:, None]], [np.zeros((1, 6))]]) * period_s)
+    shift = np.exp(2j * np.pi / count)
+    held = np.sinc(1.0 / count) * np.exp(-1j * np.pi / count)  # of an input held between steps
+    state = np.linalg.solve(shift * np.eye(5) - step[:5, :5], step[:5, 5] / held)
+    gain = abs(point.c @ state) / abs(point.gain_m_per_v)
+    assert gain == pytest.approx(math.sqrt(0.5), rel=1e-3)
+    assert 0.5 < float(found["resonance_hz"]) / at_hz < 1.0
+
+
+@pytest.mark.parametrize(
+    ("voltage_v", "message"), [(20_000.0, "no equilibrium"), (11_000.0, "breaks down at 4e.07")]
+)
+def test_a_geometry_that_cannot_work_has_no_results(voltage_v: float, message: str) -> None:
+    case = GeometrySettings(voltage_v=voltage_v).model_dump()
+    with pytest.raises(HaselabError, match=message):
+        GEOMETRY.compute(Inputs({**HZ, "case": case}), np.random.default_rng(0))
+
+
+CONTROLLER = """
+name = "a"
+kind = "controller"
+[base]
+twin = "hz"
+[case]
+task = "T3"
+controller = "{}"
+[parameters]
+twin.shell.shear_modulus_pa = [15600.0, 17000.0]
+"""
+
+
+@pytest.mark.long
+def test_a_controller_plays_its_task_on_the_device_of_the_case(
+    campaigns: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the public device it has the scores of the scoreboard; on a stiffer one others."""
+    from haselab.campaign.kinds import controller as kind
+    from haselab.controllers import CONTROLLERS, ChosenController
+    from haselab.scoreboard import CLASSES, TASKS
+    from haselab.scoreboard.board import known_in_class
+    from haselab.scoreboard.devices import find_device
+    from haselab.scoreboard.entrants import PAPER_PI
+    from haselab.scoreboard.knowledge import true_actuator
+    from haselab.scoreboard.play import play
+
+    public = find_device("hz")
+    monkeypatch.setattr(kind, "_known", lambda name: true_actuator(find_device(name)))
+    kind._design.cache_clear()
+    nominal, stiffer = computed(campaigns.plan(CONTROLLER.format("pi")))
+    kind._design.cache_clear()
+    loop, rng = CLASSES["host-100hz"], np.random.default_rng(np.random.SeedSequence(
+        0, spawn_key=(0, 0, 0)))  # fmt: skip
+    known = known_in_class(true_actuator(public), public, loop)
+    scenario = TASKS["T3"].scenario(known, rng)
+    chosen = ChosenController(CONTROLLERS.find("pi"), tuple(PAPER_PI.items()))
+    score = TASKS["T3"].score(play(scenario, chosen, loop, known, rng), scenario)
+    for name, value in score.items():
+        assert nominal.results[name] == value
+        assert stiffer.results[name] != value
+    assert nominal.results["violates"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"T3"', '"T99"', "case.task is 'T99', but must be one of T1"),
+        ('"T3"', '"T7-drawn"', "draws its own devices"),
+        ('"T3"', '"T8-peano"', "played on a peano-hasel"),
+        ('"pi"', '"nobody"', "No controller 'nobody'"),
+        ('"pi"', '"chip-force"', "does not play T3 in the loop host-100hz"),
+        ("[case]", '[case]\nloop = "fast"', "case.loop is 'fast', but must be one of host-100hz"),
+    ],
+)
+def test_a_task_that_the_campaign_cannot_play_is_refused(
+    campaigns: Any, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        campaigns.plan(CONTROLLER.format("pi").replace(old, new))
+
+
+STUDY = """
+name = "one triangle"
+[triangle]
+low_v = 0.0
+high_v = 2.0
+frequency_hz = 0.25
+cycles = 3
+skipped_cycles = 1
+frame_rate_hz = 50.0
+"""
+PLAY = """
+name = "a"
+kind = "play"
+[base]
+twin = "hz"
+study = "one.toml"
+[case]
+results = ["S14.a1", "S15.slope"]
+[parameters]
+study.triangle.high_v = [1.8]
+"""
+
+
+@pytest.mark.long
+def test_a_played_study_gives_the_chosen_results_with_their_intervals(campaigns: Any) -> None:
+    (campaigns.folder / "one.toml").write_text(STUDY)
+    plan = campaigns.plan(PLAY)
+    (row,) = computed(plan)
+    names = {f"{name}{end}" for name in ("S14.a1", "S15.slope")
+             for end in ("", ".std", ".low", ".high")}  # fmt: skip
+    assert set(row.results) == names
+    for name in ("S14.a1", "S15.slope"):
+        assert row.results[f"{name}.low"] < row.results[name] < row.results[f"{name}.high"]
+
+
+def test_a_study_that_the_bench_cannot_play_is_refused_before_it_begins(campaigns: Any) -> None:
+    (campaigns.folder / "one.toml").write_text(STUDY)
+    with pytest.raises(InputError, match=r"study\.triangle\.high_v = 2\.5"):
+        campaigns.plan(PLAY.replace("[1.8]", "[1.8, 2.5]"))
+
+
+def test_a_kind_of_another_package_is_checked_when_it_is_found() -> None:
+    fault: Any = CASE_KINDS._fault
+    wrong = Registry("kind of case", "none", {"mine": "math:pi"}, fault)
+    with pytest.raises(InputError, match="of the type 'float', not a CaseKind"):
+        wrong.find("mine")
+    wrong = Registry("kind of case", "none", {"mine": f"{GEOMETRY.__module__}:GEOMETRY"}, fault)
+    with pytest.raises(InputError, match="its name is 'geometry'"):
+        wrong.find("mine")
+    assert all(isinstance(kind, CaseKind) for kind in CASE_KINDS.usable().values())

@@ -1,0 +1,139 @@
+"""Distributions, coverage and sensitivities against numbers that are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from haselab.campaign.summary import compared, groups_of, median_interval, summarised
+from haselab.report.campaign_page import campaign_page
+from haselab.store.campaign.shards import CaseRow
+
+DESIGN = """
+name = "a"
+kind = "transfer"
+[parameters]
+case.gain = {{ uniform = [0.0, 1.0] }}
+case.natural_frequency_rad_s = {{ uniform = [1.0, 2.0] }}
+[design]
+kind = "{}"
+samples = {}
+"""
+
+
+def rows_of(plan: Any, function: Any) -> list[CaseRow]:
+    return [
+        CaseRow(f"{k}", k, plan.values(k), {"y": float(function(*plan.values(k).values()))})
+        for k in range(plan.count)
+    ]
+
+
+@pytest.mark.long
+def test_the_interval_of_a_median_contains_it_in_at_least_95_percent() -> None:
+    """Order statistics are discrete, so that for 20 values the exact share is 95.86 %."""
+    rng = np.random.default_rng(1)
+    drawn = rng.exponential(size=(4000, 20))
+    inside = [low <= math.log(2.0) <= high for low, high in map(median_interval, drawn)]
+    exact = 1.0 - 2.0 * sum(math.comb(20, k) for k in range(6)) / 2**20
+    assert np.mean(inside) == pytest.approx(exact, abs=4.0 * math.sqrt(exact * (1 - exact) / 4000))
+
+
+def test_too_few_values_have_no_interval() -> None:
+    assert median_interval(np.arange(5.0)) is None
+    assert median_interval(np.arange(6.0)) == [0.0, 5.0]
+
+
+def test_sobol_indices_are_those_of_a_known_function(campaigns: Any) -> None:
+    r"""Of $y = 3 a + b$ with uniform $a$, $b$ the variances are 9 and 1 parts of ten."""
+    plan = campaigns.plan(DESIGN.format("saltelli", 256))
+    rows = rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
+    found = {one["parameter"]: one for one in summarised(plan, rows)["sensitivities"]}
+    for path, share in (("case.gain", 0.9), ("case.natural_frequency_rad_s", 0.1)):
+        for index in ("first", "total"):
+            low, high = found[path][index]["ci95"]
+            assert low < share < high
+            assert found[path][index]["value"] == pytest.approx(share, abs=0.03)
+
+
+def test_a_failed_case_takes_its_block_out_of_the_indices(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("saltelli", 16))
+    rows = rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
+    rows[5] = replace(rows[5], results={}, error="it failed")
+    summary = summarised(plan, rows)
+    assert {one["blocks"] for one in summary["sensitivities"]} == {15}
+    assert summary["distributions"][0]["without_value"] == 1
+    assert summary["distributions"][0]["median"]["ci95"] is None  # the points share coordinates
+    assert summary["failures"][0]["count"] == 1 and summary["failures"][0]["index"] == 5
+
+
+def test_rank_correlations_are_those_of_monotone_and_unrelated_parameters(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 200))
+    rows = rows_of(plan, lambda gain, omega: math.exp(-gain))
+    found = {
+        one["parameter"]: one["correlation"] for one in summarised(plan, rows)["sensitivities"]
+    }
+    assert found["case.gain"]["value"] == pytest.approx(-1.0)
+    low, high = found["case.natural_frequency_rad_s"]["ci95"]
+    assert low < 0.0 < high and high - low == pytest.approx(2 * 1.96 / math.sqrt(197), rel=0.05)
+
+
+def test_coverage_counts_intervals_that_contain_the_truth(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 20))
+    rows = [
+        CaseRow(f"{k}", k, plan.values(k), {"y": 0.0, "y.low": -1.0, "y.high": 1.0,
+                                            "y.true": 2.0 if k < 3 else 0.5})
+        for k in range(20)
+    ]  # fmt: skip
+    (found,) = summarised(plan, rows)["coverage"]
+    assert (found["inside"], found["count"]) == (17, 20)
+    # Clopper and Pearson: tables for 17 of 20
+    assert found["share"]["ci95"] == pytest.approx([0.6211, 0.9679], abs=1e-4)
+
+
+def test_what_was_not_reached_is_larger_than_any_number(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 21))
+    rows = rows_of(plan, lambda gain, omega: gain)
+    rows = [replace(row, results={"y": math.inf}) if row.index < 12 else row for row in rows]
+    summary = summarised(plan, rows)
+    assert summary["distributions"][0]["median"]["value"] == math.inf
+    values = {"y": {"": groups_of(plan.campaign, rows)[0].present("y")}}
+    assert "not reached" in campaign_page(summary, values)
+
+
+def test_cases_are_grouped_by_the_axes(campaigns: Any) -> None:
+    plan = campaigns.plan(campaigns.quick)
+    rows = [CaseRow(f"{k}", k, plan.values(k), {"y": float(k)}) for k in range(plan.count)]
+    groups = groups_of(plan.campaign, rows)
+    assert [group.label for group in groups] == ["noise_std = 0.01", "noise_std = 0.02"]
+    assert groups[1].present("y").tolist() == list(range(8, 16))
+
+
+def test_two_campaigns_are_compared_by_their_medians(campaigns: Any) -> None:
+    rng = np.random.default_rng(3)
+    rows = [CaseRow(f"{k}", k, {}, {"y": y}) for k, y in enumerate(rng.normal(1.0, 1.0, 400))]
+    (found,) = compared(rows, {"y": rng.normal(0.0, 1.0, 400), "z": np.zeros(400)})
+    low, high = found["difference"]["ci95"]
+    # the standard deviation of a median of 400 is 1.253 / 20
+    assert low < 1.0 < high and high - low == pytest.approx(3.92 * 1.253 / 20 * 2**0.5, rel=0.35)
+    assert compared(rows, {"y": np.full(400, math.nan)}) == []
+
+
+def test_the_page_is_self_contained_and_the_same_for_the_same_rows(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 50))
+    rows = rows_of(plan, lambda gain, omega: gain + omega)
+    rows[3] = replace(rows[3], results={}, error="<b>it failed</b>")
+    summary = summarised(plan, rows) | {"comparison": compared(rows, {"y": np.ones(50)}),
+                                       "compared_with": "other"}  # fmt: skip
+    values = {"y": {"": groups_of(plan.campaign, rows)[0].present("y")}}
+    page = campaign_page(summary, values)
+    assert page == campaign_page(summary, values)
+    assert "SIMULATED" in page and "&lt;b&gt;it failed" in page and "<b>it" not in page
+    assert "Sensitivity: rank correlation" in page and "<svg" in page
+    for outside in ("http://", "https://", "src=", "@import"):
+        assert outside not in page.replace("http://www.w3.org/", "").replace(
+            "https://www.w3.org", ""
+        )

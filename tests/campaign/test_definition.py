@@ -37,7 +37,8 @@ BAD = {
     "three bounds": (DRAWN.replace("0.6]", "0.6, 0.7]"), r"\[0.4, 0.6, 0.7\], but must be two"),
     "reversed": (DRAWN.replace("[0.4, 0.6]", "[0.6, 0.4]"), "is from 0.6 to 0.4"),
     "log of 0": (DRAWN.replace("uniform = [0.4", "log-uniform = [0.0"), "begins at 0"),
-    "no spread": (DRAWN.replace("uniform", "normal").replace("0.6", "0"), "standard deviation of 0"),
+    "no spread": (
+        DRAWN.replace("uniform", "normal").replace("0.6", "0"), "standard deviation of 0"),
     "two shapes": (DRAWN.replace("0.6] }", "0.6], normal = [1, 2] }"), "uniform, normal"),
     "out of limits": (
         GRID.replace("case.gain = [0.4, 0.6]", "case.damping_ratio = [0.1, 1.5]"),

@@ -12,18 +12,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError, Json
+from haselab.campaign.definition import Campaign
 from haselab.campaign.plan import Plan
 from haselab.store.campaign.shards import CaseRow, Shards
 from haselab.store.claim import is_occupied
 from haselab.store.folder import drafted, json_text, read_json, write_new, write_text
 
 __all__ = [
-    "CAMPAIGN", "FAILED", "TABLE", "finished_rows", "open_folder", "read_results", "write_table",
+    "CAMPAIGN", "FAILED", "TABLE", "finished_rows", "open_folder", "plan_of", "read_results",
+    "write_table",
 ]  # fmt: skip
 
-CAMPAIGN, TABLE, FAILED = "campaign.json", "results.parquet", "failed.txt"
+CAMPAIGN, DESIGN = "campaign.json", "design.npy"
+TABLE, FAILED = "results.parquet", "failed.txt"
 _MOST_SHOWN = 3
 _ROWS_IN_GROUP = 50_000
+
+
+def plan_of(campaign: Campaign, folder: Path) -> Plan:
+    """The cases of a campaign; the points that a folder has for it are not drawn again.
+
+    Args:
+        campaign: checked.
+        folder: new, or of this or another campaign.
+    Returns:
+        The plan.
+    Raises:
+        InputError: a drawn value is outside the limits of its key; a library is missing.
+    """
+    drawn = None
+    with contextlib.suppress(InputError, OSError, ValueError):
+        if read_json(folder / CAMPAIGN) == campaign.described():
+            drawn = np.load(folder / DESIGN)
+    shape = (campaign.points, len(campaign.distributions))
+    return Plan(campaign, drawn if drawn is not None and drawn.shape == shape else None)
 
 
 def open_folder(plan: Plan, folder: Path) -> None:
@@ -45,6 +67,7 @@ def open_folder(plan: Plan, folder: Path) -> None:
             )
         with contextlib.suppress(InputError):  # another program has just begun it
             write_new(folder / CAMPAIGN, json_text(described))
+        _save_design(plan, folder / DESIGN)
     found = read_json(folder / CAMPAIGN)
     changes = list(_changes("", found, described))
     if changes:
@@ -54,6 +77,17 @@ def open_folder(plan: Plan, folder: Path) -> None:
             f"--out holds another campaign, which was not changed: {shown}{more}. Name a new "
             f"folder, or add --force to move this one aside. {folder}"
         )
+
+
+def _save_design(plan: Plan, path: Path) -> None:
+    """Keep the drawn points: to draw them takes longer than all else at the next start."""
+    try:
+        with drafted(path) as draft:
+            np.save(draft, plan.drawn)
+    except OSError as error:
+        raise DeviceError(
+            f"Cannot write ({error.strerror or error}). Free disk space. {path}"
+        ) from None
 
 
 def _changes(path: str, old: Json, new: Json) -> list[str]:

@@ -69,16 +69,17 @@ class Plan:
 
     Args:
         campaign: checked.
+        drawn: values of an earlier plan of the same campaign; None: they are drawn.
     Raises:
         InputError: a drawn value is outside the limits of its key; a library is missing.
     """
 
-    def __init__(self, campaign: Campaign) -> None:
+    def __init__(self, campaign: Campaign, drawn: Floats | None = None) -> None:
         self.campaign = campaign
         self.code = code_of(campaign.kind)
         self.count, self._repeats = campaign.count, campaign.design.repeats
         self._levels = _crossed([len(axis.values) for axis in campaign.axes])
-        self._drawn = _drawn(campaign)
+        self.drawn = _drawn(campaign) if drawn is None else drawn
         self._check_drawn()
         self.paths = campaign.paths
 
@@ -95,7 +96,7 @@ class Plan:
         for k, axis in enumerate(self.campaign.axes):
             found[axis.path] = axis.values[self._levels[level, k]]
         for k, one in enumerate(self.campaign.distributions):
-            found[one.path] = _value(one, self._drawn[point, k])
+            found[one.path] = _value(one, self.drawn[point, k])
         return found
 
     def job(self, index: int, case: str, attempt: int = 1) -> Job:
@@ -120,31 +121,37 @@ class Plan:
             b"\0".join(axes[k][at] for k, at in enumerate(row)) for row in self._levels.tolist()
         ]
         points = [row.tobytes() for row in self._identity()]
+        same_noise = one.design.same_noise
         found = []
-        for index in range(self.count):
-            level, point, _ = self._place(index)
-            digest = start.copy()
-            digest.update(b"%b\1%b\1%d %d %d" % (levels[level], points[point], *self._key(index)))
-            found.append(digest.hexdigest()[:_DIGITS])
+        for place, level in enumerate(levels):  # the order of the indices
+            of_level = start.copy()
+            of_level.update(b"%b\1%d " % (level, 0 if same_noise else place))
+            for number, point in enumerate(points):
+                of_point = of_level.copy()
+                of_point.update(b"%d %b" % (number, point))
+                for repeat in range(self._repeats):
+                    digest = of_point.copy()
+                    digest.update(b"%d" % repeat)
+                    found.append(digest.hexdigest()[:_DIGITS])
         return found
 
     def _identity(self) -> Floats:
         """Drawn numbers; of a choice, a number that stands for the value and not for its place."""
-        columns = self._drawn.astype("<f8")
+        columns = self.drawn.astype("<f8")
         for k, one in enumerate(self.campaign.distributions):
             if one.shape == "choice":
                 stands = [
                     int.from_bytes(hashlib.sha256(json.dumps(value).encode()).digest()[:6])
                     for value in one.numbers
                 ]
-                columns[:, k] = np.array(stands)[self._drawn[:, k].astype(np.int64)]
+                columns[:, k] = np.array(stands)[self.drawn[:, k].astype(np.int64)]
         return columns
 
     def _check_drawn(self) -> None:
         """Check the smallest and the largest drawn value of each parameter."""
         one, kind = self.campaign, self.campaign.case_kind
         for k, about in enumerate(one.distributions):
-            column = self._drawn[:, k]
+            column = self.drawn[:, k]
             if about.shape == "choice":
                 ends: Sequence[Json] = about.numbers
             else:

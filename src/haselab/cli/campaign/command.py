@@ -14,7 +14,7 @@ from haselab.base import JsonObject, ResultError, to_plain
 from haselab.campaign.definition import load_campaign
 from haselab.campaign.executors.executor import Executor
 from haselab.campaign.executors.processes import ProcessExecutor
-from haselab.campaign.folder import finished_rows, open_folder, read_results, write_table
+from haselab.campaign.folder import finished_rows, open_folder, plan_of, read_results, write_table
 from haselab.campaign.plan import Plan, Problem
 from haselab.campaign.run import Progressed, run_cases
 from haselab.campaign.summary import compared, groups_of, result_names, summarised
@@ -67,7 +67,7 @@ def command(
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the campaign.")
-    plan = Plan(load_campaign(campaign))
+    plan = plan_of(load_campaign(campaign), out)
     there = None if other is None else read_results(other)
     open_folder(plan, out)
     count = workers or os.cpu_count() or 1

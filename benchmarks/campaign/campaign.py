@@ -1,0 +1,145 @@
+"""Campaigns: efficiency of two processes and two Dask workers, time to continue, and overheads.
+
+    python -m benchmarks.campaign.campaign [--cases 10000]
+
+A case identifies a virtual device: parameters drawn, its record simulated in C and fitted. T1 is
+the time of one process. All times include the start of the workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from benchmarks.rows import Row
+from haselab.base import SilentProgress
+from haselab.campaign.definition import load_campaign
+from haselab.campaign.executors.dask import LOCAL, DaskExecutor
+from haselab.campaign.executors.executor import Executor
+from haselab.campaign.executors.processes import ProcessExecutor
+from haselab.campaign.folder import finished_rows, open_folder
+from haselab.campaign.plan import Plan, Problem
+from haselab.campaign.run import run_cases
+from haselab.store.campaign.shards import CaseRow, Shards
+
+CASES = 10_000
+FINISHED = 100_000
+CAMPAIGN = """
+name = "quick virtual devices"
+kind = "transfer"
+seed = 1
+[parameters]
+case.gain = {{ uniform = [0.3, 0.7] }}
+case.natural_frequency_rad_s = {{ log-uniform = [10.0, 60.0] }}
+case.damping_ratio = {{ log-uniform = [0.05, 0.4] }}
+case.delay_s = {{ uniform = [0.0, 0.03] }}
+[design]
+kind = "latin-hypercube"
+samples = {cases}
+"""
+# prints the time from the start of the process to the first case that would be computed
+RESUME = """
+import sys, time
+from pathlib import Path
+import psutil
+from haselab.base import SilentProgress
+from haselab.cli.campaign import command
+from haselab.campaign.run import run_cases
+
+class Started(Exception):
+    pass
+
+def started(problem, waiting):
+    raise Started
+
+plan = command.plan_of(command.load_campaign(Path(sys.argv[1])), Path(sys.argv[2]))
+command.open_folder(plan, Path(sys.argv[2]))
+try:
+    run_cases(plan, Path(sys.argv[2]), started, SilentProgress())
+except Started:
+    print(time.time() - psutil.Process().create_time())
+"""
+
+
+def _plan(folder: Path, cases: int) -> Plan:
+    path = folder / f"{cases}.toml"
+    path.write_text(CAMPAIGN.format(cases=cases))
+    return Plan(load_campaign(path))
+
+
+def _timed(plan: Plan, out: Path, make: Callable[[Problem], Executor]) -> tuple[float, float]:
+    """Wall time of a whole campaign, and processor time of this program."""
+    open_folder(plan, out)
+    start_s, cpu_s = time.perf_counter(), time.process_time()
+    found = run_cases(plan, out, lambda problem, waiting: make(problem), SilentProgress())
+    assert found.done == plan.count, found
+    return time.perf_counter() - start_s, time.process_time() - cpu_s
+
+
+def rows(cases: int = CASES, finished: int = FINISHED) -> Iterator[Row]:
+    """Measure.
+
+    Args:
+        cases: of the campaigns whose time is measured.
+        finished: cases in the folder that is continued.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        plan = _plan(folder, cases)
+        one_s, _ = _timed(plan, folder / "one", lambda problem: ProcessExecutor(problem, 1))
+        two_s, own_s = _timed(plan, folder / "two", lambda problem: ProcessExecutor(problem, 2))
+        dask_s, dask_own_s = _timed(
+            plan, folder / "dask", lambda problem: DaskExecutor(problem, LOCAL, 2)
+        )
+        about = f"{cases:,} devices, {1e3 * one_s / cases:.2g} ms each"
+        load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        yield Row("T1 / (2 T2), 2 processes", one_s / (2.0 * two_s), "", 0.9, note=about)
+        yield Row("T1 / (2 T2), 2 Dask workers", one_s / (2.0 * dask_s), "", 0.9, note=load)
+        found = finished_rows(plan, folder / "two")
+        same = [(row.case, row.results) for row in found] == [
+            (row.case, row.results) for row in finished_rows(plan, folder / "dask")
+        ]
+        yield Row("campaigns with other bits by Dask", float(not same), "", 0.0, False)
+        yield Row("own processor time, processes", 1e3 * own_s / cases, "ms/case")
+        yield Row("own processor time, Dask", 1e3 * dask_own_s / cases, "ms/case")
+        yield Row("result of a case on its way", len(pickle.dumps(found)) / cases, "byte")
+        stored = sum(path.stat().st_size for path in (folder / "two" / "shards").iterdir())
+        yield Row("result of a case on the disk", stored / cases, "byte")
+        yield _resume(folder, finished, found[0])
+
+
+def _resume(folder: Path, finished: int, like: CaseRow) -> Row:
+    """Time to continue a campaign of which all cases but one are finished."""
+    plan, out = _plan(folder, finished), folder / "resume"
+    open_folder(plan, out)
+    shards = Shards(out, "earlier")
+    hashes = plan.hashes()
+    for first in range(0, finished - 1, 500):
+        shards.write([
+            CaseRow(hashes[k], k, plan.values(k), like.results)
+            for k in range(first, min(first + 500, finished - 1))
+        ])  # fmt: skip
+    line = [sys.executable, "-c", RESUME, str(folder / f"{finished}.toml"), str(out)]
+    times_s = [float(subprocess.check_output(line, text=True)) for _ in range(3)]
+    return Row(
+        f"time to continue, {finished:,} finished", min(times_s), "s", 2.0, False,
+        f"{len(list((out / 'shards').iterdir()))} files; from the start of the process",
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", type=int, default=CASES)
+    for row in rows(parser.parse_args().cases):
+        print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

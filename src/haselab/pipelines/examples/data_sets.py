@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,12 @@ def _tensile() -> dict[str, str]:
     return {"tensile.csv": _german("Streckung;Kraft [mN]", [stretch, 1e3 * load_n])}
 
 
+def _campaigns() -> dict[str, str]:
+    folder = resources.files(__package__).joinpath("campaigns")
+    return {each.name: each.read_text(encoding="utf-8") for each in sorted(
+        folder.iterdir(), key=lambda each: each.name)}  # fmt: skip
+
+
 DATA_SETS: tuple[DataSet, ...] = (
     DataSet(
         "monitors",
@@ -141,6 +148,18 @@ DATA_SETS: tuple[DataSet, ...] = (
         "which is clamped at 3 times its natural width.",
         _tensile,
         ("identify regions tensile.csv --stretch Streckung --load Kraft --plot regions.svg",),
+    ),
+    DataSet(
+        "campaigns",
+        "Campaigns: coverage of intervals, design space, tolerance of controllers",
+        "Campaign files to start from. Those of the commands take seconds; coverage.toml, "
+        "tolerance.toml and scoreboard.toml take minutes to hours, so run them on more "
+        "processors.",
+        _campaigns,
+        (
+            "campaign devices.toml --out devices --workers 2",
+            "campaign design-space.toml --out design-space --workers 2",
+        ),
     ),
 )
 

@@ -1,0 +1,59 @@
+"""The page on campaigns: its file and its commands, in their order."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from haselab.campaign.definition import load_campaign
+from haselab.campaign.kinds.case_kind import CASE_KINDS
+from haselab.campaign.plan import Plan
+from haselab.cli.main import cli
+
+ROOT = Path(__file__).resolve().parents[3]
+TEXT = (ROOT / "docs" / "study" / "campaign.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^    (haselab .*)", TEXT, re.MULTILINE)
+FILES = ROOT / "src" / "haselab" / "pipelines" / "examples" / "campaigns"
+
+
+def test_the_commands_of_the_page_run_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = re.search(r"```toml\n(name.*?)```", TEXT, re.DOTALL)
+    assert file is not None and len(COMMANDS) == 4
+    Path("tolerance.toml").write_text(file[1])
+    for command in COMMANDS:
+        words = shlex.split(command)[1:]
+        monkeypatch.setattr(sys, "argv", ["haselab", *words])
+        cli.main(args=words, prog_name="haselab", standalone_mode=False)
+        out = Path(words[words.index("--out") + 1])
+        if words[0] == "campaign":
+            summary = json.loads((out / "summary.json").read_text())
+            assert summary["failed"] == 0
+            for name in ("results.parquet", "report.html", "failed.txt"):
+                assert (out / name).exists()
+
+
+@pytest.mark.parametrize("name", [path.stem for path in FILES.glob("*.toml")
+                                  if path.stem != "triangle"])  # fmt: skip
+def test_every_example_is_a_campaign_that_can_begin(name: str) -> None:
+    plan = Plan(load_campaign(FILES / f"{name}.toml"))
+    assert plan.count >= 100 or name == "coverage"
+    assert len(set(plan.hashes())) == plan.count
+
+
+def test_the_table_of_kinds_has_every_kind_with_its_files_and_settings() -> None:
+    rows = re.findall(r"^\| `([\w-]+)` \| (.*?) \| (.*?) \| (.*?) \|$", TEXT, re.MULTILINE)
+    found = {name: (files, settings) for name, _, files, settings in rows}
+    kinds = CASE_KINDS.usable()
+    assert set(found) == set(kinds)
+    for name, kind in kinds.items():
+        files, settings = found[name]
+        assert set(re.findall(r"`(\w+)`", files)) == {file.name for file in kind.files}
+        assert set(re.findall(r"`(\w+)`", settings)) == set(kind.settings.model_fields)

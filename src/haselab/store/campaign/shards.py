@@ -24,6 +24,7 @@ __all__ = ["CaseRow", "CaseState", "Shards"]
 
 _FAILED = "failed"
 _FOLDER = "shards"
+_ENDING = ".parquet"
 _SMALL_BYTES = 4_000_000
 _MOST_SMALL = 64
 _KEYS = ("case", "index", "status", "error", "attempt", "traceback", "compute_s")
@@ -126,10 +127,10 @@ class Shards:
             self.merge()
 
     def _save(self, table: Any, name: str) -> None:
-        self._read_names.add(f"{name}.parquet")
+        self._read_names.add(f"{name}{_ENDING}")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            path = self._folder / f"{name}.parquet"
+            path = self._folder / f"{name}{_ENDING}"
             with drafted(path) as draft, draft.open("wb") as file:
                 self._parquet.write_table(table, file, compression="zstd")
                 file.flush()
@@ -197,12 +198,12 @@ class Shards:
     def _tables(self, columns: list[str] | None, known: set[str]) -> list[Any]:
         """All shards but the known ones, also while another program merges some of them."""
         while True:
-            paths = [path for path in self._paths() if path.name not in known]
+            names = [name for name in self._names() if name not in known]
             try:
-                found = [self._read(path, columns) for path in paths]
+                found = [self._read(self._folder / name, columns) for name in sorted(names)]
             except FileNotFoundError:
                 continue
-            known.update(path.name for path in paths)
+            known.update(names)
             return found
 
     def _read(self, path: Path, columns: list[str] | None) -> Any:
@@ -215,12 +216,13 @@ class Shards:
                 f"file; its cases are then computed again. {path}"
             ) from None
 
-    def _paths(self) -> list[Path]:
+    def _names(self) -> list[str]:
+        """Names of all complete shards."""
         if not self._folder.is_dir():
             return []
-        return sorted(
-            path for path in self._folder.glob("*.parquet") if not path.name.startswith(".")
-        )
+        with os.scandir(self._folder) as found:  # often, so without making a path of each
+            names = [entry.name for entry in found]
+        return [name for name in names if name.endswith(_ENDING) and not name.startswith(".")]
 
     def merge(self) -> None:
         """Merge the small shards, unless another program does so.
@@ -230,7 +232,8 @@ class Shards:
             InputError: a shard is damaged.
         """
         with _lock(self._folder / "merge.lock") as locked:
-            small = [path for path in self._paths() if path.stat().st_size < _SMALL_BYTES]
+            paths = [self._folder / name for name in sorted(self._names())]
+            small = [path for path in paths if path.stat().st_size < _SMALL_BYTES]
             if not locked or len(small) < _MOST_SMALL // 2:
                 return
             tables = [self._read(path, None) for path in small]

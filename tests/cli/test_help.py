@@ -11,8 +11,8 @@ from haselab.cli.main import cli
 COLUMNS = 80
 # The first word of an option's help: what the option does.
 VERBS = {
-    "Acknowledge", "Add", "Apply", "Assume", "Average", "Check", "Choose", "Compare", "Compile", "Compute",
-    "Convert", "Correct", "Describe", "Draw", "Estimate", "Export", "Find", "Fit", "Fix",
+    "Acknowledge", "Add", "Apply", "Assume", "Average", "Check", "Choose", "Compare", "Compile",
+    "Compute", "Convert", "Correct", "Describe", "Draw", "Estimate", "Export", "Find", "Fit", "Fix",
     "Forecast", "Identify", "Ignore", "Keep", "Leave", "Limit", "Move", "Name", "Play", "Print",
     "Read", "Record", "Refuse", "Require", "Serve", "Set", "Show", "Simulate", "Skip", "State",
     "Subtract", "Treat", "Use", "Write",

@@ -54,6 +54,7 @@ class Claims:
             ) from None
         with contextlib.suppress(OSError):  # a file system without locks
             hold(self._file.fileno())
+        self._remove_ended()
         threading.Thread(target=self._sign, daemon=True).start()
         return self
 
@@ -66,6 +67,15 @@ class Claims:
             self.release(block)
         self._file.close()
         self._own.unlink(missing_ok=True)
+
+    def _remove_ended(self) -> None:
+        """Remove what programs that were killed have left."""
+        for other in self._programs.iterdir():
+            if other != self._own and not self._is_program_alive(other):
+                other.unlink(missing_ok=True)
+        for claim in self._claims.iterdir():
+            if not self._is_alive(claim):
+                claim.unlink(missing_ok=True)
 
     def _sign(self) -> None:
         while not self._ended.wait(_SIGN_S):
@@ -116,14 +126,20 @@ class Claims:
         """Whether the program of a claim still works on it."""
         try:
             name = claim.read_text(encoding="utf-8")
-            own = self._programs / name
             if not name:  # just created, or its program ended in between
                 return time.time() - claim.stat().st_mtime < EXPIRES_S
-            if is_held(own):
-                return True
-            here = name.startswith(f"{socket.gethostname()[:40]}-")
-            if here and CAN_TELL:
-                return False
-            return time.time() - own.stat().st_mtime < EXPIRES_S
-        except OSError:  # either file has gone
+            return self._is_program_alive(self._programs / name)
+        except OSError:  # the claim has gone
+            return False
+
+    def _is_program_alive(self, program: Path) -> bool:
+        """Whether the program of this file is at work."""
+        if is_held(program):
+            return True
+        here = program.name.startswith(f"{socket.gethostname()[:40]}-")
+        if here and CAN_TELL:
+            return False
+        try:
+            return time.time() - program.stat().st_mtime < EXPIRES_S
+        except OSError:  # it has ended
             return False

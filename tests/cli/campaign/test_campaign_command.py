@@ -1,0 +1,103 @@
+"""`haselab campaign` from its options to its answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from haselab.cli.main import main
+
+QUICK = """
+name = "quick"
+kind = "transfer"
+[case]
+duration_s = 1.0
+[parameters]
+case.gain = [0.4, 0.6]
+"""
+BREAKS = """
+name = "too high"
+kind = "geometry"
+[base]
+twin = "hz"
+[parameters]
+case.voltage_v = [20000.0, 30000.0]
+"""
+
+
+def code_of(*words: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    return int(str(stop.value.code))
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "campaign.toml"
+    path.write_text(QUICK)
+    return path
+
+
+def test_the_answer_has_the_keys_of_the_contract_and_the_folder_the_results(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("campaign", file, "--out", "out", "--workers", 1, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["cases"], answer["done"], answer["failed"]) == (2, 2, 0)
+    assert answer["wall_s"] > 0.0 and 0.0 < answer["efficiency"] <= 1.0
+    assert answer["summary"] == json.loads(Path("out/summary.json").read_text())
+    # a second start computes nothing, a comparison with itself finds no difference
+    assert code_of("campaign", file, "--out", "out", "--compare", "out") == 0
+    printed = capsys.readouterr()
+    assert printed.err == "" and "2 of 2 cases have a result, 0 failed" in printed.out
+    assert "computed" not in printed.out
+    # --force begins anew
+    file.write_text(QUICK.replace("0.6]", "0.6, 0.8]"))
+    assert code_of("campaign", file, "--out", "out", "--workers", 1) == 2
+    assert "parameters.case.gain is [0.4, 0.6] there and [0.4, 0.6, 0.8] here" in (
+        capsys.readouterr().err
+    )
+    assert code_of("campaign", file, "--out", "out", "--workers", 1, "--force") == 0
+    printed = capsys.readouterr()
+    assert "moved out to" in printed.err and "3 of 3 cases" in printed.out
+    assert Path("out.previous-1/results.parquet").exists()
+
+
+def test_if_all_cases_fail_there_is_no_result(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(BREAKS)
+    assert code_of("campaign", file, "--out", "out", "--workers", 1) == 3
+    printed = capsys.readouterr()
+    assert printed.err == "haselab: All 2 cases failed. See out/failed.txt.\n"
+    assert Path("out/failed.txt").read_text().count("has no equilibrium") == 2
+    assert "no equilibrium" in Path("out/report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ((), 2, "Missing option '--out'"),
+        (("--out", "full/notes.txt"), 2, "--out names a file, not a folder"),
+        (("--out", "full"), 2, "not empty and holds no campaign"),
+        (("--out", "new", "--compare", "full"), 2, "This folder has no results.parquet"),
+        (("--out", "new", "--workers", "0"), 2, "0 is not in the range 1<=x<=256"),
+        (("--out", "new", "--scheduler", "tcp://127.0.0.1:9"), 2, "No Dask scheduler answers at"),
+    ],
+)
+def test_bad_use_is_one_line(
+    file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...], code: int, said: str,
+) -> None:  # fmt: skip
+    from haselab.campaign.executors import dask
+
+    monkeypatch.setattr(dask, "_CONNECT_S", 0.5)
+    Path("full").mkdir()
+    Path("full/notes.txt").write_text("mine")
+    assert code_of("campaign", file, *words) == code
+    printed = capsys.readouterr()
+    assert said in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+    assert [path.name for path in Path("full").iterdir()] == ["notes.txt"]

@@ -1,0 +1,110 @@
+"""Shards of finished cases, and claims on cases."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from haselab.base import InputError
+from haselab.store.campaign import claims as module
+from haselab.store.campaign.claims import EXPIRES_S, Claims
+from haselab.store.campaign.shards import CaseRow, CaseState, Shards
+
+
+def row(index: int, **more: object) -> CaseRow:
+    found: dict[str, object] = {"results": {"y": float(index)}, **more}
+    return CaseRow(f"case-{index}", index, {"case.gain": 0.1 * index}, **found)  # type: ignore[arg-type]
+
+
+def test_rows_are_read_as_they_were_written_in_the_order_of_their_indices(tmp_path: Path) -> None:
+    failed = row(7, results={}, error="it failed", traceback="Traceback\n  line")
+    written = [row(3, compute_s=0.5), failed, row(1)]
+    shards = Shards(tmp_path, "a")
+    shards.write(written[:2])
+    shards.write(written[2:])
+    names = [one.case for one in written]
+    assert Shards(tmp_path, "b").rows(names, ["case.gain"]) == [written[2], written[0], failed]
+    assert Shards(tmp_path, "b").rows(["case-1", "none"], ["case.gain"]) == [written[2]]
+
+
+def test_a_result_beats_a_failure_and_a_later_failure_an_earlier_one(tmp_path: Path) -> None:
+    shards = Shards(tmp_path, "a")
+    shards.write([row(0, error="late", results={}, attempt=2), row(1)])
+    shards.write([row(0, error="early", results={}), row(1, error="x", results={}, attempt=2)])
+    assert Shards(tmp_path, "b").states() == {
+        "case-0": CaseState(failed=True, attempt=2), "case-1": CaseState(failed=False, attempt=1),
+    }  # fmt: skip
+    found = Shards(tmp_path, "b").rows(["case-0", "case-1"], ["case.gain"])
+    assert [one.error for one in found] == ["late", ""]
+
+
+def test_small_shards_are_merged_and_no_row_is_lost(tmp_path: Path) -> None:
+    shards, reader = Shards(tmp_path, "a"), Shards(tmp_path, "b")
+    assert reader.states() == {}
+    for index in range(70):
+        shards.write([row(index)])
+    files = list((tmp_path / "shards").glob("*.parquet"))
+    assert len(files) == 7
+    assert len(reader.news()) == 70 and reader.news() == {}
+    found = reader.rows([f"case-{index}" for index in range(70)], ["case.gain"])
+    assert found == [row(index) for index in range(70)]
+
+
+def test_a_program_that_ended_between_merging_and_deleting_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shards = Shards(tmp_path, "a")
+    for index in range(40):
+        shards.write([row(index)])
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", lambda path, missing_ok=False: None)
+        shards.merge()
+    assert len(list((tmp_path / "shards").glob("*.parquet"))) == 41
+    found = Shards(tmp_path, "b").rows([f"case-{index}" for index in range(40)], ["case.gain"])
+    assert found == [row(index) for index in range(40)]
+
+
+def test_a_damaged_shard_is_named(tmp_path: Path) -> None:
+    Shards(tmp_path, "a").write([row(0)])
+    (file,) = (tmp_path / "shards").glob("*.parquet")
+    file.write_bytes(file.read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"Not a shard of a campaign .*Delete the file.*\.parquet"):
+        Shards(tmp_path, "b").states()
+
+
+def test_a_claim_excludes_others_until_its_program_releases_it_or_ends(tmp_path: Path) -> None:
+    with Claims(tmp_path) as first, Claims(tmp_path) as second:
+        assert first.take(4) and not second.take(4) and second.take(5)
+        first.release(4)
+        assert second.take(4)
+    with Claims(tmp_path) as third:
+        assert third.take(4) and third.take(5)
+    assert not list((tmp_path / "programs").iterdir())
+
+
+def test_a_program_of_another_computer_has_its_claims_until_it_gives_no_sign_of_life(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Claims(tmp_path) as first:
+        assert first.take(1)
+        other = tmp_path / "programs" / "elsewhere-1-abc"
+        other.write_text("")
+        (tmp_path / "claims" / "2").write_text(other.name)
+        assert not first.take(2)
+        old_s = time.time() - EXPIRES_S - 1.0
+        os.utime(other, (old_s, old_s))
+        assert first.take(2)
+
+
+def test_a_program_gives_signs_of_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_SIGN_S", 0.01)
+    with Claims(tmp_path) as claims:
+        own = tmp_path / "programs" / claims.writer
+        os.utime(own, (0.0, 0.0))
+        end = time.monotonic() + 60.0
+        while own.stat().st_mtime == 0.0 and time.monotonic() < end:
+            time.sleep(0.01)
+        assert own.stat().st_mtime > 0.0

@@ -8,6 +8,7 @@ from typing import Any
 from haselab.actuators import ACTUATORS
 from haselab.base import InputError
 from haselab.base.registry import Registry
+from haselab.campaign.kinds.case_kind import CASE_KINDS
 from haselab.cli.doctor.machine import Finding
 from haselab.controllers import CONTROLLERS, ControllerKind
 from haselab.store.columns.reader import FORMATS
@@ -15,11 +16,13 @@ from haselab.study.registry import EXPERIMENTS
 
 __all__ = ["extension_findings"]
 
-_REGISTRIES: tuple[Registry[Any], ...] = (CONTROLLERS, ACTUATORS, EXPERIMENTS, FORMATS)
+_REGISTRIES: tuple[Registry[Any], ...] = (
+    CONTROLLERS, ACTUATORS, EXPERIMENTS, FORMATS, CASE_KINDS,
+)  # fmt: skip
 
 
 def extension_findings() -> Iterator[Finding]:
-    """Yield one row for each controller, actuator, experiment and format of another package."""
+    """Yield one row for each controller, actuator, experiment, format and kind of case of others."""
     for registry in _REGISTRIES:
         for name, package in registry.packages().items():
             if package == "haselab":

@@ -119,7 +119,6 @@ class _Run:
         self._each_s = 0.0
         self._rows = 0
         self._compute_s = 0.0
-        self._kept = sum(one is not None for one in self._states)
 
     def _waiting(self, block: int) -> list[int]:
         """Indices of a block that have to be computed."""
@@ -157,7 +156,9 @@ class _Run:
         return type(stop)(f"{stop} {note}")
 
     def _finished(self) -> int:
-        return self._kept + self._rows
+        """Finished cases in the folder; a signal may come between writing some and counting them."""
+        states = self._shards.states()
+        return sum(case in states for case in self._hashes)
 
     def _result(self, workers: int, wall_s: float) -> Progressed:
         states = self._shards.states()

@@ -22,7 +22,7 @@ _REGISTRIES: tuple[Registry[Any], ...] = (
 
 
 def extension_findings() -> Iterator[Finding]:
-    """Yield one row for each controller, actuator, experiment, format and kind of case of others."""
+    """Yield one row for each controller, actuator, experiment or the like of another package."""
     for registry in _REGISTRIES:
         for name, package in registry.packages().items():
             if package == "haselab":

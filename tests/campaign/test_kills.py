@@ -50,7 +50,8 @@ class Command:
         )
 
     def shards(self) -> int:
-        return len(list(self.out.glob("shards/*.parquet")))
+        found = self.out.glob("shards/*.parquet")
+        return sum(not path.name.startswith(".") for path in found)  # drafts are no shards
 
     def until_shards(self, count: int) -> bool:
         """Wait for a number of shards; False: the command has ended before."""

@@ -156,7 +156,7 @@ class _Run:
         return type(stop)(f"{stop} {note}")
 
     def _finished(self) -> int:
-        """Finished cases in the folder; a signal may come between writing some and counting them."""
+        """Finished cases in the folder; a signal may come between writing and counting."""
         states = self._shards.states()
         return sum(case in states for case in self._hashes)
 

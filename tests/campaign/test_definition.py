@@ -28,6 +28,12 @@ BAD = {
         GEOMETRY + "twin.sheel.width_m = [0.05]\n", "there is no table 'sheel'.*shell"),
     "place in a list": (
         GEOMETRY + "twin.viscosity.share.7 = [0.1]\n", "'7' is not a place in a list of 3"),
+    "place with a leading zero": (  # the same place as 0, so that one value would be lost
+        GEOMETRY + "twin.viscosity.share.00 = [0.1]\n", "'00' is not a place in a list of 3"),
+    "integer that no column has": (
+        GRID.replace("0.6", f"1{'0' * 400}"), r"case\.gain has an integer of 401 digits"),
+    "bound that no float has": (
+        DRAWN.replace("0.6", f"1{'0' * 400}"), r"case\.gain\.uniform has an integer of 401 digits"),
     "no values": (GRID.replace("[0.4, 0.6]", "[]"), "has no values, so the campaign has 0 cases"),
     "one value": (GRID.replace("[0.4, 0.6]", "0.4"), "neither a list of values nor a distrib"),
     "twice": (GRID.replace("[0.4, 0.6]", "[0.4, 0.4]"), "lists a value more than once"),

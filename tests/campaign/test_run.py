@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from haselab.base import DeviceError, InputError
+from haselab.base import DeviceError, Estimate, InputError
 from haselab.campaign import work
-from haselab.campaign.folder import open_folder
+from haselab.campaign.definition import load_campaign
+from haselab.campaign.folder import finished_rows, open_folder, plan_of
 from haselab.campaign.kinds.transfer import TRANSFER
 from haselab.store.campaign.claims import Claims
 from haselab.store.campaign.shards import CaseRow, Shards
@@ -190,3 +191,79 @@ def test_cases_of_another_version_are_computed_again_and_kept(campaigns: Any) ->
     assert (found.outdated, found.computed) == (1, 16)
     assert "0" * 32 not in campaigns.columns("old")["case"]
     assert json.loads((out / "campaign.json").read_text())["kind"] == "transfer"
+
+
+SWAPPED = """
+name = "two distributions"
+kind = "transfer"
+
+[case]
+duration_s = 1.0
+rate_hz = 100.0
+
+[parameters]
+{}
+{}
+
+[design]
+kind = "random"
+samples = 8
+"""
+
+
+def test_parameters_in_another_order_do_not_take_each_others_drawn_values(campaigns: Any) -> None:
+    """The drawn values of a folder are kept as columns in the order of the file."""
+    lines = "case.gain = { uniform = [0.4, 0.6] }", "case.amplitude = { uniform = [5.0, 9.0] }"
+    campaigns.run("out", SWAPPED.format(*lines))
+    swapped = SWAPPED.format(*reversed(lines))
+    plan = plan_of(load_campaign(campaigns.file(swapped)), campaigns.folder / "out")
+    assert all(0.4 <= plan.values(index)["case.gain"] <= 0.6 for index in range(8))
+    with pytest.raises(InputError, match=r"order of the parameters is \['case\.gain'"):
+        campaigns.run("out", swapped)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", bytes(400)])
+def test_damaged_points_are_drawn_again(campaigns: Any, content: bytes) -> None:
+    campaigns.run("out")
+    (campaigns.folder / "out" / "design.npy").write_bytes(content)
+    plan = plan_of(load_campaign(campaigns.file()), campaigns.folder / "out")
+    assert plan.drawn.tolist() == campaigns.plan().drawn.tolist()
+
+
+@pytest.mark.parametrize("begin", [0, 4])
+def test_a_damaged_shard_is_named(campaigns: Any, begin: int) -> None:
+    """Bytes that changed inside give another error of pyarrow than a file that was cut."""
+    campaigns.run("out")
+    shard = min((campaigns.folder / "out" / "shards").glob("*.parquet"))
+    whole = shard.read_bytes()
+    wrong = bytes(byte ^ 0x5A for byte in whole[4:400]) if begin else b""
+    shard.write_bytes(whole[:begin] + wrong + whole[400:] if begin else whole[:100])
+    with pytest.raises(InputError, match=rf"Not a shard .*Delete the file.*{shard.name}"):
+        finished_rows(campaigns.plan(), campaigns.folder / "out")
+
+
+@pytest.mark.parametrize(
+    ("results", "error"),
+    [
+        ({"index": 5.0}, "cannot have the result 'index'"),
+        ({"compute_s": 5.0}, "cannot have the result 'compute_s'"),
+        ({"case.gain": 5.0}, "cannot have the result 'case.gain'"),
+        ({"a": Estimate.normal(1.0, 0.1, ""), "a.low": 0.0}, "cannot have the result 'a.low'"),
+        ({"": 5.0}, "a result has no name"),
+        ({"a\udcff": 5.0}, "surrogates not allowed"),
+        (RuntimeError("no file \udcff"), r"no file \udcff"),
+    ],
+)
+def test_a_kind_of_another_package_cannot_damage_the_table(
+    campaigns: Any, monkeypatch: pytest.MonkeyPatch, results: Any, error: str
+) -> None:
+    def computed(kind: Any, inputs: Any, rng: Any) -> Any:
+        if isinstance(results, Exception):
+            raise results
+        return results
+
+    monkeypatch.setattr(type(TRANSFER), "compute", computed)
+    assert campaigns.run("out").failed == 16
+    columns = campaigns.columns("out")
+    assert columns["index"] == list(range(16)) and error in columns["error"][0]
+    assert set(columns["case.gain"]) == {campaigns.plan().values(k)["case.gain"] for k in range(16)}

@@ -24,6 +24,7 @@ __all__ = [
 MOST_CASES = 1_000_000
 _SHAPES = {"uniform": 2, "log-uniform": 2, "normal": 2, "choice": 0}
 _MOST_LEVELS = 10_000
+_LARGEST_INTEGER = 2**63 - 1  # of a column of the table
 
 DesignKind = Literal["grid", "sobol", "latin-hypercube", "random", "saltelli"]
 
@@ -136,6 +137,7 @@ class Campaign:
                 **{axis.path: list(axis.values) for axis in self.axes},
                 **{one.path: {one.shape: list(one.numbers)} for one in self.distributions},
             },
+            "order of the parameters": list(self.paths),  # of the cases and of the drawn columns
             "tables": dict(self.tables),
         }
 
@@ -256,6 +258,7 @@ def _alike(path: str, values: Sequence[Any]) -> tuple[Json, ...]:
     for value in values:
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(f"parameters.{path} has the value {value}, which is not finite.")
+        _refuse_large(path, value)
     kinds = {type(value) for value in values}
     if kinds == {int, float}:
         values, kinds = [float(value) for value in values], {float}
@@ -267,6 +270,14 @@ def _alike(path: str, values: Sequence[Any]) -> tuple[Json, ...]:
     if len(set(values)) < len(values):
         raise InputError(f"parameters.{path} lists a value more than once. Remove it.")
     return tuple(values)
+
+
+def _refuse_large(path: str, value: Any) -> None:
+    if type(value) is int and abs(value) > _LARGEST_INTEGER:
+        raise InputError(
+            f"parameters.{path} has an integer of {len(str(abs(value)))} digits, but the largest "
+            f"possible one is {_LARGEST_INTEGER}. Write it as a float, such as 1e30."
+        )
 
 
 def _distribution(path: str, data: Mapping[str, Any]) -> Distribution:
@@ -282,6 +293,8 @@ def _distribution(path: str, data: Mapping[str, Any]) -> Distribution:
     numbers = _alike(f"{path}.{shape}", numbers) if shape == "choice" else tuple(numbers)
     if shape == "choice":
         return Distribution(path, shape, numbers)
+    for number in numbers:
+        _refuse_large(f"{path}.{shape}", number)
     numeric = all(type(number) in (int, float) for number in numbers)
     if len(numbers) != _SHAPES[shape] or not numeric or not all(map(math.isfinite, numbers)):
         wanted = "a mean and a standard deviation" if shape == "normal" else "two finite bounds"
@@ -333,7 +346,7 @@ def with_values(
 
 def _inside(table: Any, part: str, path: str) -> Any:
     if isinstance(table, list):
-        if not part.isdecimal() or int(part) >= len(table):
+        if part not in map(str, range(len(table))):  # only one way to write a place
             raise InputError(
                 f"parameters.{path}: {part!r} is not a place in a list of {len(table)} values. "
                 "Places count from 0."

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError, Json
+from haselab.base import DeviceError, InputError, Json, JsonObject
 from haselab.campaign.definition import Campaign
 from haselab.campaign.plan import Plan
 from haselab.store.campaign.shards import CaseRow, Shards
@@ -19,8 +19,8 @@ from haselab.store.claim import is_occupied
 from haselab.store.folder import drafted, json_text, read_json, write_new, write_text
 
 __all__ = [
-    "CAMPAIGN", "FAILED", "TABLE", "finished_rows", "open_folder", "plan_of", "read_results",
-    "write_table",
+    "CAMPAIGN", "FAILED", "TABLE", "described_in", "finished_rows", "open_folder", "plan_of",
+    "read_results", "write_table",
 ]  # fmt: skip
 
 CAMPAIGN, DESIGN = "campaign.json", "design.npy"
@@ -41,7 +41,7 @@ def plan_of(campaign: Campaign, folder: Path) -> Plan:
         InputError: a drawn value is outside the limits of its key; a library is missing.
     """
     drawn = None
-    with contextlib.suppress(InputError, OSError, ValueError):
+    with contextlib.suppress(InputError, OSError, ValueError, EOFError):
         if read_json(folder / CAMPAIGN) == campaign.described():
             drawn = np.load(folder / DESIGN)
     shape = (campaign.points, len(campaign.distributions))
@@ -60,7 +60,10 @@ def open_folder(plan: Plan, folder: Path) -> None:
     """
     described = plan.campaign.described()
     if not (folder / CAMPAIGN).exists():
-        if is_occupied(folder) and any(not each.name.startswith(".") for each in folder.iterdir()):
+        others = is_occupied(folder) and any(
+            not each.name.startswith(".") for each in folder.iterdir()
+        )
+        if others and not (folder / CAMPAIGN).exists():  # another program may begin it now
             raise InputError(
                 "--out names a folder that is not empty and holds no campaign; it was not changed. "
                 f"Name a new folder, or add --force to move this one aside. {folder}"
@@ -183,6 +186,22 @@ def read_results(folder: Path) -> dict[str, NDArray[np.float64]]:
         name: table.column(name).to_numpy(zero_copy_only=False).astype(np.float64)
         for name in table.column_names if table.schema.field(name).type == arrow.float64()
     }  # fmt: skip
+
+
+def described_in(folder: Path) -> JsonObject:
+    """What determines the results of a campaign.
+
+    Args:
+        folder: of the campaign.
+    Returns:
+        Its `Campaign.described`.
+    Raises:
+        InputError: the folder has no campaign, or a damaged one.
+    """
+    found = read_json(folder / CAMPAIGN)
+    if not isinstance(found, dict) or not {"design", "parameters"} <= set(found):
+        raise InputError(f"Not the file of a campaign. Name another folder. {folder / CAMPAIGN}")
+    return found
 
 
 def _failures(rows: Sequence[CaseRow]) -> list[str]:

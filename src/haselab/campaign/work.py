@@ -16,7 +16,7 @@ from haselab.base.exits import no_exit
 from haselab.campaign.definition import with_values
 from haselab.campaign.kinds.case_kind import CASE_KINDS, Inputs
 from haselab.campaign.plan import Job, Problem, code_of
-from haselab.store.campaign.shards import CaseRow
+from haselab.store.campaign.shards import KEYS, CaseRow
 
 __all__ = ["compute_case", "compute_cases"]
 
@@ -60,12 +60,17 @@ def compute_case(problem: Problem, job: Job) -> CaseRow:
             warnings.simplefilter("ignore")
             results = _computed(problem, job)
     except Exception as failure:  # a case of another package may raise anything
-        error = _ADDRESS.sub("0x...", described(failure))[:_MOST_CHARACTERS]
-        trace = traceback.format_exc()
+        error = _storable(_ADDRESS.sub("0x...", described(failure)))[:_MOST_CHARACTERS]
+        trace = _storable(traceback.format_exc())
     spent_s = time.perf_counter() - start
     return CaseRow(
         job.case, job.index, dict(job.values), results, error, trace, job.attempt, spent_s
     )
+
+
+def _storable(text: str) -> str:
+    """The text with escapes for what UTF-8 does not have, such as a byte of a file's name."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _computed(problem: Problem, job: Job) -> dict[str, Json]:
@@ -77,7 +82,13 @@ def _computed(problem: Problem, job: Job) -> dict[str, Json]:
         raise TypeError(f"the case returned {type(found).__name__!r}, not results by name")
     columns: dict[str, Json] = {}
     for name, value in found.items():
-        columns |= _columns(str(name), value)
+        for column, number in _columns(str(name), value).items():
+            if not column or column in {*KEYS, *job.values, *columns}:
+                raise ValueError(f"the table cannot have the result {column!r}, because it has a "
+                                 "column of this name. Rename the result" if column else
+                                 "a result has no name")  # fmt: skip
+            column.encode()  # may raise: Parquet has names in UTF-8
+            columns[column] = number
     return columns
 
 

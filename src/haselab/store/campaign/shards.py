@@ -20,14 +20,14 @@ from haselab.base import DeviceError, InputError, Json
 from haselab.store.folder import drafted
 from haselab.store.session.lock import hold
 
-__all__ = ["CaseRow", "CaseState", "Shards"]
+__all__ = ["KEYS", "CaseRow", "CaseState", "Shards"]
 
 _FAILED = "failed"
 _FOLDER = "shards"
 _ENDING = ".parquet"
 _SMALL_BYTES = 4_000_000
 _MOST_SMALL = 64
-_KEYS = ("case", "index", "status", "error", "attempt", "traceback", "compute_s")
+KEYS = ("case", "index", "status", "error", "attempt", "traceback", "compute_s")
 _STATE = ["case", "status", "attempt"]
 
 
@@ -210,7 +210,9 @@ class Shards:
         try:
             with path.open("rb") as file:
                 return self._parquet.ParquetFile(file).read(columns=columns)
-        except (self._arrow.ArrowInvalid, self._arrow.ArrowException, KeyError) as error:
+        except (self._arrow.ArrowException, KeyError, OSError) as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                raise  # of the file system, and not of the contents
             raise InputError(
                 f"Not a shard of a campaign ({' '.join(str(error).split())[:200]}). Delete the "
                 f"file; its cases are then computed again. {path}"
@@ -248,7 +250,7 @@ def _row(data: dict[str, Any], parameters: Collection[str]) -> CaseRow:
     values = {name: data[name] for name in parameters}
     results = {
         name: value for name, value in data.items()
-        if name not in _KEYS and name not in values and value is not None
+        if name not in KEYS and name not in values and value is not None
     }  # fmt: skip
     return CaseRow(
         data["case"], data["index"], values, results, data["error"], data["traceback"],

@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from haselab.campaign.summary import compared, groups_of, median_interval, summarised
+from haselab.campaign.summary import (
+    compared,
+    draws_are_independent,
+    groups_of,
+    median_interval,
+    summarised,
+)
 from haselab.report.campaign_page import campaign_page
 from haselab.store.campaign.shards import CaseRow
 
@@ -137,3 +143,73 @@ def test_the_page_is_self_contained_and_the_same_for_the_same_rows(campaigns: An
         assert outside not in page.replace("http://www.w3.org/", "").replace(
             "https://www.w3.org", ""
         )
+
+
+def test_true_values_without_intervals_have_no_coverage(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 8))
+    rows = [CaseRow(f"{k}", k, plan.values(k), {"y": 0.0, "y.true": 0.5}) for k in range(8)]
+    assert summarised(plan, rows)["coverage"] == []
+
+
+SHARED = """
+name = "a"
+kind = "transfer"
+[parameters]
+case.noise_std = {noise}
+{drawn}
+[design]
+{design}
+"""
+_DRAWN = "case.gain = { uniform = [0.4, 0.6] }"
+_RANDOM = 'kind = "random"\nsamples = {}\n'
+
+
+@pytest.mark.parametrize(
+    ("noise", "drawn", "design", "intervals", "coverage"),
+    [
+        ([0.01, 0.02], _DRAWN, _RANDOM.format(20), True, True),  # 20 devices in each group
+        ([0.01, 0.02], _DRAWN, _RANDOM.format(6), False, False),  # one group: 6 devices, twice
+        ([0.01, 0.02], "", "repeats = 6\nsame_noise = true", False, False),
+        ([0.01, 0.02], "", "repeats = 6", True, True),
+        ([0.01], _DRAWN, _RANDOM.format(6) + "repeats = 50", False, False),
+        ([0.01], _DRAWN, 'kind = "saltelli"\nsamples = 16', False, False),
+        ([k / 1000 for k in range(1, 13)], "", "", False, True),  # no value was drawn
+    ],
+)
+def test_cases_that_share_draws_have_no_interval(
+    campaigns: Any, noise: Any, drawn: str, design: str, *, intervals: bool, coverage: bool
+) -> None:
+    """An interval for 12 independent cases would be too narrow for 6 devices that occur twice."""
+    plan = campaigns.plan(SHARED.format(noise=noise, drawn=drawn, design=design))
+    rng = np.random.default_rng(1)
+    rows = [
+        CaseRow(f"{k}", k, plan.values(k), {"y": y, "y.low": y - 1, "y.high": y + 1, "y.true": 0.0})
+        for k, y in enumerate(rng.normal(size=plan.count))
+    ]
+    summary = summarised(plan, rows)
+    assert {one["median"]["ci95"] is not None for one in summary["distributions"]} == {intervals}
+    assert {one["share"]["ci95"] is not None for one in summary["coverage"]} == {coverage}
+    correlations = [one["correlation"] for one in summary["sensitivities"] if "correlation" in one]
+    assert all((one["ci95"] is not None) == intervals for one in correlations)
+    described = plan.campaign.described()
+    assert not draws_are_independent(described, grouped=False) or len(noise) == 1 or not drawn
+    (found,) = compared(rows, {"y": rng.normal(size=50)}, independent=False)
+    assert found["difference"]["ci95"] is None and found["here"]["ci95"] is None
+    campaign_page(summary, {})
+
+
+def test_groups_of_equal_last_names_have_whole_paths(campaigns: Any) -> None:
+    text = """
+name = "a"
+kind = "geometry"
+[base]
+twin = "hz"
+[parameters]
+twin.viscosity.share.0 = [0.1, 0.2]
+[design]
+repeats = 8
+"""
+    plan = campaigns.plan(text)
+    rows = [CaseRow(f"{k}", k, plan.values(k), {"y": 1.0}) for k in range(plan.count)]
+    labels = [group.label for group in groups_of(plan.campaign, rows)]
+    assert labels == ["twin.viscosity.share.0 = 0.1", "twin.viscosity.share.0 = 0.2"]

@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,10 @@ from haselab.campaign.plan import Plan
 from haselab.store.campaign.shards import CaseRow
 from haselab.store.optional import library
 
-__all__ = ["Group", "compared", "groups_of", "median_interval", "result_names", "summarised"]
+__all__ = [
+    "LEAST_CASES", "Group", "compared", "draws_are_independent", "groups_of", "median_interval",
+    "result_names", "summarised",
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 _QUANTILES = {"p05": 0.05, "median": 0.5, "p95": 0.95}
@@ -29,7 +33,7 @@ _OF_ESTIMATES = (".std", ".low", ".high", ".true")
 _MOST_GROUPS = 24
 _RESAMPLED = 1000
 _SEED = 1  # of resampling: the same rows give the same intervals
-_LEAST_CASES = 8
+LEAST_CASES = 8
 
 
 @dataclass(frozen=True)
@@ -81,17 +85,24 @@ def groups_of(campaign: Campaign, rows: Sequence[CaseRow]) -> list[Group]:
     """
     many = math.prod(len(axis.values) for axis in campaign.axes)
     each = campaign.count // many
-    if many == 1 or many > _MOST_GROUPS or each < _LEAST_CASES:
+    if many == 1 or many > _MOST_GROUPS or each < LEAST_CASES:
         return [Group("", tuple(rows))]
+    short = _short_names([axis.path for axis in campaign.axes])
     found: dict[str, list[CaseRow]] = {}
     for row in rows:
-        label = ", ".join(f"{_last(axis.path)} = {row.values[axis.path]}" for axis in campaign.axes)
+        label = ", ".join(
+            f"{name} = {row.values[axis.path]}"
+            for name, axis in zip(short, campaign.axes, strict=True)
+        )
         found.setdefault(label, []).append(row)
     return [Group(label, tuple(part)) for label, part in found.items()]
 
 
-def _last(path: str) -> str:
-    return path.rpartition(".")[2]
+def _short_names(paths: Sequence[str]) -> list[str]:
+    """The last parts of the paths; whole paths where those would not say which parameter it is."""
+    last = [path.rpartition(".")[2] for path in paths]
+    clear = len(set(last)) == len(last) and not any(name.isdecimal() for name in last)
+    return last if clear else list(paths)
 
 
 def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
@@ -104,6 +115,8 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         Distributions, coverage, sensitivities and failures, as JSON types.
     """
     campaign, groups = plan.campaign, groups_of(plan.campaign, rows)
+    independent = draws_are_independent(campaign.described(), grouped=len(groups) > 1)
+    is_random = bool(campaign.distributions) or campaign.design.repeats > 1
     names = result_names(rows)
     return {
         "name": campaign.name,
@@ -112,16 +125,19 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         "design": campaign.design.model_dump(mode="json"),
         "cases": len(rows),
         "failed": sum(bool(row.error) for row in rows),
-        "is_random": bool(campaign.distributions) or campaign.design.repeats > 1,
+        "is_random": is_random,
         "distributions": [
-            _distribution(group, name, independent=_draws_are_independent(campaign))
+            _distribution(group, name, independent=independent and is_random)
             for name in names
             for group in groups
         ],
         "coverage": [
-            found for name in names for group in groups if (found := _coverage(group, name))
+            found
+            for name in names
+            for group in groups
+            if (found := _coverage(group, name, independent=independent))
         ],
-        "sensitivities": list(_sensitivities(campaign, groups, names)),
+        "sensitivities": list(_sensitivities(campaign, groups, names, independent=independent)),
         "failures": _failures(rows),
     }
 
@@ -129,10 +145,21 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
 # ---- distributions -----------------------------------------------------------------------------
 
 
-def _draws_are_independent(campaign: Campaign) -> bool:
-    """Whether no two cases have drawn values in common."""
-    design = campaign.design
-    return design.kind != "saltelli" and not (campaign.distributions and design.repeats > 1)
+def draws_are_independent(described: Mapping[str, Any], *, grouped: bool) -> bool:
+    """Whether no two cases of a group have drawn values or noise in common.
+
+    Args:
+        described: the campaign, as in its campaign.json.
+        grouped: each group has the cases of one point of the axes; otherwise one has all cases.
+    Returns:
+        False if intervals that take the cases as independent would be too narrow.
+    """
+    design, parameters = described["design"], described["parameters"].values()
+    is_drawn = any(isinstance(each, Mapping) for each in parameters)
+    axes = math.prod(len(each) for each in parameters if not isinstance(each, Mapping))
+    if design["kind"] == "saltelli" or (is_drawn and design["repeats"] > 1):
+        return False
+    return grouped or axes == 1 or not (is_drawn or design["same_noise"])
 
 
 def _distribution(group: Group, name: str, *, independent: bool) -> JsonObject:
@@ -183,17 +210,20 @@ def _order_interval(ordered: Floats, share: float) -> Json:
     return [float(ordered[low - 1]), float(ordered[high - 1])]
 
 
-def _coverage(group: Group, name: str) -> JsonObject | None:
-    """How often the interval of an estimate contains the true value; None: it has none."""
+def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | None:
+    """How often the interval of an estimate contains the true value; None: no case has both."""
     true = group.values(f"{name}.true")
-    if not np.isfinite(true).any():
-        return None
     low, high = group.values(f"{name}.low"), group.values(f"{name}.high")
     known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
     inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
+    if count == 0:
+        return None
     return {
         "result": name, "group": group.label, "count": count, "inside": inside,
-        "share": {"value": inside / count, "ci95": _share_interval(inside, count)},
+        "share": {
+            "value": inside / count,
+            "ci95": _share_interval(inside, count) if independent else None,
+        },
     }  # fmt: skip
 
 
@@ -209,7 +239,7 @@ def _share_interval(inside: int, count: int) -> list[float]:
 
 
 def _sensitivities(
-    campaign: Campaign, groups: Sequence[Group], names: Sequence[str]
+    campaign: Campaign, groups: Sequence[Group], names: Sequence[str], *, independent: bool
 ) -> Iterator[JsonObject]:
     paths = [one.path for one in campaign.distributions if one.shape != "choice"]
     for name in names:
@@ -217,7 +247,7 @@ def _sensitivities(
             if campaign.design.kind == "saltelli":
                 found = _sobol_indices(group, name, paths) if _is_whole(campaign, groups) else []
             else:
-                found = _rank_correlations(group, name, paths)
+                found = _rank_correlations(group, name, paths, independent=independent)
             for one in found:
                 yield {"result": name, "group": group.label, **one}
 
@@ -231,7 +261,7 @@ def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonOb
     """First-order and total indices by SALib, without sample blocks in which a case failed."""
     blocks = group.values(name).reshape(-1, len(paths) + 2)
     whole = blocks[np.isfinite(blocks).all(axis=1)]
-    if whole.shape[0] < _LEAST_CASES or np.ptp(whole) == 0.0:
+    if whole.shape[0] < LEAST_CASES or np.ptp(whole) == 0.0:
         return []
     analyse = library("SALib.analyze.sobol", "haselab[campaign]").analyze
     bounds = {"num_vars": len(paths), "names": list(paths), "bounds": [[0.0, 1.0]] * len(paths)}
@@ -252,7 +282,9 @@ def _around(value: float, half: float) -> JsonObject:
     return {"value": float(value), "ci95": [float(value - half), float(value + half)]}
 
 
-def _rank_correlations(group: Group, name: str, paths: Sequence[str]) -> list[JsonObject]:
+def _rank_correlations(
+    group: Group, name: str, paths: Sequence[str], *, independent: bool
+) -> list[JsonObject]:
     r"""Spearman's $\rho$ between each parameter and a result, with Fisher's interval.
 
     The standard error of $\mathrm{artanh}\,\rho$ is $\sqrt{(1 + \rho^2/2)/(n - 3)}$ (Bonett and
@@ -263,7 +295,7 @@ def _rank_correlations(group: Group, name: str, paths: Sequence[str]) -> list[Js
     values = group.values(name)
     good = np.isfinite(values)
     count = int(good.sum())
-    if count < _LEAST_CASES or np.ptp(values[good]) == 0.0:
+    if count < LEAST_CASES or np.ptp(values[good]) == 0.0:
         return []
     found: list[JsonObject] = []
     for path in paths:
@@ -274,7 +306,9 @@ def _rank_correlations(group: Group, name: str, paths: Sequence[str]) -> list[Js
         ends = np.tanh([middle - half, middle + half])
         found.append({
             "parameter": path, "method": "rank correlation", "count": count,
-            "correlation": {"value": rho, "ci95": [float(end) for end in ends]},
+            "correlation": {
+                "value": rho, "ci95": [float(end) for end in ends] if independent else None,
+            },
         })  # fmt: skip
     return found
 
@@ -293,12 +327,15 @@ def _failures(rows: Sequence[CaseRow]) -> list[Json]:
     ]  # fmt: skip
 
 
-def compared(here: Sequence[CaseRow], there: Mapping[str, Floats]) -> list[Json]:
+def compared(
+    here: Sequence[CaseRow], there: Mapping[str, Floats], *, independent: bool = True
+) -> list[Json]:
     """Compare the results of two campaigns.
 
     Args:
         here: rows of this one.
         there: results of the other one, by name.
+        independent: the draws of both are, see `draws_are_independent`.
     Returns:
         For each result of both: the medians, and their difference with its bootstrap interval.
     """
@@ -308,19 +345,21 @@ def compared(here: Sequence[CaseRow], there: Mapping[str, Floats]) -> list[Json]
         first = group.present(name)
         second = there.get(name, np.zeros(0))
         second = second[~np.isnan(second)]
-        if min(first.size, second.size) < _LEAST_CASES:
+        if min(first.size, second.size) < LEAST_CASES:
             continue
         if not (np.isfinite(first).all() and np.isfinite(second).all()):
             continue  # medians that were not reached have no difference
         drawn = [np.median(rng.choice(part, (_RESAMPLED, part.size)), axis=1)
                  for part in (first, second)]  # fmt: skip
         ends = np.quantile(drawn[0] - drawn[1], [_SIDE, 1.0 - _SIDE])
+        medians = [float(np.median(part)) for part in (first, second)]
+        intervals = [median_interval(first), median_interval(second), ends.tolist()]
+        if not independent:
+            intervals = [None, None, None]
         found.append({
             "result": name,
-            "here": {"value": float(np.median(first)), "ci95": median_interval(first)},
-            "there": {"value": float(np.median(second)), "ci95": median_interval(second)},
-            "difference": {
-                "value": float(np.median(first) - np.median(second)), "ci95": ends.tolist(),
-            },
+            "here": {"value": medians[0], "ci95": intervals[0]},
+            "there": {"value": medians[1], "ci95": intervals[1]},
+            "difference": {"value": medians[0] - medians[1], "ci95": intervals[2]},
         })  # fmt: skip
     return found

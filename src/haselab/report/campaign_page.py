@@ -69,13 +69,13 @@ def _about(summary: Mapping[str, Any]) -> str:
     if not summary["is_random"]:
         return (
             "All points of a grid, computed once each. The curves show which values the results "
-            "take on the grid; they are not probabilities."
+            "take on the grid; they are not probabilities, so quantiles have no intervals."
         )
     return (
         "Share of cases at or below a value. Intervals are of 95 %, from order statistics; a dash "
-        "means that there are too few cases, or that cases share drawn values. They take the cases "
-        "as independent draws; points of a Sobol or Latin hypercube design are spread more evenly, "
-        "which makes them too wide."
+        "means that there are too few cases, or that cases share drawn values or noise. Intervals "
+        "take the cases as independent draws; points of a Sobol or Latin hypercube design are "
+        "spread more evenly, which makes the intervals too wide."
     )
 
 

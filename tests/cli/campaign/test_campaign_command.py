@@ -49,10 +49,11 @@ def test_the_answer_has_the_keys_of_the_contract_and_the_folder_the_results(
     assert (answer["cases"], answer["done"], answer["failed"]) == (2, 2, 0)
     assert answer["wall_s"] > 0.0 and 0.0 < answer["efficiency"] <= 1.0
     assert answer["summary"] == json.loads(Path("out/summary.json").read_text())
-    # a second start computes nothing, a comparison with itself finds no difference
+    # a second start computes nothing; 2 cases are too few for a comparison
     assert code_of("campaign", file, "--out", "out", "--compare", "out") == 0
     printed = capsys.readouterr()
-    assert printed.err == "" and "2 of 2 cases have a result, 0 failed" in printed.out
+    assert printed.err.startswith("haselab: No comparison: no result has at least 8 values")
+    assert "2 of 2 cases have a result, 0 failed" in printed.out
     assert "computed" not in printed.out
     # --force begins anew
     file.write_text(QUICK.replace("0.6]", "0.6, 0.8]"))
@@ -64,6 +65,20 @@ def test_the_answer_has_the_keys_of_the_contract_and_the_folder_the_results(
     printed = capsys.readouterr()
     assert "moved out to" in printed.err and "3 of 3 cases" in printed.out
     assert Path("out.previous-1/results.parquet").exists()
+
+
+def test_a_comparison_with_itself_finds_no_difference(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(f"{QUICK}[design]\nrepeats = 8\n")
+    assert code_of("campaign", file, "--out", "out", "--workers", 1) == 0
+    assert "16 computed in" in (first := capsys.readouterr().out) and "by 1 worker," in first
+    assert code_of("campaign", file, "--out", "out", "--compare", "out") == 0
+    assert capsys.readouterr().err == ""
+    summary = json.loads(Path("out/summary.json").read_text())
+    differences = [one["difference"] for one in summary["comparison"]]
+    assert differences and all(one["value"] == 0.0 for one in differences)
+    assert all(one["ci95"][0] <= 0.0 <= one["ci95"][1] for one in differences)
 
 
 def test_if_all_cases_fail_there_is_no_result(

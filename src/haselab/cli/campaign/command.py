@@ -14,10 +14,24 @@ from haselab.base import JsonObject, ResultError, to_plain
 from haselab.campaign.definition import load_campaign
 from haselab.campaign.executors.executor import Executor
 from haselab.campaign.executors.processes import ProcessExecutor
-from haselab.campaign.folder import finished_rows, open_folder, plan_of, read_results, write_table
+from haselab.campaign.folder import (
+    described_in,
+    finished_rows,
+    open_folder,
+    plan_of,
+    read_results,
+    write_table,
+)
 from haselab.campaign.plan import Plan, Problem
 from haselab.campaign.run import Progressed, run_cases
-from haselab.campaign.summary import compared, groups_of, result_names, summarised
+from haselab.campaign.summary import (
+    LEAST_CASES,
+    compared,
+    draws_are_independent,
+    groups_of,
+    result_names,
+    summarised,
+)
 from haselab.cli.common import WORKERS, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
@@ -68,7 +82,7 @@ def command(
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the campaign.")
     plan = plan_of(load_campaign(campaign), out)
-    there = None if other is None else read_results(other)
+    there = None if other is None else (read_results(other), described_in(other))
     open_folder(plan, out)
     count = workers or os.cpu_count() or 1
 
@@ -94,7 +108,15 @@ def command(
         write_table(plan, rows, out)
         summary = summarised(plan, rows)
         if there is not None:
-            summary |= {"comparison": compared(rows, there), "compared_with": str(other)}
+            both = (plan.campaign.described(), there[1])
+            independent = all(draws_are_independent(each, grouped=False) for each in both)
+            comparison = compared(rows, there[0], independent=independent)
+            if not comparison:
+                click.echo(
+                    f"haselab: No comparison: no result has at least {LEAST_CASES} values in both "
+                    f"campaigns, all of them finite. {other}", err=True,
+                )  # fmt: skip
+            summary |= {"comparison": comparison, "compared_with": str(other)}
         write_text(out / "report.html", campaign_page(summary, _values(plan, rows)))
         answer["summary"] = summary
         write_json(out / "summary.json", summary)
@@ -126,8 +148,9 @@ def _answer(found: Progressed) -> JsonObject:
 def _lines(found: Progressed, out: Path) -> list[str]:
     lines = [f"{found.done:,} of {found.cases:,} cases have a result, {found.failed:,} failed"]
     if found.computed:
+        workers = "1 worker" if found.workers == 1 else f"{found.workers} workers"
         lines.append(
-            f"{found.computed:,} computed in {found.wall_s:.1f} s by {found.workers} workers, "
+            f"{found.computed:,} computed in {found.wall_s:.1f} s by {workers}, "
             f"busy for {100.0 * (found.efficiency or 0.0):.0f} % of the time"
         )
     if found.elsewhere:

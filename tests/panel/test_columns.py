@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from haselab.base import DeviceError
 from haselab.panel.columns import SIGNALS, LiveReader, LiveWriter
 
 RATE_HZ, BLOCK = 200e3, 2000
@@ -103,3 +106,19 @@ def test_a_ring_that_has_wrapped_around_shows_its_newest_part(tmp_path: Path) ->
         early = reader.monitors(0.0, 2250.0, 4000)  # no coarser level reaches back: 250 samples
         assert early.start_s > 200.0
         reader.close()
+
+
+def test_the_space_is_reserved_before_the_bench_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else memory that is full ends the bench process by SIGBUS, in the middle of a run."""
+    with LiveWriter(tmp_path / "live", RATE_HZ, BLOCK, (1.0, 1.0)):
+        found = (tmp_path / "live").stat()
+        assert 512 * found.st_blocks >= found.st_size
+
+    def full(*given: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(DeviceError, match=r"No space left on device.*Free at least \d+ MB"):
+        LiveWriter(tmp_path / "other", RATE_HZ, BLOCK, (1.0, 1.0))

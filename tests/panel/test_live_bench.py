@@ -1,16 +1,19 @@
 """The bench of the panel in this process, on the twin."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from haselab.api.design import Actuator
 from haselab.base import SafetyError
 from haselab.panel import study_player
-from haselab.panel.columns import LiveWriter
+from haselab.panel.columns import LiveReader, LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import LiveBench
 from haselab.panel.pages.study_job import StudyJob
@@ -144,6 +147,49 @@ def test_a_command_is_carried_out_before_the_next_block(tmp_path: Path) -> None:
         allowed.release(100)  # also those of the end
         stepping.join(WAIT_S)
         live.close()
+
+
+def test_a_picture_that_cannot_be_saved_ends_no_run(tmp_path: Path) -> None:
+    rig = guard(make_twin(twin_of_reading("hz"), 1))
+    about = rig.description
+    with LiveWriter(tmp_path / "live", about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
+        live = LiveBench(rig, writer, picture=tmp_path / "full" / "camera.jpg")
+        number = live.do("request", "page", {})["number"]
+        live.do("arm", "page", {"number": number, "limit_v": 1.5})
+        taken, take = [], rig.camera.take
+        rig.camera.take = lambda: taken.append(take()) or taken[-1]  # type: ignore[method-assign]
+        while not any(frames is not None and len(frames.time_s) for frames in taken):
+            live.do("lease", "page", {})
+            live.step()
+        assert live.state.stage == "running" and live.state.mode == "drive"
+        live.close()
+
+
+@pytest.mark.parametrize(
+    ("range_f", "is_shown"), [((4.96e-10, 9.01e-10), True), ((8e-10, 9.01e-10), False)]
+)
+def test_no_strain_is_shown_where_no_loop_would_use_the_map(
+    tmp_path: Path, actuator_file: Path, range_f: tuple[float, float], is_shown: bool
+) -> None:
+    """At 0 V, the capacitance of the twin is 4.5e-10 F."""
+    loop = Actuator.load(actuator_file).loop()
+    loop = replace(loop, strain_map=replace(loop.strain_map, range_f=range_f))
+    rig = guard(make_twin(twin_of_reading("hz"), 1))
+    about, path = rig.description, tmp_path / "live"
+    with LiveWriter(path, about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
+        live = LiveBench(rig, writer, lambda: loop)
+        number = live.do("request", "page", {})["number"]
+        live.do("arm", "page", {"number": number, "limit_v": 1.5})
+        for _ in range(20):
+            live.do("lease", "page", {})
+            live.step()
+        reader = LiveReader(path)
+        _, _, capacitance_f, strain, _ = reader.signals(0.0, reader.end_s, 10_000).high[-1]
+        reader.close()
+        live.close()
+    low_f, high_f = loop.strain_map.usable_f
+    assert bool(low_f <= capacitance_f <= high_f) is is_shown
+    assert (not math.isnan(strain)) is is_shown
 
 
 # Calls in which a bench can be while somebody presses STOP.

@@ -1,6 +1,7 @@
 """The panel's page in Chromium: STOP, stale data, keyboard, zoom, size and accessibility."""
 
 import gzip
+import json
 import os
 import re
 import signal
@@ -60,7 +61,7 @@ def arm(page: Page, limit_v: str = "1.5") -> None:
 def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
     arm(page)
     page.get_by_label("Drive, typed").fill("1")
-    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
     expect(page.locator("header")).to_contain_text(
         re.compile(r"running, 1\.000 V"), timeout=WAIT_MS
     )
@@ -79,6 +80,51 @@ def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
     page.get_by_label("The cause has been removed.").check()
     page.get_by_role("button", name="Arm", exact=True).click()
     expect(page.get_by_text("Armed by this page")).to_be_visible(timeout=WAIT_MS)
+
+
+def test_a_typed_drive_needs_enter_and_a_refused_one_is_not_shown(page: Page) -> None:
+    """A press on Disarm takes the focus from the field; it must not put out what was typed."""
+    arm(page)
+    box = page.get_by_label("Drive, typed")
+    box.fill("1")
+    page.keyboard.press("Tab")
+    expect(box).to_have_value("0")
+    box.fill("1.9")
+    box.press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("armed for 0 to 1.5 V", timeout=WAIT_MS)
+    expect(box).to_have_value("0")
+    box.fill("0.5")
+    box.press("Enter")
+    expect(page.locator("header")).to_contain_text(
+        re.compile(r"running, 0\.500 V"), timeout=WAIT_MS
+    )
+
+
+def test_an_old_picture_has_no_reason_that_is_not_true(page: Page) -> None:
+    old = {"x-age-s": "5", "x-fiducials": '{"size": [1, 1], "points": []}'}
+    page.route("**/camera", lambda route: route.fulfill(status=200, headers=old, body=b""))
+    arm(page)
+    text = page.get_by_text("OLD PICTURE.")
+    expect(text).to_have_text("OLD PICTURE. No new picture has arrived.", timeout=WAIT_MS)
+    page.get_by_role("button", name="Disarm").click()
+    expect(text).to_contain_text("only films while the bench is armed", timeout=WAIT_MS)
+
+
+def test_recordings_have_the_local_time_of_their_folders(browser: Browser, tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "session.h5").touch()
+    manifest = {"format": "haselab manifest 1", "state": "SEALED", "ended": "complete"}
+    manifest["opened"] = "2026-01-31T20:30:00.5+00:00"
+    (tmp_path / "a" / "manifest.json").write_text(json.dumps(manifest))
+    found = started("--runs", str(tmp_path))
+    try:
+        with browser.new_context(timezone_id="Asia/Tokyo") as context:
+            page = context.new_page()
+            page.goto(found.address)
+            page.get_by_role("button", name="Studies").click(timeout=WAIT_MS)
+            expect(page.get_by_text("2026-02-01 05:30:00")).to_be_visible(timeout=WAIT_MS)
+    finally:
+        ended(found)
 
 
 def test_every_task_is_possible_by_keyboard(page: Page) -> None:

@@ -211,8 +211,8 @@ def test_a_foreign_page_is_refused(
 
 @pytest.mark.parametrize(
     "changes",
-    [{"origin": "http://evil.example"}, {"token": "guess"}, {"token": ""}],
-    ids=["origin", "wrong token", "no token"],
+    [{"origin": "http://evil.example"}, {"token": "guess"}, {"token": ""}, {"token": "\ud800"}],
+    ids=["origin", "wrong token", "no token", "half a character"],
 )
 def test_a_socket_without_origin_or_token_is_refused(
     shared_panel: RunningPanel, changes: dict[str, str]

@@ -273,6 +273,7 @@ def test_the_doctor_of_the_panel_says_what_haselab_doctor_says(shared_panel: Run
 def test_studies_of_the_folder_are_listed_and_other_files_are_not(files: PanelFiles) -> None:
     Path("broken.toml").write_text("name = [")
     Path("other.toml").write_text("a = 1")
+    os.mkfifo("pipe.toml")  # to read it would never end
     names = [one["name"] for one in available(files)["studies"]]
     assert names == ["reference study", "triangle.toml"]
 
@@ -282,6 +283,9 @@ def test_some_experiments_of_a_study_keep_their_settings(files: PanelFiles) -> N
     part = chosen_study(files, {"study": "reference study", "experiments": ["triangle"]})
     assert part.triangle == whole.triangle and not part.has("chirp")
     assert not part.is_reference
+    for odd in (True, 0, "", "triangle", {}):  # which are not all experiments
+        with pytest.raises(InputError, match="must be a list of names"):
+            chosen_study(files, {"study": "reference study", "experiments": odd})
 
 
 def test_a_study_beyond_the_bench_is_found_by_the_check(files: PanelFiles) -> None:
@@ -315,6 +319,13 @@ def test_the_difference_of_two_recordings_is_in_deviations_of_both(files: PanelF
     assert rows["x"]["deviations"] == pytest.approx(3.0)  # 1.5 over hypot(0.3, 0.4)
     assert rows["gone"]["second"] is None and rows["new"]["first"] is None
     assert rows["exact"]["deviations"] is None
+    in_mv = (files.runs / "b" / "results.json").read_text().replace('"V"', '"mV"')
+    (files.runs / "b" / "results.json").write_text(in_mv)
+    both = [
+        row for row in compare(files, {"first": "a", "second": "b"})["rows"] if row["id"] == "x"
+    ]
+    assert [row["unit"] for row in both] == ["V", "mV"], "numbers of two units are not compared"
+    assert all(row["deviations"] is None for row in both)
     (files.runs / "b" / "results.json").write_text("{}")
     with pytest.raises(InputError, match="b has no results"):
         compare(files, {"first": "a", "second": "b"})

@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import DeviceError
+
 __all__ = ["SIGNALS", "Columns", "LiveReader", "LiveWriter"]
 
 # of each block, in SI units
@@ -60,7 +62,7 @@ class _Memory:
         file = os.open(path, flags, 0o600)
         try:
             if create:
-                os.ftruncate(file, size)
+                _reserve(file, size, path.parent.parent)
             self.map = mmap.mmap(file, size)
         finally:
             os.close(file)
@@ -99,6 +101,8 @@ class LiveWriter:
         rate_hz: samples a second.
         block_samples: of each channel in a block.
         scales: shown unit per code of the voltage and of the current channel.
+    Raises:
+        DeviceError: There is not enough space in the folder.
     """
 
     def __init__(
@@ -287,6 +291,23 @@ class LiveReader:
         parts = rows.reshape(-1, per, len(SIGNALS))
         low, high = np.fmin.reduce(parts, axis=1), np.fmax.reduce(parts, axis=1)
         return Columns(zero_s + begin * block_s, per * block_s, low, high)
+
+
+def _reserve(file: int, size: int, folder: Path) -> None:
+    """Reserve the space of a file: without it, a write to full memory ends the process by SIGBUS.
+
+    Raises:
+        DeviceError: There is not enough space.
+    """
+    try:
+        os.ftruncate(file, size)
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file, 0, size)
+    except OSError as error:
+        raise DeviceError(
+            f"There is no space for the live signals ({error.strerror}). Free at least "
+            f"{-(-size // 1_000_000)} MB in {folder}."
+        ) from None
 
 
 def _copied(ring: NDArray[Any], begin: int, end: int) -> NDArray[Any]:

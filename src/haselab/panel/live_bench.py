@@ -516,8 +516,10 @@ class LiveBench:
         capacitance_f, _, valid = self._lockin.step(codes)
         sensed_f = capacitance_f if valid and self._holder else math.nan
         strain = math.nan
-        if self._loop is not None and not math.isnan(sensed_f):
-            strain = float(self._loop.strain_map.strain(sensed_f))
+        if self._loop is not None:
+            low_f, high_f = self._loop.strain_map.usable_f
+            if low_f <= sensed_f <= high_f:  # as in the loop
+                strain = float(self._loop.strain_map.strain(sensed_f))
         seen_v = float(codes[self._settled :, 0].mean()) * about.volt_per_code
         residual_v = seen_v / about.monitor_v_per_drive_v - self._rig.present_drive_v
         reference = math.nan if self._reference is None else self._reference

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -31,13 +32,16 @@ class StudyEndedError(HaselabError):
 def save_last(frames: Frames, path: Path) -> None:
     """Save the last frame as a JPEG file, which a reader never sees half-written.
 
+    Without space for it, the page keeps the picture before: no run ends for a picture.
+
     Args:
         frames: at least one.
         path: of the file.
     """
     new = path.with_suffix(".new")
-    Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
-    new.replace(path)
+    with contextlib.suppress(OSError):
+        Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
+        new.replace(path)
 
 
 class FilmedCamera:

@@ -199,12 +199,20 @@ def compare(files: PanelFiles, values: JsonObject) -> JsonObject:
         values: `first` and `second`, names of recordings.
     Returns:
         `rows`: id, name, unit, both values with their intervals, and the difference in standard
-        deviations of both together; null where a recording has no such row or no deviation.
+        deviations of both together; null where a recording has no such row or no deviation. A row
+        with two units is two rows.
     Raises:
         InputError: there is no such recording, or one has no results.
     """
     first, second = (_results(files, values.get(which)) for which in ("first", "second"))
-    return {"rows": [_row(key, first.get(key), second.get(key)) for key in {**first, **second}]}
+    rows = []
+    for key in {**first, **second}:
+        one, other = first.get(key), second.get(key)
+        if one and other and one["unit"] != other["unit"]:  # of two versions: not comparable
+            rows += [_row(key, one, None), _row(key, None, other)]
+        else:
+            rows.append(_row(key, one, other))
+    return {"rows": rows}
 
 
 def _results(files: PanelFiles, name: object) -> dict[str, Any]:

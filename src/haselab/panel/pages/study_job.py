@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -107,7 +107,8 @@ def _study_files(files: PanelFiles) -> list[Path]:
     found = []
     for path in places:
         with contextlib.suppress(OSError):  # a link to nothing
-            if path.resolve() not in others and path.stat().st_size <= _MOST_BYTES:
+            small = path.is_file() and path.stat().st_size <= _MOST_BYTES  # and no pipe
+            if small and path.resolve() not in others:
                 found.append(path)
     return [path for path in found if not path.name.startswith(".")]
 
@@ -165,8 +166,10 @@ def chosen_study(files: PanelFiles, values: JsonObject) -> Study:
 def _reduced(study: Study, wanted: object) -> Study:
     """The study with some of its experiments; what is not played is kept, such as [control]."""
     played = {str(one["table"]): one for one in _experiments(study)}
-    if not isinstance(wanted, Sequence) or isinstance(wanted, str):
+    if wanted is None:
         return study
+    if not isinstance(wanted, list):
+        raise InputError(f"The experiments are {shown(wanted)}, but they must be a list of names.")
     unknown = [one for one in wanted if not isinstance(one, str) or one not in played]
     if unknown or not wanted:
         fault = f"The study has no experiment {shown(unknown[0])}" if unknown else "None is chosen"

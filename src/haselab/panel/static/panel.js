@@ -39,18 +39,18 @@ function Slider({ name, unit, low, high, step, value, send, about }) {
   const [typed, type] = useState(null); // while it is being typed
   const [sent, setSent] = useState(null); // until the bench has it
   useEffect(() => setSent(null), [value]);
-  const put = (text) => { setSent(text); send(Number(text)); };
+  const put = (text) => { setSent(text); send(Number(text)).then((found) => { if (found.error) setSent(null); }); };
   const now = sent ?? String(Number(value.toPrecision(6)));
   const commit = () => { if (typed !== null && typed !== "") put(typed); type(null); };
   return html`<label>${name}, in ${unit}${about ? `: ${about}` : ""}
     <input type="range" min=${low} max=${high} step=${step} value=${now} onInput=${(e) => put(e.target.value)} /></label>
-    <label>${name}, typed, in ${unit}
+    <label>${name}, typed, in ${unit} (press Enter)
     <input type="number" min=${low} max=${high} step="any" value=${typed ?? now} onInput=${(e) => type(e.target.value)}
-      onBlur=${commit} onKeyDown=${(e) => e.key === "Enter" && commit()} /></label>`;
+      onBlur=${() => type(null)} onKeyDown=${(e) => e.key === "Enter" && commit()} /></label>`;
 }
 
 function Live({ state, say }) {
-  const ask = (what, values) => link.ask(what, values).then((found) => say(found.error || ""));
+  const ask = (what, values) => link.ask(what, values).then((found) => { say(found.error || ""); return found; });
   const low = Math.max(state.low_v, -state.limit_v);
   if (state.mode === "study") return html`<${Playing} state=${state} link=${link} say=${say} />`;
   return html`
@@ -69,7 +69,7 @@ function Live({ state, say }) {
     </div>`;
 }
 
-function Camera() {
+function Camera({ filming }) {
   const [seen, see] = useState({ url: "", age_s: null, size: [1, 1], points: [] });
   useEffect(() => {
     let url = "";
@@ -93,7 +93,7 @@ function Camera() {
     ${seen.url ? html`<div class=${`frame seen ${old ? "old" : ""}`}><img src=${seen.url} alt="Actuator in the last frame of the camera" />
         <svg viewBox=${`-0.5 -0.5 ${size[0]} ${size[1]}`} aria-hidden="true">${points.map(([x, y, x0, y0]) => ["halo", "mark"].map((layer) => html`<g class=${layer}>
           <circle cx=${x} cy=${y} r=${size[1] / 50} /><line x1=${x0} y1=${y0} x2=${x} y2=${y} /></g>`))}</svg></div>
-      <p class=${old ? "error" : ""}>${old ? "OLD PICTURE. The camera only films while the bench is armed." : "5 frames/s"}</p>
+      <p class=${old ? "error" : ""}>${old ? `OLD PICTURE. ${filming ? "No new picture has arrived." : "The camera only films while the bench is armed."}` : "5 frames/s"}</p>
       <p>${points.length ? `${points.length} fiducials found. The largest motion since the first picture is ${moved.toFixed(1)} px.` : "The fiducials are not found in this picture."}</p>`
       : html`<p>No picture. The camera starts when the bench is armed.</p>`}</div>`;
 }
@@ -164,7 +164,7 @@ function Panel() {
               ${state.mode === "study" && html`<p>It plays a study.</p><${Progress} state=${state} />`}`
             : html`<${Arming} state=${state} link=${link} say=${say} />`}
         </div>
-        <${Camera} />
+        <${Camera} filming=${live} />
       </section>
     </div>`;
 }

@@ -3,6 +3,7 @@ import { html, useState, useEffect } from "/static/vendor/htm-preact.js";
 import { Arming, Playing, Progress, kilo } from "/static/bench.js";
 
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
+const local = (time) => (time ? new Date(time).toLocaleString("sv-SE") : ""); // as in the names of the folders
 const when = (s) => (s === null ? "unknown" : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
 
 let remembered = null; // the choice, while another page of the panel is shown
@@ -99,7 +100,7 @@ function Recordings({ link, state }) {
   const keep = (name, text) => link.request("note", { name, text }).then((answer) => say(answer.error || ""));
   const wanted = search.toLowerCase().split(/\s+/).filter(Boolean);
   const shown = found.recordings.filter((one) => {
-    const text = `${one.name} ${one.study} ${one.opened} ${one.state} ${one.note}`.toLowerCase();
+    const text = `${one.name} ${one.study} ${local(one.opened)} ${one.state} ${one.note}`.toLowerCase();
     return wanted.every((word) => text.includes(word));
   });
   const toggle = (name, on) => mark(on ? [...marked, name].slice(-2) : marked.filter((one) => one !== name));
@@ -112,7 +113,7 @@ function Recordings({ link, state }) {
     <table><thead><tr><th scope="col">Mark</th><th scope="col">Recording</th><th scope="col">Study</th><th scope="col">Ended</th><th scope="col">Note</th><th scope="col">Results</th></tr></thead>
     <tbody>${shown.map((one) => html`<tr key=${one.name}>
       <td><input type="checkbox" aria-label=${`Mark ${one.name}`} checked=${marked.includes(one.name)} onChange=${(e) => toggle(one.name, e.target.checked)} /></td>
-      <td>${one.name}<br /><small>${one.opened.slice(0, 19).replace("T", " ")}</small></td><td>${one.study}</td><td>${one.name === state?.recording ? "being recorded" : one.state}</td>
+      <td>${one.name}<br /><small>${local(one.opened)}</small></td><td>${one.study}</td><td>${one.name === state?.recording ? "being recorded" : one.state}</td>
       <td><textarea aria-label=${`Note about ${one.name}`} rows="2" defaultValue=${one.note} onBlur=${(e) => e.target.value !== one.note && keep(one.name, e.target.value)}></textarea></td>
       <td>${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
         <button type="button" disabled=${one.analysing || one.open} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button>

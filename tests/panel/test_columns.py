@@ -93,6 +93,36 @@ def test_signals_skip_missing_values_and_end_at_a_gap(tmp_path: Path) -> None:
         reader.close()
 
 
+@pytest.mark.parametrize("missing", [1, 3, 150])
+def test_what_was_before_a_short_gap_is_shown_at_its_time(tmp_path: Path, missing: int) -> None:
+    """0 V is read back with blocks that no page sees: what led to a STOP must not vanish."""
+    codes, late_s = blocks(40), 0.3 * BLOCK_S
+    with LiveWriter(tmp_path / "live", RATE_HZ, BLOCK, (1.0, 1.0)) as writer:
+        reader, end_s = LiveReader(tmp_path / "live"), 0.0
+        for k in range(40):
+            end_s = (k + 1) * BLOCK_S + (missing * BLOCK_S + late_s if k >= 20 else 0.0)
+            writer.append(codes[k], end_s, (float(k), *NOTHING[1:]))
+        assert math.isnan(reader.gap_s) and reader.end_s == pytest.approx(end_s)
+        for most in (40 * BLOCK * 2, (40 + missing) * 100, 40 + missing):  # by sample, finer, block
+            seen = reader.monitors(0.0, end_s, most)
+            time_s = seen.start_s + (np.arange(len(seen.low)) + 0.5) * seen.step_s - late_s
+            known = ~np.isnan(seen.low[:, 0])
+            after_s = (20 + missing) * BLOCK_S
+            inside = (time_s > 20 * BLOCK_S + seen.step_s) & (time_s < after_s - seen.step_s)
+            assert not known[inside].any(), "a block that nobody saw has no value"
+            for part, chosen in (
+                (codes[:20], time_s < 20 * BLOCK_S), (codes[20:], time_s > after_s)
+            ):  # fmt: skip
+                assert known[chosen].all()
+                assert np.nanmax(seen.high[chosen, 0]) <= part[..., 0].max()
+                assert np.nanmin(seen.low[chosen, 1]) >= part[..., 1].min()
+            assert np.nanmax(seen.high[:, 0]) == codes[..., 0].max()
+        drive = reader.signals(0.0, end_s, 1000).high[:, 0]
+        assert drive[~np.isnan(drive)].tolist() == list(range(40))
+        assert np.isnan(drive).sum() == missing
+        reader.close()
+
+
 def test_a_ring_that_has_wrapped_around_shows_its_newest_part(tmp_path: Path) -> None:
     with LiveWriter(tmp_path / "live", 1000.0, 250, (1.0, 1.0)) as writer:
         codes = np.zeros((250, 2), np.int16)

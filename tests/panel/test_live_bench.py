@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from haselab.api.design import Actuator
@@ -162,6 +163,29 @@ def test_a_picture_that_cannot_be_saved_ends_no_run(tmp_path: Path) -> None:
             live.do("lease", "page", {})
             live.step()
         assert live.state.stage == "running" and live.state.mode == "drive"
+        live.close()
+
+
+@pytest.mark.parametrize("how", ["disarm", "stop"])
+def test_what_led_to_zero_is_still_shown(tmp_path: Path, how: str) -> None:
+    rig = guard(make_twin(twin_of_reading("hz"), 1))
+    about, path = rig.description, tmp_path / "live"
+    with LiveWriter(path, about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
+        live = LiveBench(rig, writer)
+        number = live.do("request", "page", {})["number"]
+        live.do("arm", "page", {"number": number, "limit_v": 1.5})
+        live.do("drive", "page", {"value_v": 1.0})
+        while live.state.drive_v < 1.0:
+            live.do("lease", "page", {})
+            live.step()
+        live.do("disarm", "page", {}) if how == "disarm" else live.stop("STOP was pressed")
+        for _ in range(3):
+            live.step()
+        reader = LiveReader(path)
+        drive_v = reader.signals(0.0, reader.end_s, 10_000).high[:, 0]
+        assert math.isnan(reader.gap_s)
+        assert drive_v[-1] == 0.0 and np.nanmax(drive_v) == pytest.approx(1.0)
+        reader.close()
         live.close()
 
 

@@ -3,12 +3,13 @@
 The monitors are kept at several resolutions. A column of a coarser level holds the smallest and the
 largest sample of its interval, so a spike of one sample is visible at every zoom. A reader copies
 columns and then checks the counter again: columns that the writer has overwritten meanwhile are
-left out.
+left out. Blocks that nobody saw, such as those with which 0 V is read back, are missing.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import mmap
 import os
 import struct
@@ -30,6 +31,7 @@ _KEPT = (2_000_000, 400_000, 300_000, 120_000)  # columns: 10 s, 40 s, 5 min, 20
 _BLOCKS = 120_000  # rows of the signals
 _HEADER, _ABOUT = 4096, 64  # size of the header, place of its description
 _COUNTERS = struct.Struct("<qq")  # blocks so far; block after the last gap
+_BRIDGED_S = 2.0  # longest time without a block after which earlier data are still shown
 _MARGIN = 4  # blocks: a reader keeps away from the columns that are overwritten next
 
 
@@ -56,7 +58,8 @@ class _Memory:
         shapes = [
             (kept, 1 if factor == 1 else 2, 2) for factor, kept in zip(_FACTORS, _KEPT, strict=True)
         ]
-        rows = (_BLOCKS, 2 + len(SIGNALS))  # time, signals, clock of the computer
+        # time, signals, 1 if it was read or 0 if it is missing, clock of the computer
+        rows = (_BLOCKS, 3 + len(SIGNALS))
         size = _HEADER + sum(2 * int(np.prod(shape)) for shape in shapes) + 8 * int(np.prod(rows))
         flags = os.O_RDWR | (os.O_CREAT | os.O_EXCL if create else 0)
         file = os.open(path, flags, 0o600)
@@ -134,13 +137,22 @@ class LiveWriter:
 
         Args:
             codes: of both monitors, shape `(block_samples, 2)`.
-            time_s: at the end of the block; after a gap, earlier blocks are not shown any more.
+            time_s: at the end of the block. Blocks that are missing before it are counted; if
+                they last longer than 2 s, earlier blocks are not shown any more.
             values: of `SIGNALS`; NaN: there is none.
         """
         memory = self._memory
         count, first = memory.counters
-        if not abs(time_s - self._last_s - self._block_s) < 0.5 * self._block_s:
+        missing = (time_s - self._last_s) / self._block_s - 1.0
+        if not -0.5 < missing <= _BRIDGED_S / self._block_s:
             first = count
+        else:
+            nothing = (math.nan,) * len(values)
+            for k in range(round(missing)):
+                at_s = self._last_s + (k + 1) * self._block_s
+                memory.rows[count % _BLOCKS] = (at_s, *nothing, 0.0, time.monotonic())
+                count += 1
+                memory.counters = (count, first)
         for k in self._levels:
             columns, ring = len(codes) // _FACTORS[k], memory.monitors[k]
             start = count * columns % len(ring)
@@ -151,7 +163,7 @@ class LiveWriter:
                 parts = codes.reshape(columns, _FACTORS[k], 2)
                 np.minimum.reduce(parts, axis=1, out=into[:, 0])
                 np.maximum.reduce(parts, axis=1, out=into[:, 1])
-        memory.rows[count % _BLOCKS] = (time_s, *values, time.monotonic())
+        memory.rows[count % _BLOCKS] = (time_s, *values, 1.0, time.monotonic())
         memory.counters = (count + 1, first)
         self._last_s = time_s
 
@@ -213,7 +225,8 @@ class LiveReader:
             to_s: last time.
             most: largest number of columns.
         Returns:
-            Values in the unit of the writer's scales; channels are voltage and current.
+            Values in the unit of the writer's scales, NaN where blocks are missing; channels are
+            voltage and current.
         """
         wanted = max((to_s - from_s) / max(most, 1) * self._rate_hz, 1.0)  # samples of a column
         usable = [k for k in self._levels if _FACTORS[k] <= wanted] or self._levels[:1]
@@ -231,25 +244,34 @@ class LiveReader:
         if lost > 0:
             lost += -lost % per
             begin, copy = begin + lost, copy[lost:]
-        parts = copy.reshape(-1, per, *ring.shape[1:])
-        step_s = factor / self._rate_hz
+        low, high = copy[:, 0], copy[:, -1]
+        step_s, block = factor / self._rate_hz, self._block // factor
+        ends = begin // block, -(-(begin + len(copy)) // block)  # blocks
+        missing = _copied(self._memory.rows[:, -2], *ends) == 0.0
+        if missing.any():
+            those = np.repeat(missing, block)[begin - ends[0] * block :][: len(copy), np.newaxis]
+            low, high = np.where(those, 32767, low), np.where(those, -32768, high)
+        low = low.reshape(-1, per, 2).min(axis=1, initial=32767)
+        high = high.reshape(-1, per, 2).max(axis=1, initial=-32768)
+        known = low <= high
         return Columns(
             zero_s + begin * step_s,
             per * step_s,
-            parts[:, :, 0].min(axis=1, initial=32767) * self._scales,
-            parts[:, :, -1].max(axis=1, initial=-32768) * self._scales,
+            np.where(known, low * self._scales, math.nan),
+            np.where(known, high * self._scales, math.nan),
         )
 
     def _first(self, level: int) -> int:
         """First column of a level that is still valid."""
         count, first = self._memory.counters
         columns = self._block // _FACTORS[level]
-        kept = len(self._memory.monitors[level])
+        kept = min(len(self._memory.monitors[level]), _BLOCKS * columns)
         return max((count + _MARGIN) * columns - kept, first * columns)
 
     def _oldest_s(self, level: int) -> float:
         count, first = self._memory.counters
-        kept = len(self._memory.monitors[level]) * _FACTORS[level] // self._block - _MARGIN
+        kept = len(self._memory.monitors[level]) * _FACTORS[level] // self._block
+        kept = min(kept, _BLOCKS) - _MARGIN
         return self.end_s - min(count - first, kept) * self._block / self._rate_hz
 
     def _span(self, level: int, from_s: float, to_s: float) -> tuple[int, int, float]:
@@ -287,7 +309,7 @@ class LiveReader:
         per = max(-(-(end - begin) // max(most, 1)), 1)
         begin += -begin % per
         end = begin + max(end - begin, 0) // per * per
-        rows = _copied(self._memory.rows[:, 1:-1], begin, end)
+        rows = _copied(self._memory.rows[:, 1:-2], begin, end)
         parts = rows.reshape(-1, per, len(SIGNALS))
         low, high = np.fmin.reduce(parts, axis=1), np.fmax.reduce(parts, axis=1)
         return Columns(zero_s + begin * block_s, per * block_s, low, high)

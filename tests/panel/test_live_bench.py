@@ -1,6 +1,8 @@
 """The bench of the panel in this process, on the twin."""
 
+import errno
 import math
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -148,6 +150,22 @@ def test_a_command_is_carried_out_before_the_next_block(tmp_path: Path) -> None:
         allowed.release(100)  # also those of the end
         stepping.join(WAIT_S)
         live.close()
+
+
+def test_a_folder_that_goes_while_a_study_is_played_trips_the_bench(
+    bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recorder raises this error when it looks how much space is left."""
+    live, rig = bench
+
+    def gone(*given: Any) -> None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "out")
+
+    monkeypatch.setattr(live._player, "play", gone)
+    live.step()
+    assert live.state.stage == "tripped" and live.state.mode == "idle"
+    assert "The recording cannot be written (No such file" in live.state.reason
+    assert rig.bench.requested_v == 0.0 and not rig.safety.live
 
 
 def test_a_picture_that_cannot_be_saved_ends_no_run(tmp_path: Path) -> None:

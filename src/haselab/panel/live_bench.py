@@ -450,6 +450,11 @@ class LiveBench:
         except HaselabError as error:
             kept = f" The data recorded so far are in {folder}." if folder.is_dir() else ""
             reason = f"{error}{kept}"
+        except OSError as error:  # a disk or a folder that has gone
+            reason = (
+                f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"
+            )
+            self._rig.safety.trip(reason)
         finally:
             over.set()
             self._rig.safety.record_with(lambda what: None)  # the recording is closed

@@ -70,14 +70,16 @@ fmu_status fmu_settle(fmu_bench *b)
     fmu_apply(b);
     b->now->carrier_v = b->now->carrier_hz = 0.0;
     fmu_set_carrier(b);
-    if (b->p.law.voltages > 1 && fabs(b->p.gain) * (b->about.drive_high_v + 1.0) >
-                                     b->about.highest_law_v * (1.0 + 1e-9)) {
+    if (b->p.law.voltages > 1 &&
+        b->p.gain * (fmax(b->about.drive_high_v, -b->about.drive_low_v) + 1.0) >
+            b->about.highest_law_v * (1.0 + 1e-9)) {
         return fmu_fail(b, "The gain of the amplifier is %g V/V, but this FMU knows the actuator up to "
                        "%g V. Export it again from a TWIN.toml with this gain.",
                     b->p.gain, b->about.highest_law_v);
     }
     step_s = TWIN_SUB * b->p.sample_s;
     memset(s, 0, sizeof *s);
+    s->since_limited = TWIN_LONG;
     twin_seed(s, (uint64_t)b->now->seed);
     motion_rest(&b->p.law, &b->p.motion, &s->motion, b->p.motion.free_length_m,
                 b->p.motion.free_length_m);
@@ -97,16 +99,35 @@ fmu_status fmu_settle(fmu_bench *b)
     return FMU_OK;
 }
 
+fmu_status fmu_initialise(fmu_bench *b)
+{
+    fmu_status status;
+    if (!b->now->started) {
+        return fmu_fail(b, "The initialisation was not entered. Enter it before it is exited.");
+    }
+    status = fmu_settle(b);
+    b->now->initialised = status == FMU_OK;
+    return status;
+}
+
 /* ---- time ---- */
 
 fmu_status fmu_start(fmu_bench *b, double time_s)
 {
+    if (b->now->initialised) {
+        return fmu_fail(b, "The simulation has been initialised before. Reset it first.");
+    }
     if (!isfinite(time_s)) {
         return fmu_fail(b, "The start time is %g s. State a finite time.", time_s);
     }
     b->now->start_s = time_s;
     b->now->started = 1;
     return FMU_OK;
+}
+
+fmu_status fmu_enter(fmu_bench *b)
+{
+    return fmu_start(b, b->now->started ? b->now->start_s : 0.0);
 }
 
 double fmu_time(const fmu_bench *b)
@@ -181,6 +202,9 @@ fmu_status fmu_step(fmu_bench *b, double time_s, double step_s)
     const double end = floor((time_s - m->start_s + step_s) / dt + 0.5);
     fmu_status status;
     int64_t from, until;
+    if (!m->initialised) {
+        return fmu_fail(b, "A step was made before the initialisation. Initialise the FMU first.");
+    }
     if (m->failed) {
         return fmu_fail(b, "The simulation has failed before. Reset it, or restore an earlier state.");
     }
@@ -197,20 +221,25 @@ fmu_status fmu_step(fmu_bench *b, double time_s, double step_s)
         return status;
     }
     set_drive(b);
-    m->twin.field_v_m = 0.0;
     from = m->steps * TWIN_SUB;
     until = (int64_t)end * TWIN_SUB;
+    if (from < until) {
+        m->twin.field_v_m = 0.0;
+    }
     while (from < until) {
         double after_v;
-        int32_t switch_at;
+        int32_t switch_at, changed; /* samples since the last change */
         const int32_t n = next_part(b, from, until, &after_v, &switch_at);
         const double load_n = b->load_n + m->input[FMU_FORCE_N];
-        const int changed = after_v != m->drive_v;
         twin_acquire(&b->p, &m->twin, m->drive_v, after_v, switch_at, load_n, n, b->codes,
                      b->lengths);
         fmu_keep_readings(b, n);
-        if (changed) {
-            const int64_t fresh = n - switch_at - fmu_settling_samples(b);
+        changed = after_v != m->drive_v ? n - switch_at : TWIN_LONG;
+        if (m->twin.since_limited < changed) {
+            changed = m->twin.since_limited;
+        }
+        if (changed < TWIN_LONG) {
+            const int64_t fresh = changed - fmu_settling_samples(b);
             m->fresh = fresh < m->fresh ? fresh : m->fresh;
         }
         m->drive_v = after_v;

@@ -25,7 +25,7 @@ enum fmu_reference {
     FMU_STRAIN,
     FMU_OUTPUT_V,
     FMU_ACTUATOR_V,
-    FMU_FIELD_V_M, /* largest since the last step began */
+    FMU_FIELD_V_M, /* largest in the last step that was at least a step of the twin */
     FMU_CAPACITANCE_F,
     FMU_V_READING_V, /* last reading of each monitor */
     FMU_I_READING_V,
@@ -70,7 +70,9 @@ const char *fmu_message(const fmu_bench *b);
 
 void fmu_reset(fmu_bench *b);
 fmu_status fmu_start(fmu_bench *b, double time_s);
-fmu_status fmu_settle(fmu_bench *b); /* the mass has hung for a while; after it parameters are fixed */
+fmu_status fmu_enter(fmu_bench *b); /* the initialisation; starts at 0 s if no start was set */
+fmu_status fmu_settle(fmu_bench *b);     /* the mass has hung for a while */
+fmu_status fmu_initialise(fmu_bench *b); /* settles; after it parameters are fixed */
 fmu_status fmu_step(fmu_bench *b, double time_s, double step_s);
 double fmu_time(const fmu_bench *b);
 
@@ -84,6 +86,8 @@ fmu_status fmu_no_such(fmu_bench *b, uint32_t reference, const char *type);
 
 fmu_status fmu_remember(fmu_bench *b, fmu_memory **memory); /* NULL: a new one */
 fmu_status fmu_restore(fmu_bench *b, const fmu_memory *memory);
+/* `size` must be fmu_memory_size. */
+fmu_status fmu_serialise(fmu_bench *b, const fmu_memory *memory, void *bytes, size_t size);
 void fmu_forget(fmu_memory *memory);
 size_t fmu_memory_size(const fmu_bench *b);
 fmu_memory *fmu_memory_of(fmu_bench *b, const void *bytes, size_t size); /* NULL: another FMU's */

@@ -55,10 +55,11 @@ static int hex_digit(char c)
     return c >= 'a' && c <= 'f' ? c - 'a' + 10 : -1;
 }
 
-/* Path of a file URI, decoded in place of `path`; one without a scheme is taken as a path. */
+/* Path of a file URI, decoded into `path`; one without a scheme is a path, and is not decoded. */
 static void path_of(const char *uri, char *path)
 {
-    if (strncmp(uri, "file:", 5) == 0) {
+    const int encoded = strncmp(uri, "file:", 5) == 0;
+    if (encoded) {
         uri += 5;
         if (strncmp(uri, "//", 2) == 0) { /* file://host/path; the host is this one */
             const char *slash = strchr(uri + 2, '/');
@@ -71,7 +72,7 @@ static void path_of(const char *uri, char *path)
 #endif
     }
     while (*uri != '\0') {
-        const int high = *uri == '%' ? hex_digit(uri[1]) : -1;
+        const int high = encoded && *uri == '%' ? hex_digit(uri[1]) : -1;
         const int low = high >= 0 ? hex_digit(uri[2]) : -1;
         *path++ = low >= 0 ? (char)(16 * high + low) : *uri;
         uri += low >= 0 ? 3 : 1;
@@ -128,13 +129,12 @@ FMI_EXPORT int fmi2SetupExperiment(void *f, int tolerance_defined, double tolera
 
 FMI_EXPORT int fmi2EnterInitializationMode(void *f)
 {
-    (void)f;
-    return FMU_OK;
+    return answer(f, fmu_enter(((instance *)f)->bench));
 }
 
 FMI_EXPORT int fmi2ExitInitializationMode(void *f)
 {
-    return answer(f, fmu_settle(((instance *)f)->bench));
+    return answer(f, fmu_initialise(((instance *)f)->bench));
 }
 
 FMI_EXPORT int fmi2Terminate(void *f)
@@ -213,11 +213,7 @@ FMI_EXPORT int fmi2SerializedFMUstateSize(void *f, void *state, size_t *size)
 
 FMI_EXPORT int fmi2SerializeFMUstate(void *f, void *state, char *bytes, size_t size)
 {
-    if (size != fmu_memory_size(((instance *)f)->bench)) {
-        return FMU_ERROR;
-    }
-    memcpy(bytes, state, size);
-    return FMU_OK;
+    return answer(f, fmu_serialise(((instance *)f)->bench, state, bytes, size));
 }
 
 FMI_EXPORT int fmi2DeSerializeFMUstate(void *f, const char *bytes, size_t size, void **state)

@@ -3,7 +3,6 @@
 
 #include <stdbool.h>
 #include <stdlib.h>
-#include <string.h>
 
 typedef void (*log_message)(void *environment, int status, const char *category,
                             const char *message);
@@ -112,7 +111,7 @@ FMI_EXPORT int fmi3EnterInitializationMode(void *f, bool tolerance_defined, doub
 
 FMI_EXPORT int fmi3ExitInitializationMode(void *f)
 {
-    return answer(f, fmu_settle(((instance *)f)->bench));
+    return answer(f, fmu_initialise(((instance *)f)->bench));
 }
 
 FMI_EXPORT int fmi3Terminate(void *f)
@@ -228,11 +227,7 @@ FMI_EXPORT int fmi3SerializedFMUStateSize(void *f, void *state, size_t *size)
 
 FMI_EXPORT int fmi3SerializeFMUState(void *f, void *state, uint8_t *bytes, size_t size)
 {
-    if (size != fmu_memory_size(((instance *)f)->bench)) {
-        return FMU_ERROR;
-    }
-    memcpy(bytes, state, size);
-    return FMU_OK;
+    return answer(f, fmu_serialise(((instance *)f)->bench, state, bytes, size));
 }
 
 FMI_EXPORT int fmi3DeserializeFMUState(void *f, const uint8_t *bytes, size_t size, void **state)

@@ -41,7 +41,7 @@ struct fmu_memory {
     int32_t pending, first_pending;
     fmu_change queue[FMU_PENDING];
     double sensed_f, sensed_ohm, v_reading_v, i_reading_v;
-    int32_t sensed_valid, unused;
+    int32_t sensed_valid, initialised;
     double parameter[]; /* then the last readings of both monitors: floats of a block each */
 };
 

@@ -151,14 +151,36 @@ fmu_status fmu_remember(fmu_bench *b, fmu_memory **memory)
     return FMU_OK;
 }
 
-fmu_status fmu_restore(fmu_bench *b, const fmu_memory *memory)
+static int is_own(fmu_bench *b, const fmu_memory *memory)
 {
     if (memory == NULL || memory->owner != b->owner) {
-        return fmu_fail(b, "This is no state of this FMU. Restore one that it has given.");
+        fmu_fail(b, "This is no state of this FMU. Use one that it has given.");
+        return 0;
+    }
+    return 1;
+}
+
+fmu_status fmu_restore(fmu_bench *b, const fmu_memory *memory)
+{
+    if (!is_own(b, memory)) {
+        return FMU_ERROR;
     }
     memcpy(b->now, memory, fmu_memory_size(b));
     fmu_apply(b);
     fmu_set_carrier(b);
+    return FMU_OK;
+}
+
+fmu_status fmu_serialise(fmu_bench *b, const fmu_memory *memory, void *bytes, size_t size)
+{
+    if (!is_own(b, memory)) {
+        return FMU_ERROR;
+    }
+    if (size != fmu_memory_size(b)) {
+        return fmu_fail(b, "There are %lu bytes for a state, but it has %lu. Ask for its size.",
+                        (unsigned long)size, (unsigned long)fmu_memory_size(b));
+    }
+    memcpy(bytes, memory, size);
     return FMU_OK;
 }
 

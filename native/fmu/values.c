@@ -1,6 +1,8 @@
 /* Takes: value references. Gives: the values of an instance, and sets its inputs and parameters. */
 #include "fmu/instance.h"
 
+#include <math.h>
+
 fmu_status fmu_no_such(fmu_bench *b, uint32_t reference, const char *type)
 {
     return fmu_fail(b, "Value reference %u is no %s of this kind. See modelDescription.xml.",
@@ -45,7 +47,12 @@ fmu_status fmu_get_real(fmu_bench *b, uint32_t reference, double *value)
         return FMU_OK;
     }
     if (reference >= FMU_FIRST_OUTPUT && reference < FMU_END_OUTPUTS) {
-        const fmu_status status = b->now->started ? fmu_settle(b) : FMU_OK;
+        fmu_status status;
+        if (!b->now->started) {
+            return fmu_fail(b, "An output was read before the initialisation. Enter the "
+                           "initialisation first.");
+        }
+        status = fmu_settle(b);
         *value = output(b, reference);
         return status;
     }
@@ -71,12 +78,16 @@ fmu_status fmu_set_real(fmu_bench *b, uint32_t reference, double value)
     if (reference < FMU_FIRST_PARAMETER || k >= b->about.parameters) {
         return fmu_no_such(b, reference, "input or parameter");
     }
+    if (!isfinite(value)) {
+        return fmu_fail(b, "The parameter with value reference %u is %g. Set a finite number.",
+                        (unsigned)reference, value);
+    }
     if (!(value >= b->records[k].low && value <= b->records[k].high)) {
         return fmu_fail(b, "The parameter with value reference %u is %g, but it must be within %g to "
                        "%g. Correct it.", (unsigned)reference, value, b->records[k].low,
                     b->records[k].high);
     }
-    if (b->now->steps > 0) {
+    if (b->now->initialised) {
         return fmu_fail(b, "A parameter was set during the simulation. Set it before the "
                        "initialisation ends.");
     }
@@ -96,7 +107,7 @@ fmu_status fmu_set_integer(fmu_bench *b, uint32_t reference, int32_t value)
     if (reference != FMU_SEED) {
         return fmu_no_such(b, reference, "integer");
     }
-    if (value < 0 || b->now->steps > 0) {
+    if (value < 0 || b->now->initialised) {
         return fmu_fail(b, "The seed is %d. Set one that is not negative, before the initialisation "
                        "ends.", (int)value);
     }

@@ -298,6 +298,7 @@ typedef struct {
 static void amplify(const twin_parameters *p, twin_state *s, double largest_step, samples *x)
 {
     double v = s->amp_v, rate = s->amp_v_s;
+    int32_t since = s->since_limited;
     int j;
     x->amp_v[0] = v;
     x->amp_v_s[0] = rate;
@@ -312,12 +313,15 @@ static void amplify(const twin_parameters *p, twin_state *s, double largest_step
             v = before + step;
             rate = step / p->sample_s;
             ++s->limited;
+            since = -1;
         }
+        ++since;
         x->amp_v[j + 1] = v;
         x->amp_v_s[j + 1] = rate;
     }
     s->amp_v = v;
     s->amp_v_s = rate;
+    s->since_limited = since < TWIN_LONG ? since : TWIN_LONG;
 }
 
 /* Series R-C in samples in which the voltage follows the cubic from one output and rate of the

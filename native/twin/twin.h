@@ -11,6 +11,7 @@
 #include "motion/motion.h"
 
 #define TWIN_SUB 20
+#define TWIN_LONG (1 << 30)
 
 /* One sample of a first-order lag whose input goes in straight lines. */
 typedef struct {
@@ -55,6 +56,7 @@ typedef struct {
     int32_t broken;              /* 1 after a dielectric breakdown, until the state is made anew */
     int32_t limited;             /* samples at the current or slew limit */
     int32_t outside;             /* 1 after the length left the table of the law; then also broken */
+    int32_t since_limited;       /* samples since the last at such a limit, TWIN_LONG at most */
 } twin_state;
 
 void twin_prepare(twin_parameters *p);

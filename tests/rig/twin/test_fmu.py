@@ -1,5 +1,6 @@
 """The twin as an FMU: in lock-step with the twin itself, in importers that others wrote."""
 
+import ctypes
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -427,3 +428,120 @@ def test_the_same_twin_gives_the_same_bytes_and_a_large_seed_is_refused() -> Non
     assert twin_fmu(TwinConfig()).content == twin_fmu(TwinConfig()).content
     with pytest.raises(InputError, match="The seed is 2147483648, but an FMU takes 0 to"):
         twin_fmu(TwinConfig(), seed=2**31)
+
+
+def test_calls_before_the_initialisation_or_after_it_are_errors(
+    planar: Unpacked, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Otherwise they gave numbers: a strain of -1, or a mass that acted from the next get on."""
+
+    def fails(message: str, call: Callable[[], object]) -> None:
+        with pytest.raises(FMICallException, match="status 3"):
+            call()
+        assert message in capsys.readouterr().out
+
+    twin = planar.instance()
+    fails("An output was read before the initialisation.", lambda: twin.get("strain"))
+    fails("A step was made before the initialisation.", twin.step)
+    fails("The initialisation was not entered.", twin.fmu.exitInitializationMode)
+    twin.begin()
+    first_m = twin.get("length_m")
+    fails("A parameter was set during", lambda: twin.set_named({"load.mass_kg": 0.1}))
+    fails("The simulation has been initialised before.", lambda: twin.begin(5.0))
+    twin.time_s = 0.0
+    twin.step()
+    assert twin.get("load.mass_kg") == 0.25
+    assert twin.get("length_m") == pytest.approx(first_m, rel=1e-4)
+    for value in (np.inf, np.nan):
+        fresh = planar.instance()
+        fails("is", lambda x=value, t=fresh: t.set_named({"amplifier.slew_v_per_s": x}))
+
+
+def test_the_largest_field_stays_when_no_time_passes(planar: Unpacked) -> None:
+    twin = planar.instance()
+    twin.begin()
+    run(twin, BLOCK_S, 3, lambda t: 1.0)
+    field = twin.get("field_v_per_m")
+    assert field > 1e6
+    for step_s in (0.0, 1e-6):
+        twin.step(step_s)
+        assert twin.get("field_v_per_m") == field
+
+
+@pytest.mark.parametrize(
+    ("limit", "ever_valid"),
+    [({"slew_v_per_s": 8e6}, True), ({"slew_v_per_s": 2e6}, False),
+     ({"current_limit_a": 2e-3}, False)],
+)  # fmt: skip
+def test_what_is_sensed_at_a_limit_of_the_amplifier_is_not_valid(
+    tmp_path: Path, limit: dict[str, float], ever_valid: bool
+) -> None:
+    """The carrier of 500 V at 2 kHz needs 6.3e6 V/s and 3 mA; steps of 5 kV need more."""
+    config = validated(TwinConfig, {"amplifier": limit}, "test")
+    twin = unpacked(tmp_path, config).instance()
+    twin.set(carrier_v=CARRIER_V, carrier_hz=CARRIER_HZ)
+    twin.begin()
+    valid = 0
+    for k in range(12):
+        twin.set(drive_v=(0.3, 1.3)[k % 2])
+        capacitance = []
+        for _ in range(100):
+            twin.step(1e-4)
+            capacitance.append(twin.get("capacitance_f"))
+        if twin.flag("sensed_valid"):
+            valid += 1
+            # The mean over the window is within all that the capacitance was, and 1e-3.
+            sensed = twin.get("sensed_capacitance_f")
+            assert 0.999 * min(capacitance) < sensed < 1.001 * max(capacitance)
+    assert (valid > 0) == ever_valid
+
+
+def test_a_larger_gain_than_that_of_the_table_is_refused_with_negative_drive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = {"kind": "peano-hasel", "acquisition": {"drive_low_v": -1.4, "drive_high_v": 0.5}}
+    extracted = unpacked(tmp_path, validated(TwinConfig, data, "test"))
+    twin = extracted.instance()
+    twin.begin()
+    twin = extracted.instance()
+    twin.set_named({"amplifier.gain": 5010.0})
+    with pytest.raises(FMICallException, match="status 3"):
+        twin.begin()
+    assert "this FMU knows the actuator up to 12000 V" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("version", ["2", "3"])
+def test_the_folder_may_have_any_name(tmp_path: Path, version: str) -> None:
+    folder = tmp_path / "mit Lücke 100%41#?"
+    folder.mkdir()
+    extracted = unpacked(folder, TwinConfig(), version)
+    extracted.instance().fmu.freeInstance()
+
+
+def test_a_path_that_is_no_uri_is_not_decoded(tmp_path: Path) -> None:
+    folder = tmp_path / "100%41"
+    folder.mkdir()
+    extracted = unpacked(folder, TwinConfig(), "2").folder
+    (path,) = (path for path in (extracted / "binaries").rglob("*") if path.is_file())
+    library = ctypes.CDLL(str(path))
+    library.fmi2Instantiate.restype = ctypes.c_void_p
+    resources = str(extracted / "resources").encode()
+    found = library.fmi2Instantiate(b"twin", 1, b"", resources, None, 0, 0)
+    assert found is not None
+    library.fmi2FreeInstance(ctypes.c_void_p(found))
+
+
+def test_a_state_of_another_fmu_is_refused(tmp_path: Path, planar: Unpacked) -> None:
+    capital = "FMUState" if planar.version == "3" else "FMUstate"
+    name = "deserialize" if planar.version == "3" else "deSerialize"
+    other = unpacked(tmp_path, TwinConfig(), planar.version, seed=2).instance()
+    twin = planar.instance()
+    state = getattr(other.fmu, f"get{capital}")()
+    content = getattr(other.fmu, f"serialize{capital}")(state)
+    for call in (
+        lambda: getattr(twin.fmu, f"set{capital}")(state),
+        lambda: getattr(twin.fmu, f"serialize{capital}")(state),
+        lambda: getattr(twin.fmu, f"{name}{capital}")(content),
+    ):
+        with pytest.raises(FMICallException, match="status 3"):
+            call()

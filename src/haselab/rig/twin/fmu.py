@@ -41,22 +41,22 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # of the files in the archive: the same twin give
 # Value references and places of native/fmu/bench.h.
 _INPUTS = (
     ("drive_v", "V", 0.0, "voltage at the amplifier's input"),
-    ("force_n", "N", 0.0, "pull at the moving end, beside the weight of the mass"),
+    ("force_n", "N", 0.0, "force at the moving end in addition to the weight, positive: lengthens"),
     ("carrier_v", "V", 0.0, "amplitude of the carrier at the amplifier's input; 0: off"),
     ("carrier_hz", "Hz", 2000.0, "frequency of the carrier"),
 )
 _OUTPUTS = (
     ("length_m", "m", "length of the actuator"),
-    ("speed_m_per_s", "m/s", "its rate"),
+    ("speed_m_per_s", "m/s", "rate of the length"),
     ("strain", "", "length over free length, minus 1"),
     ("output_v", "V", "output of the amplifier"),
     ("actuator_v", "V", "voltage over the capacitor, without its series resistance"),
-    ("field_v_per_m", "V/m", "largest field since the step began"),
+    ("field_v_per_m", "V/m", "largest field during the last step"),
     ("capacitance_f", "F", "true differential capacitance"),
     ("v_reading_v", "V", "last reading of the voltage monitor"),
     ("i_reading_v", "V", "last reading of the current monitor"),
-    ("sensed_capacitance_f", "F", "of the lock-in, without a correction for stray capacitance"),
-    ("sensed_resistance_ohm", "ohm", "of the lock-in, in series"),
+    ("sensed_capacitance_f", "F", "sensed by the lock-in, with stray capacitance"),
+    ("sensed_resistance_ohm", "ohm", "series resistance, sensed by the lock-in"),
 )
 _FIRST_OUTPUT, _BREAKDOWN, _SENSED_VALID, _SEED, _TIME = 100, 200, 201, 300, 400
 _FIRST_PARAMETER, _FIRST_CONSTANT = 1000, 3000
@@ -403,9 +403,9 @@ def _variables(
         yield "Float64", about, _in(unit)
     text = "the dielectric broke down: the output stays at 0 V"
     yield "Boolean", _variable("breakdown", _BREAKDOWN, text, "output", "discrete"), {}
-    text = "whether the sensed values are of this step: two periods since the last change"
+    text = "false: the sensed values are not of this step, do not use them"
     yield "Boolean", _variable("sensed_valid", _SENSED_VALID, text, "output", "discrete"), {}
-    text = "of the monitors' noise"
+    text = "seed of the noise of the monitors"
     yield "Int32", _variable("seed", _SEED, text, "parameter", "fixed"), {
         "min": "0", "start": str(seed)}  # fmt: skip
     for k, each in enumerate(free):

@@ -206,7 +206,7 @@ fmu_status fmu_step(fmu_bench *b, double time_s, double step_s)
         return fmu_fail(b, "A step was made before the initialisation. Initialise the FMU first.");
     }
     if (m->failed) {
-        return fmu_fail(b, "The simulation has failed before. Reset it, or restore an earlier state.");
+        return fmu_fail(b, "An earlier step failed. Reset the simulation, or restore an earlier state.");
     }
     if (!(step_s >= 0.0 && isfinite(time_s) && end < 1e15)) {
         return fmu_fail(b, "The step goes from %g s for %g s. State a finite time and a step that is "

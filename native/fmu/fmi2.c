@@ -95,7 +95,7 @@ FMI_EXPORT void *fmi2Instantiate(const char *name, int type, const char *guid, c
         strncpy(f->name, name != NULL ? name : "", sizeof f->name - 1);
         path_of(uri != NULL ? uri : "", path);
         if (type != 1) {
-            strcpy(message, "This FMU is for co-simulation alone.");
+            strcpy(message, "This FMU supports co-simulation only.");
         } else {
             f->bench = fmu_new(path, message, sizeof message);
         }

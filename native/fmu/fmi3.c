@@ -42,7 +42,7 @@ FMI_EXPORT void *fmi3InstantiateModelExchange(const char *name, const char *toke
     (void)visible;
     (void)logging;
     if (log != NULL) {
-        log(environment, FMU_ERROR, "logStatusError", "This FMU is for co-simulation alone.");
+        log(environment, FMU_ERROR, "logStatusError", "This FMU supports co-simulation only.");
     }
     return NULL;
 }

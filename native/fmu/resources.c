@@ -154,7 +154,7 @@ fmu_status fmu_remember(fmu_bench *b, fmu_memory **memory)
 static int is_own(fmu_bench *b, const fmu_memory *memory)
 {
     if (memory == NULL || memory->owner != b->owner) {
-        fmu_fail(b, "This is no state of this FMU. Use one that it has given.");
+        fmu_fail(b, "The state is not of this FMU. Use a state that this FMU has returned.");
         return 0;
     }
     return 1;
@@ -177,7 +177,7 @@ fmu_status fmu_serialise(fmu_bench *b, const fmu_memory *memory, void *bytes, si
         return FMU_ERROR;
     }
     if (size != fmu_memory_size(b)) {
-        return fmu_fail(b, "There are %lu bytes for a state, but it has %lu. Ask for its size.",
+        return fmu_fail(b, "The buffer has %lu bytes, but a state has %lu. Allocate as many.",
                         (unsigned long)size, (unsigned long)fmu_memory_size(b));
     }
     memcpy(bytes, memory, size);
@@ -197,8 +197,8 @@ fmu_memory *fmu_memory_of(fmu_bench *b, const void *bytes, size_t size)
         }
     }
     if (kept == NULL) {
-        fmu_fail(b, "These %lu bytes are no state of this FMU. Restore one that it has given.",
-             (unsigned long)size);
+        fmu_fail(b, "These %lu bytes are not a state of this FMU. Use a state that this FMU has "
+                    "returned.", (unsigned long)size);
     }
     return kept;
 }

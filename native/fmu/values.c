@@ -5,8 +5,8 @@
 
 fmu_status fmu_no_such(fmu_bench *b, uint32_t reference, const char *type)
 {
-    return fmu_fail(b, "Value reference %u is no %s of this kind. See modelDescription.xml.",
-                (unsigned)reference, type);
+    return fmu_fail(b, "This FMU has no %s with value reference %u. See modelDescription.xml.", type,
+                    (unsigned)reference);
 }
 
 static double output(const fmu_bench *b, uint32_t reference)
@@ -76,16 +76,15 @@ fmu_status fmu_set_real(fmu_bench *b, uint32_t reference, double value)
         return FMU_OK;
     }
     if (reference < FMU_FIRST_PARAMETER || k >= b->about.parameters) {
-        return fmu_no_such(b, reference, "input or parameter");
+        return fmu_no_such(b, reference, "real input or parameter");
     }
     if (!isfinite(value)) {
         return fmu_fail(b, "The parameter with value reference %u is %g. Set a finite number.",
                         (unsigned)reference, value);
     }
     if (!(value >= b->records[k].low && value <= b->records[k].high)) {
-        return fmu_fail(b, "The parameter with value reference %u is %g, but it must be within %g to "
-                       "%g. Correct it.", (unsigned)reference, value, b->records[k].low,
-                    b->records[k].high);
+        return fmu_fail(b, "The parameter with value reference %u is %g. Set it within %g to %g.",
+                        (unsigned)reference, value, b->records[k].low, b->records[k].high);
     }
     if (b->now->initialised) {
         return fmu_fail(b, "A parameter was set during the simulation. Set it before the "
@@ -99,13 +98,13 @@ fmu_status fmu_set_real(fmu_bench *b, uint32_t reference, double value)
 fmu_status fmu_get_integer(fmu_bench *b, uint32_t reference, int32_t *value)
 {
     *value = b->now->seed;
-    return reference == FMU_SEED ? FMU_OK : fmu_no_such(b, reference, "integer");
+    return reference == FMU_SEED ? FMU_OK : fmu_no_such(b, reference, "32-bit integer");
 }
 
 fmu_status fmu_set_integer(fmu_bench *b, uint32_t reference, int32_t value)
 {
     if (reference != FMU_SEED) {
-        return fmu_no_such(b, reference, "integer");
+        return fmu_no_such(b, reference, "32-bit integer");
     }
     if (value < 0 || b->now->initialised) {
         return fmu_fail(b, "The seed is %d. Set one that is not negative, before the initialisation "

@@ -38,7 +38,7 @@ study: setup
 	$(BIN)/haselab reproduce --out $(OUT) --force
 
 test: setup tools
-	$(PYTEST) -m 'not slow'
+	$(PYTEST) -m 'not slow' --durations=25
 
 check: setup
 	$(PYTEST) -m unit

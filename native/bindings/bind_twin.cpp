@@ -2,11 +2,17 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
+#include <memory>
+#include <new>
 #include <stdexcept>
 #include <tuple>
+#include <utility>
+#include <vector>
 
 #include "bindings/law.h"
 #include "bindings/records.h"
@@ -18,6 +24,7 @@ extern "C" {
 namespace nb = nanobind;
 using Codes = nb::ndarray<nb::numpy, int16_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 using Lengths = nb::ndarray<nb::numpy, double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 namespace {
 
 struct Value {
@@ -63,9 +70,9 @@ class Bench {
     Bench(const nb::dict &values, nb::handle motion, double length_m, uint64_t seed, double low_m,
           double step_m, double step_v, Values elastic_n, Values gap_m, Rows capacitance_f,
           Rows pull_n_v2)
+        : memory_(zeroed()), p_(*memory_)
     {
         const Records<const motion_parameters> moving(motion);
-        std::memset(&p_, 0, sizeof p_);
         std::memset(&s_, 0, sizeof s_);
         for (const Value &value : kValues) {
             p_.*(value.member) = nb::cast<double>(values[value.name]);
@@ -129,8 +136,128 @@ class Bench {
     }
     double gap(double length_m) const { return motion_gap(&p_.law, length_m); }
 
-    twin_parameters p_;
+    // Pages of the law's table that no voltage of this law needs stay without memory.
+    struct Free {
+        void operator()(void *memory) const { std::free(memory); }
+    };
+    static twin_parameters *zeroed()
+    {
+        void *memory = std::calloc(1, sizeof(twin_parameters));
+        if (memory == nullptr) {
+            throw std::bad_alloc();
+        }
+        return static_cast<twin_parameters *>(memory);
+    }
+    std::unique_ptr<twin_parameters, Free> memory_;
+    twin_parameters &p_;
     twin_state s_;
+};
+
+// Many devices that move one update further in one call. Each slot has a state of its own; slots of
+// the same bench share its parameters. The benches are kept and not changed.
+class Ensemble {
+  public:
+    // switch_at: of each bench; window: steps, first and last of twin_update
+    Ensemble(std::vector<const Bench *> benches, std::vector<int32_t> switch_at, int32_t slots,
+             std::tuple<int32_t, int32_t, int32_t> window)
+        : benches_(std::move(benches)), switch_at_(std::move(switch_at)), window_(window)
+    {
+        const auto [steps, first, last] = window_;
+        if (benches_.empty() || switch_at_.size() != benches_.size() || slots < 1 || steps < 1 ||
+            last > steps || first >= last || first < -1000) {
+            throw std::invalid_argument("a bench, a slot, and a window that ends in its update");
+        }
+        for (const int32_t at : switch_at_) {
+            if (at < 0 || at > steps) {
+                throw std::invalid_argument("an output that changes within its update");
+            }
+        }
+        lead_ = first < 1 ? 1 - first : 1;
+        states_.resize(static_cast<size_t>(slots));
+        owner_.assign(static_cast<size_t>(slots), 0);
+        lengths_.resize(static_cast<size_t>(slots) * static_cast<size_t>(lead_ + steps));
+        for (size_t k = 0; k < states_.size(); ++k) {
+            restart(k, 0);
+        }
+    }
+
+    // Puts devices into slots, in the states that their benches have now.
+    void reset(Indices slots, Indices benches)
+    {
+        if (slots.size() != benches.size()) {
+            throw std::invalid_argument("as many benches as slots");
+        }
+        for (size_t k = 0; k < slots.size(); ++k) {
+            const auto slot = static_cast<size_t>(slots.data()[k]);
+            const auto bench = static_cast<size_t>(benches.data()[k]);
+            if (slot >= states_.size() || bench >= benches_.size()) {
+                throw std::invalid_argument("a slot or a bench that does not exist");
+            }
+            restart(slot, bench);
+        }
+    }
+
+    // One update of every slot. Writes the mean capacitances and the lengths at the end.
+    void update(Values before_v, Values after_v, Values load_n, Lengths capacitances_f,
+                Lengths lengths_m)
+    {
+        const size_t n = states_.size();
+        if (before_v.size() != n || after_v.size() != n || load_n.size() != n ||
+            capacitances_f.size() != n || lengths_m.size() != n) {
+            throw std::invalid_argument("one value for each slot");
+        }
+        const auto [steps, first, last] = window_;
+        const auto lead = static_cast<size_t>(lead_);
+        const size_t row = lead + static_cast<size_t>(steps);
+        nb::gil_scoped_release free_gil;
+        for (size_t k = 0; k < n; ++k) {
+            const twin_update_input in = {before_v.data()[k], after_v.data()[k], load_n.data()[k],
+                                          steps, switch_at_[owner_[k]], first, last};
+            double *lengths = lengths_.data() + k * row;
+            capacitances_f.data()[k] =
+                twin_update(&benches_[owner_[k]]->p_, &states_[k], &in, lengths, lead_);
+            lengths_m.data()[k] = lengths[row - 1];
+            std::memmove(lengths, lengths + row - lead, lead * sizeof *lengths);
+        }
+    }
+
+    // 0: works; 1: broken down; 2: left the lengths in which the law is valid.
+    int32_t fault(size_t slot) const
+    {
+        const twin_state &state = states_.at(slot);
+        return state.outside != 0 ? 2 : state.broken != 0;
+    }
+
+    // Whether any slot no longer works.
+    bool any_fault() const
+    {
+        for (const twin_state &state : states_) {
+            if (state.broken != 0) {
+                return true;
+            }
+        }
+        return false;
+    }
+
+  private:
+    void restart(size_t slot, size_t bench)
+    {
+        const auto lead = static_cast<size_t>(lead_);
+        const size_t row = lead + static_cast<size_t>(std::get<0>(window_));
+        owner_[slot] = bench;
+        states_[slot] = benches_[bench]->s_;
+        for (size_t k = 0; k < lead; ++k) {
+            lengths_[slot * row + k] = states_[slot].motion.length_m;
+        }
+    }
+
+    std::vector<const Bench *> benches_;
+    std::vector<int32_t> switch_at_;
+    std::tuple<int32_t, int32_t, int32_t> window_;
+    int32_t lead_ = 1;
+    std::vector<twin_state> states_;
+    std::vector<size_t> owner_;
+    std::vector<double> lengths_;
 };
 
 } // namespace
@@ -148,6 +275,14 @@ NB_MODULE(_twin, m)
     offsets["motion"] = offsetof(twin_parameters, motion);
     m.attr("OFFSETS") = offsets;
     m.attr("SIZES") = std::make_tuple(sizeof(twin_parameters), sizeof(twin_state));
+    nb::class_<Ensemble>(m, "Ensemble")
+        .def(nb::init<std::vector<const Bench *>, std::vector<int32_t>, int32_t,
+                      std::tuple<int32_t, int32_t, int32_t>>(),
+             nb::keep_alive<1, 2>()) // the list, and with it the benches
+        .def("reset", &Ensemble::reset)
+        .def("update", &Ensemble::update)
+        .def("fault", &Ensemble::fault)
+        .def_prop_ro("any_fault", &Ensemble::any_fault);
     nb::class_<Bench>(m, "Bench")
         .def(nb::init<const nb::dict &, nb::handle, double, uint64_t, double, double, double, Values,
                       Values, Rows, Rows>())

@@ -1,10 +1,31 @@
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 OFFSETS: dict[str, int]
 SIZES: tuple[int, int]
+
+class Ensemble:
+    def __init__(
+        self,
+        benches: tuple[Bench, ...],
+        switch_at: Sequence[int],
+        slots: int,
+        window: tuple[int, int, int],
+    ) -> None: ...
+    def reset(self, slots: NDArray[np.int64], benches: NDArray[np.int64]) -> None: ...
+    def update(
+        self,
+        before_v: NDArray[np.float64],
+        after_v: NDArray[np.float64],
+        load_n: NDArray[np.float64],
+        capacitances_f: NDArray[np.float64],
+        lengths_m: NDArray[np.float64],
+    ) -> None: ...
+    def fault(self, slot: int) -> int: ...
+    @property
+    def any_fault(self) -> bool: ...
 
 class Bench:
     inertia_kg: float

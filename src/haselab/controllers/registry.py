@@ -39,6 +39,7 @@ CONTROLLERS: Registry[ControllerKind] = Registry(
         "alternating": "haselab.controllers.model_based.alternating:ALTERNATING",
         "h-infinity": "haselab.controllers.model_based.h_infinity_design:H_INFINITY",
         "mpc": "haselab.controllers.model_based.mpc:MPC",
+        "network": "haselab.controllers.network:NETWORK",
         "scheduled-pid": "haselab.controllers.adaptive.scheduled:SCHEDULED",
     },
     _fault,

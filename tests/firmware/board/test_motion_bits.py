@@ -1,4 +1,4 @@
-"""The controllers of the identified motion: the same bits on chip and computer, within budget."""
+"""Controllers with a C step of their own: the same bits on chip and computer, within budget."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ PARAMETERS = {
     "chip-force": {"kp": 2.8, "ki": 467.0, "kd": 0.575, "filter_s": 0.0088, "reserve": 0.15},
     "chip-observer": {"bandwidth_rad_s": 149.9, "load_n": 0.132, "shake_m_s2": 0.01,
                       "reserve": 0.15},
+    "network": {},
 }  # fmt: skip
 
 

@@ -1,0 +1,63 @@
+"""Steps per second of the learning environments, and the trained network on unseen devices.
+
+python -m benchmarks.control.learning
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from benchmarks.rows import Row
+from haselab.base import SilentProgress
+from haselab.learning import StrainVectorEnv
+from haselab.scoreboard import Plan, board_rows, play_board
+
+ENVIRONMENTS = 1024
+STEPS = 100
+STEPS_PER_S = 500_000.0
+# less is better; T1-drawn and the others are devices that no training has seen
+COMPARED = (("T1", "rise_s"), ("T1", "iae"), ("T3", "sine_1hz"), ("T3", "gait_1hz"))
+
+
+def steps_per_s() -> float:
+    """Of one core, by processor time."""
+    envs = StrainVectorEnv(ENVIRONMENTS, "track", devices=16)
+    envs.reset(seed=1)
+    actions = np.random.default_rng(1).uniform(-1.0, 0.5, (ENVIRONMENTS, 1)).astype(np.float32)
+    envs.step(actions)
+    start_s = time.process_time()
+    for _ in range(STEPS):
+        envs.step(actions)
+    return ENVIRONMENTS * STEPS / (time.process_time() - start_s)
+
+
+def rows(seeds: int = 1) -> Iterator[Row]:
+    """Measure the speed, and play the network against the paper's PI.
+
+    Args:
+        seeds: of each task.
+    """
+    yield Row("steps of a vector environment, one core",
+              float(np.median([steps_per_s() for _ in range(3)])), "1/s", STEPS_PER_S)  # fmt: skip
+    tasks = tuple(dict.fromkeys(task for task, _ in COMPARED))
+    plan = Plan(("pi", "network"), tasks, ("host-100hz",), seed=1, seeds=seeds, workers=2)
+    found = {(row.controller, row.task, row.metric): row
+             for row in board_rows(play_board(plan, SilentProgress()))}  # fmt: skip
+    for task, metric in COMPARED:
+        paper, network = (found[name, task, metric].median for name in ("pi", "network"))
+        ratio = math.nan if paper is None or network is None else network / paper
+        yield Row(f"{task} {metric}, network over the paper's PI", ratio, "", 1.0,
+                  more_is_better=False)  # fmt: skip
+
+
+def main() -> None:
+    for row in rows():
+        print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

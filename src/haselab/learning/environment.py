@@ -1,0 +1,104 @@
+"""One loop as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from haselab.base import InputError, JsonObject
+from haselab.learning.simulation import OBSERVATIONS, StrainSimulation
+from haselab.rig.twin.camera import TwinCamera
+from haselab.scoreboard.devices import find_device
+
+__all__ = ["StrainEnv", "action_space", "observation_space"]
+
+_LIMIT = 10.0
+
+
+def observation_space() -> spaces.Box[np.float32]:
+    """What one policy sees, see `StrainSimulation.observe`."""
+    return spaces.Box(-_LIMIT, _LIMIT, (len(OBSERVATIONS),), np.float32)
+
+
+def action_space() -> spaces.Box[np.float32]:
+    """The drive voltage, from the lowest (-1) to the highest (1)."""
+    return spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """A policy closes the loop on a planar HASEL by capacitive self-sensing, at 100 Hz.
+
+    Each episode takes one of the drawn devices. The reward of an update is
+    `-|strain - reference| / 0.05 - 0.05 change**2` with the true strain and the change of the
+    action, and -100 if the device breaks down, which ends the episode.
+
+    Args:
+        task: `track`, `hold` or `gait`.
+        render_mode: None, or `rgb_array`: what the twin's camera sees.
+        options: see `StrainSimulation`.
+    Raises:
+        InputError: An argument is unknown or out of range.
+    Example:
+        >>> env = StrainEnv("track", devices=2)
+        >>> observation, info = env.reset(seed=1)
+        >>> observation.shape
+        (6,)
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
+
+    def __init__(
+        self, task: str = "track", *, render_mode: str | None = None, **options: Any
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise InputError(f"render_mode is {render_mode!r}. Use None or 'rgb_array'.")
+        self._simulation = StrainSimulation(task, 1, **options)
+        self.observation_space, self.action_space = observation_space(), action_space()
+        self.render_mode = render_mode
+        self._camera: TwinCamera | None = None
+        self._frames = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: JsonObject | None = None
+    ) -> tuple[NDArray[np.float32], JsonObject]:
+        """Begin an episode, see `gymnasium.Env.reset`."""
+        super().reset(seed=seed)
+        self._simulation.reset(np.zeros(1, dtype=np.int64), self.np_random)
+        return self._simulation.observe()[0], self._info()
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, JsonObject]:
+        """Let 10 ms pass, see `gymnasium.Env.step`."""
+        actions = np.asarray(action, dtype=np.float64).reshape(1)
+        rewards, terminated, truncated = self._simulation.step(actions, self.np_random)
+        return (
+            self._simulation.observe()[0], float(rewards[0]), bool(terminated[0]),
+            bool(truncated[0]), self._info(),
+        )  # fmt: skip
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Frame of the camera, shape `(H, W, 3)`; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        if self._camera is None:
+            config = find_device("hz").config
+            law = config.law
+            self._camera = TwinCamera(config.camera, 0.5 * law.width_m, law.free_length_m, 0)
+        length_m = float(self._simulation.length_m[0])
+        exposure = np.full((1, self._camera.exposure_times_s(np.zeros(1)).shape[1]), length_m)
+        grey = self._camera.render(exposure, self._frames)[0]
+        self._frames += 1
+        return np.repeat(grey[:, :, None], 3, axis=2)
+
+    def _info(self) -> JsonObject:
+        simulation = self._simulation
+        return {
+            "strain": float(simulation.strain[0]),
+            "reference": float(simulation.reference[0]),
+            "drive_v": float(simulation.drive_v[0]),
+        }

@@ -1,0 +1,278 @@
+"""Many loops on twins, one update at a time: the physics and the sensing of the environments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab import _twin
+from haselab.actuators import GRAVITY_M_S2
+from haselab.base import InputError
+from haselab.controllers.network.controller import STRAIN_PER_ONE
+from haselab.learning.tasks import find_task
+from haselab.rig.twin.twin_bench import native_bench
+from haselab.scoreboard.devices import Device, drawn, find_device
+from haselab.scoreboard.knowledge import TRAINED
+from haselab.scoreboard.loop_class import CARRIER_HZ, CARRIER_V, CLASSES, STEP_S, noise_of
+
+__all__ = ["OBSERVATIONS", "StrainSimulation"]
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+CHANGE_COST = 0.05
+BREAKDOWN_COST = 100.0
+OBSERVATIONS = (
+    "strain", "strain_1", "strain_2", "reference", "drive_1", "drive_2",
+)  # fmt: skip  # _1, _2: one and two updates ago
+_LIMIT = 10.0  # of an observation
+_DEVICES = 64
+_EPISODE_S = 5.0
+_LOOP = CLASSES["host-100hz"]
+_TRAIN_S, _REST_S = 20.0, 60.0
+_MAP_KNOTS = 200
+_USED = 0.85  # of the drive's range: no drawn device breaks down there
+_REACH_UPDATES = 200
+
+
+@dataclass(frozen=True)
+class _Pool:
+    """Settled devices."""
+
+    benches: tuple[_twin.Bench, ...]
+    switch_at: tuple[int, ...]
+    zero_m: Floats  # length at rest, at the drive of strain 0
+    zero_f: Floats  # capacitance there
+    relative_noise: Floats
+    load_n: float
+    low_v: float
+    high_v: float
+    zero_v: float
+
+
+class StrainSimulation:
+    """Closed loops on planar HASELs, with one action for each update of 10 ms.
+
+    Args:
+        task: name of a task.
+        slots: number of loops.
+        devices: how many different devices are drawn, or the devices; each episode takes one.
+        devices_seed: of the drawn devices.
+        episode_s: duration of an episode, in s.
+    Raises:
+        InputError: The task is unknown, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        slots: int,
+        *,
+        devices: int | Sequence[Device] = _DEVICES,
+        devices_seed: int = 0,
+        episode_s: float = _EPISODE_S,
+    ) -> None:
+        self.task = find_task(task)
+        if slots < 1:
+            raise InputError(f"The number of environments is {slots}. State at least 1.")
+        if not 0.1 <= episode_s <= 3600.0:
+            raise InputError(f"The episode lasts {episode_s:g} s. State 0.1 to 3600 s.")
+        self._pool = _pool(devices, devices_seed)
+        window = (_LOOP.steps, _LOOP.first, _LOOP.last)
+        self._ensemble = _twin.Ensemble(self._pool.benches, self._pool.switch_at, slots, window)
+        self._updates = round(episode_s / _LOOP.period_s)
+        self._time_s: Floats = _LOOP.period_s * np.arange(1.0, self._updates + 2.0)
+        self.slots = slots
+        self._reference = np.zeros((slots, self._updates + 1))
+        self._pull_n = np.zeros((slots, self._updates + 1))
+        self._device = np.zeros(slots, dtype=np.int64)
+        self._update = np.zeros(slots, dtype=np.int64)
+        self._drive_v = np.zeros((3, slots))  # of this update, and of one and two before
+        self._strain = np.zeros((3, slots))
+        self._capacitance_f, self.length_m = np.zeros(slots), np.zeros(slots)
+        self._row = np.arange(slots)
+        nominal = find_device("hz").law
+        lengths = np.linspace(0.85, 1.35, _MAP_KNOTS) * _zero_length_m()
+        self._map_f = nominal.capacitance_f(lengths) / nominal.capacitance_f(_zero_length_m())
+        self._map_strain = lengths / _zero_length_m() - 1.0
+        self._reach = _reach(self._pool)
+
+    @property
+    def period_s(self) -> float:
+        """Time between two actions, in s."""
+        return _LOOP.period_s
+
+    @property
+    def strain(self) -> Floats:
+        """True strains now. Shape `(slots,)`."""
+        return np.asarray(self.length_m / self._pool.zero_m[self._device] - 1.0)
+
+    @property
+    def reference(self) -> Floats:
+        """Strains that the next update is to reach. Shape `(slots,)`."""
+        return np.asarray(self._reference[self._row, self._update])
+
+    @property
+    def drive_v(self) -> Floats:
+        """Drives that were set last, at the amplifier's input, in V. Shape `(slots,)`."""
+        return np.asarray(self._drive_v[0])
+
+    def reset(self, which: NDArray[np.int64], rng: np.random.Generator) -> None:
+        """Begin episodes: each with a device, a reference and loads of its own.
+
+        Args:
+            which: slots.
+            rng: of everything that is drawn.
+        """
+        pool = self._pool
+        chosen = rng.integers(len(pool.benches), size=which.size)
+        self._ensemble.reset(which, chosen)
+        self._device[which], self._update[which] = chosen, 0
+        self._drive_v[:, which] = pool.zero_v
+        self.length_m[which] = pool.zero_m[chosen]
+        low, high = self._reach
+        for slot, device in zip(which.tolist(), chosen.tolist(), strict=True):
+            reference, pull = self.task.draw(rng, self._time_s)
+            self._reference[slot] = low[device] + (high[device] - low[device]) * reference
+            self._pull_n[slot] = pool.load_n * pull
+        sensed = self._sense(np.asarray(pool.zero_f[chosen]), chosen, rng)
+        self._strain[:, which] = sensed
+
+    def reset_alike(self, groups: int, rng: np.random.Generator) -> None:
+        """Begin the same episodes in each of some groups of slots, to compare policies.
+
+        Args:
+            groups: number of groups, which divides that of the slots.
+            rng: of everything that is drawn.
+        """
+        size = self.slots // groups
+        first = np.arange(size)
+        self.reset(first, rng)
+        device = np.tile(self._device[:size], groups)
+        self._ensemble.reset(np.arange(self.slots), device)
+        self._device[:], self._update[:] = device, 0
+        for values in (self._reference, self._pull_n):
+            values[:] = np.tile(values[:size], (groups, 1))
+        self._drive_v[:] = self._pool.zero_v
+        self.length_m[:] = self._pool.zero_m[device]
+        self._strain[:] = np.tile(self._strain[:, :size], (1, groups))
+
+    def step(self, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Flags, Flags]:
+        """Let one update pass in all loops.
+
+        Args:
+            actions: -1 to 1 over the range of the drive; values beyond count as the end. Shape
+                `(slots,)`.
+            rng: of the noise.
+        Returns:
+            Rewards; whether a device no longer works; whether the episode is at its end.
+        """
+        pool, drive = self._pool, self._drive_v
+        scale = 0.5 * (pool.high_v - pool.low_v)
+        drive[1:] = drive[:-1].copy()
+        drive[0] = pool.low_v + scale * (np.clip(actions, -1.0, 1.0) + 1.0)
+        pull_n = self._pull_n[self._row, self._update]
+        self._ensemble.update(
+            drive[1].copy(), drive[0].copy(), pool.load_n + pull_n,
+            self._capacitance_f, self.length_m,
+        )  # fmt: skip
+        error = (self.strain - self.reference) / STRAIN_PER_ONE
+        change = (drive[0] - drive[1]) / scale
+        rewards = -np.abs(error) - CHANGE_COST * change**2
+        terminated = np.zeros(self.slots, dtype=bool)
+        if self._ensemble.any_fault:
+            terminated = np.array([self._ensemble.fault(k) != 0 for k in range(self.slots)])
+            rewards[terminated] = -BREAKDOWN_COST
+        self._strain[1:] = self._strain[:-1].copy()
+        self._strain[0] = self._sense(self._capacitance_f, self._device, rng)
+        self._update += 1
+        return rewards, terminated, self._update >= self._updates
+
+    def observe(self) -> NDArray[np.float32]:
+        """What a policy sees: `OBSERVATIONS`, strains over 0.05, drives from -1 to 1.
+
+        Returns:
+            Shape `(slots, 6)`.
+        """
+        pool = self._pool
+        found = np.empty((self.slots, len(OBSERVATIONS)), dtype=np.float32)
+        found[:, 0:3] = self._strain.T / STRAIN_PER_ONE
+        found[:, 3] = self.reference / STRAIN_PER_ONE
+        middle, scale = 0.5 * (pool.high_v + pool.low_v), 0.5 * (pool.high_v - pool.low_v)
+        found[:, 4:6] = (self._drive_v[:2].T - middle) / scale
+        return np.clip(found, -_LIMIT, _LIMIT, out=found)
+
+    def _sense(
+        self, capacitance_f: Floats, device: NDArray[np.int64], rng: np.random.Generator
+    ) -> Floats:
+        """Strains by the map of the nominal device, from capacitances with noise."""
+        relative = capacitance_f / self._pool.zero_f[device]
+        noise = self._pool.relative_noise[device] * rng.standard_normal(device.size)
+        return np.interp(relative * (1.0 + noise), self._map_f, self._map_strain)
+
+
+def _zero_length_m() -> float:
+    return 0.051
+
+
+def _pool(devices: int | Sequence[Device], seed: int) -> _Pool:
+    if isinstance(devices, int):
+        if not 1 <= devices <= 100_000:
+            raise InputError(f"The number of devices is {devices}. State 1 to 100000.")
+        rng = np.random.default_rng(seed)
+        devices = [drawn(rng) for _ in range(devices)]
+    if not devices:
+        raise InputError("No devices are given. State at least one.")
+    first = devices[0]
+    settled = [_settled(device) for device in devices]
+    return _Pool(
+        tuple(settled),
+        tuple(_LOOP.switch_at + round(device.late_s / STEP_S) for device in devices),
+        np.array([bench.length_m for bench in settled]),
+        np.array([bench.capacitance(bench.length_m, device.zero_v * device.config.amplifier.gain)
+                  for bench, device in zip(settled, devices, strict=True)]),
+        np.array([_noise(device, bench.length_m)
+                  for bench, device in zip(settled, devices, strict=True)]),
+        GRAVITY_M_S2 * first.mass_kg,
+        first.low_v, first.high_v, first.zero_v,
+    )  # fmt: skip
+
+
+def _reach(pool: _Pool) -> tuple[Floats, Floats]:
+    """Strains at rest at the lowest drive and at `_USED` of the highest. Shapes `(devices,)`."""
+    count = len(pool.benches)
+    ends = _twin.Ensemble(
+        pool.benches, pool.switch_at, count, (_LOOP.steps, _LOOP.first, _LOOP.last)
+    )
+    load_n, farad, length_m = np.full(count, pool.load_n), np.empty(count), np.empty(count)
+    found = []
+    for drive_v in (pool.low_v, pool.low_v + _USED * (pool.high_v - pool.low_v)):
+        ends.reset(np.arange(count), np.arange(count))
+        held = np.full(count, drive_v)
+        for _ in range(_REACH_UPDATES):
+            ends.update(held, held, load_n, farad, length_m)
+        found.append(length_m / pool.zero_m - 1.0)
+    return found[0], found[1]
+
+
+def _noise(device: Device, length_m: float) -> float:
+    farad = float(device.law.capacitance_f(length_m))
+    return noise_of(_LOOP, device.config, farad) / farad
+
+
+def _settled(device: Device) -> _twin.Bench:
+    """A bench whose device was stretched once, and now hangs at the drive of strain 0."""
+    bench = native_bench(device.config, 0)
+    bench.carrier_v, bench.carrier_rad_s = CARRIER_V, 2.0 * math.pi * CARRIER_HZ
+    own_kg = device.config.load.added_inertia_kg + device.law.moving_mass_kg
+    plan = ((TRAINED, 0.0, _TRAIN_S), (1.0, 0.0, _REST_S), (1.0, device.zero_v, _REST_S))
+    for share, drive_v, duration_s in plan:
+        mass_kg = share * device.mass_kg
+        bench.inertia_kg = mass_kg + own_kg
+        lengths = np.empty(round(duration_s / STEP_S))
+        bench.move(np.array([drive_v]), 1, GRAVITY_M_S2 * mass_kg, lengths)
+    return bench

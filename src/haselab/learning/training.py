@@ -1,0 +1,164 @@
+"""Train a network by evolution strategies (CMA-ES) on many twins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.controllers.network.weights import (
+    FEATURES,
+    HIDDEN,
+    LARGEST_FEATURE,
+    LARGEST_WEIGHT,
+    ONE,
+    WEIGHT_ONE,
+    Network,
+)
+from haselab.learning.simulation import StrainSimulation
+
+__all__ = ["WEIGHTS", "Progress", "changes", "train"]
+
+Floats = NDArray[np.float64]
+WEIGHTS = HIDDEN * (FEATURES + 1) + HIDDEN + 1
+_FIRST_SIGMA = 0.2
+_EPISODE_S = 3.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a training is.
+
+    Args:
+        generation: that has ended, from 1.
+        best: mean reward of an update, of its best network.
+        median: the same of the median network.
+    """
+
+    generation: int
+    best: float
+    median: float
+
+
+def _first_guess() -> Floats:
+    """A network with one unit that integrates the error."""
+    hidden = np.zeros((HIDDEN, FEATURES + 1))
+    hidden[0, 0] = 1.0
+    output = np.zeros(HIDDEN + 1)
+    output[0] = 0.1
+    return np.concatenate([hidden.ravel(), output])
+
+
+def changes(weights: NDArray[np.int32], features: NDArray[np.int32]) -> NDArray[np.int32]:
+    """What many networks answer, as `Network.change`.
+
+    Args:
+        weights: Shape `(P, WEIGHTS)`.
+        features: Shape `(P, K, FEATURES)`.
+    Returns:
+        Shape `(P, K)`.
+    """
+    hidden = weights[:, : HIDDEN * (FEATURES + 1)].reshape(-1, HIDDEN, FEATURES + 1)
+    output = weights[:, HIDDEN * (FEATURES + 1) :]
+    clipped = np.clip(features, -LARGEST_FEATURE, LARGEST_FEATURE)
+    total = np.matmul(clipped, hidden[:, :, :-1].transpose(0, 2, 1))
+    total += ONE * hidden[:, None, :, -1]
+    units = np.clip(total >> 5, -ONE, ONE)
+    last = (units * output[:, None, :-1]).sum(axis=2, dtype=np.int32) + ONE * output[:, -1:]
+    return np.asarray(np.clip(last >> 5, -ONE, ONE))
+
+
+class _Loops:
+    """The networks of one generation, each in as many loops."""
+
+    def __init__(self, simulations: list[StrainSimulation], population: int) -> None:
+        self._simulations, self._population = simulations, population
+
+    def returns(self, weights: NDArray[np.int32], seed: int) -> Floats:
+        """Mean reward per update of each network. Shape `(P,)`."""
+        whole = np.zeros(self._population)
+        for simulation in self._simulations:
+            rng = np.random.default_rng(seed)
+            simulation.reset_alike(self._population, rng)
+            whole += self._play(simulation, weights, rng)
+        return whole / len(self._simulations)
+
+    def _play(
+        self, simulation: StrainSimulation, weights: NDArray[np.int32], rng: np.random.Generator
+    ) -> Floats:
+        shape = (self._population, -1)
+        total, ended, count = np.zeros(simulation.slots), False, 0
+        alive = np.ones(simulation.slots, dtype=bool)
+        drive = _to_one(simulation.observe()[:, 4])
+        last = drive
+        while not ended:
+            seen = simulation.observe()
+            strain = [_to_one(seen[:, k]) for k in range(3)]
+            wanted = _to_one(seen[:, 3])
+            features = np.stack([
+                wanted - strain[0], 10 * (strain[0] - strain[1]), 10 * (strain[1] - strain[2]),
+                wanted >> 1, drive, 4 * (drive - last),
+            ], axis=1)  # fmt: skip
+            change = changes(weights, features.reshape(*shape, FEATURES))
+            last, drive = drive, np.clip(drive + (change.ravel() >> 1), -ONE, ONE)
+            rewards, terminated, truncated = simulation.step(drive / ONE, rng)
+            total += np.where(alive, rewards, 0.0)
+            alive &= ~terminated
+            count += 1
+            ended = bool(truncated.any())
+        return np.asarray(total.reshape(shape).mean(axis=1) / count)
+
+
+def _to_one(values: NDArray[np.floating]) -> NDArray[np.int32]:
+    return np.rint(ONE * values.astype(np.float64)).astype(np.int32)
+
+
+def train(
+    tasks: tuple[str, ...] = ("track", "gait"),
+    *,
+    seed: int = 1,
+    generations: int = 400,
+    population: int = 32,
+    loops: int = 12,
+    devices: int = 64,
+    report: Callable[[Progress], None] | None = None,
+) -> Network:
+    """Train a network that closes the loop on drawn devices.
+
+    Args:
+        tasks: names, which count alike.
+        seed: of devices, episodes and search.
+        generations: of the search.
+        population: networks in a generation.
+        loops: in which each of them is tried, in each task.
+        devices: different ones.
+        report: called after each generation.
+    Returns:
+        The mean network of the last generation's search.
+    Source:
+        Hansen, N. The CMA evolution strategy: a tutorial. arXiv:1604.00772, 2016.
+    """
+    import cma
+
+    simulations = [
+        StrainSimulation(
+            task, population * loops, devices=devices, devices_seed=seed, episode_s=_EPISODE_S
+        )
+        for task in tasks
+    ]
+    tried = _Loops(simulations, population)
+    bound = LARGEST_WEIGHT / WEIGHT_ONE
+    search = cma.CMAEvolutionStrategy(
+        _first_guess(), _FIRST_SIGMA,
+        {"seed": seed + 1, "popsize": population, "bounds": [-bound, bound], "verbose": -9},
+    )  # fmt: skip
+    for generation in range(generations):
+        asked = np.array(search.ask())
+        weights = np.clip(np.rint(WEIGHT_ONE * asked), -LARGEST_WEIGHT, LARGEST_WEIGHT)
+        returns = tried.returns(weights.astype(np.int32), 1000 * seed + generation)
+        search.tell(list(asked), (-returns).tolist())
+        if report is not None:
+            report(Progress(generation + 1, float(returns.max()), float(np.median(returns))))
+    return Network.from_vector(np.asarray(search.result.xfavorite))

@@ -1,0 +1,84 @@
+"""Many loops as one Gymnasium vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from haselab.base import JsonObject
+from haselab.learning.environment import action_space, observation_space
+from haselab.learning.simulation import StrainSimulation
+
+__all__ = ["StrainVectorEnv"]
+
+Observed = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+
+
+class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
+    """`StrainEnv` many times over, stepped in one call of the compiled twin.
+
+    An episode that has ended begins anew with the next step, whose action it ignores and whose
+    reward is 0 (`AutoresetMode.NEXT_STEP`).
+
+    Args:
+        num_envs: number of loops.
+        task: `track`, `hold` or `gait`.
+        options: see `StrainSimulation`.
+    Raises:
+        InputError: An argument is unknown or out of range.
+    Example:
+        >>> envs = StrainVectorEnv(4, "gait", devices=2)
+        >>> observations, _ = envs.reset(seed=1)
+        >>> envs.step(envs.action_space.sample())[0].shape
+        (4, 6)
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(self, num_envs: int = 1, task: str = "track", **options: Any) -> None:
+        options.pop("render_mode", None)
+        self._simulation = StrainSimulation(task, num_envs, **options)
+        self.num_envs = num_envs
+        self.single_observation_space = observation_space()
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ended = np.zeros(num_envs, dtype=bool)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Any = None
+    ) -> tuple[Observed, JsonObject]:
+        """Begin all episodes.
+
+        Args:
+            seed: of all loops together; several are combined.
+            options: `reset_mask`, shape `(num_envs,)`: which episodes begin; default: all.
+        """
+        if seed is not None:
+            combined = seed if isinstance(seed, int) else [part or 0 for part in seed]
+            self._np_random = np.random.default_rng(combined)
+            self._np_random_seed = seed if isinstance(seed, int) else None
+        mask = (options or {}).get("reset_mask")
+        which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        self._simulation.reset(which.astype(np.int64), self.np_random)
+        self._ended[which] = False
+        return self._simulation.observe(), {}
+
+    def step(
+        self, actions: Observed
+    ) -> tuple[Observed, NDArray[np.float64], Flags, Flags, JsonObject]:
+        """Let 10 ms pass in all loops."""
+        flat = np.asarray(actions, dtype=np.float64).reshape(self.num_envs)
+        began = self._ended
+        rewards, terminated, truncated = self._simulation.step(flat, self.np_random)
+        if began.any():
+            self._simulation.reset(np.flatnonzero(began).astype(np.int64), self.np_random)
+            rewards[began], terminated[began], truncated[began] = 0.0, False, False
+        self._ended = terminated | truncated
+        return self._simulation.observe(), rewards, terminated, truncated, {}

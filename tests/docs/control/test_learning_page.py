@@ -1,0 +1,16 @@
+"""What the page on learning shows is run here as it stands."""
+
+import pytest
+
+from tests.docs.page import Page
+
+PAGE = Page("control/learning.md")
+
+
+def test_the_examples_of_the_page_run(capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, object] = {}
+    for code in PAGE.python:
+        PAGE.execute(code, names)
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first == "(6,) ['drive_v', 'reference', 'strain']"
+    assert second == "(64, 6) (64,)"

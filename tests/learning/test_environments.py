@@ -1,0 +1,161 @@
+"""The environments: by Gymnasium's own rules, and against the closed loop of the scoreboard."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+from haselab.actuators import GRAVITY_M_S2
+from haselab.base import InputError
+from haselab.learning import TASKS, StrainEnv, StrainVectorEnv
+from haselab.learning.simulation import StrainSimulation
+from haselab.scoreboard.devices import drawn
+from haselab.scoreboard.loop_class import CLASSES
+from haselab.scoreboard.plant import FastPlant
+
+DEVICES = 3
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+@pytest.mark.filterwarnings("ignore:.*render_fps.*")
+def test_gymnasium_finds_and_accepts_each(task: str) -> None:
+    env = gymnasium.make(f"haselab.learning:haselab/{task.capitalize()}-v0", devices=DEVICES)
+    check_env(env.unwrapped, skip_render_check=False)
+
+
+def test_the_vector_form_has_the_episodes_of_the_single_one() -> None:
+    """One loop: the same numbers in both, up to the end of the episode and over it."""
+    kwargs = {"devices": DEVICES, "episode_s": 0.5}
+    single = StrainEnv("gait", **kwargs)
+    many = gymnasium.make_vec(
+        "haselab/Gait-v0", num_envs=1, vectorization_mode="vector_entry_point", **kwargs
+    )
+    assert many.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    first, _ = single.reset(seed=5)
+    others, _ = many.reset(seed=5)
+    np.testing.assert_array_equal(others[0], first)
+    rng = np.random.default_rng(1)
+    for k in range(50):
+        action = rng.uniform(-1.0, 1.0, 1).astype(np.float32)
+        found = single.step(action)
+        observed, rewards, terminated, truncated, _ = many.step(action[None])
+        np.testing.assert_array_equal(observed[0], found[0])
+        assert (rewards[0], terminated[0], truncated[0]) == found[1:4]
+        assert found[3] == (k == 49)
+    observed, rewards, _, truncated, _ = many.step(np.zeros((1, 1), np.float32))
+    assert rewards[0] == 0.0 and not truncated[0]
+    assert observed[0, 4] == observed[0, 5], "a new episode, which begins at rest"
+
+
+def test_the_motion_is_that_of_the_scoreboard() -> None:
+    device = drawn(np.random.default_rng(3))
+    simulation = StrainSimulation("track", 2, devices=[device], episode_s=1.0)
+    simulation.reset(np.arange(2), np.random.default_rng(0))
+    loop = CLASSES["host-100hz"]
+    plant = FastPlant(device, loop, np.random.default_rng(0), 200)
+    plant.train()
+    plant.hold(0.0, 0.0)
+    plant.hold(device.zero_v, 60.0)
+    rng = np.random.default_rng(2)
+    for _ in range(90):
+        actions = rng.uniform(-1.0, 0.6, 2)
+        simulation.step(actions, rng)
+        plant.update(float(device.high_v * 0.5 * (actions[0] + 1.0)))
+        assert simulation.length_m[0] == plant.true_lengths_m[-1]
+    assert simulation.length_m[0] != simulation.length_m[1]
+
+
+def test_the_sensed_strain_has_the_noise_of_the_monitors_and_an_error_of_the_map() -> None:
+    simulation = StrainSimulation("track", 2000, devices=[drawn(np.random.default_rng(3))])
+    rng = np.random.default_rng(0)
+    simulation.reset(np.arange(2000), rng)
+    sensed = 0.05 * simulation.observe()[:, 0].astype(float)
+    device = drawn(np.random.default_rng(3))
+    relative = simulation._pool.relative_noise[0]
+    # d strain / d ln C is 1 / 3.33 by the nominal map.
+    assert sensed.std() == pytest.approx(relative / 3.33, rel=0.1)
+    assert abs(sensed.mean()) < 4.0 * relative / 3.33 / np.sqrt(2000) + 1e-4
+    high = np.full(2000, 0.6)
+    for _ in range(200):
+        simulation.step(high, rng)
+    off = 0.05 * simulation.observe()[:, 0].mean() - simulation.strain.mean()
+    assert 1e-4 < abs(off) < 0.1, f"exponent {device.config.dielectric.capacitance_exponent}"
+
+
+def test_a_pull_in_hold_elongates_by_the_compliance() -> None:
+    simulation = StrainSimulation("hold", 1, devices=[drawn(np.random.default_rng(3))])
+    rng = np.random.default_rng(0)
+    simulation.reset(np.zeros(1, np.int64), rng)
+    rest = float(simulation.length_m[0])
+    simulation._pull_n[:] = 0.05 * GRAVITY_M_S2
+    at_rest = np.array([2.0 * simulation._pool.zero_v / simulation._pool.high_v - 1.0])
+    for _ in range(400):
+        simulation.step(at_rest, rng)
+    assert float(simulation.length_m[0]) - rest > 1e-4
+
+
+def test_an_episode_depends_on_the_seed_alone() -> None:
+    envs = StrainVectorEnv(8, "hold", devices=DEVICES)
+
+    def play(seed: int) -> np.ndarray:
+        envs.reset(seed=seed)
+        rng = np.random.default_rng(4)
+        return np.stack([envs.step(rng.uniform(-1, 1, (8, 1)).astype(np.float32))[0]
+                         for _ in range(30)])  # fmt: skip
+
+    first = play(1)
+    assert not np.array_equal(play(2), first)
+    np.testing.assert_array_equal(play(1), first)
+
+
+def test_a_breakdown_ends_the_episode_and_costs_100() -> None:
+    weak = drawn(np.random.default_rng(3))
+    data = weak.config.model_dump(exclude={"origin"})
+    data["dielectric"]["breakdown_v_per_m"] = 15e6
+    device = type(weak)(**{**weak.__dict__, "config": type(weak.config)(**data)})
+    env = StrainEnv("track", devices=[device])
+    env.reset(seed=1)
+    for _ in range(100):
+        _, reward, terminated, truncated, _ = env.step(np.ones(1, np.float32))
+        if terminated:
+            break
+    assert terminated and not truncated and reward == -100.0
+
+
+def test_references_are_what_the_device_reaches_without_breaking_down() -> None:
+    """With the drive that is known to reach the level, the strain gets there."""
+    simulation = StrainSimulation("hold", 200, devices=40)
+    simulation.reset(np.arange(200), np.random.default_rng(0))
+    low, high = (ends[simulation._device] for ends in simulation._reach)
+    assert (low < 0.0).all() and (high - low > 0.03).all()
+    assert (simulation.reference > low).all() and (simulation.reference < high).all()
+    simulation._pull_n[:] = 0.0
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        _, terminated, _ = simulation.step(np.full(200, 0.7), rng)  # 0.85 of the range
+        assert not terminated.any()
+    np.testing.assert_allclose(simulation.strain, high, atol=2e-3)
+
+
+def test_a_frame_shows_the_actuator_of_the_camera() -> None:
+    env = StrainEnv("track", devices=1, render_mode="rgb_array")
+    env.reset(seed=1)
+    frame = env.render()
+    assert frame is not None and frame.ndim == 3 and frame.dtype == np.uint8
+    assert frame.std() > 5.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task": "walk"}, "No task 'walk'. The tasks are track, hold, gait."),
+        ({"devices": 0}, "The number of devices is 0. State 1 to 100000."),
+        ({"devices": []}, "No devices are given."),
+        ({"episode_s": 0.0}, "The episode lasts 0 s. State 0.1 to 3600 s."),
+        ({"render_mode": "human"}, "render_mode is 'human'. Use None or 'rgb_array'."),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match="^" + message.replace("[", r"\[").split("(")[0]):
+        StrainEnv(**{"task": "track", **options})

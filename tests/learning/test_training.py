@@ -1,0 +1,92 @@
+"""Training: the same network from the same seed, and the same numbers as the controller's."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from haselab.base import InputError
+from haselab.controllers import ControllerSetting, Measurement
+from haselab.controllers.network import FEATURES, HIDDEN, Network, NetworkController, network_kind
+from haselab.learning import Progress, train
+from haselab.learning.simulation import StrainSimulation
+from haselab.learning.training import WEIGHTS, changes
+from haselab.scoreboard.devices import drawn
+
+SMALL = {"generations": 3, "population": 8, "loops": 4, "devices": 3}
+
+
+def network(seed: int) -> Network:
+    return Network.from_vector(np.random.default_rng(seed).uniform(-4.5, 4.5, WEIGHTS))
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(-20_000, 20_000), min_size=6, max_size=6))
+def test_many_networks_at_once_answer_as_each_alone(seed: int, features: list[int]) -> None:
+    networks = [network(seed), network(seed + 1)]
+    rows = [np.concatenate([*each.hidden, each.output]) for each in networks]
+    weights = np.array(rows, dtype=np.int32)
+    seen = np.tile(np.array(features, dtype=np.int32), (2, 3, 1))
+    seen[1] //= 7
+    found = changes(weights, seen)
+    for k, each in enumerate(networks):
+        assert found[k].tolist() == [each.change(tuple(seen[k, 0].tolist()))] * 3
+
+
+def test_the_loop_of_the_training_is_that_of_the_controller() -> None:
+    """One device without noise: the controller drives the environment as the training does."""
+    trained = train(**SMALL, seed=3)
+    device = drawn(np.random.default_rng(3))
+    rewards = []
+    for through_controller in (True, False):
+        simulation = StrainSimulation("gait", 1, devices=[device], episode_s=1.0)
+        rng = np.random.default_rng(5)
+        simulation.reset(np.zeros(1, np.int64), rng)
+        controller = NetworkController(trained)
+        controller.start(ControllerSetting(0.01, device.low_v, device.high_v))
+        total, drive = 0.0, None
+        seen = simulation.observe()[0].astype(float)
+        last = now = round(1024 * seen[4])
+        for _ in range(100):
+            if through_controller:
+                measured = Measurement(0.05 * seen[0], 1e-9, float(simulation.drive_v[0]), 0.0)
+                drive_v = controller.step(0.05 * seen[3], measured)
+                drive = np.array([drive_v / (0.5 * device.high_v) - 1.0])
+            else:
+                s = [round(1024 * x) for x in seen[:4]]
+                features = (s[3] - s[0], 10 * (s[0] - s[1]), 10 * (s[1] - s[2]), s[3] >> 1,
+                            now, 4 * (now - last))  # fmt: skip
+                change = trained.change(features)
+                last, now = now, min(max(now + (change >> 1), -1024), 1024)
+                drive = np.array([now / 1024])
+            reward, _, _ = simulation.step(drive, rng)
+            total += float(reward[0])
+            seen = simulation.observe()[0].astype(float)
+        rewards.append(total)
+    assert rewards[0] == pytest.approx(rewards[1], rel=1e-3)  # float32 of the strain may round
+
+
+def test_a_seed_gives_the_same_network_again_and_the_search_improves() -> None:
+    progress: list[Progress] = []
+    first = train(**SMALL, seed=1, report=progress.append)
+    assert train(**SMALL, seed=1) == first != train(**SMALL, seed=2)
+    assert [each.generation for each in progress] == [1, 2, 3]
+    assert all(each.best >= each.median for each in progress)
+
+
+def test_a_file_gives_its_network_back_and_a_bad_one_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "network.json"
+    path.write_text(json.dumps(network(1).to_dict()))
+    assert Network.load(path) == network(1)
+    assert network_kind("mine", network(1)).choose().make().c_text  # type: ignore[attr-defined]
+    path.write_text('{"hidden": [[1, 2]], "output": [1]}')
+    with pytest.raises(InputError, match=f"It must have {HIDDEN} rows of {FEATURES + 1}"):
+        Network.load(path)
+    path.write_text("{}")
+    with pytest.raises(InputError, match="No network can be read"):
+        Network.load(path)
+    with pytest.raises(InputError, match="A weight is outside -127 to 127"):
+        Network(((128,) * (FEATURES + 1),) * HIDDEN, (0,) * (HIDDEN + 1))

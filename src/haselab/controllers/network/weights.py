@@ -62,7 +62,8 @@ class Network:
         """Round a vector of weights, in units of 1.
 
         Args:
-            values: hidden weights row by row, then those of the output. Shape `(HIDDEN * (FEATURES + 2) + 1,)`.
+            values: hidden weights row by row, then those of the output. Shape
+                `(HIDDEN * (FEATURES + 2) + 1,)`.
         """
         scaled = np.clip(np.rint(values * WEIGHT_ONE), -LARGEST_WEIGHT, LARGEST_WEIGHT)
         numbers = scaled.astype(int)

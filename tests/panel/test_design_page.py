@@ -186,5 +186,5 @@ def test_without_an_actuator_file_the_page_says_how_to_start(
         page = context.new_page()
         page.goto(shared_panel.address)
         page.get_by_role("button", name="Design").click()
-        said = page.get_by_text("Start it with: haselab panel --actuator ACTUATOR.toml")
+        said = page.get_by_text("Start it with: haselab panel --actuator ACTUATOR.toml").first
         expect(said).to_be_visible(timeout=WAIT_MS)

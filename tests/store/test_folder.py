@@ -35,15 +35,15 @@ def test_a_new_text_replaces_the_old_one_and_leaves_no_draft(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("step", ["write_text", "replace"])
+@pytest.mark.parametrize("step", ["write_bytes", "replace"])
 def test_a_disk_that_fills_up_keeps_the_old_file_whole(tmp_path, monkeypatch, step):
     path = tmp_path / "a.txt"
     write_text(path, "old")
-    real = Path.write_text
+    real = Path.write_bytes
 
     def full(self: Path, *args: object, **kwargs: object) -> None:
-        if step == "write_text":
-            real(self, "half")
+        if step == "write_bytes":
+            real(self, b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, step, full)

@@ -10,18 +10,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from haselab.base import InputError, JsonObject
-from haselab.learning.simulation import OBSERVATIONS, StrainSimulation
+from haselab.learning.simulation import LARGEST_OBSERVATION, OBSERVATIONS, StrainSimulation
 from haselab.rig.twin.camera import TwinCamera
 from haselab.scoreboard.devices import find_device
 
 __all__ = ["StrainEnv", "action_space", "observation_space"]
 
-_LIMIT = 10.0
-
 
 def observation_space() -> spaces.Box[np.float32]:
     """What one policy sees, see `StrainSimulation.observe`."""
-    return spaces.Box(-_LIMIT, _LIMIT, (len(OBSERVATIONS),), np.float32)
+    return spaces.Box(-LARGEST_OBSERVATION, LARGEST_OBSERVATION, (len(OBSERVATIONS),), np.float32)
 
 
 def action_space() -> spaces.Box[np.float32]:

@@ -15,11 +15,11 @@ from haselab.base import InputError
 from haselab.controllers.network.controller import STRAIN_PER_ONE
 from haselab.learning.tasks import find_task
 from haselab.rig.twin.twin_bench import native_bench
-from haselab.scoreboard.devices import Device, drawn, find_device
+from haselab.scoreboard.devices import ZERO_LENGTH_M, Device, drawn, find_device
 from haselab.scoreboard.knowledge import TRAINED
 from haselab.scoreboard.loop_class import CARRIER_HZ, CARRIER_V, CLASSES, STEP_S, noise_of
 
-__all__ = ["OBSERVATIONS", "StrainSimulation"]
+__all__ = ["LARGEST_OBSERVATION", "OBSERVATIONS", "StrainSimulation"]
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -29,7 +29,7 @@ BREAKDOWN_COST = 100.0
 OBSERVATIONS = (
     "strain", "strain_1", "strain_2", "reference", "drive_1", "drive_2",
 )  # fmt: skip  # _1, _2: one and two updates ago
-_LIMIT = 10.0  # of an observation
+LARGEST_OBSERVATION = 10.0
 _DEVICES = 64
 _EPISODE_S = 5.0
 _LOOP = CLASSES["host-100hz"]
@@ -91,14 +91,14 @@ class StrainSimulation:
         self._pull_n = np.zeros((slots, self._updates + 1))
         self._device = np.zeros(slots, dtype=np.int64)
         self._update = np.zeros(slots, dtype=np.int64)
-        self._drive_v = np.zeros((3, slots))  # of this update, and of one and two before
+        self._drive_v = np.zeros((2, slots))  # of this update, and of the one before
         self._strain = np.zeros((3, slots))
         self._capacitance_f, self.length_m = np.zeros(slots), np.zeros(slots)
         self._row = np.arange(slots)
         nominal = find_device("hz").law
-        lengths = np.linspace(0.85, 1.35, _MAP_KNOTS) * _zero_length_m()
-        self._map_f = nominal.capacitance_f(lengths) / nominal.capacitance_f(_zero_length_m())
-        self._map_strain = lengths / _zero_length_m() - 1.0
+        lengths = np.linspace(0.85, 1.35, _MAP_KNOTS) * ZERO_LENGTH_M
+        self._map_f = nominal.capacitance_f(lengths) / nominal.capacitance_f(ZERO_LENGTH_M)
+        self._map_strain = lengths / ZERO_LENGTH_M - 1.0
         self._reach = _reach(self._pool)
 
     @property
@@ -173,11 +173,11 @@ class StrainSimulation:
         """
         pool, drive = self._pool, self._drive_v
         scale = 0.5 * (pool.high_v - pool.low_v)
-        drive[1:] = drive[:-1].copy()
+        drive[1] = drive[0]
         drive[0] = pool.low_v + scale * (np.clip(actions, -1.0, 1.0) + 1.0)
         pull_n = self._pull_n[self._row, self._update]
         self._ensemble.update(
-            drive[1].copy(), drive[0].copy(), pool.load_n + pull_n,
+            drive[1], drive[0], pool.load_n + pull_n,
             self._capacitance_f, self.length_m,
         )  # fmt: skip
         error = (self.strain - self.reference) / STRAIN_PER_ONE
@@ -203,8 +203,8 @@ class StrainSimulation:
         found[:, 0:3] = self._strain.T / STRAIN_PER_ONE
         found[:, 3] = self.reference / STRAIN_PER_ONE
         middle, scale = 0.5 * (pool.high_v + pool.low_v), 0.5 * (pool.high_v - pool.low_v)
-        found[:, 4:6] = (self._drive_v[:2].T - middle) / scale
-        return np.clip(found, -_LIMIT, _LIMIT, out=found)
+        found[:, 4:6] = (self._drive_v.T - middle) / scale
+        return np.clip(found, -LARGEST_OBSERVATION, LARGEST_OBSERVATION, out=found)
 
     def _sense(
         self, capacitance_f: Floats, device: NDArray[np.int64], rng: np.random.Generator
@@ -213,10 +213,6 @@ class StrainSimulation:
         relative = capacitance_f / self._pool.zero_f[device]
         noise = self._pool.relative_noise[device] * rng.standard_normal(device.size)
         return np.interp(relative * (1.0 + noise), self._map_f, self._map_strain)
-
-
-def _zero_length_m() -> float:
-    return 0.051
 
 
 def _pool(devices: int | Sequence[Device], seed: int) -> _Pool:

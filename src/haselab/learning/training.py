@@ -16,6 +16,7 @@ from haselab.controllers.network.weights import (
     ONE,
     WEIGHT_ONE,
     Network,
+    features_of,
 )
 from haselab.learning.simulation import StrainSimulation
 
@@ -95,12 +96,8 @@ class _Loops:
         last = drive
         while not ended:
             seen = simulation.observe()
-            strain = [_to_one(seen[:, k]) for k in range(3)]
-            wanted = _to_one(seen[:, 3])
-            features = np.stack([
-                wanted - strain[0], 10 * (strain[0] - strain[1]), 10 * (strain[1] - strain[2]),
-                wanted >> 1, drive, 4 * (drive - last),
-            ], axis=1)  # fmt: skip
+            strain = (_to_one(seen[:, 0]), _to_one(seen[:, 1]), _to_one(seen[:, 2]))
+            features = np.stack(features_of(_to_one(seen[:, 3]), strain, drive, last), axis=1)
             change = changes(weights, features.reshape(*shape, FEATURES))
             last, drive = drive, np.clip(drive + (change.ravel() >> 1), -ONE, ONE)
             rewards, terminated, truncated = simulation.step(drive / ONE, rng)

@@ -12,7 +12,7 @@ from haselab.base import InputError
 from haselab.rig.twin.config import TwinConfig, twin_of_reading
 from haselab.store.toml import validated
 
-__all__ = ["DEVICES", "Device", "drawn", "find_device"]
+__all__ = ["DEVICES", "ZERO_LENGTH_M", "Device", "drawn", "find_device"]
 
 _FIELD_SHARE = 0.85  # of the breakdown field that a controller may use
 _LATE_S = 0.005  # added at most to the delay of a drawn device
@@ -72,7 +72,7 @@ def _changed(**tables: dict[str, float]) -> TwinConfig:
     return validated(TwinConfig, {"reading": "hz", **tables}, "scoreboard")
 
 
-_ZERO_M = 0.051  # length of the public twin at strain 0
+ZERO_LENGTH_M = 0.051  # length of the public twin at strain 0
 _HZ = twin_of_reading("hz")
 DEVICES = {
     one.name: one
@@ -137,7 +137,7 @@ def drawn(rng: np.random.Generator, *, senses_alike: bool = False) -> Device:
     ).tolist()
     config["hysteresis"]["force_n"] = hysteresis_n
     if not senses_alike:
-        dielectric, zero = config["dielectric"], _ZERO_M / _HZ.free_length_m
+        dielectric, zero = config["dielectric"], ZERO_LENGTH_M / _HZ.free_length_m
         dielectric["permittivity"] *= zero ** (dielectric["capacitance_exponent"] - exponent)
         dielectric["capacitance_exponent"] = exponent
         dielectric["relaxation_share"] = share

@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from haselab.controllers.kind import ControllerKind
-from haselab.controllers.network.weights import FEATURES, HIDDEN, LARGEST_FEATURE, ONE, Network
+from haselab.controllers.network.weights import (
+    FEATURES,
+    HIDDEN,
+    LARGEST_FEATURE,
+    ONE,
+    Network,
+    features_of,
+)
 from haselab.controllers.protocol import ControllerSetting, Measurement
 
 __all__ = ["NETWORK", "PERIOD_S", "STRAIN_PER_ONE", "NetworkController", "network_kind"]
@@ -152,10 +159,8 @@ class _NetworkLoop:
         wanted = _whole(np.float32(reference) * np.float32(ONE / STRAIN_PER_ONE))
         self._count, self._sum = 0, np.float32(0.0)
         before, earlier = self._strain or (now, now)
-        change = self._network.change((
-            wanted - now, 10 * (now - before), 10 * (before - earlier), wanted >> 1,
-            self._drive, 4 * (self._drive - self._last_drive),
-        ))  # fmt: skip
+        seen = features_of(wanted, (now, before, earlier), self._drive, self._last_drive)
+        change = self._network.change(seen)
         self._strain, self._last_drive = (now, before), self._drive
         self._drive = min(max(self._drive + (change >> 1), -ONE), ONE)
 

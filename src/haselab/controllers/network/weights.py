@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ __all__ = [
     "ONE",
     "WEIGHT_ONE",
     "Network",
+    "features_of",
 ]
 
 FEATURES = 6
@@ -104,3 +106,26 @@ class Network:
             )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"No network can be read ({error}). Train one. {path}") from None
+
+
+Number = TypeVar("Number", int, NDArray[np.int32])
+
+
+def features_of(
+    wanted: Number, strain: tuple[Number, Number, Number], drive: Number, last_drive: Number
+) -> tuple[Number, ...]:
+    """The features of a network, of one loop or of many.
+
+    Args:
+        wanted: reference.
+        strain: sensed now and one and two steps ago, in the unit of the reference.
+        drive: in force.
+        last_drive: before it.
+    Returns:
+        `FEATURES` numbers, each of the shape of the arguments.
+    """
+    now, before, earlier = strain
+    return (
+        wanted - now, 10 * (now - before), 10 * (before - earlier), wanted >> 1,
+        drive, 4 * (drive - last_drive),
+    )  # fmt: skip

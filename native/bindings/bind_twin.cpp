@@ -53,6 +53,7 @@ const Value kValues[] = {
     {"sample_s", &twin_parameters::sample_s},
     {"skew_s", &twin_parameters::skew_s},
     {"lsb_v", &twin_parameters::lsb_v},
+    {"top_code", &twin_parameters::top_code},
     {"v_noise_v", &twin_parameters::v_noise_v},
     {"i_noise_v", &twin_parameters::i_noise_v},
     {"capacitance_rise", &twin_parameters::capacitance_rise},

@@ -126,7 +126,7 @@ void fmu_keep_readings(fmu_bench *b, int32_t samples)
         for (k = 0; k < n; ++k) {
             const int16_t code = b->codes[2 * k + (size_t)c];
             kept[block - n + k] = (float)(code * b->p.lsb_v);
-            if (code >= 32767 || code <= -32768) {
+            if (code >= b->p.top_code || code <= -b->p.top_code - 1.0) {
                 fresh = fresh < samples - 1 - (int64_t)k ? fresh : samples - 1 - (int64_t)k;
             }
         }

@@ -390,14 +390,15 @@ static void follow(const twin_lag *lag, double *shown, double *seen, double *val
 }
 
 HS_CLONES static void convert(const double *values, double scale, double offset_v,
-                              const float *noise, double noise_v, double lsb_v, int16_t *codes)
+                              const float *noise, double noise_v, double lsb_v, double top,
+                              int16_t *codes)
 {
     int32_t rounded[TWIN_SUB];
     int j;
     for (j = 0; j < TWIN_SUB; ++j) {
         double code = (values[j] * scale + noise_v * (double)noise[j] + offset_v) / lsb_v;
-        code = code < 32767.0 ? code : 32767.0;
-        code = code > -32768.0 ? code : -32768.0;
+        code = code < top ? code : top;
+        code = code > -top - 1.0 ? code : -top - 1.0;
         rounded[j] = (int32_t)nearbyint(code);
     }
     for (j = 0; j < TWIN_SUB; ++j) {
@@ -433,8 +434,10 @@ static void read_monitors(const twin_parameters *p, twin_state *s, samples *x, i
     }
     follow(&p->v_lag, &s->v_shown, &s->v_seen, x->amp_v); /* at the begin of each sample */
     follow(&p->i_lag, &s->i_shown, &s->i_seen, x->amps);
-    convert(x->amp_v, p->v_monitor, p->v_offset_v, x->noise_v, p->v_noise_v, p->lsb_v, codes);
-    convert(x->amps, p->i_monitor, p->i_offset_v, x->noise_i, p->i_noise_v, p->lsb_v, codes + 1);
+    convert(x->amp_v, p->v_monitor, p->v_offset_v, x->noise_v, p->v_noise_v, p->lsb_v, p->top_code,
+            codes);
+    convert(x->amps, p->i_monitor, p->i_offset_v, x->noise_i, p->i_noise_v, p->lsb_v, p->top_code,
+            codes + 1);
 }
 
 /* Mean voltage and its ripple over some samples, by the trapezoidal rule. */

@@ -32,6 +32,7 @@ typedef struct {
     double v_offset_v, i_offset_v;           /* readings at 0 V, 0 A */
     /* converters */
     double sample_s, skew_s, lsb_v, v_noise_v, i_noise_v;
+    double top_code; /* the largest; the smallest is -top_code - 1 */
     /* What no law has, all off at 0: the permittivity rises by capacitance_rise as the bench warms
      * up, ageing takes stiffness_loss of the elastic force, both from begins_s on, and a second
      * mass hangs on a spring. */

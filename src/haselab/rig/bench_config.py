@@ -230,6 +230,7 @@ class BenchConfig(PrintableSection):
             switch_sample=daq.switch_in_block + daq.ahead_blocks * daq.block_samples,
             skew_s=daq.skew_s,
             volt_per_code=daq.volt_per_code,
+            top_code=daq.top_code,
             amplifier_gain=amplifier.gain,
             v_monitor_v_per_v=1.0 / amplifier.volt_per_monitor_volt,
             i_monitor_v_per_a=1.0 / amplifier.ampere_per_monitor_volt,

@@ -77,6 +77,7 @@ class RigDescription:
         calibration: of the monitors; None: by the nominal gains.
         exposure_s: of one frame; 0 if it is not known.
         actuator_kind: of the actuator, as in its actuator file.
+        top_code: largest code of the converter; a reading there, or below `-top_code`, is clipped.
     """
 
     name: str
@@ -97,6 +98,7 @@ class RigDescription:
     calibration: MonitorCalibration | None = None
     exposure_s: float = 0.0
     actuator_kind: str = PLANAR_HASEL
+    top_code: int = 2**15 - 1
 
     @property
     def block_s(self) -> float:

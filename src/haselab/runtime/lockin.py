@@ -26,6 +26,7 @@ def lockin_of(rig: RigDescription, carrier_hz: float) -> Lockin:
         skew_s=rig.skew_s,
         ohm_per_ratio=rig.i_monitor_v_per_a / rig.v_monitor_v_per_v,
         blank=(0, settled),
+        full_scale=rig.top_code,
     )
     if (found := rig.calibration) is not None:
         volt_v, ampere_v = found.offsets_v

@@ -204,6 +204,7 @@ def read_reference(
     rate_hz: float,
     carrier_hz: float,
     volt_per_reading: float = 1.0,
+    full_scale: float | None = None,
 ) -> ReferenceReading:
     """Read a reference: mean over valid blocks, with noise from their scatter.
 
@@ -212,6 +213,8 @@ def read_reference(
         rate_hz: samples per second and channel.
         carrier_hz: sensing frequency.
         volt_per_reading: 1 for volts, else volts of one ADC code.
+        full_scale: a reading of this magnitude is clipped; None: the last code of 16 bits for
+            codes, no limit for volts.
     Returns:
         The reading.
     Raises:
@@ -230,6 +233,8 @@ def read_reference(
             f"Readings of shape {readings.shape}; they must be at least {_FEWEST_BLOCKS} blocks, "
             "(blocks, block_samples, 2). Record the reference for longer."
         )
+    if full_scale is None:
+        full_scale = np.iinfo(np.int16).max if readings.dtype == np.int16 else math.inf
     config = LockinConfig(
         rate_hz=rate_hz,
         block_samples=readings.shape[1],
@@ -237,7 +242,7 @@ def read_reference(
         skew_s=0.0,
         ohm_per_ratio=1.0,
         min_amplitude_codes=1e-6 / volt_per_reading,
-        full_scale=np.iinfo(np.int16).max if readings.dtype == np.int16 else math.inf,
+        full_scale=full_scale,
     )
     sensed = Lockin(config).sense(readings)
     good = sensed.valid

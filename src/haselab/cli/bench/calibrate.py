@@ -123,6 +123,7 @@ def _measure(
                     rate_hz=rig.description.rate_hz,
                     carrier_hz=request.carrier_hz,
                     volt_per_reading=rig.description.volt_per_code,
+                    full_scale=rig.description.top_code,
                 )
             )
             progress.advance(1.0, f"{1e9 * reference.capacitance_f:g} nF")

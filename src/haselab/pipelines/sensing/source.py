@@ -361,6 +361,8 @@ def session_config(
         1.0 / _number(session, 1.0 / _AMPERE_PER_MONITOR_VOLT, "rig", "i_monitor_v_per_a"),
     )
     full_scale = _FULL_SCALE_CODES
+    if session.states("rig", "top_code"):  # older sessions lack it
+        full_scale = float(session.stated("rig", "top_code"))
     if request.full_scale_v is not None:
         full_scale = request.full_scale_v * _LAST_CODE / volt_per_code
     search = request.blank_s is None and request.method == "lockin" and _is_imported(session)

@@ -142,7 +142,7 @@ def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[CheckResult]:
     volt, ampere = volts(rig, codes), amperes(rig, codes)
     at_input = input_volts(rig, codes)
     for k, what in enumerate(("voltage monitor", "current monitor")):
-        stuck = saturated(codes[:, k])
+        stuck = saturated(codes[:, k], rig.description.top_code)
         at_rest_v = float(at_input[:, k].mean())
         quiet_v = (quiet_at_input_v(rig), _CURRENT_OFFSET_V)[k]
         if k == 0:

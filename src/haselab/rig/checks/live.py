@@ -244,7 +244,8 @@ def _carrier(rig: Rig) -> tuple[str, complex, complex]:
     codes = rig.acquisition.read()
     rig.generator.off()
     at_input = input_volts(rig, codes)
-    clipped = [name for k, name in enumerate(("voltage", "current")) if saturated(codes[:, k])]
+    top = rig.description.top_code
+    clipped = [name for k, name in enumerate(("voltage", "current")) if saturated(codes[:, k], top)]
     rate_hz = rig.description.rate_hz
     found = [phasor(at_input[:, k], _CARRIER_HZ, rate_hz) for k in (0, 1)]
     return "".join(clipped[:1]), found[0], found[1]
@@ -306,7 +307,7 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
         )
         return
     codes = seen.codes
-    if saturated(codes[:, 0]):
+    if saturated(codes[:, 0], rig.description.top_code):
         yield CheckResult(
             "live",
             "size of an output",

@@ -39,9 +39,9 @@ def phasor(values: NDArray[np.float64], frequency_hz: float, rate_hz: float) -> 
     return complex(2.0 * (values * turn).mean())
 
 
-def saturated(codes: NDArray[np.int16]) -> bool:
-    """Whether a channel, `(n,)`, is at an end of its range."""
-    return bool(np.abs(codes.astype(int)).max() >= 2**15 - 1)
+def saturated(codes: NDArray[np.int16], top_code: int) -> bool:
+    """Whether a channel, `(n,)`, is at an end of the range of a converter."""
+    return bool(np.abs(codes.astype(int)).max() >= top_code)
 
 
 def keep(rig: Rig, on: bool) -> None:

@@ -93,6 +93,11 @@ class DaqConfig(InstrumentConfig):
         """Of the recorded codes."""
         return 2.0 * self.range_v / 2.0**self.bits
 
+    @property
+    def top_code(self) -> int:
+        """Largest code; the smallest is `-top_code - 1`."""
+        return 2 ** (self.bits - 1) - 1
+
 
 class GeneratorConfig(InstrumentConfig):
     """Section `generator`: the sensing signal."""

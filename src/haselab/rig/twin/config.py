@@ -169,6 +169,11 @@ class AcquisitionConfig(Section):
     drive_low_v: float = Field(0.0, ge=-10)
     drive_high_v: float = Field(2.0, le=10)
 
+    @property
+    def top_code(self) -> int:
+        """Largest code; the smallest is `-top_code - 1`."""
+        return 2 ** (self.bits - 1) - 1
+
     @model_validator(mode="after")
     def _times(self) -> Self:
         if self.skew_s > 0.5 / self.rate_hz:

@@ -208,6 +208,7 @@ def desktop_loop(
     sensing = LockinConfig(
         rig.rate_hz, rig.block_samples, desk.carrier_hz, rig.skew_s,
         rig.i_monitor_v_per_a / rig.v_monitor_v_per_v, blank=(0, blank),
+        full_scale=rig.top_code,
     )  # fmt: skip
     share = _reference_share(bench, Lockin(sensing), desk.carrier_hz)
     lockin = Lockin(replace(sensing, scale_s=sensing.admittance_scale_s * share))

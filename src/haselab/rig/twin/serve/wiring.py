@@ -45,7 +45,8 @@ class Wiring:
         return 0.0 if self.loop_back else output_v * self.output_gain
 
     def read(
-        self, codes: NDArray[np.int16], output_v: float, volt_per_code: float, time_s: float,
+        self, codes: NDArray[np.int16], output_v: float, volt_per_code: float, top_code: int,
+        time_s: float,
         sample_s: float,
     ) -> NDArray[np.int16]:  # fmt: skip
         """Compute the codes that the board reads.
@@ -54,6 +55,7 @@ class Wiring:
             codes: of both monitors, `(n, 2)`, wired as the rig file says.
             output_v: of the board, in V.
             volt_per_code: of the converter.
+            top_code: the largest code of the converter.
             time_s: of the first sample, for the mains.
             sample_s: from sample to sample.
         Returns:
@@ -71,8 +73,7 @@ class Wiring:
         # An input without a signal still shows the converter's noise.
         noise = np.random.default_rng(round(time_s / sample_s)).normal(0.0, _NOISE, codes.shape)
         read = np.rint(read + noise + ((self.offset_v + hum_v) / volt_per_code)[:, None])
-        top = np.iinfo(np.int16)
-        clipped: NDArray[np.int16] = np.clip(read, top.min, top.max).astype(np.int16)
+        clipped: NDArray[np.int16] = np.clip(read, -top_code - 1, top_code).astype(np.int16)
         return clipped
 
 

@@ -287,7 +287,7 @@ class LiveBench:
                 self._rig.camera.start(_PICTURES_HZ)
             if not self._rig.safety.live:  # STOP, while an instrument was slow
                 raise self._rig.safety.refusal()
-        except HaselabError:
+        except BaseException:  # also a fault of a driver from another package
             self._end()
             raise
         self._mode, self._holder, self._limit_v, self._reason = "drive", holder, limit_v, ""

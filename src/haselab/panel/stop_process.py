@@ -79,8 +79,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._reply(404, {"error": "There is only /stop."})
             return
         self._reply(200, self.server.stop())
+        size = self.headers.get("Content-Length") or ""
         with contextlib.suppress(OSError):  # what the page sent has no meaning
-            self.rfile.read(min(int(self.headers.get("Content-Length") or 0), 4096))
+            self.rfile.read(min(int(size), 4096) if size.isdecimal() else 0)
 
     def _allowed(self) -> bool:
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")

@@ -308,6 +308,15 @@ def test_a_full_disk_is_reported_before_the_first_block(tmp_path, monkeypatch):
         SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER)
 
 
+def test_a_drive_that_has_gone_is_one_line(tmp_path, monkeypatch):
+    def gone(_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(shutil, "disk_usage", gone)
+    with pytest.raises(DeviceError, match=r"cannot be written .*Input/output error"):
+        SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER)
+
+
 @pytest.mark.parametrize("method", ["event", "append_frames", "flush"])
 def test_a_write_that_hdf5_refuses_is_a_device_error(tmp_path, monkeypatch, method):
     session = SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER)

@@ -64,7 +64,10 @@ class Claims:
     ) -> None:  # fmt: skip
         self._ended.set()
         for block in tuple(self._held):
-            self.release(block)
+            with contextlib.suppress(OSError):
+                # An interrupt may have come before this program knew whether the claim is its own.
+                if (self._claims / str(block)).read_text(encoding="utf-8") in ("", self.writer):
+                    self.release(block)
         self._file.close()
         self._own.unlink(missing_ok=True)
 
@@ -93,13 +96,14 @@ class Claims:
             DeviceError: the disk is full, or refuses.
         """
         path = self._claims / str(block)
+        self._held.add(block)  # first: an interrupt must not leave a claim that nobody ends
         for _ in range(2):
             try:
                 with path.open("x", encoding="utf-8") as file:
                     file.write(self.writer)
             except FileExistsError:
                 if self._is_alive(path):
-                    return False
+                    break
                 with contextlib.suppress(OSError):
                     path.unlink()
                 continue
@@ -108,8 +112,8 @@ class Claims:
                 raise DeviceError(
                     f"Cannot write ({error.strerror}). Free disk space. {path}"
                 ) from None
-            self._held.add(block)
             return True
+        self._held.discard(block)
         return False
 
     def release(self, block: int) -> None:
@@ -118,9 +122,9 @@ class Claims:
         Args:
             block: number.
         """
-        self._held.discard(block)
         with contextlib.suppress(OSError):
             (self._claims / str(block)).unlink()
+        self._held.discard(block)
 
     def _is_alive(self, claim: Path) -> bool:
         """Whether the program of a claim still works on it."""

@@ -211,8 +211,11 @@ class SessionWriter:
 
     def _check_room(self) -> None:
         """Stop while HDF5 can still finish the file, which it cannot after a failed write."""
-        free = shutil.disk_usage(self._path.parent).free
-        free = min(free, _size_limit() - self._path.stat().st_size)
+        try:
+            free = shutil.disk_usage(self._path.parent).free
+            free = min(free, _size_limit() - self._path.stat().st_size)
+        except OSError as error:  # the folder has gone, or its drive
+            raise self._failed(error) from None
         if free < _RESERVE_BYTES:
             raise DeviceError(
                 f"The disk is full: {free / 1e6:.0f} MB are left, {_RESERVE_BYTES / 1e6:.0f} MB "

@@ -175,10 +175,10 @@ def _import(
     zero_length_m: float | None,
     **more: Any,
 ) -> None:
-    """Import columns of voltage, current and perhaps strain as a session.
+    """Import columns of a file as a recording.
 
-    FILE is CSV, MAT, NPZ, HDF5 or TDMS. The session can be sensed, exported and read like a
-    recorded one. A strain, displacement or length is stored like the tracks of a camera.
+    FILE is CSV, MAT, NPZ, HDF5 or TDMS, with columns of voltage and current. The session can be
+    sensed, exported and read like a recorded one. A strain, displacement or length is stored like the tracks of a camera.
     """
     if out is None:
         raise InputError("Missing option '--out': the new folder of the session.")

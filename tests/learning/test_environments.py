@@ -1,5 +1,7 @@
 """The environments: by Gymnasium's own rules, and against the closed loop of the scoreboard."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from haselab.actuators import GRAVITY_M_S2
 from haselab.base import InputError
 from haselab.learning import TASKS, StrainEnv, StrainVectorEnv
 from haselab.learning.simulation import StrainSimulation
-from haselab.scoreboard.devices import drawn
+from haselab.scoreboard.devices import drawn, find_device
 from haselab.scoreboard.loop_class import CLASSES
 from haselab.scoreboard.plant import FastPlant
 
@@ -153,6 +155,11 @@ def test_a_frame_shows_the_actuator_of_the_camera() -> None:
         ({"devices": 0}, "The number of devices is 0. State 1 to 100000."),
         ({"devices": []}, "No devices are given."),
         ({"episode_s": 0.0}, "The episode lasts 0 s. State 0.1 to 3600 s."),
+        (
+            {"devices": [find_device("hz"), replace(find_device("hz"), high_v=1.5)]},
+            "The devices have high_v from 1.5 to 2. Devices of one environment share",
+        ),
+        ({"devices": [find_device("peano-hasel")]}, "The devices contain a peano-hasel."),
         ({"render_mode": "human"}, "render_mode is 'human'. Use None or 'rgb_array'."),
     ],
 )

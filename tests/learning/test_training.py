@@ -8,9 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from haselab.actuators import DeaStack
 from haselab.base import InputError
-from haselab.controllers import ControllerSetting, Measurement
-from haselab.controllers.network import FEATURES, HIDDEN, Network, NetworkController, network_kind
+from haselab.controllers import ControllerSetting, KnownActuator, Measurement
+from haselab.controllers.network import (
+    FEATURES,
+    HIDDEN,
+    NETWORK,
+    Network,
+    NetworkController,
+    network_kind,
+)
 from haselab.learning import Progress, train
 from haselab.learning.simulation import StrainSimulation
 from haselab.learning.training import WEIGHTS, changes
@@ -90,3 +98,14 @@ def test_a_file_gives_its_network_back_and_a_bad_one_is_refused(tmp_path: Path) 
         Network.load(path)
     with pytest.raises(InputError, match="A weight is outside -127 to 127"):
         Network(((128,) * (FEATURES + 1),) * HIDDEN, (0,) * (HIDDEN + 1))
+
+
+def test_an_actuator_that_networks_are_not_trained_on_is_refused() -> None:
+    """A stack contracts where a planar HASEL elongates: the loop would be unstable."""
+    stack = KnownActuator(DeaStack(), 0.2, 0.036, 0.0, 1.8, 5000.0)
+    setting = ControllerSetting(0.01, 0.0, 1.8, actuator=stack)
+    controller = NETWORK.make()
+    assert NETWORK.design is not None
+    for use in (controller.start, controller.c_text, NETWORK.design):
+        with pytest.raises(InputError, match=r"planar-hasel.*but this one is a dea-stack\."):
+            use(setting)

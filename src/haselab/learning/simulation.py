@@ -224,6 +224,17 @@ def _pool(devices: int | Sequence[Device], seed: int) -> _Pool:
     if not devices:
         raise InputError("No devices are given. State at least one.")
     first = devices[0]
+    if other := {device.config.kind for device in devices} - {find_device("hz").config.kind}:
+        raise InputError(
+            f"The devices contain a {other.pop()}. The environments simulate planar HASELs only."
+        )
+    for name in ("mass_kg", "low_v", "high_v", "zero_v"):
+        values = sorted({getattr(device, name) for device in devices})
+        if len(values) > 1:
+            raise InputError(
+                f"The devices have {name} from {values[0]:g} to {values[-1]:g}. Devices of one "
+                "environment share mass and voltages: make an environment for each value."
+            )
     settled = [_settled(device) for device in devices]
     return _Pool(
         tuple(settled),

@@ -299,7 +299,7 @@ def test_stop_commands_zero_while_a_call_hangs_and_nothing_undoes_it(
         live.close()
 
 
-class DriverFault(Exception):
+class DriverFaultError(Exception):
     """An exception of a driver that haselab does not know."""
 
 
@@ -308,7 +308,7 @@ def test_a_driver_that_fails_in_its_own_way_while_arming_leaves_zero(tmp_path: P
     bench: Any = twin.acquisition
 
     def faulty(*_: object) -> None:
-        raise DriverFault("a cable")
+        raise DriverFaultError("a cable")
 
     bench.sine = faulty
     rig = guard(twin)
@@ -316,7 +316,7 @@ def test_a_driver_that_fails_in_its_own_way_while_arming_leaves_zero(tmp_path: P
     with LiveWriter(tmp_path / "live", about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
         live = LiveBench(rig, writer)
         number = live.do("request", "page", {})["number"]
-        with pytest.raises(DriverFault, match="a cable"):
+        with pytest.raises(DriverFaultError, match="a cable"):
             live.do("arm", "page", {"number": number, "limit_v": 1.5})
         assert not rig.safety.live and live.state.mode == "idle"
         assert rig.bench.requested_v == 0.0

@@ -31,7 +31,7 @@ def test_an_interrupt_leaves_no_claim(
                 answer.close()
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="^$"), Claims(tmp_path) as claims:
+    with pytest.raises(KeyboardInterrupt, match=r"^$"), Claims(tmp_path) as claims:
         if step == "unlink":
             assert claims.take(7)
         monkeypatch.setattr(Path, step, interrupted)
@@ -44,7 +44,7 @@ def test_an_interrupt_leaves_another_program_s_claim(
 ) -> None:
     with Claims(tmp_path) as first:
         assert first.take(7)
-        with pytest.raises(KeyboardInterrupt, match="^$"), Claims(tmp_path) as second:
+        with pytest.raises(KeyboardInterrupt, match=r"^$"), Claims(tmp_path) as second:
 
             def interrupted(self: Claims, claim: Path) -> bool:
                 raise KeyboardInterrupt

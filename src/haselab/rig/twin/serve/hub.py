@@ -163,8 +163,12 @@ class TwinHub(Closing):
             codes = np.zeros((samples, 2), dtype=np.int16)
         sample_s = 1.0 / self.rate_hz
         codes = self.wiring.read(
-            codes, self._drive_v, self.volt_per_code, self.description.top_code,
-            self._total * sample_s, sample_s,
+            codes,
+            self._drive_v,
+            self.volt_per_code,
+            self.description.top_code,
+            self._total * sample_s,
+            sample_s,
         )
         self._total += samples
         if self._sampling:

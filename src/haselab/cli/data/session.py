@@ -178,7 +178,8 @@ def _import(
     """Import columns of a file as a recording.
 
     FILE is CSV, MAT, NPZ, HDF5 or TDMS, with columns of voltage and current. The session can be
-    sensed, exported and read like a recorded one. A strain, displacement or length is stored like the tracks of a camera.
+    sensed, exported and read like a recorded one. A strain, displacement or length is stored like
+    the tracks of a camera.
     """
     if out is None:
         raise InputError("Missing option '--out': the new folder of the session.")

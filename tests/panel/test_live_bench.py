@@ -208,10 +208,19 @@ def test_what_led_to_zero_is_still_shown(tmp_path: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("range_f", "is_shown"), [((4.96e-10, 9.01e-10), True), ((8e-10, 9.01e-10), False)]
+    ("range_f", "is_shown", "is_extrapolated"),
+    [
+        ((4e-10, 9.01e-10), True, False),
+        ((4.96e-10, 9.01e-10), True, True),
+        ((8e-10, 9.01e-10), False, False),
+    ],
 )
 def test_no_strain_is_shown_where_no_loop_would_use_the_map(
-    tmp_path: Path, actuator_file: Path, range_f: tuple[float, float], is_shown: bool
+    tmp_path: Path,
+    actuator_file: Path,
+    range_f: tuple[float, float],
+    is_shown: bool,
+    is_extrapolated: bool,
 ) -> None:
     """At 0 V, the capacitance of the twin is 4.5e-10 F."""
     loop = Actuator.load(actuator_file).loop()
@@ -228,6 +237,7 @@ def test_no_strain_is_shown_where_no_loop_would_use_the_map(
         reader = LiveReader(path)
         _, _, capacitance_f, strain, _ = reader.signals(0.0, reader.end_s, 10_000).high[-1]
         reader.close()
+        assert live.state.extrapolated is is_extrapolated
         live.close()
     low_f, high_f = loop.strain_map.usable_f
     assert bool(low_f <= capacitance_f <= high_f) is is_shown

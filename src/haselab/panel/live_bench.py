@@ -69,6 +69,8 @@ class BenchState:
         events: the last ones, each with its time on the clock of the rig, in s.
         recorded: folder of the last study that was played to its end; empty: none.
         recording: folder of the study that is being played; empty: none.
+        extrapolated: whether the capacitance is outside the range in which the strain map was
+            fitted, so that the strain has no valid band.
     """
 
     stage: str
@@ -91,6 +93,7 @@ class BenchState:
     events: tuple[tuple[float, str], ...]
     recorded: str
     recording: str
+    extrapolated: bool
 
 
 class _NoCamera:
@@ -156,6 +159,7 @@ class LiveBench:
         self._block_s = 0.0  # when the last block was read
         self._recorded = ""  # folder of the last study that was played to its end
         self._end_study = ""  # why the study must end; empty: it may go on
+        self._extrapolated = False  # the strain of the last block
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
         rig.bench.on_block = self._on_block
         self._settled = about.switch_in_block + round(1e-3 * about.rate_hz)
@@ -179,6 +183,7 @@ class LiveBench:
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, tuple(self._events),
             self._recorded, "" if self._job is None else self._job.options.folder.name,
+            self._extrapolated,
         )  # fmt: skip
 
     def do(self, what: str, holder: str, values: JsonObject) -> JsonObject:
@@ -521,10 +526,13 @@ class LiveBench:
         capacitance_f, _, valid = self._lockin.step(codes)
         sensed_f = capacitance_f if valid and self._holder else math.nan
         strain = math.nan
+        self._extrapolated = False
         if self._loop is not None:
-            low_f, high_f = self._loop.strain_map.usable_f
+            strain_map = self._loop.strain_map
+            low_f, high_f = strain_map.usable_f
             if low_f <= sensed_f <= high_f:  # as in the loop
-                strain = float(self._loop.strain_map.strain(sensed_f))
+                strain = float(strain_map.strain(sensed_f))
+                self._extrapolated = not bool(strain_map.inside(sensed_f))
         seen_v = float(codes[self._settled :, 0].mean()) * about.volt_per_code
         residual_v = seen_v / about.monitor_v_per_drive_v - self._rig.present_drive_v
         reference = math.nan if self._reference is None else self._reference

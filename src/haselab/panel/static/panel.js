@@ -157,6 +157,7 @@ function Panel() {
           <h2>Bench</h2>
           ${link.problem && html`<p class="error" role="alert">${link.problem}</p>`}
           ${error && html`<p class="error" role="alert">${error}</p>`}
+          ${state?.extrapolated && html`<p class="error" role="status">The strain is extrapolated: the capacitance is outside the range of the strain map.</p>`}
           ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}</p>`}
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`

@@ -49,6 +49,7 @@ _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
 _COLUMN_STEP = 100  # so that windows of almost the same width share their frames
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
+_ENERGISING = ("arm", "drive", "loop")
 _HEAD = struct.Struct("<HHIddddII")
 
 
@@ -143,15 +144,25 @@ class _Bench:
                 "error": "There is no connection to the bench process. Check that the "
                 "bench is at 0 V, then start the panel again."
             }
-        self._number += 1
-        answer = asyncio.get_running_loop().create_future()
-        self._waiting[self._number] = answer
-        command = {"id": self._number, "do": what, "holder": holder, "values": values}
-        self._writer.write(json.dumps(command).encode() + b"\n")
+        number = self._send(what, holder, values)
+        answer = self._waiting[number] = asyncio.get_running_loop().create_future()
         try:
             return await asyncio.wait_for(answer, _BENCH_S)
         except TimeoutError:
-            return {"error": f"No answer from the bench process for {_BENCH_S:g} s. Press STOP."}
+            self._waiting.pop(number, None)
+            error = f"No answer from the bench process for {_BENCH_S:g} s. Press STOP."
+            if what in _ENERGISING:  # a command that has failed must not energise the bench
+                self._send("disarm", holder, {})
+                error += " If the command is carried out late, the bench is disarmed at once."
+            return {"error": error}
+
+    def _send(self, what: str, holder: str, values: dict[str, Any]) -> int:
+        """Send a command; returns its number."""
+        self._number += 1
+        command = {"id": self._number, "do": what, "holder": holder, "values": values}
+        if self._writer is not None:
+            self._writer.write(json.dumps(command).encode() + b"\n")
+        return self._number
 
 
 class _View(NamedTuple):

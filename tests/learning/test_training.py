@@ -21,7 +21,7 @@ from haselab.controllers.network import (
 )
 from haselab.learning import Progress, train
 from haselab.learning.simulation import StrainSimulation
-from haselab.learning.training import WEIGHTS, changes
+from haselab.learning.training import WEIGHTS, _Objective, changes
 from haselab.scoreboard.devices import drawn
 
 SMALL = {"generations": 3, "population": 8, "loops": 4, "devices": 3}
@@ -42,6 +42,30 @@ def test_many_networks_at_once_answer_as_each_alone(seed: int, features: list[in
     found = changes(weights, seen)
     for k, each in enumerate(networks):
         assert found[k].tolist() == [each.change(tuple(seen[k, 0].tolist()))] * 3
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_network_begins_the_next_search_with_its_own_weights(seed: int) -> None:
+    assert Network.from_vector(network(seed).to_vector()) == network(seed)
+
+
+def test_an_error_counts_more_after_a_step_and_more_again_beyond_it() -> None:
+    """Equation: reward (1 + min(k / 10, 4)) - cost * overshoot / 0.05, k updates after a step."""
+    simulation = StrainSimulation("track", 2, devices=1)
+    simulation.reset(np.arange(2), np.random.default_rng(1))
+    simulation._reference[:] = 0.0
+    simulation._reference[:, 3:] = [[0.02], [-0.02]]  # up in one loop, down in the other
+    simulation.length_m[:] = 1.01 * simulation._pool.zero_m[0]  # strain 0.01 in both
+    objective, rewards, found = _Objective(simulation, 4.0), np.array([-1.0, -1.0]), []
+    for update in range(1, 60):
+        simulation._update[:] = update
+        found.append(objective.of(rewards, np.zeros(2, dtype=bool)))
+    weights = np.array([1.0 + min(0.1 * k, 4.0) for k in range(57)])
+    np.testing.assert_allclose(np.array(found)[2:, 0], -weights)  # below its reference
+    np.testing.assert_allclose(np.array(found)[2:, 1], -weights)  # above it, from above
+    simulation.length_m[:] = 1.03 * simulation._pool.zero_m[0]
+    beyond = objective.of(rewards, np.array([False, True]))
+    np.testing.assert_allclose(beyond, [-5.0 - 4.0 * 0.01 / 0.05, -1.0])  # broken: its reward alone
 
 
 def test_the_loop_of_the_training_is_that_of_the_controller() -> None:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import InputError
+from haselab.controllers.network.controller import STRAIN_PER_ONE
 from haselab.controllers.network.weights import (
     FEATURES,
     HIDDEN,
@@ -24,8 +26,11 @@ __all__ = ["WEIGHTS", "Progress", "changes", "train"]
 
 Floats = NDArray[np.float64]
 WEIGHTS = HIDDEN * (FEATURES + 1) + HIDDEN + 1
-_FIRST_SIGMA = 0.2
+_FIRST_SIGMA, _NEXT_SIGMA = 0.2, 0.1
 _EPISODE_S = 3.0
+# An error counts more the longer the reference has been constant, up to 1 + `_MOST_PATIENCE` times.
+_PATIENCE, _MOST_PATIENCE = 0.1, 4.0
+_JUMP, _CONSTANT = 5e-3, 1e-9  # of the reference in one update: a step, and none
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Progress:
 
     Args:
         generation: that has ended, from 1.
-        best: mean reward of an update, of its best network.
+        best: mean objective of an update, of its best network.
         median: the same of the median network.
     """
 
@@ -71,14 +76,43 @@ def changes(weights: NDArray[np.int32], features: NDArray[np.int32]) -> NDArray[
     return np.asarray(np.clip(last >> 5, -ONE, ONE))
 
 
+class _Objective:
+    """What the search maximises in one episode: the rewards, with more for a step that settles.
+
+    Args:
+        simulation: at the beginning of the episode.
+        overshoot_cost: of a strain beyond a constant reference, over that of an error.
+    """
+
+    def __init__(self, simulation: StrainSimulation, overshoot_cost: float) -> None:
+        self._simulation, self._overshoot_cost = simulation, overshoot_cost
+        self._reference = simulation.reference
+        self._held, self._direction = np.zeros(simulation.slots), np.zeros(simulation.slots)
+
+    def of(self, rewards: Floats, terminated: NDArray[np.bool_]) -> Floats:
+        """Of one update. Shapes `(slots,)`."""
+        reference = self._simulation.reference
+        jump = reference - self._reference
+        self._reference = reference
+        self._direction = np.where(np.abs(jump) > _JUMP, np.sign(jump), self._direction)
+        self._held = np.where(np.abs(jump) < _CONSTANT, self._held + 1.0, 0.0)
+        beyond = np.maximum(self._direction * (self._simulation.strain - reference), 0.0)
+        found = rewards * (1.0 + np.minimum(_PATIENCE * self._held, _MOST_PATIENCE))
+        found -= self._overshoot_cost * beyond / STRAIN_PER_ONE * (self._held > 0.0)
+        return np.where(terminated, rewards, found)
+
+
 class _Loops:
     """The networks of one generation, each in as many loops."""
 
-    def __init__(self, simulations: list[StrainSimulation], population: int) -> None:
+    def __init__(
+        self, simulations: list[StrainSimulation], population: int, overshoot_cost: float
+    ) -> None:
         self._simulations, self._population = simulations, population
+        self._overshoot_cost = overshoot_cost
 
     def returns(self, weights: NDArray[np.int32], seed: int) -> Floats:
-        """Mean reward per update of each network. Shape `(P,)`."""
+        """Mean objective per update of each network. Shape `(P,)`."""
         whole = np.zeros(self._population)
         for simulation in self._simulations:
             rng = np.random.default_rng(seed)
@@ -94,6 +128,7 @@ class _Loops:
         alive = np.ones(simulation.slots, dtype=bool)
         drive = _to_one(simulation.observe()[:, 4])
         last = drive
+        objective = _Objective(simulation, self._overshoot_cost)
         while not ended:
             seen = simulation.observe()
             strain = (_to_one(seen[:, 0]), _to_one(seen[:, 1]), _to_one(seen[:, 2]))
@@ -101,7 +136,7 @@ class _Loops:
             change = changes(weights, features.reshape(*shape, FEATURES))
             last, drive = drive, np.clip(drive + (change.ravel() >> 1), -ONE, ONE)
             rewards, terminated, truncated = simulation.step(drive / ONE, rng)
-            total += np.where(alive, rewards, 0.0)
+            total += np.where(alive, objective.of(rewards, terminated), 0.0)
             alive &= ~terminated
             count += 1
             ended = bool(truncated.any())
@@ -120,9 +155,14 @@ def train(
     population: int = 32,
     loops: int = 12,
     devices: int = 64,
+    start: Network | None = None,
+    overshoot_cost: float = 0.0,
     report: Callable[[Progress], None] | None = None,
 ) -> Network:
     """Train a network that closes the loop on drawn devices.
+
+    The search maximises the mean reward, where an error counts up to five times after the reference
+    has been constant for 0.4 s, so that steps settle.
 
     Args:
         tasks: names, which count alike.
@@ -131,24 +171,30 @@ def train(
         population: networks in a generation.
         loops: in which each of them is tried, in each task.
         devices: different ones.
+        start: network from which the search begins; None: one that integrates the error.
+        overshoot_cost: of a strain beyond a constant reference, over that of an error.
         report: called after each generation.
     Returns:
         The mean network of the last generation's search.
+    Raises:
+        InputError: An argument is out of range.
     Source:
         Hansen, N. The CMA evolution strategy: a tutorial. arXiv:1604.00772, 2016.
     """
     import cma
 
+    if not 0.0 <= overshoot_cost <= 100.0:
+        raise InputError(f"overshoot_cost is {overshoot_cost:g}. State 0 to 100.")
     simulations = [
         StrainSimulation(
             task, population * loops, devices=devices, devices_seed=seed, episode_s=_EPISODE_S
         )
         for task in tasks
     ]
-    tried = _Loops(simulations, population)
+    tried = _Loops(simulations, population, overshoot_cost)
     bound = LARGEST_WEIGHT / WEIGHT_ONE
     search = cma.CMAEvolutionStrategy(
-        _first_guess(), _FIRST_SIGMA,
+        *((_first_guess(), _FIRST_SIGMA) if start is None else (start.to_vector(), _NEXT_SIGMA)),
         {"seed": seed + 1, "popsize": population, "bounds": [-bound, bound], "verbose": -9},
     )  # fmt: skip
     for generation in range(generations):

@@ -73,6 +73,10 @@ class Network:
         output = numbers[HIDDEN * (FEATURES + 1) :]
         return cls(tuple(tuple(row) for row in hidden.tolist()), tuple(output.tolist()))
 
+    def to_vector(self) -> NDArray[np.float64]:
+        """The weights as `from_vector` takes them."""
+        return np.concatenate([np.ravel(self.hidden), self.output]) / WEIGHT_ONE
+
     def change(self, features: tuple[int, ...]) -> int:
         """Change of the drive, where `ONE` is half of its half range.
 

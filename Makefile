@@ -95,7 +95,7 @@ $(VENV)/.packages: pyproject.toml | $(VENV)/bin/python
 	  sys.exit(not os.path.exists(s.get_path("include") + "/Python.h"))' || \
 	  .ci/apt-install python3-dev
 	@echo 'setup: packages'
-	@$(PIP) install 'scikit-build-core>=0.11' 'nanobind>=2.7' 'cmake>=3.20' ninja 'setuptools>=70.1'
+	@$(PIP) install 'scikit-build-core>=1.1' 'nanobind>=2.7' 'cmake>=3.20' ninja 'setuptools>=70.1'
 	@$(PIP) install --no-build-isolation --editable '.[formats,test,lint]'
 	@touch $@ $(VENV)/.built
 

@@ -8,5 +8,5 @@ foreach(program C_COMPILER:cc CXX_COMPILER:c++ AR:ar RANLIB:ranlib RC_COMPILER:r
   list(GET pair 1 name)
   set(CMAKE_${variable} $ENV{HASELAB_TOOLS}/${name})
 endforeach()
-set(CMAKE_TRY_COMPILE_TARGET_TYPE EXECUTABLE)
+set(CMAKE_MODULE_LINKER_FLAGS_INIT "-s") # no symbols for a debugger
 set(CMAKE_FIND_ROOT_PATH_MODE_PROGRAM NEVER)

@@ -95,7 +95,6 @@ def build_wheel(python: Path, name: str, source: Path, work: Path, out: Path) ->
         "HASELAB_SYSTEM": target.system,
         "HASELAB_PROCESSOR": target.processor,
         "HASELAB_TOOLS": str(work / "tools"),
-        "ZIG_GLOBAL_CACHE_DIR": str(work.parent / "zig-cache"),
     }
     settings = [f"-Ccmake.define.{key}={value}" for key, value in defines.items()]
     _run(

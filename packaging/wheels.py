@@ -1,7 +1,7 @@
-"""Build the source distribution and the wheels with `zig cc`, for the systems of TARGETS.
+"""Build the source distribution and the wheels of TARGETS with `zig cc`.
 
-Zig brings its own C library headers, so one Linux computer builds for all of them, and the wheels of
-Linux run on every glibc since 2.17. The version of zig is fixed in requirements.txt.
+Zig brings the C library's headers and symbols of every version and processor, so one computer builds
+for all of them, and the wheels run on every glibc since 2.17. The version of zig is fixed in requirements.txt.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ class Target:
         system: its name in CMake.
         processor: its name in CMake.
         platform_tag: of the wheel's file name.
-        suffix: of an extension module for one Python version; empty: only the stable ABI is built.
+        suffix: of an extension module for one Python version.
     """
 
     triple: str
     system: str
     processor: str
     platform_tag: str
-    suffix: str = ""
+    suffix: str
 
 
 TARGETS = {
@@ -47,9 +47,6 @@ TARGETS = {
         "aarch64-linux-gnu.2.17", "Linux", "aarch64",
         "manylinux_2_17_aarch64.manylinux2014_aarch64", "aarch64-linux-gnu",
     ),
-    "windows-x86_64": Target("x86_64-windows-gnu", "Windows", "AMD64", "win_amd64"),
-    "macos-arm64": Target("aarch64-macos.11.0", "Darwin", "arm64", "macosx_11_0_arm64"),
-    "macos-x86_64": Target("x86_64-macos.11.0", "Darwin", "x86_64", "macosx_11_0_x86_64"),
 }  # fmt: skip
 
 
@@ -87,10 +84,9 @@ def build_wheel(python: Path, name: str, source: Path, work: Path, out: Path) ->
     _write_tools(python, target, work / "tools")
     defines = {
         "CMAKE_TOOLCHAIN_FILE": TOOLS / "toolchain.cmake",
+        "HASELAB_EXTRA_SOURCES": TOOLS / "runtime.c",
         "SKBUILD_SOABI": f"cpython-{version}-{target.suffix}",
     }
-    if target.processor in ("x86_64", "AMD64"):
-        defines["HASELAB_CPU_FEATURES"] = TOOLS / "cpu_features.c"
     environment = {
         "HASELAB_SYSTEM": target.system,
         "HASELAB_PROCESSOR": target.processor,
@@ -112,7 +108,7 @@ def build_wheel(python: Path, name: str, source: Path, work: Path, out: Path) ->
 def _write_tools(python: Path, target: Target, folder: Path) -> None:
     """Write the programs that the toolchain file names, each a call of zig."""
     zig = _ask(python, "import ziglang; print(ziglang.__path__[0])") + "/zig"
-    compile_for = f"-target {target.triple} -fno-sanitize=undefined"
+    compile_for = f"-target {target.triple} -fno-sanitize=undefined -rtlib=none"
     lines = {
         "cc": f"cc {compile_for}",
         "c++": f"c++ {compile_for}",

@@ -1,13 +1,30 @@
-/* The features of an x86-64 processor, for compilers whose run-time library reports none.
+/* What haselab needs of a compiler's run-time library, in place of that of `zig cc`.
  *
- * `__builtin_cpu_supports` and `target_clones` of GCC and Clang read these two variables. The
+ * The library of zig contains exp, log, sin, cos and tan too. They would replace those of the system's
+ * libm and give other bits than a build from source, so the wheels are linked without it.
+ */
+#include <complex.h>
+
+#define HIDDEN __attribute__((visibility("hidden")))
+
+/* Called where the parts of a product are not numbers. */
+double complex __muldc3(double a, double b, double c, double d);
+HIDDEN double complex __muldc3(double a, double b, double c, double d)
+{
+    double complex out;
+    double *const parts = (double *)&out;
+    parts[0] = a * c - b * d;
+    parts[1] = a * d + b * c;
+    return out;
+}
+
+#ifdef __x86_64__
+/* The features of the processor. `__builtin_cpu_supports` and `target_clones` of GCC and Clang read these two variables. The
  * library of `zig cc` sets no bit in them, so every choice would be the slowest one. The layout
  * and the bit numbers are those of libgcc and compiler-rt. Only the bits that haselab asks for
  * are set.
  */
 #include <cpuid.h>
-
-#define HIDDEN __attribute__((visibility("hidden")))
 
 enum { AVX2 = 10, AVX512F = 15, AVX512VL = 20, AVX512BW = 21, AVX512DQ = 22, LEVEL_4 = 98 - 32 };
 enum { READY = 1U }; /* any vendor: the variables are set */
@@ -62,3 +79,4 @@ HIDDEN int __cpu_indicator_init(void)
 
 /* Also before any constructor that asks. */
 __attribute__((constructor(101))) static void at_start(void) { (void)__cpu_indicator_init(); }
+#endif

@@ -19,7 +19,7 @@ NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] n
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fuzz help study test check test-all setup lint ctest tools bench bench-full clean
+.PHONY: fuzz dist help study test check test-all setup lint ctest tools bench bench-full clean
 .DELETE_ON_ERROR:
 
 help:
@@ -32,6 +32,7 @@ help:
 	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment, extensions and the packages of the tests'
+	@echo 'make dist    wheels and source distribution into dist/, built and checked'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
 study: $(VENV)/.built
@@ -79,6 +80,9 @@ bench: setup $(VENV)/.bench
 
 bench-full: setup $(VENV)/.bench
 	$(BIN)/python -m benchmarks --full
+
+dist: setup
+	$(PYTHON) packaging/dist.py $(if $(TARGETS),--targets $(TARGETS))
 
 setup: $(VENV)/.packages
 

@@ -1,7 +1,8 @@
 """Build the source distribution and the wheels of TARGETS with `zig cc`.
 
-Zig brings the C library's headers and symbols of every version and processor, so one computer builds
-for all of them, and the wheels run on every glibc since 2.17. The version of zig is fixed in requirements.txt.
+Zig brings the C library's headers and symbols of every version and processor, so one computer
+builds for all of them, and the wheels run on every glibc since 2.17. The version of zig is fixed in
+requirements.txt.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks of built packages: each returns what was found, and raises `CheckError` with what is wrong."""
+"""Checks of built packages: each returns what it found, or raises `CheckError` with the fault."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] n
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fuzz help study test check test-all setup lint ctest tools bench bench-full clean
+.PHONY: fuzz dist help study test check test-all setup lint ctest tools bench bench-full clean
 .DELETE_ON_ERROR:
 
 help:
@@ -31,11 +31,15 @@ help:
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
 	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
-	@echo 'make setup   virtual environment and extensions only'
+	@echo 'make setup   virtual environment, extensions and the packages of the tests'
+	@echo 'make dist    wheels and source distribution into dist/, built and checked'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
-study: setup
+study: $(VENV)/.built
 	$(BIN)/haselab reproduce --out $(OUT) --force
+
+# A warning of the C compiler fails the build of those who change the code, not of those who use it.
+test check test-all ctest lint setup: export WERROR ?= ON
 
 test: setup tools
 	$(PYTEST) -m 'not slow' --durations=25
@@ -77,7 +81,10 @@ bench: setup $(VENV)/.bench
 bench-full: setup $(VENV)/.bench
 	$(BIN)/python -m benchmarks --full
 
-setup: $(VENV)/.built
+dist: setup
+	$(PYTHON) packaging/dist.py $(if $(TARGETS),--targets $(TARGETS))
+
+setup: $(VENV)/.packages
 
 # ---- set-up ---------------------------------------------------------------------------------
 
@@ -88,26 +95,46 @@ $(VENV)/bin/python:
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || .ci/apt-install python3-venv python3-dev
 	@$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.packages: pyproject.toml | $(VENV)/bin/python
+# uv downloads in parallel. It does not read pip's settings, so pip does what uv cannot.
+UV := [ -x $(BIN)/uv ] && VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet
+DEVELOPER := --no-build-isolation --editable '.[formats,test,lint]'
+
+# What compiles the extensions. CMake and Ninja are large: those of the system are used, if new enough.
+$(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
 	@command -v $${CXX:-c++} >/dev/null && command -v $${CC:-cc} >/dev/null || \
 	  .ci/apt-install gcc g++ libc6-dev
 	@$(BIN)/python -c 'import os, sys, sysconfig as s; \
 	  sys.exit(not os.path.exists(s.get_path("include") + "/Python.h"))' || \
 	  .ci/apt-install python3-dev
-	@echo 'setup: packages'
-	@$(PIP) install 'scikit-build-core>=0.11' 'nanobind>=2.7' 'cmake>=3.20' ninja 'setuptools>=70.1'
-	@$(PIP) install --no-build-isolation --editable '.[formats,test,lint]'
-	@touch $@ $(VENV)/.built
+	@echo 'setup: build tools'
+	@$(PIP) install --no-compile --only-binary :all: uv || echo 'setup: without uv, with pip alone' >&2
+	@set -- 'scikit-build-core>=1.1' 'nanobind>=2.7' 'setuptools-scm>=8'; \
+	case "$$(cmake --version 2>/dev/null | sed -n '1s/.* //p')" in \
+	  3.2[0-9].*|3.3[0-9].*|[4-9].*) ;; *) set -- "$$@" 'cmake>=3.20' ;; esac; \
+	command -v ninja >/dev/null || set -- "$$@" ninja; \
+	$(UV) "$$@" || $(PIP) install "$$@"
+	@touch $@
 
-# scikit-build-core keeps its build folder, so this compiles what changed and nothing else.
-$(VENV)/.built: $(NATIVE) $(VENV)/.packages
-	@echo 'setup: extensions'
-	@$(PIP) install --no-build-isolation --no-deps --editable .
+# Downloads and the compiler run at the same time. scikit-build-core keeps its build folder, so a
+# later call compiles what changed and nothing else.
+$(VENV)/.built: $(NATIVE) $(VENV)/.tools
+	@echo 'setup: extensions and packages'
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) install --no-build-isolation --no-deps \
+	  $(if $(WERROR),-C cmake.define.HASELAB_WERROR=$(WERROR)) --editable . & compiling=$$!; \
+	$(UV) -r pyproject.toml || missing=yes; wait $$compiling && { [ -z "$${missing:-}" ] || \
+	$(PIP) install --no-build-isolation --editable .; }
 	@$(BIN)/python -m compileall -q src/haselab # else each process compiles it, where no cache may be written
 	@touch $@
 
+# What the tests and checkers need besides.
+$(VENV)/.packages: pyproject.toml $(VENV)/.built
+	@echo 'setup: packages of the tests'
+	@export PATH="$(CURDIR)/$(BIN):$$PATH"; \
+	$(UV) $(DEVELOPER) || $(PIP) install $(DEVELOPER)
+	@touch $@
+
 $(VENV)/.bench: pyproject.toml $(VENV)/.packages
-	@$(PIP) install --no-build-isolation --editable '.[bench,comparison]'
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) install --no-build-isolation --editable '.[bench,comparison]'
 	@echo 'bench: other libraries for transfer functions, which need an older numpy of their own'
 	@$(BIN)/python -m venv $(VENV)/libraries && $(VENV)/libraries/bin/pip --disable-pip-version-check \
 	  --quiet install sippy_unipi sysidentpy pysib control || \

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-import haselab
-
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "haselab"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -337,11 +335,6 @@ def test_every_raises_has_a_match() -> None:
                     yield f"line {node.lineno}"
 
     no_faults(faults, TESTS)
-
-
-def test_the_version_is_the_same_in_both_places() -> None:
-    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    assert f'version = "{haselab.__version__}"' in text
 
 
 PAGES = sorted(

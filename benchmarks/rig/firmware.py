@@ -19,12 +19,19 @@ from haselab.base import InputError
 from haselab.control import step_metrics
 from haselab.firmware import FrontEnd
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
-from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_design
+from haselab.rig.chip import (
+    CoSim,
+    Firmware,
+    build_cosim,
+    build_firmware,
+    read_design,
+    source_folder,
+)
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench
 from haselab.study.chip.loops import StepPlan, step_experiment
 
-DATA = checkout() / "tests" / "firmware" / "data"
+DATA = source_folder() / "tests" / "firmware" / "data"
 WORKED_IN_V = 2.0  # as in the study, whose triangle goes so far before anything is fitted
 CODE_HIGH = 3800
 # Registers, input and output, memory, stack.

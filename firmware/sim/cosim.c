@@ -1,4 +1,5 @@
-/* SPDX-License-Identifier: GPL-3.0-or-later (linked with libsimavr; see LICENSE.md)
+/* SPDX-License-Identifier: BSD-3-Clause (the program, linked with libsimavr, is under the GPL; see
+ * LICENSE.md)
  *
  * Co-simulation of the microcontroller, instruction by instruction, with the twin's physics.
  *     cosim FIRMWARE.elf PHYSICS.bin      commands on stdin, replies on stdout

@@ -1,6 +1,8 @@
 /* Takes: an input on its edges, a pole, a delay. Gives: states at the output's times. */
 #include "identification/held_poles.h"
 
+#include "identification/quotient.h"
+
 #include <complex.h>
 #include <math.h>
 
@@ -41,10 +43,10 @@ static void phi(double complex z, double complex e, double complex out[4])
         out[3] = sums[3];
         return;
     }
-    out[0] = (e - 1.0) / z;
-    out[1] = (out[0] - 1.0) / z;
-    out[2] = (e - out[0]) / z;
-    out[3] = (out[2] - out[1]) / z;
+    out[0] = quotient(e - 1.0, z);
+    out[1] = quotient(out[0] - 1.0, z);
+    out[2] = quotient(e - out[0], z);
+    out[3] = quotient(out[2] - out[1], z);
 }
 
 static stretch stretch_of(held_complex pole, double r)

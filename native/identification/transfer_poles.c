@@ -1,6 +1,8 @@
 /* Takes: a structure and its numbers. Gives: poles, residues, and their derivatives. */
 #include "identification/transfer_poles.h"
 
+#include "identification/quotient.h"
+
 #include <math.h>
 #include <string.h>
 
@@ -27,7 +29,7 @@ transfer_poles transfer_poles_of(const transfer_structure *s, const double *numb
             const double sign = side == 0 ? 1.0 : -1.0;
             set.value[set.n] = omega * (-zeta + sign * root);
             set.slope[set.n][at] = set.value[set.n];
-            set.slope[set.n][at + 1] = omega * zeta * (-1.0 + sign * zeta / root);
+            set.slope[set.n][at + 1] = omega * zeta * (-1.0 + quotient(sign * zeta, root));
             set.counts[set.n++] = spread > 0.0 ? 1 : 2 * (1 - side);
         }
         at += 2;
@@ -77,15 +79,15 @@ static transfer_residues residues_of(const transfer_poles *set, transfer_section
         for (k = 0; k < part.order; ++k) {
             if (k != i) {
                 const double complex gap = p - set->value[part.first + k];
-                weight /= gap;
-                gaps += 1.0 / gap;
+                weight = quotient(weight, gap);
+                gaps += quotient(1.0, gap);
             }
         }
         out.value[part.first + i] = weight;
         for (k = 0; k < part.order; ++k) {
             const double complex q = set->value[part.first + k];
-            double complex by_pole = size / q;
-            by_pole += k == i ? power / p - gaps : 1.0 / (p - q);
+            double complex by_pole = quotient(size, q);
+            by_pole += k == i ? quotient(power, p) - gaps : quotient(1.0, p - q);
             for (j = 0; j < set->numbers; ++j) {
                 out.slope[part.first + i][j] += weight * by_pole * set->slope[part.first + k][j];
             }

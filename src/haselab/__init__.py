@@ -9,6 +9,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    __version__: str
+
     from haselab import control, identify, models, sensing, signals, tracking
     from haselab.api.bench import Recording, Runner, twin
     from haselab.api.data import Session, example, load, records, table
@@ -36,8 +38,6 @@ if TYPE_CHECKING:
     from haselab.safety.armed import armed
     from haselab.sensing.strain import fit_strain_map
     from haselab.store.columns.table import Table
-
-__version__ = "0.1.0"
 
 _PACKAGES = ("control", "identify", "models", "sensing", "signals", "tracking")
 _HOMES = {
@@ -114,6 +114,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        return _version()
     if name in _PACKAGES:
         return importlib.import_module(f"haselab.{name}")
     if name in _HOME:
@@ -124,4 +126,14 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})
+
+
+def _version() -> str:
+    """Version of the installed package, from the tag of the commit it was built from."""
+    from importlib import metadata
+
+    try:
+        return metadata.version(__name__)
+    except metadata.PackageNotFoundError:
+        return "0+unknown"  # imported from a folder that was never installed

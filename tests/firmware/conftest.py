@@ -11,12 +11,19 @@ import pytest
 
 from haselab.base import InputError
 from haselab.firmware import ChipSettings, FrontEnd, settings_header
-from haselab.rig.chip import CoSim, Firmware, build_cosim, build_firmware, checkout, read_design
+from haselab.rig.chip import (
+    CoSim,
+    Firmware,
+    build_cosim,
+    build_firmware,
+    read_design,
+    source_folder,
+)
 from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench
 
 DATA = Path(__file__).resolve().parent / "data"
-ROOT = checkout()
+ROOT = source_folder()
 CC = os.environ.get("CC", "cc")
 STRICT = ["-std=c99", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion",
           "-Wdouble-promotion", "-Werror"]  # fmt: skip

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from haselab.firmware.messages import Event, Trace
-from haselab.rig.chip import Firmware, checkout
+from haselab.rig.chip import Firmware, source_folder
 from haselab.rig.twin.twin_bench import TwinBench
 from tests.firmware.board.traces import UPDATES, latched, replayed, reported, traced
 
-ROOT = checkout()
+ROOT = source_folder()
 CORE = sorted((ROOT / "core").glob("*.c"))
 REPLAY = [
     *CORE,

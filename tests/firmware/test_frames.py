@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from haselab.base import InputError
 from haselab.firmware import FrameReader, decode_message, encode_message, stuff, unstuff
 from haselab.firmware.messages import COMMANDS, TELEMETRY, Hello, SetReference, Trace
-from haselab.rig.chip import checkout
+from haselab.rig.chip import source_folder
 
 # Cheshire and Baker 1999 give the rules; these are the usual examples of them.
 VECTORS = [
@@ -140,7 +140,7 @@ def test_values_beyond_their_type_are_refused(message: Any) -> None:
 
 
 def test_c_python_and_the_page_are_what_the_table_makes_of_them() -> None:
-    path = checkout() / "firmware" / "protocol" / "generate.py"
+    path = source_folder() / "firmware" / "protocol" / "generate.py"
     spec = importlib.util.spec_from_file_location("generate_protocol", path)
     assert spec is not None
     assert spec.loader is not None

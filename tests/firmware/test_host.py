@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from haselab.firmware import ChipSettings, settings_header
-from haselab.rig.chip import Firmware, checkout
+from haselab.rig.chip import Firmware, source_folder
 
-ROOT = checkout()
+ROOT = source_folder()
 HERE = Path(__file__).resolve().parent
 CORE = sorted((ROOT / "core").glob("*.c"))
 APP = [ROOT / "firmware/app" / name for name in ("app.c", "controller_pid.c", "link.c", "frame.c")]

@@ -25,12 +25,12 @@ from haselab.firmware import (
     settings_header,
 )
 from haselab.firmware.messages import Fault, KeepAlive, Run, State, Status
-from haselab.rig.chip import CoSim, build_firmware, checkout, read_design
+from haselab.rig.chip import CoSim, build_firmware, read_design, source_folder
 from haselab.rig.twin.twin_bench import TwinBench
 from haselab.store.actuator_file import read_run, write_sections
 from haselab.study.chip.trials import Chip
 
-ROOT = checkout()
+ROOT = source_folder()
 DATA = Path(__file__).resolve().parent / "data"
 EXAMPLE = ROOT / "examples/plugins/haselab-mycontroller/src/haselab_mycontroller"
 C_FILE = EXAMPLE / "mycontroller.c"

@@ -12,7 +12,6 @@ from typing import Any, TextIO
 
 import click
 
-from haselab import __version__
 from haselab.base.errors import HaselabError, described, text_of
 from haselab.base.exits import SignalExit, exit_code_text
 from haselab.base.foreign_code import foreign_failure
@@ -108,7 +107,7 @@ class _Root(LazyGroup):
     places={name: f"{module}:command" for name, (module, _) in _COMMANDS.items()},
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-@click.version_option(__version__, prog_name="haselab")
+@click.version_option(package_name="haselab", prog_name="haselab")
 def cli() -> None:
     """Measure, model and control soft electrostatic actuators (HASEL, DEA).
 

@@ -14,12 +14,12 @@ __all__ = ["source_digest"]
 _PACKAGE = Path(__file__).resolve().parents[1]
 _ROOT = _PACKAGE.parents[1]
 _NOT_COMPUTING = {"cli", "panel", "report", "__pycache__"}  # nothing that computes imports them
-_COMPILED = {".so", ".pyd", ".pyc"}  # differ between computers with the same source
+_COMPILED = {".so", ".pyd", ".dll", ".pyc"}  # differ between computers with the same source
 
 
 @functools.cache
 def source_digest() -> str:
-    """Version of haselab and a hash of the source files that a result can depend on.
+    """Release of haselab and a hash of the source files that a result can depend on.
 
     In a checkout, the C and C++ sources of the compiled modules are included.
 
@@ -30,7 +30,8 @@ def source_digest() -> str:
     for path in sorted(_files()):
         digest.update(path.relative_to(_ROOT).as_posix().encode() + b"\0")
         digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return f"{__version__}+{digest.hexdigest()[:12]}"
+    release = __version__.partition(".dev")[0]
+    return f"{release}+{digest.hexdigest()[:12]}"
 
 
 def _files() -> Iterator[Path]:

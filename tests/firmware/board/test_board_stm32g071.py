@@ -20,14 +20,14 @@ from haselab.rig.chip import (
     Firmware,
     board_names,
     build_firmware,
-    checkout,
     find_tool,
     load_board,
     read_design,
+    source_folder,
 )
 
 HERE = Path(__file__).resolve().parent
-ROOT = checkout()
+ROOT = source_folder()
 BOARD = ROOT / "firmware/board/stm32g071"
 CORE = sorted((ROOT / "core").glob("*.c"))
 APP = sorted((ROOT / "firmware/app").glob("*.c"))
@@ -382,7 +382,7 @@ def test_settings_of_another_converter_and_unknown_boards_are_refused(
         load_board("uno")
     folder = tmp_path / "firmware/board/mine"
     folder.mkdir(parents=True)
-    monkeypatch.setattr("haselab.rig.chip.boards.checkout", lambda: tmp_path)
+    monkeypatch.setattr("haselab.rig.chip.boards.source_folder", lambda: tmp_path)
     for text, match in (
         ('prefix = "x-"\nflags = []\n', "lacks or misuses 'package'"),
         ('prefix = "x-"\npackage = "x"\nflags = []\nflag = 1\n', "misuses 'flag'"),

@@ -20,13 +20,13 @@ from haselab.firmware.messages import (
     Status,
     Trace,
 )
-from haselab.rig.chip import CoSim, Firmware, build_firmware, checkout
+from haselab.rig.chip import CoSim, Firmware, build_firmware, source_folder
 from haselab.rig.twin.twin_bench import TwinBench
 from haselab.scoreboard.devices import find_device
 from haselab.scoreboard.knowledge import true_actuator
 from tests.firmware.board.traces import UPDATES, bits, latched, replayed, reported, traced
 
-ROOT = checkout()
+ROOT = source_folder()
 REPLAY = [*sorted((ROOT / "core").glob("*.c")), ROOT / "firmware/app/app.c",
           ROOT / "firmware/sim/replay.c"]  # fmt: skip
 REFERENCES = (0.0, 0.03, 0.06, 0.02, -0.02, 0.045, 0.01, 0.08, 0.078, 0.03)

@@ -89,6 +89,14 @@ def _campaigns() -> dict[str, str]:
         folder.iterdir(), key=lambda each: each.name)}  # fmt: skip
 
 
+def _bench() -> dict[str, str]:
+    from haselab.rig.chip import source_folder  # the import takes half a second
+
+    folder = source_folder() / "rigs"
+    names = ("bench.toml", "twin-hz.toml", "twin-rad.toml")
+    return {name: (folder / name).read_text(encoding="utf-8") for name in names}
+
+
 DATA_SETS: tuple[DataSet, ...] = (
     DataSet(
         "monitors",
@@ -159,6 +167,18 @@ DATA_SETS: tuple[DataSet, ...] = (
         (
             "campaign devices.toml --out devices --workers 2",
             "campaign design-space.toml --out design-space --workers 2",
+        ),
+    ),
+    DataSet(
+        "bench",
+        "Rig files of the simulated bench",
+        "`bench.toml` is a rig for every command with `--rig` or RIG.toml, such as `haselab panel "
+        "--rig bench.toml` and `haselab twin serve bench.toml --out served.toml`. `twin-hz.toml` "
+        "and `twin-rad.toml` hold the physical parameters, which you may change.",
+        _bench,
+        (
+            "rig check bench.toml --out check.json",
+            "export twin-hz.toml --to fmu --out twin.fmu",
         ),
     ),
 )

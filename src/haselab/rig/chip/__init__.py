@@ -1,6 +1,6 @@
 """The microcontroller: build its firmware, use it as a rig, and simulate it with the twin."""
 
-from haselab.rig.chip.boards import Board, board_names, checkout, load_board
+from haselab.rig.chip.boards import Board, board_names, load_board, source_folder
 from haselab.rig.chip.build import Firmware, build_cosim, build_firmware, find_tool
 from haselab.rig.chip.calibrate import (
     REFERENCE,
@@ -41,11 +41,11 @@ __all__ = [
     "build_cosim",
     "build_firmware",
     "calibrated_firmware",
-    "checkout",
     "chip_correction",
     "find_tool",
     "key_of_port",
     "load_board",
     "opened_chip",
     "read_design",
+    "source_folder",
 ]

@@ -11,7 +11,7 @@ from typing import Any
 from haselab.base import InputError
 from haselab.firmware import FrontEnd
 
-__all__ = ["Board", "board_names", "checkout", "load_board"]
+__all__ = ["Board", "board_names", "load_board", "source_folder"]
 
 _FILE = "board.toml"
 
@@ -37,21 +37,22 @@ class Board:
     front_end: FrontEnd
 
 
-def checkout() -> Path:
-    """Find the folder of the sources.
+def source_folder() -> Path:
+    """Find the folder that contains the C sources: core, firmware and native.
 
     Returns:
-        The root of the checkout that this package runs from.
+        The checkout that this package runs from, or the copy in the installed package.
     Raises:
         InputError: This package was installed without them.
     """
-    root = Path(__file__).resolve().parents[4]
-    if not (root / "firmware" / "app" / "main.c").is_file():
-        raise InputError(
-            "The firmware's sources are not part of an installed package. Clone the project, and "
-            f"run haselab from there. {root}"
-        )
-    return root
+    package = Path(__file__).resolve().parents[2]
+    for root in (package.parents[1], package / "sources"):
+        if (root / "firmware" / "app" / "main.c").is_file():
+            return root
+    raise InputError(
+        "The C sources of the firmware are missing from this installation of haselab. Install it "
+        f"again, from a wheel or from a checkout. {package / 'sources'}"
+    )
 
 
 def board_names() -> list[str]:
@@ -64,7 +65,7 @@ def board_names() -> list[str]:
         ['atmega2560', 'stm32g071']
     """
     try:
-        folder = checkout() / "firmware" / "board"
+        folder = source_folder() / "firmware" / "board"
     except InputError:
         return []
     return sorted(path.parent.name for path in folder.glob(f"*/{_FILE}"))
@@ -83,7 +84,7 @@ def load_board(name: str) -> Board:
         >>> load_board("stm32g071").front_end.converter_codes
         4096
     """
-    path = checkout() / "firmware" / "board" / name / _FILE
+    path = source_folder() / "firmware" / "board" / name / _FILE
     if name not in board_names():
         raise InputError(
             f"There is no board {name!r}. Choose one of {', '.join(board_names())}, or add a "

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from haselab.base import InputError, ResultError
 from haselab.firmware import ChipSettings, settings_header
-from haselab.rig.chip.boards import Board, checkout, load_board
+from haselab.rig.chip.boards import Board, load_board, source_folder
 
 __all__ = ["Firmware", "build_cosim", "build_firmware", "find_tool", "simavr_header"]
 
@@ -87,7 +87,7 @@ def build_firmware(
             converter.
         ResultError: The firmware does not compile.
     """
-    root, chosen = checkout(), load_board(board)
+    root, chosen = source_folder(), load_board(board)
     _check_converter(settings, chosen)
     gcc, copy, sizes = (chosen.prefix + name for name in ("gcc", "objcopy", "size"))
     compiler = find_tool(gcc, chosen.package)
@@ -148,7 +148,7 @@ def build_cosim(folder: Path) -> Path:
         InputError: Sources, compiler or libsimavr are missing.
         ResultError: The program does not compile.
     """
-    root = checkout()
+    root = source_folder()
     compiler = find_tool("cc", "gcc libc6-dev")
     if simavr_header() is None:
         raise InputError(

@@ -1,0 +1,183 @@
+"""Checks of built packages: each returns what it found, or raises `CheckError` with the fault."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import time
+import zipfile
+from pathlib import Path
+
+from wheels import ROOT
+
+__all__ = [
+    "CheckError", "check_abi3", "check_contents", "check_digest", "check_install", "check_metadata",
+    "check_old_processor", "check_platform", "check_sdist", "check_size", "is_abi3",
+]  # fmt: skip
+
+_LARGEST_MB = 5.0
+_INSTALL_S = 60.0
+_MODULES = ("_camera", "_core", "_identify", "_loops", "_models", "_motion", "_sense", "_track",
+            "_twin")  # fmt: skip
+_SOURCES = ("core", "firmware/app", "firmware/board", "firmware/protocol", "native/twin",
+            "native/motion", "rigs")  # fmt: skip
+_WITHOUT_COMPILER = ("cc", "gcc", "c++", "g++", "clang", "clang++")
+
+
+class CheckError(Exception):
+    """What is wrong with a package."""
+
+
+def is_abi3(wheel: Path) -> bool:
+    """Whether a wheel uses the stable ABI."""
+    return "-abi3-" in wheel.name
+
+
+def check_size(wheel: Path) -> str:
+    """A wheel has at most 5 MB."""
+    size_mb = wheel.stat().st_size / 1e6
+    if size_mb > _LARGEST_MB:
+        raise CheckError(f"{size_mb:.1f} MB; at most {_LARGEST_MB:g} MB")
+    return f"{size_mb:.1f} MB"
+
+
+def check_contents(wheel: Path) -> str:
+    """A wheel holds every file of the package, each extension and the C sources of the firmware."""
+    with zipfile.ZipFile(wheel) as opened:
+        names = set(opened.namelist())
+    line = ["git", "-C", str(ROOT), "ls-files", "src/haselab", *_SOURCES]
+    listed = subprocess.run(line, check=True, capture_output=True, text=True).stdout.split("\n")
+    wanted = {
+        name.removeprefix("src/") if name.startswith("src/") else f"haselab/sources/{name}"
+        for name in listed
+        if name.startswith("src/") or name.endswith((".c", ".h", ".toml", ".ld"))
+    }
+    missing = sorted(wanted - names)
+    missing += [name for name in _MODULES if not any(f"haselab/{name}." in each for each in names)]
+    if "haselab/libraries/haselab_twin.so" not in names:
+        missing.append("the library of the FMU")
+    if missing:
+        raise CheckError(f"{len(missing)} files are missing, such as {missing[0]}")
+    return f"{len(names)} files"
+
+
+def check_metadata(python: Path, files: list[Path]) -> str:
+    """The description and the other metadata are accepted by the package index."""
+    _run([python, "-m", "twine", "check", "--strict", *files])
+    return f"{len(files)} files"
+
+
+def check_platform(python: Path, wheel: Path) -> str:
+    """The wheel runs where its file name says: auditwheel."""
+    found = " ".join(_run([python, "-m", "auditwheel", "show", wheel]).split())
+    tag = next(each for each in wheel.stem.split("-")[-1].split(".") if "_2_" in each)
+    if f'platform tag: "{tag}"' not in found:
+        raise CheckError(found[:200])
+    return tag
+
+
+def check_abi3(python: Path, wheel: Path) -> str:
+    """The wheel uses nothing outside the stable ABI: abi3audit."""
+    _run([python, "-m", "abi3audit", "--strict", wheel])
+    return "stable ABI of 3.12"
+
+
+def check_install(python: Path, wheel: Path, folder: Path) -> str:
+    """Without a compiler: install, doctor, a quick study, an FMU and firmware."""
+    shutil.rmtree(folder, ignore_errors=True)
+    _run([python, "-m", "venv", folder / "venv"])
+    environment = {**os.environ, "PATH": str(_programs(folder))}
+    begin_s = time.monotonic()
+    pip = [folder / "venv/bin/python", "-m", "pip", "install", "--quiet", "--only-binary", ":all:"]
+    _run([*pip, wheel, *_same_numpy()], environment)
+    took_s = time.monotonic() - begin_s
+    haselab, here = folder / "venv/bin/haselab", folder / "work"
+    here.mkdir()
+    for line in (
+        "doctor",
+        "init my-actuator --out actuator.toml",
+        "example bench --out bench",
+        "rig check bench/bench.toml",
+        "example chirp --out chirp",
+        "identify transfer chirp/chirp.csv --input Drive --output Displacement --out model.json",
+        "export bench/twin-hz.toml --to fmu --out twin.fmu",
+        "reproduce --quick --out study",
+        "scoreboard --help",
+    ):
+        _run([haselab, *line.split()], environment, here)
+    built = "no avr-gcc: no firmware"
+    if shutil.which("avr-gcc"):
+        line = ["firmware", "build", "study/actuator.toml", "--build-dir", "chip"]
+        _run([haselab, *line], environment, here)
+        built = "firmware built"
+    if took_s > _INSTALL_S:
+        raise CheckError(f"the installation took {took_s:.0f} s; at most {_INSTALL_S:g} s")
+    return f"installed in {took_s:.0f} s, {built}"
+
+
+def check_digest(folder: Path) -> str:
+    """The installed wheel computes the bits of the build from source in .venv."""
+    found, wanted = (
+        json.loads(_run([python, ROOT / "packaging/digest.py"]))
+        for python in (folder / "venv/bin/python", ROOT / ".venv/bin/python")
+    )
+    different = [name for name in wanted if wanted[name] != found[name]]
+    if different:
+        raise CheckError(f"other bits than the build from source: {', '.join(different)}")
+    return f"{len(wanted)} equal digests"
+
+
+def check_old_processor(folder: Path) -> str:
+    """Every extension loads, and the lock-in runs, on a processor without AVX."""
+    code = "; ".join(f"import haselab.{name}" for name in _MODULES)
+    script = f"{code}\nimport digest\nprint(digest.sensing())\n"
+    line = ["qemu-x86_64", "-cpu", "Nehalem", folder / "venv/bin/python", "-W", "ignore"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "packaging")}
+    return _run([*line, "-c", script], environment).strip()
+
+
+def check_sdist(python: Path, sdist: Path, compilers: tuple[str, str], folder: Path) -> str:
+    """The source distribution builds with these compilers, and the result loads."""
+    shutil.rmtree(folder, ignore_errors=True)
+    environment = {**os.environ, "CC": compilers[0], "CXX": compilers[1]}
+    _run([python, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
+          "--wheel-dir", folder, sdist], environment)  # fmt: skip
+    wheel = next(folder.glob("*.whl"))
+    check_contents(wheel)
+    return wheel.name
+
+
+def _programs(folder: Path) -> Path:
+    """A folder with links to the programs of /usr/bin, but without its compilers."""
+    programs = folder / "programs"
+    programs.mkdir(parents=True)
+    for name in ("/usr/bin", "/bin"):
+        for path in Path(name).iterdir():
+            base = path.name.rpartition("-gnu-")[2] if "linux-gnu" in path.name else path.name
+            if base.rstrip("0123456789.").rstrip("-") in _WITHOUT_COMPILER:
+                continue
+            if not (programs / path.name).is_symlink():
+                (programs / path.name).symlink_to(path)
+    return programs
+
+
+def _same_numpy() -> list[str]:
+    """The numpy and scipy of .venv, since other versions may give other bits."""
+    code = "import numpy, scipy; print(f'numpy=={numpy.__version__} scipy=={scipy.__version__}')"
+    return _run([ROOT / ".venv/bin/python", "-c", code]).split()
+
+
+def _run(
+    line: list[str | Path], environment: dict[str, str] | None = None, folder: Path | None = None
+) -> str:
+    done = subprocess.run(
+        [str(part) for part in line], env=environment, cwd=folder or Path(ROOT).anchor,
+        capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    if done.returncode:
+        said = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
+        words = " ".join(str(part) for part in line[:6])
+        raise CheckError(f"exit code {done.returncode}: {words}: {said[-1]}")
+    return done.stdout

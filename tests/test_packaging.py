@@ -1,0 +1,126 @@
+"""Packages: the version, what a wheel contains, and processors without AVX."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import haselab
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGING = ROOT / "packaging"
+Installed = Callable[[str, str], str]
+
+
+def run(line: list[object], folder: Path | None = None, **environment: str) -> str:
+    done = subprocess.run(
+        [str(word) for word in line], cwd=folder, env=os.environ | environment, check=False,
+        capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def checks() -> ModuleType:
+    """The checks of make dist."""
+    sys.path.insert(0, str(PACKAGING))
+    try:
+        import checks
+    finally:
+        sys.path.remove(str(PACKAGING))
+    return checks
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory, installed: Installed) -> Path:
+    """A wheel from the compiled files of the set-up."""
+    installed("git", "git")
+    folder = tmp_path_factory.mktemp("wheel")
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--quiet"]
+    options = ["--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", folder]
+    run([*pip, *options, ROOT], PATH=programs)
+    return next(folder.glob("*.whl"))
+
+
+def test_the_version_is_that_of_the_installed_package() -> None:
+    assert haselab.__version__ == metadata.version("haselab")
+    assert "__version__" in dir(haselab)
+
+
+def test_the_version_comes_from_the_tag(tmp_path: Path, installed: Installed) -> None:
+    git = [installed("git", "git"), "-c", "user.name=a", "-c", "user.email=a@example.org"]
+    ask = [sys.executable, "-m", "setuptools_scm"]
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for line in (["init", "--quiet"], ["add", "."], ["commit", "--quiet", "-m", "one"]):
+        run([*git, *line], tmp_path)
+    assert run(ask, tmp_path).startswith("0.1.0.dev")
+    run([*git, "tag", "v0.2.0"], tmp_path)
+    assert run(ask, tmp_path) == "0.2.0"
+    run([*git, "commit", "--quiet", "--allow-empty", "-m", "two"], tmp_path)
+    assert run(ask, tmp_path) == "0.2.1.dev1"
+
+
+def test_a_wheel_contains_everything_that_runs(
+    wheel: Path, checks: ModuleType, tmp_path: Path
+) -> None:
+    checks.check_contents(wheel)
+    checks.check_size(wheel)
+    shutil.unpack_archive(wheel, tmp_path / "site", "zip")
+    # Without the start-up files of this environment, which would find the checkout.
+    paths = os.pathsep.join([str(tmp_path / "site"), sysconfig.get_path("platlib")])
+    code = (
+        "from haselab.rig.chip import board_names, source_folder\n"
+        "from haselab.pipelines.examples.data_sets import find_data_set\n"
+        "print(source_folder(), *board_names(), *find_data_set('bench').tables())"
+    )
+    found = run([sys.executable, "-S", "-c", code], tmp_path, PYTHONPATH=paths).split()
+    assert found == [
+        str(tmp_path / "site" / "haselab" / "sources"), "atmega2560", "stm32g071", "bench.toml",
+        "twin-hz.toml", "twin-rad.toml",
+    ]  # fmt: skip
+
+
+def test_a_missing_file_is_found(wheel: Path, checks: ModuleType, tmp_path: Path) -> None:
+    lacking = tmp_path / wheel.name
+    with zipfile.ZipFile(wheel) as whole, zipfile.ZipFile(lacking, "w") as part:
+        for name in whole.namelist():
+            if name != "haselab/sources/firmware/app/main.c":
+                part.writestr(name, whole.read(name))
+    with pytest.raises(checks.CheckError, match=r"such as haselab/sources/firmware/app/main\.c"):
+        checks.check_contents(lacking)
+
+
+OLD_PROCESSOR = """
+import numpy as np
+from haselab import _camera, _core, _identify, _loops, _models, _motion, _sense, _track, _twin
+from haselab.sensing import Lockin, LockinConfig
+phase = 2.0 * np.pi * 2000.0 / 200e3 * np.arange(2000)
+carrier = np.round(3000.0 * np.stack([np.sin(phase), np.cos(phase)], axis=-1))
+noise = np.random.default_rng(1).integers(-40, 40, (4, 2000, 2))
+config = LockinConfig(
+    rate_hz=200e3, block_samples=2000, carrier_hz=2000.0, skew_s=2.5e-6, ohm_per_ratio=2.5e6
+)
+found = Lockin(config).sense((carrier + noise).astype(np.int16))
+print(_loops.widest(), *(float(value) for value in found.capacitance_f))
+"""
+
+
+def test_haselab_runs_on_a_processor_without_avx(installed: Installed) -> None:
+    emulator = installed("qemu-x86_64", "qemu-user")
+    python = [sys.executable, "-W", "ignore", "-c", OLD_PROCESSOR]
+    _, *wanted = map(float, run(python).split())
+    widest, *found = map(float, run([emulator, "-cpu", "Nehalem", *python]).split())
+    assert widest == 0
+    # haselab's own sums are equal. numpy's sine, of which the plan is made, is off by up to 4 units
+    # of the last place on other processors: 2**-50 of each of a few factors.
+    assert found == pytest.approx(wanted, rel=2.0**-46)

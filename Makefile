@@ -19,7 +19,7 @@ NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] n
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fuzz help study test check test-all setup lint ctest tools bench bench-full clean
+.PHONY: docs fuzz help study test check test-all setup lint ctest tools bench bench-full clean
 .DELETE_ON_ERROR:
 
 help:
@@ -29,6 +29,7 @@ help:
 	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
+	@echo 'make docs    the documentation site, out/site/index.html: a minute, and the time of the notebooks'
 	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment and extensions only'
@@ -37,13 +38,13 @@ help:
 study: setup
 	$(BIN)/haselab reproduce --out $(OUT) --force
 
-test: setup tools
+test: setup tools $(VENV)/.docs
 	$(PYTEST) -m 'not slow' --durations=25
 
 check: setup
 	$(PYTEST) -m unit
 
-test-all: setup tools
+test-all: setup tools $(VENV)/.docs
 	$(PYTEST)
 
 lint: setup
@@ -77,6 +78,12 @@ bench: setup $(VENV)/.bench
 bench-full: setup $(VENV)/.bench
 	$(BIN)/python -m benchmarks --full
 
+# -W: a warning is an error. -n: so is a name without a target. Not in parallel: Sphinx 9.0 then
+# leaves out pages in silence if one of them fails.
+docs: setup $(VENV)/.docs
+	$(BIN)/python -m sphinx -q -W --keep-going -n -c docs -d out/doctrees . out/site
+	@echo 'out/site/index.html'
+
 setup: $(VENV)/.built
 
 # ---- set-up ---------------------------------------------------------------------------------
@@ -104,6 +111,11 @@ $(VENV)/.built: $(NATIVE) $(VENV)/.packages
 	@echo 'setup: extensions'
 	@$(PIP) install --no-build-isolation --no-deps --editable .
 	@$(BIN)/python -m compileall -q src/haselab # else each process compiles it, where no cache may be written
+	@touch $@
+
+$(VENV)/.docs: pyproject.toml $(VENV)/.packages
+	@echo 'docs: packages'
+	@$(PIP) install --no-build-isolation --editable '.[docs]'
 	@touch $@
 
 $(VENV)/.bench: pyproject.toml $(VENV)/.packages

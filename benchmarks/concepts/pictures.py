@@ -48,8 +48,8 @@ def draw_creep() -> Figure:
         above.plot(time_s, 100 * strain, color=colour, label=name)
         below.plot(time_s, each["drive_v"], color=colour, label=name)
         at = [float(np.mean(strain[np.abs(time_s - one) < 0.5])) for one in (1.5, 10.0, 39.0)]
-        print(f"{name}: strain after 1.5, 10 and 39 s: {np.round(at, 4)}; drive after 1.5 and 39 s: "
-              f"{np.interp([1.5, 39.0], time_s, each['drive_v']).round(3)}")  # fmt: skip
+        drive_v = np.interp([1.5, 39.0], time_s, each["drive_v"]).round(3)
+        print(f"{name}: strain after 1.5, 10 and 39 s {np.round(at, 4)}; drive then {drive_v} V")
     above.set_ylabel("strain since the step / %")
     below.set(xlabel="time after the step / s", ylabel="drive / V", xlim=(-2.0, STEP_S))
     above.legend(loc="lower right")

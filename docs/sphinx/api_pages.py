@@ -26,6 +26,10 @@ FOLDER = Path(__file__).resolve().parents[1] / "reference" / "api"
 _LONGEST_VALUE = 200  # characters of a constant that is shown
 _SECTION = re.compile(r"^(Args|Returns|Yields|Raises|Source|Example):(?:\s+(.*))?$")
 _ENTRY = re.compile(r"^(\*{0,2}\w[\w., *]*): ?(.*)$")
+_ARRAY = re.compile(
+    r"~?(?:numpy\.)?ndarray\[tuple\[~?(?:typing\.)?Any, \.\.\.\], "
+    r"~?(?:numpy\.)?dtype\[([^\[\]]*)\]\]"
+)
 _SPAN = re.compile(r"``.+?``|`([^`]+)`|\$([^$]+)\$|(\*|\||\\)|(?<=\w)(_)(?!\w)", re.DOTALL)
 
 
@@ -81,8 +85,9 @@ def _documented(package: str, names: list[str]) -> Iterator[str]:
         value = getattr(module, name)
         if inspect.isclass(value):
             options = [] if issubclass(value, BaseException) else ["   :members:"]
-            entry = [f".. autoclass:: {package}.{name}", *options, "   :show-inheritance:", ""]
-            groups["Classes"] += entry
+            if value.__bases__ != (object,):
+                options.append("   :show-inheritance:")
+            groups["Classes"] += [f".. autoclass:: {package}.{name}", *options, ""]
         elif callable(value) and hasattr(value, "__qualname__"):
             groups["Functions"] += [f".. autofunction:: {package}.{name}", ""]
         else:
@@ -236,10 +241,11 @@ def _without_annotated(text: str) -> str:
 
 def _sign(_app: Sphinx, _what: str, _name: str, _object: object, _options: object,
           signature: str | None, result: str | None) -> tuple[str | None, str | None]:  # fmt: skip
-    """Show a default that has no text in Python, as of a dataclass, as three dots."""
+    """Show arrays as NDArray, and a default without a text in Python as three dots."""
     if signature is None:
         return signature, result
-    return _without_annotated(re.sub(r"= ?<[^<>]*>", "= ...", signature)), result
+    shown = _ARRAY.sub(r"NDArray[\1]", re.sub(r"= ?<[^<>]*>", "= ...", signature))
+    return _without_annotated(shown), result and _ARRAY.sub(r"NDArray[\1]", result)
 
 
 # ---- References -----------------------------------------------------------------------------

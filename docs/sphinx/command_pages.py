@@ -13,12 +13,13 @@ from sphinx.application import Sphinx
 from haselab.cli.main import cli
 
 FOLDER = Path(__file__).resolve().parents[1] / "reference" / "commands"
+_OPTION = re.compile(r"(?<![\w-])(--[a-z][a-z-]*)")
 _SPECIAL = re.compile(r"([*|\\`]|(?<=\w)_(?!\w))")
 
 
 def _plain(text: str) -> str:
     """Text of a help page, whose marks mean nothing."""
-    return _SPECIAL.sub(r"\\\1", text)
+    return _OPTION.sub(r"``\1``", _SPECIAL.sub(r"\\\1", text))
 
 
 def _paragraphs(text: str) -> Iterator[str]:
@@ -45,7 +46,7 @@ def _option(option: click.Option, context: click.Context) -> Iterator[str]:
     yield ""
 
 
-def _command(command: click.Command, path: list[str], parent: click.Context | None) -> Iterator[str]:
+def _command(command: click.Command, path: list[str], parent: click.Context) -> Iterator[str]:
     context = click.Context(command, info_name=path[-1], parent=parent)
     title = " ".join(path)
     mark = "=" if len(path) == 2 else "-" if len(path) == 3 else "~"

@@ -76,7 +76,8 @@ def test_a_film_becomes_tracks_and_a_strain(make_shell: Callable) -> None:
     (shell.folder / "study.toml").write_text(page.toml[0], encoding="utf-8")
     answers = _answers(shell, page.commands)
     tracks = answers["tracks.csv"]
-    assert abs(100 * tracks["valid_fraction"] - _stated(page, "`tracks.png` | twelve frames with the points on them |", " %")) < 1.0
+    valid = _stated(page, "twelve frames with the points on them |", " %")
+    assert abs(100 * tracks["valid_fraction"] - valid) < 1.0
     assert abs(tracks["strain"]["largest"] - _stated(page, "largest strain is ", ". Look")) < 1e-3
     assert answers["scaled.csv"]["scale_mm_per_px"] is not None
     for name in ("tracks.html", "tracks.png", "tracks-strain.csv"):
@@ -86,7 +87,7 @@ def test_a_film_becomes_tracks_and_a_strain(make_shell: Callable) -> None:
     default = command.partition(" --report")[0].replace(" --model translation", "")
     done = shell.run(f"{default.replace('tracks.csv', 'default.csv')} --json")
     lost = json.loads(done.stdout)
-    assert lost["valid_fraction"] < 0.8 and lost["strain"]["largest"] < 0.1
+    assert 0.4 < lost["valid_fraction"] < 0.6 and lost["strain"]["largest"] < 0.15
 
 
 @contextmanager

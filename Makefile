@@ -19,7 +19,7 @@ NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] n
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fuzz dist help study test check test-all setup lint ctest tools bench bench-full clean
+.PHONY: docs fuzz dist help study test check test-all setup lint ctest tools bench bench-full clean
 .DELETE_ON_ERROR:
 
 help:
@@ -29,6 +29,7 @@ help:
 	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
+	@echo 'make docs    the documentation site, out/site/index.html: a minute, and the time of the notebooks'
 	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment, extensions and the packages of the tests'
@@ -81,6 +82,12 @@ bench: setup $(VENV)/.bench
 bench-full: setup $(VENV)/.bench
 	$(BIN)/python -m benchmarks --full
 
+# -W: a warning is an error. -n: so is a name without a target. Not in parallel: Sphinx 9.0 then
+# leaves out pages in silence if one of them fails.
+docs: setup
+	$(BIN)/python -m sphinx -q -W --keep-going -n -c docs -d out/doctrees . out/site
+	@echo 'out/site/index.html'
+
 dist: setup
 	$(PYTHON) packaging/dist.py $(if $(TARGETS),--targets $(TARGETS))
 
@@ -97,7 +104,7 @@ $(VENV)/bin/python:
 
 # uv downloads in parallel. It does not read pip's settings, so pip does what uv cannot.
 UV := [ -x $(BIN)/uv ] && VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet
-DEVELOPER := --no-build-isolation --editable '.[formats,test,lint]'
+DEVELOPER := --no-build-isolation --editable '.[formats,test,lint,docs]'
 
 # What compiles the extensions. CMake and Ninja are large: those of the system are used, if new enough.
 $(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
@@ -126,7 +133,7 @@ $(VENV)/.built: $(NATIVE) $(VENV)/.tools
 	@$(BIN)/python -m compileall -q src/haselab # else each process compiles it, where no cache may be written
 	@touch $@
 
-# What the tests and checkers need besides.
+# What the tests, the checkers and the documentation need besides.
 $(VENV)/.packages: pyproject.toml $(VENV)/.built
 	@echo 'setup: packages of the tests'
 	@export PATH="$(CURDIR)/$(BIN):$$PATH"; \

@@ -30,6 +30,12 @@ class Page:
         ]
         #: Blocks in Python.
         self.python: list[str] = [code for language, code in blocks if language == "python"]
+        #: Blocks in TOML.
+        self.toml: list[str] = [code for language, code in blocks if language == "toml"]
+        #: Lines of the blocks in `sh`: commands that need a second terminal, or a browser.
+        self.terminal: list[str] = [
+            line for language, code in blocks if language == "sh" for line in code.splitlines()
+        ]
 
     def run(self, command: str) -> None:
         """Run one command line in this process. What it is to write must not be empty."""

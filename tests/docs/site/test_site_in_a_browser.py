@@ -1,0 +1,65 @@
+"""The site in Chromium, opened as a file: search, accessibility, and no request to anywhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect
+
+WIDE, PHONE = {"width": 1400, "height": 900}, {"width": 390, "height": 844}
+SECTIONS = (
+    "docs/index.html", "docs/start/your-own-csv.html", "docs/how-to/index.html",
+    "docs/measure/sensing.html", "docs/concepts/what-an-interval-means.html",
+    "docs/identify/which-model.html", "docs/reference/commands/sense.html",
+    "docs/reference/api/haselab.sensing.html", "docs/reference/files.html", "docs/gallery.html",
+    "ARCHITECTURE.html",
+)  # fmt: skip
+
+
+def _watched(page: Page) -> list[str]:
+    """Errors of the console, and requests for anything but a file."""
+    problems: list[str] = []
+    page.on("console", lambda said: problems.append(said.text) if said.type == "error" else None)
+    page.on("request", lambda sent: None if sent.url.startswith(("file:", "data:"))
+            else problems.append(sent.url))  # fmt: skip
+    return problems
+
+
+def test_the_search_finds_a_word_without_a_server(browser: Browser, site: Path) -> None:
+    page = browser.new_page()
+    problems = _watched(page)
+    page.goto((site / "index.html").as_uri())
+    expect(page.locator("h1")).to_contain_text("haselab")  # the root leads to the first page
+    page.keyboard.press("Control+k")
+    page.locator("dialog input[type=search]").fill("capacitance")
+    page.keyboard.press("Enter")
+    first = page.locator("#search-results li a").first
+    expect(first).to_be_visible()
+    found = page.locator("#search-results li a").evaluate_all("links => links.map(a => a.href)")
+    assert any("/measure/sensing.html" in address for address in found)
+    first.click()
+    expect(page.locator("h1").first).to_be_visible()
+    assert not problems
+
+
+@pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
+def test_no_page_of_a_section_has_a_serious_barrier(
+    browser: Browser, site: Path, size: dict[str, int]
+) -> None:
+    for scheme in ("light", "dark"):
+        with browser.new_context(viewport=size, color_scheme=scheme) as context:  # type: ignore[arg-type]
+            page = context.new_page()
+            problems = _watched(page)
+            for name in SECTIONS if scheme == "light" else SECTIONS[:4]:
+                page.goto((site / name).as_uri())
+                grave = [
+                    f"{each['id']}: {each['nodes'][0]['html']}"
+                    for each in Axe().run(page).response["violations"]
+                    if each["impact"] in ("serious", "critical")
+                ]
+                assert not grave, f"{name}, {scheme}: {grave}"
+                wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+                assert page.evaluate(wide) <= 0, f"{name} is wider than the window"
+            assert not problems

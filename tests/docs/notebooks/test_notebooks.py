@@ -1,6 +1,6 @@
 """The notebooks of docs/notebooks run from top to bottom, and what they find is right."""
 
-import ast
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -35,11 +35,12 @@ def executed(name: str, folder: Path, wanted: str) -> Any:
         wanted: expression in its names afterwards, of plain numbers, texts, lists and dictionaries.
     """
     notebook = read(name)
-    notebook.cells.append(nbformat.v4.new_code_cell(f"print(repr({wanted}))"))
+    code = f"import json\nprint(json.dumps({wanted}, default=float))"
+    notebook.cells.append(nbformat.v4.new_code_cell(code))
     where = {"metadata": {"path": str(folder)}}
     NotebookClient(notebook, timeout=_GUARD_S, kernel_name="python3", resources=where).execute()
     assert list(folder.iterdir()) == [], "a notebook writes into a temporary folder of its own"
-    return ast.literal_eval(notebook.cells[-1].outputs[0].text)
+    return json.loads(notebook.cells[-1].outputs[0].text)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -78,7 +79,7 @@ def test_the_loop_of_the_reference_study_leaves_no_error_but_that_of_its_map(
         "rise_s": closed_loop.rise_time_s.ci95,
         "map": to_strain.hysteresis_strain + max(map(abs, to_strain.band)),
         "slope": line.parameters["slope"].ci95,
-        "used": [to_strain.slope_at(c) / 100.0 for c in np.quantile(capacitance_f, [0.1, 0.5, 0.9])],
+        "used": [to_strain.slope_at(c) / 100 for c in np.quantile(capacitance_f, [0.1, 0.5, 0.9])],
     }""")  # fmt: skip
     # An integrator leaves no sensed error; what is left is the error of sensing.
     assert abs(found["closed"]) < found["map"]

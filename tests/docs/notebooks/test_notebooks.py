@@ -102,7 +102,8 @@ def test_the_frequency_from_the_data_is_that_of_the_record_without_noise(
     time_s, drive_v, strain = recordings.actuator_records(8).played["chirp"]
     to_volt = VoltageMap(*found["map"])
     corrected = to_volt.strain(drive_v)
-    fit = hl.fit_transfer(hl.Record(corrected, 100.0, strain, time_s), slow_modes=1)
+    record = hl.Record(corrected, 100.0, strain, time_s)
+    fit = hl.fit_transfer(record, hl.identify.TransferStructure(slow_modes=1))
     assert fit.succeeded
     low, high = fit.parameters["natural_frequency_rad_s"].ci95
     assert low < found["frequency"] < high
@@ -127,7 +128,7 @@ def test_the_stated_deviations_of_the_video_are_those_of_its_true_motion(tmp_pat
     assert found["outside"] <= binom.ppf(0.999, found["frames"], 0.05)
     for name, is_right in (("all", False), ("chosen", True)):
         squares, count = found[name]
-        assert (squares < chi2.ppf(0.999, count)) is is_right, name
+        assert bool(squares < chi2.ppf(0.999, count)) == is_right, name
 
 
 def test_no_controller_is_faster_than_the_physical_limit(tmp_path: Path) -> None:

@@ -109,7 +109,8 @@ def build_wheel(python: Path, name: str, source: Path, work: Path, out: Path) ->
 def _write_tools(python: Path, target: Target, folder: Path) -> None:
     """Write the programs that the toolchain file names, each a call of zig."""
     zig = _ask(python, "import ziglang; print(ziglang.__path__[0])") + "/zig"
-    compile_for = f"-target {target.triple} -fno-sanitize=undefined -rtlib=none"
+    # Zig compiles its C++ library for each level of optimisation: CMake's tests use this one too.
+    compile_for = f"-target {target.triple} -O2 -fno-sanitize=undefined -rtlib=none"
     lines = {
         "cc": f"cc {compile_for}",
         "c++": f"c++ {compile_for}",

@@ -92,7 +92,8 @@ def _actuator() -> dict[str, str]:
                                [1e3 * time_s, 1e3 * drive_v, 100.0 * strain])
         for name, (time_s, drive_v, strain) in found.played.items()
     }  # fmt: skip
-    monitors = _german("Zeit [ms];U Monitor [mV];I Monitor [mV]", [time_ms, 1e3 * v, 1e3 * i])
+    columns = [time_ms, 1e3 * v, 1e3 * i]
+    monitors = _german("Zeit [ms];U Monitor [mV];I Monitor [mV]", columns, "%.6g")
     return {"monitors.csv": monitors, **tables}
 
 

@@ -64,7 +64,7 @@ ctest: setup tools
 TOOLS := avr-gcc:gcc-avr /usr/lib/avr/include/avr/io.h:avr-libc \
   /usr/include/simavr/sim_avr.h:libsimavr-dev /usr/include/libelf.h:libelf-dev \
   arm-none-eabi-gcc:gcc-arm-none-eabi qemu-arm:qemu-user cppcheck:cppcheck \
-  clang-tidy:clang-tidy h5dump:hdf5-tools chromium:chromium \
+  git:git clang-tidy:clang-tidy h5dump:hdf5-tools chromium:chromium \
   /usr/lib/*/libaravis-0.8.so.0:libaravis-0.8-0 arv-fake-gv-camera-0.8:aravis-tools
 
 tools:

@@ -57,6 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 # Files beside whole studies with a test or a fixture of more than 7 s of CPU, the longest first.
 _LONGEST = (
+    "test_notebooks.py",
     "test_kinds.py", "test_own_controller.py", "test_your_actuator_page.py", "test_fuzz.py",
     "test_add_an_experiment_page.py", "test_one_experiment_page.py", "test_transfer_choice.py",
     "test_add_an_instrument_page.py", "test_add_a_controller_page.py",

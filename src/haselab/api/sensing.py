@@ -139,7 +139,7 @@ def track(
         with open_video(video) as reader:
             times: list[float] = []
 
-            def frames() -> Iterable[NDArray[np.uint8]]:
+            def frames() -> Iterable[NDArray[Any]]:
                 for time_s, frame in reader.timed():
                     times.append(time_s)
                     yield frame
@@ -175,7 +175,7 @@ def _positive(name: str, number: float | None) -> None:
 
 
 def _tracked(
-    frames: Iterable[NDArray[np.uint8]],
+    frames: Iterable[NDArray[Any]],
     points: Any,
     rest_frames: int,
     options: TrackOptions | None,

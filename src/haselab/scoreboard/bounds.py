@@ -127,8 +127,8 @@ def fastest_step(known: KnownActuator, before: float, after: float) -> FastestSt
     turn = _turn(rate, high_s, sign)
     moved = (strain[: turn + 1] - before) / (after - before)
     ten, ninety = (float(np.interp(level, moved, time_s[: turn + 1])) for level in (0.1, 0.9))
-    motion = np.stack([time_s, strain])[:, : turn + 1]
-    return FastestStep(float(time_s[turn]), ninety - ten, high_s, motion)
+    path = np.stack([time_s, strain])[:, : turn + 1]
+    return FastestStep(float(time_s[turn]), ninety - ten, high_s, path)
 
 
 def _turn(rate: Floats, after_s: float, sign: float) -> int:

@@ -180,7 +180,7 @@ def actuator_records(seed: int) -> ActuatorRecords:
         bench.wait(_SETTLE_S)
     rig = describe(twin_of_reading("hz"))
     every = 4
-    volts = np.concatenate(codes)[::every] * rig.volt_per_code
+    volts = np.asarray(np.concatenate(codes)[::every] * rig.volt_per_code, np.float64)
     return ActuatorRecords(volts, rig.rate_hz / every, played)
 
 

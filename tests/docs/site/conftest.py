@@ -19,9 +19,13 @@ _FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "-
 
 
 def _build(folder: Path) -> None:
-    """Build the site cold, with its notebooks; the log of a build with a warning is kept."""
+    """Build the site cold; the log of a build with a warning is kept.
+
+    The notebooks are not executed here: `tests/docs/notebooks` does that.
+    """
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-n", "-c", "docs",
-               "-d", str(folder / "doctrees"), ".", str(folder / "site")]  # fmt: skip
+               "-D", "nb_execution_mode=off", "-d", str(folder / "doctrees"), ".",
+               str(folder / "site")]  # fmt: skip
     done = subprocess.run(
         command, cwd=_ROOT, capture_output=True, text=True, check=False, timeout=_GUARD_S
     )

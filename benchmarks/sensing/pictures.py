@@ -1,6 +1,6 @@
 """Draws the pictures of docs/measure/sensing.md and docs/measure/how-self-sensing-works.md.
 
-    python -m benchmarks.sensing.pictures [docs/pictures]
+    python -m benchmarks.sensing.pictures [docs/pictures/measure]
 
 Two minutes on one core. What each picture is of: `pictures_error.py` has the errors
 beside their bound, `pictures_bench.py` what is done on the twin.
@@ -96,5 +96,5 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    here = Path(__file__).resolve().parents[2] / "docs" / "pictures"
+    here = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "measure"
     main(Path(sys.argv[1]) if len(sys.argv) > 1 else here)

@@ -174,6 +174,7 @@ CALLS = {
     hl.Runner: {
         "rig": (hl.twin(), OBJECT),
         "baseline_v": (0.0, NOT_A_NUMBER),
+        "zero_length_m": (0.05, without(POSITIVE, "nothing")),
         "carrier_hz": (2000.0, POSITIVE),
         "carrier_v": (0.02, NOT_A_NUMBER),
         "frame_rate_hz": (50.0, NOT_A_NUMBER),

@@ -6,6 +6,7 @@ import pytest
 
 import haselab as hl
 from haselab.base import InputError
+from haselab.store.video.writer import VideoWriter
 
 RATE_HZ, CARRIER_HZ = 200_000.0, 2000.0
 CAPACITANCE_F, RESISTANCE_OHM = 1.2e-9, 50e3
@@ -67,6 +68,16 @@ def test_points_follow_a_moving_pattern():
     assert (off < 5.0 * np.maximum(frame["std_x_px"], 0.005)).all()
     assert frame["time_s"].iloc[-1] == pytest.approx(3 / 50.0)
     assert np.array_equal(frame["x_mm"], 0.1 * frame["x_px"])
+
+
+def test_a_file_gives_the_tracks_of_its_frames_and_its_own_times(tmp_path):
+    images, points = frames([0.0, 0.5, 1.25, 2.0]), np.array([[40.0, 45.0]])
+    writer = VideoWriter(tmp_path / "clip.mkv", 50.0)  # lossless
+    writer.append(np.stack(images), np.arange(4) / 50.0)
+    writer.close()
+    found = hl.track(tmp_path / "clip.mkv", points)
+    assert np.array_equal(found["x_px"], hl.track(images, points)["x_px"])
+    assert np.allclose(found["time_s"], np.arange(4) / 50.0, atol=1e-3)  # Matroska counts in ms
 
 
 def test_a_video_without_frames_is_refused():

@@ -9,7 +9,7 @@ import pytest
 from tests.docs.page import Page
 
 PAGE = Page("python.md")
-NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "notebooks" / "close-a-loop.ipynb"
+NOTEBOOK = Path(__file__).resolve().parents[2] / "docs" / "notebooks" / "close-a-loop.ipynb"
 CLOSES_LOOP = "runner.close_loop("
 
 

@@ -82,6 +82,12 @@ def test_the_fastest_step_of_a_double_integrator_is_that_of_its_closed_form():
         assert found.time_s == pytest.approx(2.0 * unit_s, abs=2e-4)
         assert found.rise_s == pytest.approx((2.0 - 2.0 * math.sqrt(0.2)) * unit_s, abs=2e-4)
         assert found.switch_s == pytest.approx(unit_s, abs=2e-4)
+        time_s, strain = found.motion
+        assert time_s[-1] == pytest.approx(found.time_s)
+        # Half of the way is done when the voltage switches, and the end is the desired strain.
+        halfway = float(np.interp(found.switch_s, time_s, strain))
+        assert halfway == pytest.approx(0.5 * after, rel=0.02)
+        assert strain[-1] == pytest.approx(after, rel=0.02)
 
 
 def test_a_step_out_of_reach_has_no_bound():

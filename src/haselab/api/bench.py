@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.api.design import Actuator
-from haselab.base import InputError, Progress, SilentProgress, checked, real_array, shown
+from haselab.base import (
+    InputError,
+    Progress,
+    ResultError,
+    SilentProgress,
+    checked,
+    real_array,
+    shown,
+)
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.record import Record
 from haselab.models.maps import VoltageMap
@@ -37,7 +45,8 @@ __all__ = ["Recording", "Runner", "twin"]
 
 Floats = NDArray[np.float64]
 _SEEDS = 2**64
-_BASELINE_S = 4.0  # for which the voltage of zero strain is held at first
+_SETTLE_S = 4.0  # until the actuator is at rest: the first frames are the tracker's reference
+_BASELINE_S = 4.0  # for which the length of zero strain is then measured
 _NO_FOLDER = Path()  # no video is kept
 
 
@@ -214,13 +223,17 @@ class Runner:
 
     Args:
         rig: a simulated bench, or a real one that `hl.armed` has armed.
-        baseline_v: drive of zero strain, in V; it is held for 4 s at first. 0: zero strain is the
-            length at rest.
+        baseline_v: drive of zero strain, in V; it is held for 8 s at first, of which the camera
+            films the last 4 s. 0: zero strain is the length at 0 V.
+        zero_length_m: length of zero strain, in m, such as that of an earlier recording. None: it
+            is measured at the baseline.
         carrier_hz: frequency of the sensing signal, in Hz.
         carrier_v: its peak amplitude ahead of the amplifier, in V.
         frame_rate_hz: of the camera, in Hz.
         progress: what shows how far it is.
     Raises:
+        InputError: a length of zero strain that is not above 0 and finite.
+        ResultError: the camera sees no fiducials.
         SafetyError: a bench that is neither armed nor simulated; or at the end, an output that is
             not at 0 V, or not known to be.
     """
@@ -231,11 +244,16 @@ class Runner:
         rig: Rig,
         *,
         baseline_v: float = 0.0,
+        zero_length_m: float | None = None,
         carrier_hz: float = 2000.0,
         carrier_v: float = 0.02,
         frame_rate_hz: float = 50.0,
         progress: Progress | None = None,
     ) -> None:
+        if zero_length_m is not None and not 0.0 < zero_length_m < math.inf:
+            raise InputError(
+                f"zero_length_m is {zero_length_m:g}; it must be above 0 m and finite."
+            )
         self._memory = _Memory()
         self._camera = CameraRecorder(rig.camera, self._memory, _NO_FOLDER, "none")
         self._runner = runtime.Runner(
@@ -247,7 +265,7 @@ class Runner:
             frame_rate_hz,
         )
         self._lockin = lockin_of(rig.description, carrier_hz)
-        self._zero_m = math.nan
+        self._zero_m = math.nan if zero_length_m is None else zero_length_m
         self._played = 0
 
     @property
@@ -258,11 +276,13 @@ class Runner:
     def __enter__(self) -> Self:
         self._runner.__enter__()
         try:
+            self.hold(self._baseline_v, _SETTLE_S)
             held = self.play(np.full(round(_BASELINE_S * self.update_hz), self._baseline_v))
         except BaseException as error:
             self._runner.__exit__(type(error), error, error.__traceback__)
             raise
-        self._zero_m = float(held.length_m[held.length_m.size // 2 :].mean())
+        if math.isnan(self._zero_m):
+            self._zero_m = float(held.length_m[held.length_m.size // 2 :].mean())
         return self
 
     def __exit__(
@@ -283,6 +303,7 @@ class Runner:
             What was measured.
         Raises:
             LimitError: a value outside the limits of the bench; nothing is put out then.
+            ResultError: the camera lost the fiducials in all frames.
             SafetyError: the bench protected itself.
             DeviceError: an instrument failed.
         """
@@ -331,6 +352,12 @@ class Runner:
         times, tracks = zip(*self._memory.frames, strict=True)
         length_m = gauge_length(np.concatenate(tracks), self._rig.scale_m_per_px)
         good = np.isfinite(length_m)
+        if not good.any():
+            raise ResultError(
+                f"The camera found all six fiducials in none of {good.size} frames, so there is no "
+                "strain. Check that they are visible, and that the actuator is at rest when the "
+                "with block begins."
+            )
         return Recording(
             rig=self._rig,
             start_s=start_s,

@@ -140,7 +140,7 @@ def track(
             times: list[float] = []
 
             def frames() -> Iterable[NDArray[np.uint8]]:
-                for time_s, frame in reader:
+                for time_s, frame in reader.timed():
                     times.append(time_s)
                     yield frame
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -191,5 +192,10 @@ class _BarProgress:
 
 
 def progress_bar() -> Progress:
-    """A progress bar when stderr is a terminal, silence otherwise."""
-    return _BarProgress() if sys.stderr.isatty() else SilentProgress()
+    """A progress bar when stderr is a terminal that a person sees, silence otherwise.
+
+    A line with ! in a notebook gets a terminal, too, but the notebook keeps each state of the bar
+    as a line of its own. Jupyter states the variable in each kernel.
+    """
+    seen = sys.stderr.isatty() and "JPY_PARENT_PID" not in os.environ
+    return _BarProgress() if seen else SilentProgress()

@@ -8,7 +8,7 @@ exactly. Limits of the knowledge come from the noise of the sensed length alone.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,13 @@ class FastestStep:
         time_s: until the actuator is at rest at its new length.
         rise_s: 10 to 90 % of the way.
         switch_s: when the voltage switches.
+        motion: times from the start, and strains. Shape `(2, N)`.
     """
 
     time_s: float
     rise_s: float
     switch_s: float
+    motion: Floats = field(compare=False, repr=False)
 
 
 class _Motion:
@@ -125,7 +127,8 @@ def fastest_step(known: KnownActuator, before: float, after: float) -> FastestSt
     turn = _turn(rate, high_s, sign)
     moved = (strain[: turn + 1] - before) / (after - before)
     ten, ninety = (float(np.interp(level, moved, time_s[: turn + 1])) for level in (0.1, 0.9))
-    return FastestStep(float(time_s[turn]), ninety - ten, high_s)
+    motion = np.stack([time_s, strain])[:, : turn + 1]
+    return FastestStep(float(time_s[turn]), ninety - ten, high_s, motion)
 
 
 def _turn(rate: Floats, after_s: float, sign: float) -> int:

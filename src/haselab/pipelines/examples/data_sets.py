@@ -83,6 +83,20 @@ def _tensile() -> dict[str, str]:
     return {"tensile.csv": _german("Streckung;Kraft [mN]", [stretch, 1e3 * load_n])}
 
 
+def _actuator() -> dict[str, str]:
+    found = recordings.actuator_records(_SEED)
+    v, i = found.monitors_v.T
+    time_ms = np.asarray(1e3 * np.arange(v.size) / found.monitor_rate_hz, np.float64)
+    tables = {
+        f"{name}.csv": _german("Zeit [ms];U [mV];Dehnung [%]",
+                               [1e3 * time_s, 1e3 * drive_v, 100.0 * strain])
+        for name, (time_s, drive_v, strain) in found.played.items()
+    }  # fmt: skip
+    columns = [time_ms, 1e3 * v, 1e3 * i]
+    monitors = _german("Zeit [ms];U Monitor [mV];I Monitor [mV]", columns, "%.6g")
+    return {"monitors.csv": monitors, **tables}
+
+
 def _campaigns() -> dict[str, str]:
     folder = resources.files(__package__).joinpath("campaigns")
     return {each.name: each.read_text(encoding="utf-8") for each in sorted(
@@ -148,6 +162,30 @@ DATA_SETS: tuple[DataSet, ...] = (
         "which is clamped at 3 times its natural width.",
         _tensile,
         ("identify regions tensile.csv --stretch Streckung --load Kraft --plot regions.svg",),
+    ),
+    DataSet(
+        "actuator",
+        "Records of one actuator, from which its actuator file and its controller follow",
+        "A planar HASEL with a hung mass of 0.25 kg. triangle.csv: twice 0 to 2 V in 1.5 s, while "
+        "monitors.csv records both monitors at 50 kHz (5000 V/V and 2 mA/V; the current is sampled "
+        "2.5 us later). chirp.csv: a step, then 0.1 to 10 Hz. steps.csv: steps that are not used "
+        "for a fit. A row every 10 ms: drive before the amplifier of 5000 V/V, and strain relative "
+        f"to {1e3 * recordings.ZERO_LENGTH_M:g} mm.",
+        _actuator,
+        (
+            f'init "my HASEL" --zero-length-m {recordings.ZERO_LENGTH_M:g} --high-v 2 '
+            "--gain-v-per-v 5000 --out actuator.toml",
+            'sense monitors.csv --v "U Monitor" --i "I Monitor" --carrier-hz 2000 '
+            "--skew-s 2.5e-6 --out capacitance.csv",
+            "identify capacitance-map capacitance.csv --strain Dehnung --strain-file triangle.csv "
+            "--actuator actuator.toml",
+            "identify voltage-map triangle.csv --voltage U --strain Dehnung "
+            "--actuator actuator.toml",
+            "identify transfer chirp.csv --input U --output Dehnung --slow-modes 1 "
+            "--through-voltage-map --actuator actuator.toml",
+            "compare actuator.toml steps.csv --input U --output Dehnung --through-voltage-map",
+            "design actuator.toml",
+        ),
     ),
     DataSet(
         "campaigns",

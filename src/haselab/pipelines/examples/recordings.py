@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.rig.twin.config import twin_of_reading
+from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.lockin import lockin_of
-from haselab.signals import linear_chirp, triangle
+from haselab.signals import constant, linear_chirp, triangle
 
-__all__ = ["CARRIER_HZ", "Cycles", "chirp", "cycles", "monitors", "release", "tensile"]
+__all__ = [
+    "CARRIER_HZ", "ZERO_LENGTH_M", "ActuatorRecords", "Cycles", "actuator_records", "chirp",
+    "cycles", "monitors", "release", "tensile",
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 CARRIER_HZ = 2000.0
 _CARRIER_V, _MASS_KG, _BLOCK_S = 0.02, 0.25, 0.01
 _CAMERA_M = 3e-6  # standard deviation of a measured length
 _SETTLE_S = 30.0
+_HIGHEST_V = 2.0
+ZERO_LENGTH_M = 0.051  # of the records of one actuator
 
 
 @dataclass(frozen=True)
@@ -38,9 +45,25 @@ class Cycles:
     strain: Floats
 
 
-def _bench(seed: int, *, carrier: bool) -> TwinBench:
+@dataclass(frozen=True)
+class ActuatorRecords:
+    """Records of one actuator, from which its controller follows.
+
+    Args:
+        monitors_v: voltage and current monitor during the triangle. Shape `(N, 2)`.
+        monitor_rate_hz: of the monitors.
+        played: time, drive before the amplifier in V, and strain, by the name of the drive:
+            `triangle`, `chirp`, `steps`. Shape `(3, B)` each.
+    """
+
+    monitors_v: Floats
+    monitor_rate_hz: float
+    played: dict[str, Floats]
+
+
+def _bench(seed: int, *, carrier: bool, reading: Literal["rad", "hz"] = "rad") -> TwinBench:
     """Make a twin with its hung mass, at rest."""
-    bench = TwinBench(twin_of_reading("rad"), seed)
+    bench = TwinBench(twin_of_reading(reading), seed)
     bench.hang(_MASS_KG)
     bench.wait(_SETTLE_S)
     if carrier:
@@ -119,6 +142,46 @@ def chirp(seed: int) -> tuple[Floats, Floats, Floats]:
     time_s = np.arange(change_v.size) / rate_hz
     # Lengths belong to the middle of a block, whose output began 2 ms after its start.
     return time_s, change_v, length_m - length_m[0]
+
+
+def actuator_records(seed: int) -> ActuatorRecords:
+    """Record what the way from an actuator to its controller needs.
+
+    Args:
+        seed: of all noise.
+    Returns:
+        A triangle with the monitors, a chirp after a step, and steps.
+    """
+    bench, rng = _bench(seed, carrier=True, reading="hz"), np.random.default_rng(seed)
+    precondition(bench, _HIGHEST_V)
+    rate_hz, played = 1.0 / _BLOCK_S, dict[str, Floats]()
+    drives = {
+        "triangle": triangle(0.0, _HIGHEST_V, 1.0 / 1.5, 2, rate_hz),
+        "chirp": np.concatenate([
+            constant(1.0, 5.0, rate_hz), constant(1.3, 15.0, rate_hz),
+            1.0 + 0.5 * linear_chirp(0.1, 10.0, 20.0, rate_hz),
+        ]),
+        "steps": np.repeat([1.0, 1.3, 0.8, 1.2, 0.9], round(5.0 * rate_hz)),
+    }  # fmt: skip
+    codes: list[NDArray[np.int16]] = []
+    for name, drive_v in drives.items():
+        length_m = []
+        for value in drive_v:
+            length_m.append(bench.length_m)
+            bench.write(float(value))
+            if name == "triangle":
+                codes.append(bench.read())
+            else:
+                bench.wait(_BLOCK_S)
+        noise_m = _CAMERA_M * rng.standard_normal(drive_v.size)
+        strain = (np.array(length_m) + noise_m) / ZERO_LENGTH_M - 1.0
+        played[name] = np.stack([np.arange(drive_v.size) / rate_hz, drive_v, strain])
+        bench.write(1.0)
+        bench.wait(_SETTLE_S)
+    rig = describe(twin_of_reading("hz"))
+    every = 4
+    volts = np.concatenate(codes)[::every] * rig.volt_per_code
+    return ActuatorRecords(volts, rig.rate_hz / every, played)
 
 
 def release(seed: int) -> tuple[Floats, Floats]:

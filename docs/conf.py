@@ -28,6 +28,7 @@ extensions = [
     "api_pages",
     "command_pages",
     "mathml",
+    "notebook_lexer",
 ]
 root_doc = "docs/index"
 include_patterns = [

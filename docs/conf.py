@@ -10,6 +10,7 @@ import re
 import sys
 from pathlib import Path
 
+from docutils import nodes
 from sphinx.application import Sphinx
 
 sys.path.insert(0, str(Path(__file__).parent / "sphinx"))
@@ -116,6 +117,17 @@ def _leave_out_empty_patterns(app: Sphinx, docname: str, source: list[str]) -> N
         source[0] = "\n".join(found)
 
 
+def _shorten_paths(app: Sphinx, doctree: nodes.document) -> None:
+    """A traceback in a notebook names the files of the checkout, not where it lies."""
+    folder = f"{app.srcdir}/"
+    for text in list(doctree.findall(nodes.Text)):
+        if folder in text:
+            parent = text.parent
+            parent.replace(text, nodes.Text(text.replace(folder, "")))
+            parent.rawsource = parent.rawsource.replace(folder, "")
+
+
 def setup(app: Sphinx) -> None:
     """Connect what belongs to no extension."""
+    app.connect("doctree-read", _shorten_paths)
     app.connect("source-read", _leave_out_empty_patterns)

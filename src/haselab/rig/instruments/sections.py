@@ -96,7 +96,7 @@ class DaqConfig(InstrumentConfig):
     @property
     def top_code(self) -> int:
         """Largest code; the smallest is `-top_code - 1`."""
-        return 2 ** (self.bits - 1) - 1
+        return (1 << (self.bits - 1)) - 1
 
 
 class GeneratorConfig(InstrumentConfig):

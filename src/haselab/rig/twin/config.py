@@ -172,7 +172,7 @@ class AcquisitionConfig(Section):
     @property
     def top_code(self) -> int:
         """Largest code; the smallest is `-top_code - 1`."""
-        return 2 ** (self.bits - 1) - 1
+        return (1 << (self.bits - 1)) - 1
 
     @model_validator(mode="after")
     def _times(self) -> Self:

@@ -354,8 +354,8 @@ class Runner:
         good = np.isfinite(length_m)
         if not good.any():
             raise ResultError(
-                f"The camera did not find all six fiducials in any of {good.size} frames, so there is "
-                "no strain. Check that they are visible, and that the actuator is at rest when the "
+                f"The camera did not find all six fiducials in any of {good.size} frames, so there "
+                "is no strain. Check that they are visible, and that the actuator is at rest when the "
                 "with block begins."
             )
         return Recording(

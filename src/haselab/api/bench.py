@@ -355,8 +355,8 @@ class Runner:
         if not good.any():
             raise ResultError(
                 f"The camera did not find all six fiducials in any of {good.size} frames, so there "
-                "is no strain. Check that they are visible, and that the actuator is at rest when the "
-                "with block begins."
+                "is no strain. Check that they are visible, and that the actuator is at rest when "
+                "the with block begins."
             )
         return Recording(
             rig=self._rig,

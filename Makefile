@@ -29,17 +29,17 @@ help:
 	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
-	@echo 'make docs    the documentation site, out/site/index.html: a minute, and the time of the notebooks'
+	@echo 'make docs    build the documentation site, out/site/index.html: a minute, and minutes more for new notebooks'
 	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
-	@echo 'make setup   virtual environment, extensions and the packages of the tests'
-	@echo 'make dist    wheels and source distribution into dist/, built and checked'
+	@echo 'make setup   virtual environment, extensions, and the packages that the tests need'
+	@echo 'make dist    build and check the wheels and the source distribution in dist/'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
 study: $(VENV)/.built
 	$(BIN)/haselab reproduce --out $(OUT) --force
 
-# A warning of the C compiler fails the build of those who change the code, not of those who use it.
+# Warnings of the C compiler are errors for developers, but not for users, whose compiler may be newer.
 test check test-all ctest lint setup: export WERROR ?= ON
 
 test: setup tools
@@ -82,8 +82,8 @@ bench: setup $(VENV)/.bench
 bench-full: setup $(VENV)/.bench
 	$(BIN)/python -m benchmarks --full
 
-# -W: a warning is an error. -n: so is a name without a target. Not in parallel: Sphinx 9.0 then
-# leaves out pages in silence if one of them fails.
+# -W makes warnings errors; -n warns of each reference without a target. Not in parallel: with -j,
+# Sphinx 9.0 leaves out pages without a message if one of them fails.
 docs: setup
 	$(BIN)/python -m sphinx -q -W --keep-going -n -c docs -d out/doctrees . out/site
 	@echo 'out/site/index.html'
@@ -102,11 +102,11 @@ $(VENV)/bin/python:
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || .ci/apt-install python3-venv python3-dev
 	@$(PYTHON) -m venv $(VENV)
 
-# uv downloads in parallel. It does not read pip's settings, so pip does what uv cannot.
+# uv downloads in parallel, but does not read pip's settings. If uv fails, pip is used.
 UV := [ -x $(BIN)/uv ] && VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet
 DEVELOPER := --no-build-isolation --editable '.[formats,test,lint,docs]'
 
-# What compiles the extensions. CMake and Ninja are large: those of the system are used, if new enough.
+# The build tools. CMake and Ninja are large, so those of the system are used if they are new enough.
 $(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
 	@command -v $${CXX:-c++} >/dev/null && command -v $${CC:-cc} >/dev/null || \
 	  .ci/apt-install gcc g++ libc6-dev
@@ -114,7 +114,7 @@ $(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
 	  sys.exit(not os.path.exists(s.get_path("include") + "/Python.h"))' || \
 	  .ci/apt-install python3-dev
 	@echo 'setup: build tools'
-	@$(PIP) install --no-compile --only-binary :all: uv || echo 'setup: without uv, with pip alone' >&2
+	@$(PIP) install --no-compile --only-binary :all: uv || echo 'setup: uv could not be installed; using pip' >&2
 	@set -- 'scikit-build-core>=1.1' 'nanobind>=2.7' 'setuptools-scm>=8'; \
 	case "$$(cmake --version 2>/dev/null | sed -n '1s/.* //p')" in \
 	  3.2[0-9].*|3.3[0-9].*|[4-9].*) ;; *) set -- "$$@" 'cmake>=3.20' ;; esac; \
@@ -122,8 +122,8 @@ $(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
 	$(UV) "$$@" || $(PIP) install "$$@"
 	@touch $@
 
-# Downloads and the compiler run at the same time. scikit-build-core keeps its build folder, so a
-# later call compiles what changed and nothing else.
+# Packages are downloaded while the extensions are compiled. scikit-build-core keeps its build folder,
+# so a later call compiles only what changed.
 $(VENV)/.built: $(NATIVE) $(VENV)/.tools
 	@echo 'setup: extensions and packages'
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) install --no-build-isolation --no-deps \
@@ -133,7 +133,7 @@ $(VENV)/.built: $(NATIVE) $(VENV)/.tools
 	@$(BIN)/python -m compileall -q src/haselab # else each process compiles it, where no cache may be written
 	@touch $@
 
-# What the tests, the checkers and the documentation need besides.
+# The additional packages that the tests, the checkers and the documentation need.
 $(VENV)/.packages: pyproject.toml $(VENV)/.built
 	@echo 'setup: packages of the tests'
 	@export PATH="$(CURDIR)/$(BIN):$$PATH"; \

@@ -35,7 +35,7 @@ root_doc = "docs/index"
 include_patterns = [
     "docs/**.md", "docs/**.rst", "docs/**.ipynb",
     "README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "CHANGELOG.md",
-    "benchmarks/README.md", "examples/plugins/*/README.md", "examples/notebooks/*.ipynb",
+    "benchmarks/README.md", "examples/plugins/*/README.md",
 ]  # fmt: skip
 exclude_patterns = [
     ".*", "out", "build", "dist", "src", "tests", "**/.ipynb_checkpoints", "docs/sphinx",

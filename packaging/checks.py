@@ -1,4 +1,4 @@
-"""Checks of built packages: each returns what it found, or raises `CheckError` with the fault."""
+"""Checks of built packages: each returns its result as text, or raises `CheckError`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WITHOUT_COMPILER = ("cc", "gcc", "c++", "g++", "clang", "clang++")
 
 
 class CheckError(Exception):
-    """What is wrong with a package."""
+    """A package has a fault; the message describes it."""
 
 
 def is_abi3(wheel: Path) -> bool:
@@ -36,7 +36,7 @@ def is_abi3(wheel: Path) -> bool:
 
 
 def check_size(wheel: Path) -> str:
-    """A wheel has at most 5 MB."""
+    """A wheel is at most 5 MB large."""
     size_mb = wheel.stat().st_size / 1e6
     if size_mb > _LARGEST_MB:
         raise CheckError(f"{size_mb:.1f} MB; at most {_LARGEST_MB:g} MB")
@@ -44,7 +44,7 @@ def check_size(wheel: Path) -> str:
 
 
 def check_contents(wheel: Path) -> str:
-    """A wheel holds every file of the package, each extension and the C sources of the firmware."""
+    """A wheel contains all files of the package, all extensions and the sources of the firmware."""
     with zipfile.ZipFile(wheel) as opened:
         names = set(opened.namelist())
     line = ["git", "-C", str(ROOT), "ls-files", "src/haselab", *_SOURCES]
@@ -70,7 +70,7 @@ def check_metadata(python: Path, files: list[Path]) -> str:
 
 
 def check_platform(python: Path, wheel: Path) -> str:
-    """The wheel runs where its file name says: auditwheel."""
+    """The wheel fits the platform tag in its file name (auditwheel)."""
     found = " ".join(_run([python, "-m", "auditwheel", "show", wheel]).split())
     tag = next(each for each in wheel.stem.split("-")[-1].split(".") if "_2_" in each)
     if f'platform tag: "{tag}"' not in found:
@@ -79,13 +79,13 @@ def check_platform(python: Path, wheel: Path) -> str:
 
 
 def check_abi3(python: Path, wheel: Path) -> str:
-    """The wheel uses nothing outside the stable ABI: abi3audit."""
+    """The wheel uses only the stable ABI (abi3audit)."""
     _run([python, "-m", "abi3audit", "--strict", wheel])
     return "stable ABI of 3.12"
 
 
 def check_install(python: Path, wheel: Path, folder: Path) -> str:
-    """Without a compiler: install, doctor, a quick study, an FMU and firmware."""
+    """Install the wheel without a compiler; run doctor, a quick study, an FMU and firmware."""
     shutil.rmtree(folder, ignore_errors=True)
     _run([python, "-m", "venv", folder / "venv"])
     environment = {**os.environ, "PATH": str(_programs(folder))}
@@ -107,7 +107,7 @@ def check_install(python: Path, wheel: Path, folder: Path) -> str:
         "scoreboard --help",
     ):
         _run([haselab, *line.split()], environment, here)
-    built = "no avr-gcc: no firmware"
+    built = "firmware not built (no avr-gcc)"
     if shutil.which("avr-gcc"):
         line = ["firmware", "build", "study/actuator.toml", "--build-dir", "chip"]
         _run([haselab, *line], environment, here)
@@ -118,14 +118,14 @@ def check_install(python: Path, wheel: Path, folder: Path) -> str:
 
 
 def check_digest(folder: Path) -> str:
-    """The installed wheel computes the bits of the build from source in .venv."""
+    """The installed wheel gives the same bits as the build from source in .venv."""
     found, wanted = (
         json.loads(_run([python, ROOT / "packaging/digest.py"]))
         for python in (folder / "venv/bin/python", ROOT / ".venv/bin/python")
     )
     different = [name for name in wanted if wanted[name] != found[name]]
     if different:
-        raise CheckError(f"other bits than the build from source: {', '.join(different)}")
+        raise CheckError(f"other results than the build from source: {', '.join(different)}")
     return f"{len(wanted)} equal digests"
 
 
@@ -139,7 +139,7 @@ def check_old_processor(folder: Path) -> str:
 
 
 def check_sdist(python: Path, sdist: Path, compilers: tuple[str, str], folder: Path) -> str:
-    """The source distribution builds with these compilers, and the result loads."""
+    """The source distribution builds with these compilers, and the wheel is complete."""
     shutil.rmtree(folder, ignore_errors=True)
     environment = {**os.environ, "CC": compilers[0], "CXX": compilers[1]}
     _run([python, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
@@ -164,7 +164,7 @@ def _programs(folder: Path) -> Path:
 
 
 def _same_numpy() -> list[str]:
-    """The numpy and scipy of .venv, since other versions may give other bits."""
+    """Versions of numpy and scipy in .venv; other versions may give different bits."""
     code = "import numpy, scipy; print(f'numpy=={numpy.__version__} scipy=={scipy.__version__}')"
     return _run([ROOT / ".venv/bin/python", "-c", code]).split()
 

@@ -2,8 +2,8 @@
 
     python packaging/digest.py
 
-Equal digests need the same numpy and scipy and the same processor type: both choose instructions by
-themselves. haselab's own modules give the same bits with every instruction set.
+The digests are equal only with the same numpy, scipy and processor type, because numpy and scipy
+choose instructions at run time. haselab's own modules give the same bits with all instructions.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BLOCK, RATE_HZ = 2000, 200e3
 
 
 def of(*arrays: object) -> str:
-    """First 16 digits of the hash of the values' bytes."""
+    """First 16 digits of a hash of the values."""
     digest = hashlib.sha256()
     for array in arrays:
         values = np.ascontiguousarray(array)
@@ -39,7 +39,7 @@ def estimates(named: dict[str, Estimate]) -> list[float]:
 
 
 def sensing() -> str:
-    """Random codes and a carrier, by the lock-in."""
+    """The lock-in's results for random codes and a carrier."""
     noise = np.random.default_rng(1).integers(-40, 40, (200, BLOCK, 2), np.int16)
     phase = 2.0 * np.pi * 2000.0 / RATE_HZ * np.arange(BLOCK)
     carrier = np.round(3000.0 * np.stack([np.sin(phase), np.cos(phase)], axis=-1)).astype(np.int16)

@@ -1,4 +1,4 @@
-"""Build the packages into dist/, check them, and print a table; exit code 1 if a check failed.
+"""Build the packages into dist/, check them and print a table. A failed check gives exit code 1.
 
 make dist                                 all targets
 make dist TARGETS=linux-x86_64            one of them

@@ -10,7 +10,7 @@ __all__ = ["unpack"]
 
 
 def unpack(archive: Path, folder: Path) -> Path:
-    """Bring a folder to the contents of an archive, and leave equal files untouched.
+    """Update a folder to the contents of an archive, and leave equal files untouched.
 
     Args:
         archive: source distribution.
@@ -31,6 +31,6 @@ def unpack(archive: Path, folder: Path) -> Path:
         target = folder / name
         if not target.is_file() or target.read_bytes() != path.read_bytes():
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)  # now is its time, not that of the archive
+            shutil.copyfile(path, target)  # with the current time, so that it is compiled again
     shutil.rmtree(fresh)
     return folder

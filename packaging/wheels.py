@@ -1,8 +1,8 @@
 """Build the source distribution and the wheels of TARGETS with `zig cc`.
 
-Zig brings the C library's headers and symbols of every version and processor, so one computer
-builds for all of them, and the wheels run on every glibc since 2.17. The version of zig is fixed in
-requirements.txt.
+Zig contains the headers and symbols of each version of the C library for each processor. So one
+computer builds the wheels for all targets, and they need glibc 2.17 or newer. requirements.txt pins
+the version of zig.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def build_wheel(python: Path, name: str, source: Path, work: Path, out: Path) ->
 def _write_tools(python: Path, target: Target, folder: Path) -> None:
     """Write the programs that the toolchain file names, each a call of zig."""
     zig = _ask(python, "import ziglang; print(ziglang.__path__[0])") + "/zig"
-    # Zig compiles its C++ library for each level of optimisation: CMake's tests use this one too.
+    # Zig compiles its C++ library for each optimisation level, so CMake's own tests use -O2 too.
     compile_for = f"-target {target.triple} -O2 -fno-sanitize=undefined -rtlib=none"
     lines = {
         "cc": f"cc {compile_for}",

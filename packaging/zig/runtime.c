@@ -1,4 +1,4 @@
-/* What haselab needs of a compiler's run-time library, in place of that of `zig cc`.
+/* Functions of a compiler's run-time library that haselab needs, in place of those of `zig cc`.
  *
  * The library of zig contains exp, log, sin, cos and tan too. They would replace those of the system's
  * libm and give other bits than a build from source, so the wheels are linked without it.
@@ -7,7 +7,7 @@
 
 #define HIDDEN __attribute__((visibility("hidden")))
 
-/* Called where the parts of a product are not numbers. */
+/* Called when both parts of a complex product are NaN. */
 double complex __muldc3(double a, double b, double c, double d);
 HIDDEN double complex __muldc3(double a, double b, double c, double d)
 {
@@ -21,13 +21,13 @@ HIDDEN double complex __muldc3(double a, double b, double c, double d)
 #ifdef __x86_64__
 /* The features of the processor. `__builtin_cpu_supports` and `target_clones` of GCC and Clang read these two variables. The
  * library of `zig cc` sets no bit in them, so every choice would be the slowest one. The layout
- * and the bit numbers are those of libgcc and compiler-rt. Only the bits that haselab asks for
+ * and the bit numbers are those of libgcc and compiler-rt. Only the bits that haselab reads
  * are set.
  */
 #include <cpuid.h>
 
 enum { AVX2 = 10, AVX512F = 15, AVX512VL = 20, AVX512BW = 21, AVX512DQ = 22, LEVEL_4 = 98 - 32 };
-enum { READY = 1U }; /* any vendor: the variables are set */
+enum { READY = 1U }; /* as the vendor: the variables are set */
 
 extern struct model {
     unsigned int vendor, type, subtype, features;
@@ -77,6 +77,6 @@ HIDDEN int __cpu_indicator_init(void)
     return 0;
 }
 
-/* Also before any constructor that asks. */
+/* Runs before the constructors that read these variables. */
 __attribute__((constructor(101))) static void at_start(void) { (void)__cpu_indicator_init(); }
 #endif

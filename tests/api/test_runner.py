@@ -46,7 +46,7 @@ def test_a_camera_that_sees_nothing_is_one_line(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(CameraRecorder, "_track", lost)
     with (
-        pytest.raises(ResultError, match="all six fiducials in none of 200 frames"),
+        pytest.raises(ResultError, match="not find all six fiducials in any of 200 frames"),
         hl.Runner(hl.twin(seed=1)),
     ):
         pass

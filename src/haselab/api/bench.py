@@ -354,9 +354,9 @@ class Runner:
         good = np.isfinite(length_m)
         if not good.any():
             raise ResultError(
-                f"The camera found all six fiducials in none of {good.size} frames, so there is no "
-                "strain. Check that they are visible, and that the actuator is at rest when the "
-                "with block begins."
+                f"The camera did not find all six fiducials in any of {good.size} frames, so there "
+                "is no strain. Check that they are visible, and that the actuator is at rest when "
+                "the with block begins."
             )
         return Recording(
             rig=self._rig,

@@ -192,10 +192,10 @@ class _BarProgress:
 
 
 def progress_bar() -> Progress:
-    """A progress bar when stderr is a terminal that a person sees, silence otherwise.
+    """A progress bar if stderr is a terminal but not that of a notebook, silence otherwise.
 
-    A line with ! in a notebook gets a terminal, too, but the notebook keeps each state of the bar
-    as a line of its own. Jupyter states the variable in each kernel.
+    Commands after ! in a notebook also get a terminal, but the notebook shows each state of the bar
+    as a separate line. Jupyter sets JPY_PARENT_PID in each kernel.
     """
     seen = sys.stderr.isatty() and "JPY_PARENT_PID" not in os.environ
     return _BarProgress() if seen else SilentProgress()

@@ -233,7 +233,7 @@ def _pool(devices: int | Sequence[Device], seed: int) -> _Pool:
         if len(values) > 1:
             raise InputError(
                 f"The devices have {name} from {values[0]:g} to {values[-1]:g}. Devices of one "
-                "environment share mass and voltages: make an environment for each value."
+                "environment must share mass and voltages: make an environment for each value."
             )
     settled = [_settled(device) for device in devices]
     return _Pool(

@@ -28,9 +28,9 @@ Floats = NDArray[np.float64]
 WEIGHTS = HIDDEN * (FEATURES + 1) + HIDDEN + 1
 _FIRST_SIGMA, _NEXT_SIGMA = 0.2, 0.1
 _EPISODE_S = 3.0
-# An error counts more the longer the reference has been constant, up to 1 + `_MOST_PATIENCE` times.
+# The longer the reference is constant, the more an error counts: up to 1 + `_MOST_PATIENCE` times.
 _PATIENCE, _MOST_PATIENCE = 0.1, 4.0
-_JUMP, _CONSTANT = 5e-3, 1e-9  # of the reference in one update: a step, and none
+_JUMP, _CONSTANT = 5e-3, 1e-9  # changes per update: a larger one is a step, a smaller one none
 
 
 @dataclass(frozen=True)
@@ -77,11 +77,11 @@ def changes(weights: NDArray[np.int32], features: NDArray[np.int32]) -> NDArray[
 
 
 class _Objective:
-    """What the search maximises in one episode: the rewards, with more for a step that settles.
+    """What the search maximises in one episode: the rewards, weighted so that steps settle.
 
     Args:
         simulation: at the beginning of the episode.
-        overshoot_cost: of a strain beyond a constant reference, over that of an error.
+        overshoot_cost: of a strain beyond a constant reference, relative to that of an error.
     """
 
     def __init__(self, simulation: StrainSimulation, overshoot_cost: float) -> None:
@@ -161,8 +161,8 @@ def train(
 ) -> Network:
     """Train a network that closes the loop on drawn devices.
 
-    The search maximises the mean reward, where an error counts up to five times after the reference
-    has been constant for 0.4 s, so that steps settle.
+    The search maximises the mean reward. While the reference is constant, the weight of an error
+    grows, to five times after 0.4 s, so that steps settle.
 
     Args:
         tasks: names, which count alike.
@@ -171,8 +171,8 @@ def train(
         population: networks in a generation.
         loops: in which each of them is tried, in each task.
         devices: different ones.
-        start: network from which the search begins; None: one that integrates the error.
-        overshoot_cost: of a strain beyond a constant reference, over that of an error.
+        start: network at which the search begins; None: one that integrates the error.
+        overshoot_cost: of a strain beyond a constant reference, relative to that of an error.
         report: called after each generation.
     Returns:
         The mean network of the last generation's search.

@@ -70,7 +70,7 @@ class BenchState:
         recorded: folder of the last study that was played to its end; empty: none.
         recording: folder of the study that is being played; empty: none.
         extrapolated: whether the capacitance is outside the range in which the strain map was
-            fitted, so that the strain has no valid band.
+            fitted, so that the band of the strain is not valid.
     """
 
     stage: str

@@ -151,7 +151,8 @@ class _Bench:
         except TimeoutError:
             self._waiting.pop(number, None)
             error = f"No answer from the bench process for {_BENCH_S:g} s. Press STOP."
-            if what in _ENERGISING:  # a command that has failed must not energise the bench
+            # A command that was reported as failed must not energise the bench later.
+            if what in _ENERGISING:
                 self._send("disarm", holder, {})
                 error += " If the command is carried out late, the bench is disarmed at once."
             return {"error": error}

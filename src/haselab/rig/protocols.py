@@ -77,7 +77,7 @@ class RigDescription:
         calibration: of the monitors; None: by the nominal gains.
         exposure_s: of one frame; 0 if it is not known.
         actuator_kind: of the actuator, as in its actuator file.
-        top_code: largest code of the converter; a reading there, or below `-top_code`, is clipped.
+        top_code: largest code of the converter; a code of this magnitude or more is clipped.
     """
 
     name: str

@@ -213,8 +213,8 @@ def read_reference(
         rate_hz: samples per second and channel.
         carrier_hz: sensing frequency.
         volt_per_reading: 1 for volts, else volts of one ADC code.
-        full_scale: a reading of this magnitude is clipped; None: the last code of 16 bits for
-            codes, no limit for volts.
+        full_scale: a reading of this magnitude or more is clipped; None: the last code of 16 bits
+            for codes, no limit for volts.
     Returns:
         The reading.
     Raises:

@@ -212,12 +212,12 @@ def _c_float(value: float) -> str:
 
 
 def _check(setting: ControllerSetting) -> dict[str, float]:
-    """Refuse an actuator on which no network is trained; a network has no parameters."""
+    """Refuse an actuator of a kind for which no network is trained; there are no parameters."""
     kind = _TRAINED_ON if setting.actuator is None else setting.actuator.law.kind
     if kind != _TRAINED_ON:
         raise InputError(
             f"Networks are trained on actuators of kind {_TRAINED_ON!r}, but this one is a {kind}. "
-            "Another kind may even move in the other direction. Use another controller."
+            "Another kind may even move in the opposite direction. Use another controller."
         )
     return {}
 

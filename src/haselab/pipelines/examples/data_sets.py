@@ -173,12 +173,12 @@ DATA_SETS: tuple[DataSet, ...] = (
     ),
     DataSet(
         "actuator",
-        "Records of one actuator, from which its actuator file and its controller follow",
-        "A planar HASEL with a hung mass of 0.25 kg. triangle.csv: twice 0 to 2 V in 1.5 s, while "
-        "monitors.csv records both monitors at 50 kHz (5000 V/V and 2 mA/V; the current is sampled "
-        "2.5 us later). chirp.csv: a step, then 0.1 to 10 Hz. steps.csv: steps that are not used "
-        "for a fit. A row every 10 ms: drive before the amplifier of 5000 V/V, and strain relative "
-        f"to {1e3 * recordings.ZERO_LENGTH_M:g} mm.",
+        "Records of one actuator, for its actuator file and its controller",
+        "A planar HASEL with a hung mass of 0.25 kg. triangle.csv: two cycles of 0 to 2 V, 1.5 s "
+        "each; monitors.csv records both monitors at 50 kHz during them (5000 V/V and 2 mA/V; the "
+        "current is sampled 2.5 us later). chirp.csv: a step, then 0.1 to 10 Hz. steps.csv: steps "
+        "that are not used for a fit. These three files have a row every 10 ms: drive before the "
+        f"amplifier of 5000 V/V, and strain relative to {1e3 * recordings.ZERO_LENGTH_M:g} mm.",
         _actuator,
         (
             f'init "my HASEL" --zero-length-m {recordings.ZERO_LENGTH_M:g} --high-v 2 '

@@ -47,7 +47,7 @@ class Cycles:
 
 @dataclass(frozen=True)
 class ActuatorRecords:
-    """Records of one actuator, from which its controller follows.
+    """Records of one actuator, for the design of its controller.
 
     Args:
         monitors_v: voltage and current monitor during the triangle. Shape `(N, 2)`.
@@ -145,7 +145,7 @@ def chirp(seed: int) -> tuple[Floats, Floats, Floats]:
 
 
 def actuator_records(seed: int) -> ActuatorRecords:
-    """Record what the way from an actuator to its controller needs.
+    """Record what the design of a controller for one actuator needs.
 
     Args:
         seed: of all noise.

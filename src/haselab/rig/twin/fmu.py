@@ -33,7 +33,7 @@ from haselab.rig.twin.twin_bench import CARRIER_HIGH_V, CLAMP_KG, instrument_val
 __all__ = ["FMI_VERSIONS", "Fmu", "twin_fmu"]
 
 FMI_VERSIONS = ("3", "2")
-_SUFFIX = ".dll" if sys.platform == "win32" else ".so"  # of a CMake module, also on macOS
+_SUFFIX = ".dll" if sys.platform == "win32" else ".so"  # CMake modules end with .so on macOS too
 _LIBRARY = Path(_twin.__file__).parent / "libraries" / f"haselab_twin{_SUFFIX}"
 _MODEL = "haselab_twin"
 _STEP_SAMPLES = 20  # TWIN_SUB

@@ -65,7 +65,7 @@ class Claims:
         self._ended.set()
         for block in tuple(self._held):
             with contextlib.suppress(OSError):
-                # An interrupt may have come before this program knew whether the claim is its own.
+                # After an interrupt, the claim may be that of another program.
                 if (self._claims / str(block)).read_text(encoding="utf-8") in ("", self.writer):
                     self.release(block)
         self._file.close()
@@ -96,7 +96,7 @@ class Claims:
             DeviceError: the disk is full, or refuses.
         """
         path = self._claims / str(block)
-        self._held.add(block)  # first: an interrupt must not leave a claim that nobody ends
+        self._held.add(block)  # first: an interrupt must not leave a claim that nobody releases
         for _ in range(2):
             try:
                 with path.open("x", encoding="utf-8") as file:

@@ -214,7 +214,7 @@ class SessionWriter:
         try:
             free = shutil.disk_usage(self._path.parent).free
             free = min(free, _size_limit() - self._path.stat().st_size)
-        except OSError as error:  # the folder has gone, or its drive
+        except OSError as error:  # the folder or its drive is gone
             raise self._failed(error) from None
         if free < _RESERVE_BYTES:
             raise DeviceError(

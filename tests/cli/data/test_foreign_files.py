@@ -301,19 +301,24 @@ def test_commands_of_input_and_output_give_the_same_for_a_foreign_file(tmp_path,
     assert_same(expected, found)
 
 
-def assert_same(one: object, other: object) -> None:
-    """Equal answers, but for the last digits of numbers."""
+# Deviations by draws from a covariance, whose roots the last digits may turn round, have draws of
+# their own: of 100 draws, a deviation scatters by 7 %. The reduction is a ratio of deviations.
+DRAWN = {"std": 0.3, "reduction": 0.3}
+
+
+def assert_same(one: object, other: object, rel: float = 1e-2) -> None:
+    """Equal answers, but for the last digits of numbers and the scatter of drawn deviations."""
     assert type(one) is type(other)
     if isinstance(one, dict) and isinstance(other, dict):
         assert one.keys() == other.keys()
         for key, value in one.items():
-            assert_same(value, other[key])
+            assert_same(value, other[key], DRAWN.get(key, rel))
     elif isinstance(one, list) and isinstance(other, list):
         assert len(one) == len(other)
         for a, b in zip(one, other, strict=True):
-            assert_same(a, b)
+            assert_same(a, b, rel)
     elif isinstance(one, float):
-        assert other == pytest.approx(one, rel=1e-2, abs=1e-6)
+        assert other == pytest.approx(one, rel=rel, abs=1e-6)
 
 
 def test_free_response_in_millimetres_and_milliseconds(tmp_path, capsys):

@@ -34,7 +34,7 @@ extensions = [
 root_doc = "docs/index"
 include_patterns = [
     "docs/**.md", "docs/**.rst", "docs/**.ipynb",
-    "README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "CHANGELOG.md",
+    "README.md", "CONTRIBUTING.md", "SECURITY.md", "ARCHITECTURE.md", "CHANGELOG.md",
     "benchmarks/README.md", "examples/plugins/*/README.md",
 ]  # fmt: skip
 exclude_patterns = [

@@ -127,12 +127,18 @@ def served_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 class TestServedSupply(SupplyConformance):
+    # One twin serves all these tests; instruments/test_supply_traps.py has one that stays on.
+    test_an_output_that_stays_on_is_not_reported_as_off = None  # type: ignore[assignment]
+
     @pytest.fixture
     def rig_file(self, served_file: Path) -> Path:
         return served_file
 
 
 class TestServedGenerator(GeneratorConformance):
+    # instruments/test_generator_traps.py has one that stays on.
+    test_an_output_that_stays_on_is_not_reported_as_off = None  # type: ignore[assignment]
+
     @pytest.fixture
     def rig_file(self, served_file: Path) -> Path:
         return served_file

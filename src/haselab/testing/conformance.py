@@ -19,7 +19,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -167,6 +167,26 @@ class _OffConformance(InstrumentConformance):
         self.energise(device)
         instrument.shut_down(config, _WITHIN_S)
         assert device.is_off()
+
+    @pytest.fixture
+    def stuck_on(self) -> Callable[[], None]:
+        """Makes the instrument ignore every command for off. Override it with your emulator."""
+        pytest.skip(
+            "no fixture stuck_on: not tested whether shut_down confirms that the output is off"
+        )
+
+    def test_an_output_that_stays_on_is_not_reported_as_off(
+        self,
+        stuck_on: Callable[[], None],
+        device: Any,
+        instrument: OutputInstrument[Any],
+        config: Any,
+    ) -> None:
+        """A shutdown that does not confirm it would leave high voltage on in silence."""
+        self.energise(device)
+        stuck_on()
+        with pytest.raises(DeviceError, match=r"."):
+            instrument.shut_down(config, _WITHIN_S)
 
     def test_identifying_leaves_an_output_that_is_off(
         self, device: Any, instrument: OutputInstrument[Any], config: Any

@@ -104,6 +104,36 @@ def test_the_model_is_written_with_its_full_covariance_and_origin(files, capsys)
     assert 'colour = "red"  # of the shell' in actuator.read_text()
 
 
+def test_a_model_file_has_the_band_of_the_actuator_file(files, tmp_path, capsys):
+    """The band contains the noise of the output, which both files state."""
+    actuator, first, second = files
+    model = tmp_path / "model.json"
+    for arguments in (("--actuator", actuator), ("--out", model)):
+        assert run(capsys, "identify", "transfer", first, *arguments)[0] == 0
+    inside = [
+        json.loads(run(capsys, "compare", path, second, "--json")[1])["inside_band"]
+        for path in (actuator, model)
+    ]
+    assert inside[0] == inside[1] == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / 1200))
+    answer = json.loads(model.read_text())
+    del answer["residual_std"]
+    model.write_text(json.dumps(answer))  # as haselab wrote it before
+    without = json.loads(run(capsys, "compare", model, second, "--json")[1])
+    assert without["inside_band"] is None and "does not state residual_std" in without["band"]
+
+
+@pytest.mark.parametrize(
+    ("options", "is_said"),
+    [((), True), (("--hold", "zero"), False), (("--delay", "0.004"), False)],
+)
+def test_a_delay_that_depends_on_the_hold_of_the_input_has_a_note(files, options, is_said, capsys):
+    """A measured input is no staircase: its delay would be too short by half a sample."""
+    _, first, _ = files
+    answer = json.loads(run(capsys, "identify", "transfer", first, *options, "--json")[1])
+    note = "too short by half a sample, 0.005 s."
+    assert any(text.endswith(note) for text in answer["notes"]) is is_said
+
+
 def test_design_reads_the_model_and_writes_the_controller(known, capsys):
     actuator, *_ = known
     code, text, _ = run(capsys, "design", actuator, "--json")

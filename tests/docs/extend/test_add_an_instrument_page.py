@@ -27,7 +27,7 @@ pytest.importorskip("setuptools", reason="builds the package of the page")
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGE = ROOT / "examples" / "plugins" / "haselab-mysupply"
 TEXT = (ROOT / "docs" / "extend" / "add-an-instrument.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^    ((?:cp|pip|pytest|haselab) .*)", TEXT, re.MULTILINE)
+COMMANDS = re.findall(r"^    ((?:cp|pip|python|haselab) .*)", TEXT, re.MULTILINE)
 SECTION = re.search(r"```toml\n(\[supply\]\n.*?)```", TEXT, re.DOTALL)
 
 
@@ -73,7 +73,7 @@ def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
     before = lab.shell.run("haselab rig check bench.toml")
     assert before.returncode == 2
     assert "no supply of kind 'mysupply'; use one of 'petapicovoltron', or install" in before.stderr
-    assert [command.split()[0] for command in COMMANDS] == ["cp", "pip", "pytest", *["haselab"] * 4]
+    assert [command.split()[0] for command in COMMANDS] == ["cp", "pip", "python", *["haselab"] * 4]
     told = {}
     for command in COMMANDS:
         if "rig safe" in command:
@@ -81,7 +81,7 @@ def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
         done = lab.shell.run(command)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         told[command] = done.stdout
-    assert "20 passed" in told["pytest haselab-mysupply/tests"]
+    assert "20 passed" in told["python -m pytest haselab-mysupply/tests"]
     doctor = told["haselab doctor --rig bench.toml"]
     assert re.search(r"ok  driver +mysupply +section supply, package haselab-mysupply 0\.1", doctor)
     assert re.search(r"ok  instrument supply +ACME,HV-3000,A1234", doctor)

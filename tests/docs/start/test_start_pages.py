@@ -65,7 +65,7 @@ def test_a_csv_becomes_a_bode_plot_a_model_and_a_prediction(make_shell: Callable
     assert abs(values["damping_ratio"] - _stated(page, "damping ratio, ", ",")) < 1e-4
     assert abs(1e3 * values["gain"] - _stated(page, "the gain, ", " mm/V")) < 0.01
     assert abs(compared["fit_percent"] - _stated(page, "explains ", " %")) < 0.1
-    assert abs(100 * compared["inside_band"] - _stated(page, "but only ", " %")) < 1.0
+    assert abs(100 * compared["inside_band"] - _stated(page, "(`fit_percent`), and ", " %")) < 1.0
     assert "not white" in " ".join(model["notes"])
     drawn = ("bode.svg", "transfer.svg", "test.svg")
     assert all((shell.folder / name).stat().st_size > 0 for name in drawn)

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 import numpy as np
+from click.core import ParameterSource
 
 from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator, save_section
@@ -184,6 +185,10 @@ def transfer(
     modelled = "strain" if options["through_voltage_map"] else source
     more: dict[str, Any] = {"input": modelled, "output": output}
     more |= {f"{end}_unit": unit for end, unit in zip(more, units, strict=True) if unit}
+    context = click.get_current_context()
+    is_held = options["held_at_hz"] is not None or options["through_voltage_map"]
+    if not is_held and context.get_parameter_source("hold") is ParameterSource.DEFAULT:
+        notes += _doubts_of_hold(fit)
     if notes:
         more["notes"] = [*fit.notes, *notes]
     if options["bootstrap"] is not None and fit.succeeded:
@@ -217,6 +222,20 @@ def _save(
     used = load_actuator(actuator).drive.voltage_map if through_map else None
     section["through_voltage_map"] = None if used is None else used.coefficients
     save_section(actuator, "model", section, files, MODEL_KEYS)
+
+
+def _doubts_of_hold(fit: TransferFit) -> list[str]:
+    """A note where the delay depends on how the input behaves between its samples."""
+    delay = fit.parameters.get("delay_s")
+    sample_s = 1.0 / fit.records[0].input_rate_hz if fit.records else math.nan
+    # Not where the interval is wider than half a sample, or the delay was not estimated.
+    if not fit.succeeded or delay is None or not 0.0 < 4.0 * delay.std < sample_s:
+        return []
+    return [
+        "The input is taken as held from sample to sample, as the output of a converter is. If it "
+        "was measured, such as a monitor voltage, add --hold band-limited: otherwise the delay is "
+        f"too short by half a sample, {sample_s / 2:.3g} s."
+    ]
 
 
 def _agreed(

@@ -46,6 +46,10 @@ from haselab.store.columns.selection import ColumnOptions
 __all__ = ["command"]
 
 _NO_BAND = "no uncertainty: the model has no covariance"
+_NO_NOISE = (
+    "none: the model file does not state residual_std, without which the band would be too narrow. "
+    "Identify the model again"
+)
 
 
 @click.command("compare")
@@ -142,6 +146,8 @@ def command(
     refuse_for_linear(options)
     warn_misspelled_in(model)
     plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
+    noise_std = origin.residual_std
+    no_band = _NO_BAND if posterior is None else _NO_NOISE if noise_std is None else ""
     through = model if through_voltage_map else None
     records = []
     for file in files:
@@ -155,8 +161,8 @@ def command(
         prediction = predict(
             plant,
             records,
-            posterior=posterior,
-            noise_std=origin.residual_std,
+            posterior=None if no_band else posterior,
+            noise_std=noise_std or 0.0,
             free_start=not at_rest,
             training_output=_training_output(origin),
             rng=np.random.default_rng(seed),
@@ -164,7 +170,7 @@ def command(
     if math.isnan(prediction.used_for_fit):
         why = _why_unknown(_training_output(origin), records)
         click.echo(f"haselab: warning: {why}. {model}", err=True)
-    emit(_answer(prediction, posterior is not None), as_json=as_json, out=out)
+    emit(_answer(prediction, no_band), as_json=as_json, out=out)
     names = ", ".join(file.name for file in files)
     title = f"Prediction of {names}: {prediction.fit_percent:.1f} %"
     save_plot(plot, lambda: prediction_chart(prediction, _times(records), title))
@@ -238,14 +244,12 @@ def _times(records: Sequence[Record]) -> NDArray[np.float64]:
     return np.concatenate(parts)
 
 
-def _answer(found: Prediction, has_band: bool) -> dict[str, object]:
+def _answer(found: Prediction, no_band: str) -> dict[str, object]:
     return {
         "fit_percent": found.fit_percent,
         "rms_error": found.rms_error,
-        "inside_band": found.inside_band if has_band else None,
-        "band": "95 %, from the covariance of the model and its residuals"
-        if has_band
-        else _NO_BAND,
+        "inside_band": None if no_band else found.inside_band,
+        "band": no_band or "95 %, from the covariance of the model and its residuals",
         "samples": found.measured.size,
         "used_for_fit": None if math.isnan(found.used_for_fit) else found.used_for_fit,
         "status": found.status,

@@ -230,6 +230,7 @@ class TransferFit(RecordFit[Record]):
         """The result under its public JSON keys."""
         keys = ("natural_frequency_rad_s", "damping_ratio", "gain", "delay_s")
         known = self.training_output
+        residuals = np.concatenate(self.residuals) if self.residuals else np.zeros(0)
         return {
             **{key: self.parameters.get(key) for key in keys},
             "poles": list(self.poles),
@@ -242,6 +243,7 @@ class TransferFit(RecordFit[Record]):
             "status": self.status,
             "notes": list(self.notes),
             "covariance": covariance_table(self.parameters, self.covariance),
+            "residual_std": float(np.sqrt(np.mean(residuals**2))) if residuals.size else None,
             "training_output": None if known is None else known.to_dict(),
             "other_minima": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}

@@ -142,7 +142,7 @@ class OriginTable(_Table):
     output: str = ""
     input_unit: str = ""
     output_unit: str = ""
-    residual_std: Annotated[Number, Field(ge=0)] = 0.0
+    residual_std: Annotated[Number, Field(ge=0)] | None = None
     training_output: TrainingOutputTable | None = None
     through_voltage_map: tuple[Number, Number, Number, Number] | None = None
 

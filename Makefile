@@ -115,7 +115,7 @@ $(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
 	  .ci/apt-install python3-dev
 	@echo 'setup: build tools'
 	@$(PIP) install --no-compile --only-binary :all: uv || echo 'setup: uv could not be installed; using pip' >&2
-	@set -- 'scikit-build-core>=1.1' 'nanobind>=2.7' 'setuptools-scm>=8'; \
+	@set -- 'scikit-build-core>=1.1' 'nanobind>=2.7' 'setuptools-scm>=8' 'setuptools>=70.1' wheel; \
 	case "$$(cmake --version 2>/dev/null | sed -n '1s/.* //p')" in \
 	  3.2[0-9].*|3.3[0-9].*|[4-9].*) ;; *) set -- "$$@" 'cmake>=3.20' ;; esac; \
 	command -v ninja >/dev/null || set -- "$$@" ninja; \
@@ -137,7 +137,7 @@ $(VENV)/.built: $(NATIVE) $(VENV)/.tools
 $(VENV)/.packages: pyproject.toml $(VENV)/.built
 	@echo 'setup: packages of the tests'
 	@export PATH="$(CURDIR)/$(BIN):$$PATH"; \
-	$(UV) $(DEVELOPER) || $(PIP) install $(DEVELOPER)
+	$(UV) $(DEVELOPER) || { echo 'setup: uv could not, pip tries: minutes'; $(PIP) install $(DEVELOPER); }
 	@touch $@
 
 $(VENV)/.bench: pyproject.toml $(VENV)/.packages

@@ -42,6 +42,14 @@ def test_a_plant_goes_through_every_form_and_comes_back(model, tmp_path):
     assert plant.delay_s == 0.012
 
 
+def test_the_names_of_the_fit_are_kept(model, tmp_path):
+    named = json.loads(model.read_text()) | {"input": "U", "output": "Weg"}
+    model.write_text(json.dumps(named))
+    answer = export(model, "--to", "json")
+    assert (answer["input"], answer["output"]) == ("U", "Weg")
+    assert export(model, "--to", "json", "--output-name", "x")["output"] == "x"
+
+
 def test_the_mat_file_holds_what_tf_takes(model, tmp_path):
     path = tmp_path / "model.mat"
     export(model, "--to", "mat", "--out", path)

@@ -77,11 +77,12 @@ def command(
     _refuse({"--fmi": version, "--seed": seed}, form)
     warn_misspelled_in(model)
     rational = read_model(model)
+    fitted = read_origin(model)
     names = {
-        "input": input_name or rational.input_name,
-        "output": output_name or rational.output_name,
+        "input": input_name or fitted.input or rational.input_name,
+        "output": output_name or fitted.output or rational.output_name,
     }
-    origin = read_origin(model).model_dump(exclude_defaults=True)
+    origin = fitted.model_dump(exclude_defaults=True)
     data = rational.to_dict() | origin | names
     if form == "plant":
         emit({"plant": rational.to_plant().to_dict(), **origin}, as_json=as_json, out=out)

@@ -45,7 +45,9 @@ def test_the_search_finds_a_word_without_a_server(browser: Browser, site: Path) 
     assert not problems
 
 
-@pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
+@pytest.mark.parametrize(
+    "size", [WIDE, pytest.param(PHONE, marks=pytest.mark.slow)], ids=["wide", "phone"]
+)
 def test_no_page_of_a_section_has_a_serious_barrier(
     browser: Browser, site: Path, size: dict[str, int]
 ) -> None:

@@ -71,6 +71,7 @@ def test_a_csv_becomes_a_bode_plot_a_model_and_a_prediction(make_shell: Callable
     assert all((shell.folder / name).stat().st_size > 0 for name in drawn)
 
 
+@pytest.mark.slow
 def test_a_film_becomes_tracks_and_a_strain(make_shell: Callable) -> None:
     page, shell = Page("start/your-own-video.md"), make_shell("video")
     (shell.folder / "study.toml").write_text(page.toml[0], encoding="utf-8")
@@ -109,6 +110,7 @@ def _served(shell: Any, command: str) -> Iterator[None]:
             process.wait(_GUARD_S)
 
 
+@pytest.mark.slow
 def test_a_bench_is_rehearsed_with_a_fault_and_without(make_shell: Callable) -> None:
     for needed in ("pty", "serial", "pymeasure", "pyvisa_py", "nidaqmx", "grpc"):
         pytest.importorskip(needed, reason="the served twin's drivers")

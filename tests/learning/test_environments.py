@@ -157,7 +157,7 @@ def test_a_frame_shows_the_actuator_of_the_camera() -> None:
         ({"episode_s": 0.0}, "The episode lasts 0 s. State 0.1 to 3600 s."),
         (
             {"devices": [find_device("hz"), replace(find_device("hz"), high_v=1.5)]},
-            "The devices have high_v from 1.5 to 2. Devices of one environment share",
+            "The devices have high_v from 1.5 to 2. Devices of one environment must share",
         ),
         ({"devices": [find_device("peano-hasel")]}, "The devices contain a peano-hasel."),
         ({"render_mode": "human"}, "render_mode is 'human'. Use None or 'rgb_array'."),

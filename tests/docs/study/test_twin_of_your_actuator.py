@@ -14,7 +14,7 @@ from haselab.rig.twin.twin_file import load_twin
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "study" / "study.md"
 (SECTION,) = re.findall(
-    r"### A twin of your actuator\n(.*?)\nA study that the bench", PAGE.read_text(), re.DOTALL
+    r"## A twin of your actuator\n(.*?)\nA study that the bench", PAGE.read_text(), re.DOTALL
 )
 (BLOCK,) = re.findall(r"```\n(haselab twin new.*?)```", SECTION, re.DOTALL)
 (STUDY,) = re.findall(r"```toml\n(.*?)```", SECTION, re.DOTALL)

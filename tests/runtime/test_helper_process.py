@@ -115,6 +115,16 @@ def test_the_priority_is_restored_even_if_it_was_not_allowed(monkeypatch):
     assert sys.getswitchinterval() == switch_s
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="sessions are POSIX's")
+def test_the_process_yields_to_the_program_and_gets_no_ctrl_c() -> None:
+    aside = HelperProcess(["math"], yields=True)
+    helper = aside.call(os.getpid)
+    assert os.getpriority(os.PRIO_PROCESS, helper) > os.getpriority(os.PRIO_PROCESS, 0)
+    assert os.getsid(helper) == os.getsid(0)  # priorities count within a session
+    assert os.getpgid(helper) != os.getpgrp()  # the terminal's Ctrl-C goes to a group
+    aside.close()
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGSTOP is POSIX's")
 def test_a_stopped_process_is_an_error_and_not_waited_for_forever() -> None:
     aside = HelperProcess(["math"])

@@ -151,7 +151,7 @@ class CameraRecorder:
         self._waiting: list[Frames] = []
         self._video: RawVideoWriter | VideoWriter | None = None
         self._raws: list[Path] = []
-        self._helper = HelperProcess([__name__]) if real_time else None
+        self._helper = HelperProcess([__name__], yields=True) if real_time else None
         self._call: _Call = _here if self._helper is None else self._helper.call
         self._first_s: float | None = None
         self._last_s = 0.0

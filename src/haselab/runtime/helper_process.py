@@ -26,6 +26,7 @@ __all__ = ["HelperProcess"]
 _T = TypeVar("_T")
 _END_S = 5.0
 _PATIENCE_S = 30.0  # a search of one image takes a second; loading the modules takes a few more
+_YIELDS = "--yields"
 
 
 class HelperProcess:
@@ -36,6 +37,7 @@ class HelperProcess:
     Args:
         modules: modules to load at once, so that the first call need not wait for them.
         patience_s: longest time of a call.
+        yields: give it a lower priority than this process.
     Raises:
         DeviceError: The process cannot be started.
     Example:
@@ -46,12 +48,15 @@ class HelperProcess:
         >>> helper.close()
     """
 
-    def __init__(self, modules: Sequence[str], patience_s: float = _PATIENCE_S) -> None:
+    def __init__(
+        self, modules: Sequence[str], patience_s: float = _PATIENCE_S, *, yields: bool = False
+    ) -> None:
         self._patience_s = patience_s
-        command = [sys.executable, "-m", __name__, *modules]
+        priority = [_YIELDS] if yields else []
+        command = [sys.executable, "-m", __name__, *priority, *modules]
         try:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0
             )
         except OSError as error:
             raise self._gone(error) from None
@@ -124,14 +129,15 @@ def _serve(come: BinaryIO, go: BinaryIO) -> None:
         go.flush()
 
 
-def _main() -> None:
-    lower_priority()
+def _main(words: Sequence[str]) -> None:
+    if yields := words[:1] == [_YIELDS]:
+        lower_priority()
     # Ctrl-C is for the program, which ends this process
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     come, go = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # printed text must not get between two replies
     gc.disable()  # imports leave hardly anything to collect
-    for name in sys.argv[1:]:
+    for name in words[yields:]:
         importlib.import_module(name)
     gc.freeze()  # the garbage collector need not look at them again
     gc.enable()
@@ -140,4 +146,4 @@ def _main() -> None:
 
 
 if __name__ == "__main__":
-    _main()
+    _main(sys.argv[1:])

@@ -34,7 +34,11 @@ def with_priority() -> Iterator[bool]:
 
 
 def lower_priority() -> None:
-    """Lower the priority of this process below that of others."""
+    """Lower the priority of this process below that of the other processes of its session.
+
+    Linux shares the processor among sessions first (autogroup), whatever their priorities, so a
+    process that lowers its own must not be started in a session of its own.
+    """
     _set_niceness(max(_niceness(), -_NICENESS))
 
 

@@ -115,7 +115,7 @@ class ChipExperiments:
             self._processes[name] = subprocess.Popen(
                 [sys.executable, "-m", __name__, str(self._folder), self._keep_video, name],
                 stdin=subprocess.PIPE, stdout=output, stderr=output,
-                start_new_session=True,  # Ctrl-C is for the study, whose end ends these
+                process_group=0,  # Ctrl-C is for the study, whose end ends these
             )  # fmt: skip
 
     def finish(self) -> Mapping[str, str]:

@@ -51,7 +51,7 @@ class NoiseFreeRun:
         self._process = subprocess.Popen(
             [sys.executable, "-m", __name__],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
-            start_new_session=True,  # Ctrl-C is for the study, whose end ends this process
+            process_group=0,  # Ctrl-C is for the study, whose end ends this process
         )  # fmt: skip
         self._send(self._problem)
         return self

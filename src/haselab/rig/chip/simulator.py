@@ -74,7 +74,7 @@ class CoSim(Closing, ChipLink):
                 [str(program), str(elf), str(physics), str(round(1e3 * supply_v))],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
                 # Ctrl-C is for the main program, which stops the output first
-                start_new_session=True,
+                process_group=0,
             )  # fmt: skip
         except (OSError, subprocess.CalledProcessError) as error:
             self._folder.cleanup()

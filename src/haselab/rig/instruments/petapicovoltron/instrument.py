@@ -22,7 +22,6 @@ class PetaPicoVoltronInstrument(SupplyInstrument[PetaPicoVoltronConfig]):
 
     kind = "petapicovoltron"
     config = PetaPicoVoltronConfig
-    packages = ("pyserial",)
     purpose = "high-voltage supplies on serial ports"
 
     def check_driver(self) -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from scipy.io import savemat
 
 import haselab as hl
 from haselab.base import InputError
@@ -210,3 +211,40 @@ def test_a_session_of_several_experiments_asks_for_one(tmp_path):
     for convert in (found.to_pandas, found.to_xarray):
         with pytest.raises(InputError, match=r"^The session has 2 experiments\. Name one of"):
             convert()
+
+
+def _runs(path, **root):
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.normal(size=40), 10)
+    y = np.cumsum(u)
+    runs = {
+        "first": {"u": u, "y": y, "time_s": np.arange(400) / 100.0},
+        "second": {"u": u[:300], "y": -y[:300], "time_s": np.arange(300) / 50.0},
+    }
+    savemat(path, runs | root)
+    return u, y
+
+
+def test_structures_of_a_matlab_file_bring_their_own_times(tmp_path):
+    _, y = _runs(tmp_path / "runs.mat")
+    for source in (tmp_path / "runs.mat", str(tmp_path / "runs.mat")):
+        (first,) = hl.records(source, "first/u", "first/y")
+        (second,) = hl.records(source, "second/u", "second/y")
+        assert (first.input_rate_hz, second.input_rate_hz) == (100.0, 50.0)
+        assert np.array_equal(second.y, -y[:300])
+
+
+def test_a_loaded_file_knows_the_full_names_and_keeps_those_that_repeat(tmp_path):
+    u, y = _runs(tmp_path / "runs.mat")
+    loaded = hl.load(tmp_path / "runs.mat")  # the longest columns
+    assert list(loaded) == ["first/u", "first/y", "first/time_s"]
+    (record,) = hl.records(loaded, "first/u", "first/y")
+    assert np.array_equal(record.y, y)
+    savemat(tmp_path / "one.mat", {"run": {"u": u, "y": y, "time_s": np.arange(400) / 100.0}})
+    one = hl.load(tmp_path / "one.mat")
+    assert list(one) == ["u", "y", "time_s"]
+    assert np.array_equal(one["run/u"], one["u"])
+    assert "run/u" in one and "run/z" not in one
+    (named,) = hl.records(one, "run/u", "run/y")
+    (plain,) = hl.records(one, "u", "y")
+    assert np.array_equal(named.y, plain.y)

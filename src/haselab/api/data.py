@@ -151,7 +151,7 @@ def numeric_table(data: Data, names: Sequence[str], rate_hz: float | None) -> Ta
         return _at_rate(read_table(data, names), rate_hz)
     found = table(data, rate_hz=rate_hz)
     for name in names:
-        if name not in found.columns:
+        if name not in found:
             reasons = {} if isinstance(data, Table) else _columns(data)[1]
             listed = f"There is no column {name!r}; the data have {', '.join(found)}."
             raise InputError(f"{reasons.get(name, listed)} Name another column.")

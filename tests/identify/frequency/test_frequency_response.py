@@ -244,6 +244,20 @@ def test_the_charts_agree_with_the_response():
     assert ((bode.phase_high_rad - bode.phase_low_rad) <= 2 * np.pi + 1e-12).all()
 
 
+def test_the_figure_has_the_response_the_fit_and_their_bands():
+    response = estimate(SWEEP, CLEAN, 400.0)
+    drawn = response.chart(0.5 * response.response)
+    positive = response.frequency_hz > 0.0
+    magnitude, phase, coherence = drawn.panels
+    assert np.allclose(magnitude.curves[0].y, np.abs(response.response)[positive])
+    assert np.allclose(magnitude.curves[0].std, response.magnitude_std[positive])
+    assert np.allclose(magnitude.curves[1].y, 0.5 * magnitude.curves[0].y)
+    assert np.allclose(phase.curves[0].y, phase.curves[1].y)
+    assert np.allclose(coherence.curves[0].y, response.coherence[positive])
+    axes = response.plot().axes
+    assert [each.get_ylabel() for each in axes] == ["Magnitude", "Phase (°)", "Coherence"]
+
+
 @pytest.mark.long
 def test_the_hold_of_the_input_is_taken_out_or_left_in():
     u = np.random.default_rng(3).normal(size=2000)

@@ -19,7 +19,6 @@ from haselab.cli.plot import save_plot
 from haselab.identify.free.response import FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
 from haselab.identify.frequency.response import RESPONSE_METHODS, estimate_frequency_response
-from haselab.identify.frequency.response_chart import response_chart
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.store.columns.selection import ColumnOptions
@@ -83,7 +82,7 @@ def frequency_response(
         emit(answer, as_json=as_json, out=out)
         if not response.succeeded:
             raise ResultError(f"{response.status}: {' '.join(str(file) for file in files)}")
-        save_plot(plot, lambda: response_chart("Frequency response", response, None))
+        save_plot(plot, response.chart)
         return
     fit = response.fit(TransferStructure(slow_modes=choice["slow_modes"]))
     if as_json or out is not None:
@@ -99,7 +98,7 @@ def frequency_response(
         if _is_plant(fit)
         else None
     )
-    save_plot(plot, lambda: response_chart("Frequency response and fit", response, fitted))
+    save_plot(plot, lambda: response.chart(fitted))
 
 
 def _is_plant(fit: ResponseFit) -> bool:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from haselab.base import InputError, JsonObject, checked
+from haselab.base.chart import Chart, Curve, Panel
 from haselab.identify.fit import several
 from haselab.identify.frequency.charts import BodeChart, NicholsChart, NyquistChart
 from haselab.identify.frequency.clipping import clipped_at
@@ -21,6 +23,9 @@ from haselab.identify.frequency.welch import averaged_response
 from haselab.identify.record import Record
 from haselab.identify.sampled.record import single_driven_record
 from haselab.identify.transfer.layout import TransferStructure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["RESPONSE_METHODS", "FrequencyResponse", "estimate_frequency_response"]
 
@@ -84,6 +89,40 @@ class FrequencyResponse:
     def nichols(self) -> NicholsChart:
         """Magnitude in dB over phase in degrees, with 95 % intervals."""
         return NicholsChart.of(self.frequency_hz, self.response, self.std)
+
+    def chart(self, fitted: Complexes | None = None) -> Chart:
+        """Magnitude, phase and coherence over the frequency as data of a figure.
+
+        Args:
+            fitted: response of a model at the same frequencies. Shape `(K,)`.
+        Returns:
+            The chart; without the line at 0 Hz, which a logarithmic axis does not have.
+        """
+        used, axis = self.frequency_hz > 0.0, "Frequency (Hz)"
+        hz, std_deg = self.frequency_hz[used], np.degrees(self.phase_std_rad[used])
+
+        def degrees(response: Complexes) -> Floats:
+            return np.degrees(np.unwrap(np.angle(response)))[used]
+
+        size = np.abs(self.response)[used]
+        sizes = [Curve(hz, size, "estimate, 95 %", std=self.magnitude_std[used])]
+        phases = [Curve(hz, degrees(self.response), std=std_deg)]
+        if fitted is not None:
+            sizes.append(Curve(hz, np.abs(fitted[used]), "fit"))
+            phases.append(Curve(hz, degrees(fitted)))
+        return Chart("Frequency response" if fitted is None else "Frequency response and fit", (
+            Panel(axis, "Magnitude", sizes, log_x=True, log_y=True),
+            Panel(axis, "Phase (°)", phases, log_x=True),
+            Panel(axis, "Coherence", (Curve(hz, self.coherence[used]),), log_x=True),
+        ))  # fmt: skip
+
+    def plot(self) -> Figure:
+        """Draw the Bode diagram with bands of 95 %, and the coherence.
+
+        Returns:
+            A matplotlib figure: a notebook shows it, and `savefig` writes it.
+        """
+        return self.chart().plot()
 
     def fit(self, structure: TransferStructure | None = None) -> ResponseFit:
         """Fit a transfer function to the lines, weighted by their covariance."""

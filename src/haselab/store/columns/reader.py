@@ -405,7 +405,7 @@ def check_times(
         found = [1.0 / float(step) for step in (steps.mean(), np.median(steps))]
         nearest = min(found, key=lambda rate: abs(rate / given_hz - 1.0))
         with open_archive(path) as archive:
-            full = time_column(archive, options) or name
+            full = time_column(archive, options, beside=archive.locate_all(names)) or name
             assumed = name if assumed_seconds(archive, full, options) else ""
         check_rate(given_hz, nearest, steps.size, f"column {name}", path, assumed=assumed)
 
@@ -426,7 +426,7 @@ def head_of_times(
         InputError: the column that the options name is missing or does not contain numbers.
     """
     with open_archive(path) as archive:
-        name = time_column(archive, options)
+        name = time_column(archive, options, beside=archive.locate_all(names))
         if name is None:
             return None
         unit = stated_unit(archive, name, options)

@@ -67,16 +67,23 @@ def stated_unit(archive: Archive, full: str, options: ColumnOptions) -> Unit | N
         raise InputError(f"{error} {advice}: {archive.file}") from error
 
 
-def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = ()) -> str | None:
+def time_column(
+    archive: Archive,
+    options: ColumnOptions,
+    used: Sequence[str] = (),
+    beside: Sequence[str] | None = None,
+) -> str | None:
     """Full name of the column of times.
 
     A column is used as the time if it is the only one with the first of the names time, Zeit, t,
-    X_Value and the like, and if its unit, if stated, is a time.
+    X_Value and the like, and if its unit, if stated, is a time. Where a file has several groups of
+    columns, such as the structures of a MATLAB file, those of the group of the data come first.
 
     Args:
         archive: the file.
         options: of the user.
         used: columns that are something else.
+        beside: columns to which the times belong. None: `used`.
     Returns:
         The name; None where there is none.
     Raises:
@@ -91,10 +98,27 @@ def time_column(archive: Archive, options: ColumnOptions, used: Sequence[str] = 
                 f"the column of the times: {archive.file}"
             )
         return full
-    exact = archive.locate("time_s")
+    groups = {full.rpartition("/")[0] for full in (used if beside is None else beside)}
+    if len(groups) == 1 and (group := groups.pop()):
+        own = [full for full in archive.names if full.rpartition("/")[0] == group]
+        exact = f"{group}/time_s" if f"{group}/time_s" in own else None
+        if (found := _times_among(archive, options, own, exact, used)) is not None:
+            return found
+    exact = None if len(groups) > 1 else archive.locate("time_s")
+    return _times_among(archive, options, archive.names, exact, used)
+
+
+def _times_among(
+    archive: Archive,
+    options: ColumnOptions,
+    names: Sequence[str],
+    exact: str | None,
+    used: Sequence[str],
+) -> str | None:
+    """The column of times among some columns, one of which may be called exactly `time_s`."""
     if exact is not None:
         return None if exact in used or not _is_time(archive, exact, options) else exact
-    plain = [(full, archive.plain_name(full).casefold()) for full in archive.names]
+    plain = [(full, archive.plain_name(full).casefold()) for full in names]
     for name in TIME_NAMES:
         found = [full for full, base in plain if base == name and full not in used]
         times = [full for full in found if _is_time(archive, full, options)]

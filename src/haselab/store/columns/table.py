@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +50,8 @@ class Table:
         assumed_seconds: no unit of these times is stated anywhere: they are taken as seconds.
         time_s: its values. Shape `(N,)`.
         why_no_times: why a column that is called like one of times is none; empty: there is none.
+        full_names: name of a column by its name in the file, with group and unit, which finds it
+            too.
     """
 
     columns: Mapping[str, Floats]
@@ -60,8 +62,13 @@ class Table:
     time_s: Floats | None = None
     assumed_seconds: bool = False
     why_no_times: str = ""
+    full_names: Mapping[str, str] = field(default_factory=dict, repr=False)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.columns or name in self.full_names
 
     def __getitem__(self, name: str) -> Floats:
+        name = name if name in self.columns else self.full_names.get(name, name)
         if name not in self.columns:
             raise InputError(
                 f"There is no column {name!r}; the table has {', '.join(self)}. Name one of these."
@@ -130,14 +137,19 @@ def read_every_column(path: Path | str) -> Table:
         InputError: no such file, unknown kind, or no column of numbers.
     """
     with open_archive(path) as archive:
-        names = [archive.plain_name(full) for full in archive.names]
-        found = {name: _column(archive, name) for name in dict.fromkeys(names) if name != "valid"}
+        plain = [archive.plain_name(full) for full in archive.names]
+        names = {
+            full: name if plain.count(name) == 1 else full
+            for full, name in zip(archive.names, plain, strict=True)
+        }
+        found = {name: _column(archive, name) for name in names.values() if name != "valid"}
         columns = {name: values for name, values in found.items() if values is not None}
         longest = max((values.size for values in columns.values()), default=0)
         wanted = [name for name, values in columns.items() if values.size == longest]
     if not longest:
         raise InputError(f"The file has no column of numbers. {path}")
-    return read_table(path, wanted)
+    full_names = {full: name for full, name in names.items() if name in wanted and name != full}
+    return replace(read_table(path, wanted), full_names=full_names)
 
 
 def read_table(
@@ -180,7 +192,7 @@ def read_table(
         }
         left_out = int(np.count_nonzero(~valid))
         rate_hz = stream.rate_hz if kept.all() else None
-        name, time_s = _times(archive, kept, options) if rate_hz is None else (None, None)
+        name, time_s = _times(archive, kept, options, wanted) if rate_hz is None else (None, None)
         if time_s is not None:
             rate_hz = rate_of_times(time_s)
         time_name, why = (
@@ -220,10 +232,10 @@ def _column(
 
 
 def _times(
-    archive: Archive, kept: NDArray[np.bool_], options: ColumnOptions
+    archive: Archive, kept: NDArray[np.bool_], options: ColumnOptions, beside: Sequence[str]
 ) -> tuple[str | None, Floats | None]:
     """Read the column of times; no values if it does not rise, no name if it has no numbers."""
-    name = time_column(archive, options)
+    name = time_column(archive, options, beside=archive.locate_all(beside))
     if name is None:
         return None, None
     times = _column(archive, name, options)

@@ -86,6 +86,7 @@ html_js_files = ["site.js"]
 html_additional_pages = {"index": "redirect.html"}
 html_context = {"default_mode": "auto"}
 html_show_sourcelink = False
+html_search_scorer = str(Path(__file__).parent / "sphinx/search_scorer.js")
 html_show_search_summary = False  # a page from file:// may not read the others
 html_copy_source = False
 html_last_updated_fmt = None

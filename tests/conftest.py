@@ -7,9 +7,13 @@ import sys
 import tempfile
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 # Interlocks of benches under test, apart from those of this computer's own benches.
 os.environ["HASELAB_INTERLOCKS"] = tempfile.mkdtemp(prefix="haselab-interlocks-")
@@ -25,6 +29,7 @@ def pytest_unconfigure() -> None:
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+_BROWSER_MS = 300e3  # how long a test may hang; a busy machine must not fail it
 _TESTS = Path(__file__).resolve().parent
 _SHARED = _TESTS.parents[1] / "shared" / "data"
 
@@ -138,6 +143,21 @@ def installed() -> Callable[[str, str], str]:
         return path
 
     return find
+
+
+@pytest.fixture(scope="module")
+def browser(installed: Callable[[str, str], str]) -> "Iterator[Browser]":
+    """The distribution's Chromium."""
+    path = installed("chromium", "chromium")
+    playwright = pytest.importorskip("playwright.sync_api")
+    playwright.expect.set_options(timeout=_BROWSER_MS)
+    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
+    with playwright.sync_playwright() as running:
+        found = running.chromium.launch(executable_path=path, args=flags)
+        try:
+            yield found
+        finally:
+            found.close()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -1,27 +1,11 @@
 """Panels on the twin, a browser, and an actuator file with a loop."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect, sync_playwright
 
-from tests.panel.running import WAIT_S, RunningPanel, ended, started
-
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
-
-
-@pytest.fixture(scope="module")
-def browser(installed: Callable[[str, str], str]) -> Iterator[Browser]:
-    """The distribution's Chromium."""
-    path = installed("chromium", "chromium")
-    expect.set_options(timeout=1e3 * WAIT_S)
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        try:
-            yield found
-        finally:
-            found.close()
+from tests.panel.running import RunningPanel, ended, started
 
 
 @pytest.fixture

@@ -6,16 +6,12 @@ import fcntl
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect, sync_playwright
 
 _ROOT = Path(__file__).resolve().parents[3]
 _GUARD_S = 1800.0
-_WAIT_MS = 300e3
-_FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
 
 
 def _build(folder: Path) -> None:
@@ -52,16 +48,3 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def site(built: Path) -> Path:
     """The root of the site."""
     return built / "site"
-
-
-@pytest.fixture(scope="module")
-def browser(installed: Callable[[str, str], str]) -> Iterator[Browser]:
-    """The distribution's Chromium."""
-    path = installed("chromium", "chromium")
-    expect.set_options(timeout=_WAIT_MS)
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=path, args=_FLAGS)
-        try:
-            yield found
-        finally:
-            found.close()

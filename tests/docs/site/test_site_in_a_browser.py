@@ -45,6 +45,32 @@ def test_the_search_finds_a_word_without_a_server(browser: Browser, site: Path) 
     assert not problems
 
 
+FIRST = {
+    "install": "start/install",
+    "CSV": "start/your-own-csv",
+    "bode": "start/your-own-csv",
+    "video": "start/your-own-video",
+    "PID": "control/control",
+    "firmware": "control/firmware",
+    "hysteresis": "identify/hysteresis-and-creep",
+    "National Instruments": "hardware",
+    "quick start": "start/twin-in-five-minutes",
+    "emergency stop": "bench/panel",
+}
+
+
+def test_the_search_shows_guides_before_the_api_and_the_history(
+    browser: Browser, site: Path
+) -> None:
+    page = browser.new_page()
+    for words, guide in FIRST.items():
+        page.goto(f"{(site / 'search.html').as_uri()}?q={words}")
+        expect(page.locator("#search-results h2")).to_have_text("Search Results")
+        found = page.locator("#search-results li > a").evaluate_all("all => all.map(a => a.href)")
+        assert any(f"docs/{guide}.html" in address for address in found[:3]), (words, found[:5])
+    page.close()
+
+
 @pytest.mark.parametrize(
     "size", [WIDE, pytest.param(PHONE, marks=pytest.mark.slow)], ids=["wide", "phone"]
 )

@@ -254,9 +254,9 @@ class NidaqBoard:
             self._fetch()
             if self._exposures is not None:
                 self._exposures.collect(self._position)
-        top = 2 ** (self._config.bits - 1)
+        top = self._config.top_code
         codes = np.rint(self._volts.T / self._config.volt_per_code)
-        return np.clip(codes, -top, top - 1).astype(np.int16, order="C")
+        return np.clip(codes, -top - 1, top).astype(np.int16, order="C")
 
     def _give(self) -> None:
         """Queue the output of the next block, and known outputs of later blocks."""

@@ -95,3 +95,28 @@ def test_a_blank_image_and_wrong_requests_are_refused():
         detect_particles(noise, polarity="grey")
     with pytest.raises(InputError, match=r"shape \(64,\)"):
         detect_particles(noise[0])
+
+
+def test_dots_whose_subset_contains_an_edge_are_left_out_and_a_dense_pattern_is_none():
+    rng = np.random.default_rng(5)
+    x, y = np.meshgrid(np.arange(20.0, 221.0, 20.0), np.arange(20.0, 221.0, 20.0))
+    dots = np.stack([x.ravel(), y.ravel()], axis=1) + rng.uniform(-2.0, 2.0, (121, 2))
+    columns, rows = np.meshgrid(np.arange(240.0), np.arange(240.0))
+    image = np.where(rows < 52, 210.0, 130.0)  # a clamp, and the sheet below it
+    for cx, cy in dots:
+        image -= 60 * np.exp(-((columns - cx) ** 2 + (rows - cy) ** 2) / 8)
+    noisy = np.rint(rng.normal(image, 1.5))
+    kept = detect_particles(noisy, polarity="dark", sigma_px=2.0, subset_px=15)
+    away = np.abs(dots[:, 1] - 51.5)
+    inside = np.all((dots > 14.0) & (dots < 225.0), axis=1)
+    # Wholly beyond: half of the subset, two pixels that are compared, and rounding.
+    missed, _ = cKDTree(kept).query(dots[inside & (away > 11.0)])
+    assert missed.max() < 0.5
+    assert np.abs(kept[:, 1] - 51.5).min() > 7.0
+    crowd = rng.uniform(0.0, 240.0, (1400, 2))  # dots cover most of the ground
+    dense = np.full((240, 240), 150.0)
+    for cx, cy in crowd:
+        dense -= 40 * np.exp(-((columns - cx) ** 2 + (rows - cy) ** 2) / 8)
+    every = detect_particles(dense, polarity="dark", sigma_px=2.0)
+    even = detect_particles(dense, polarity="dark", sigma_px=2.0, subset_px=15)
+    assert len(even) > 0.9 * len(every)

@@ -83,12 +83,6 @@ def test_a_film_becomes_tracks_and_a_strain(make_shell: Callable) -> None:
     assert answers["scaled.csv"]["scale_mm_per_px"] is not None
     for name in ("tracks.html", "tracks.png", "tracks-strain.csv"):
         assert (shell.folder / name).stat().st_size > 0
-    # What the page says of the default model. When it no longer loses points, the page changes.
-    command = next(line for line in page.commands if "tracks.csv" in line)
-    default = command.partition(" --report")[0].replace(" --model translation", "")
-    done = shell.run(f"{default.replace('tracks.csv', 'default.csv')} --json")
-    lost = json.loads(done.stdout)
-    assert 0.4 < lost["valid_fraction"] < 0.6 and lost["strain"]["largest"] < 0.15
 
 
 @contextmanager

@@ -58,17 +58,19 @@ from haselab.pipelines.tracking.stream import (
     read_ahead,
     read_clock,
 )
+from haselab.pipelines.tracking.stretch import largest_stretch
 from haselab.pipelines.tracking.table import Block, TrackRows
 from haselab.pipelines.tracking.track_collector import TrackCollector
 from haselab.store.manifest import check_recorded
 from haselab.store.video.opening import VideoReader, open_video
-from haselab.tracking import TrackOptions, frames_at_rest
+from haselab.tracking import TrackOptions, Tracks, frames_at_rest
 from haselab.tracking.options import Frame
 from haselab.tracking.particles.follow import ParticleTracker
 
 __all__ = ["command"]
 
 _MANY_LOST = 0.1
+_ERROR_OF_STRETCH = 0.07  # rms error per stretch and side of the subset, with dots of the twin
 _TURN_S = 0.5e-3
 
 
@@ -194,11 +196,8 @@ def _track(
     if request.report is not None:
         from haselab.pipelines.tracking.page import write_report  # slow to load
 
-        warnings = [
-            line
-            for line in (_loss_line(video), _gap_line(video), moving, str(followed.error or ""))
-            if line
-        ]
+        lines = (_loss_line(video), _gap_line(video), moving, *answer.get("notes", ()))
+        warnings = [line for line in (*lines, str(followed.error or "")) if line]
         clip = (rest[0], points, correction.rest_px)
         write_report(request.report, answer, clip, kept, gauge, warnings)
         answer["report"] = str(request.report)
@@ -215,7 +214,11 @@ def _answer(points: Points, choice: Choice, kept: TrackCollector) -> dict[str, A
             err=True,
         )
     noise = choice.state.noise
+    notes = [line for line in [_stretch_line(points, choice, thin)] if line]
+    for line in notes:
+        click.echo(f"haselab: {line}", err=True)
     return {
+        **({"notes": notes} if notes else {}),
         "frames_read": kept.frames,
         "points": len(points.names),
         "model": choice.options.model,
@@ -231,6 +234,21 @@ def _answer(points: Points, choice: Choice, kept: TrackCollector) -> dict[str, A
         "median_std_px": float(np.median(thin.std_x_px[thin.valid])) if thin.valid.any() else None,
         "noise": None if noise is None else {"floor": noise.floor, "slope": noise.slope},
     }
+
+
+def _stretch_line(points: Points, choice: Choice, tracks: Tracks) -> str:
+    """A warning about subsets that do not stretch with the sheet; empty if there is no need."""
+    if choice.options.model != "translation" or isinstance(choice.tracker, ParticleTracker):
+        return ""
+    stretch = largest_stretch(points.place_px, tracks)
+    wrong_px = _ERROR_OF_STRETCH * stretch * choice.options.subset_px
+    if not tracks.valid.any() or wrong_px < np.median(tracks.std_x_px[tracks.valid]):
+        return ""
+    return (
+        f"The points move apart by up to {100 * stretch:.1f} %, which the subsets of the model "
+        f"translation do not follow. Positions may be wrong by {wrong_px:.1g} px rms, which the "
+        "standard deviations do not include. Use --model neighbours."
+    )
 
 
 def _loss_line(video: VideoReader) -> str:

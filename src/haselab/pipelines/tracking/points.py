@@ -245,8 +245,9 @@ def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
         )
     half = subset_px // 2 + 2
     found = detect_particles(
-        image, polarity=profile.polarity, sigma_px=profile.sigma_px, count=count, margin_px=half
-    )
+        image, polarity=profile.polarity, sigma_px=profile.sigma_px, count=count, margin_px=half,
+        subset_px=subset_px,
+    )  # fmt: skip
     if names:
         away = np.linalg.norm(found[:, None] - clamps[None], axis=2).min(axis=1)
         found = found[away > half]

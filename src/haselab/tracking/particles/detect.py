@@ -40,6 +40,9 @@ _LEAST_COMPACT = 0.3  # the same for a particle, which may touch another; an edg
 _SAME_SIZE = 0.6
 _NEIGHBOURS = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
 _AROUND_PX = 48  # seen around a place: to 4.5 standard deviations of a dot of 10 px
+_LEAST_COMPARED = 12  # dots that show how uneven the ground usually is
+_UNEVEN_TIMES = 5.0  # step of the ground that is an edge, relative to the most even quarter's
+_UNEVEN_DEPTH = 0.5  # and relative to the depth of a dot
 _EVEN = 0.2  # largest unevenness around a fiducial, relative to its depth
 
 
@@ -255,6 +258,7 @@ def detect_particles(
     count: int | None = None,
     sigma_px: float | None = None,
     margin_px: int = 12,
+    subset_px: int | None = None,
 ) -> Floats:
     """Detect small dots with sub-pixel accuracy.
 
@@ -265,6 +269,8 @@ def detect_particles(
         count: largest number, strong and well spread over the image; `None` for all.
         sigma_px: standard deviation of a dot's profile, in px; `None` to find it.
         margin_px: width of the excluded margin, in px.
+        subset_px: leave out dots whose subset of this side contains the edge of something else,
+            such as a clamp, which moves in another way; `None` to keep them.
 
     Returns:
         Centres `[x, y]`, in px, from the top down. Shape `(N, 2)`.
@@ -285,15 +291,42 @@ def detect_particles(
     if sigma_px is not None:
         profile = DotProfile(float(sigma_px), profile.polarity)
     found = locate_particles(image, profile, margin_px=margin_px)
-    points = found.points_px
+    points, strength = found.points_px, found.strength
+    if subset_px is not None:
+        even = _is_even_around(image.astype(float), points, subset_px, strength)
+        points, strength = points[even], strength[even]
     if not len(points):
         raise ResultError(
             f"No {profile.polarity} dot exceeds the noise by {_NOISE_FACTOR:g} standard "
             "deviations. Try the other polarity, or give the points manually."
         )
     if count is not None and count < len(points):
-        points = points[spread_out(points, found.strength, count)]
+        points = points[spread_out(points, strength, count)]
     return np.asarray(points[np.lexsort((points[:, 0], points[:, 1]))])
+
+
+def _is_even_around(
+    image: Floats, points: Floats, subset_px: int, strength: Floats
+) -> NDArray[np.bool_]:
+    """Whether the ground on opposite sides of each subset is equally bright. Shape `(N,)`.
+
+    The levels are medians of two rows or columns of pixels just outside the subset. What counts as
+    an edge follows from the most even quarter of the dots, so that a dense pattern is none.
+    """
+    if len(points) < _LEAST_COMPARED:
+        return np.ones(len(points), dtype=bool)
+    half = subset_px // 2 + 2
+    padded = np.pad(image, half, mode="edge")
+    windows = sliding_window_view(padded, (2 * half + 1,) * 2)
+    x, y = np.rint(points).astype(int).T
+    unequal = np.empty(len(points))
+    for part in np.split(np.arange(len(points)), range(_AT_ONCE, len(points), _AT_ONCE)):
+        around = windows[y[part], x[part]]
+        sides = (around[:, :2], around[:, -2:], around[:, :, :2], around[:, :, -2:])
+        top, bottom, left, right = (np.median(each, axis=(1, 2)) for each in sides)
+        unequal[part] = np.maximum(np.abs(top - bottom), np.abs(left - right))
+    usual, depth = float(np.quantile(unequal, 0.25)), 2.0 * float(np.median(strength))
+    return np.asarray(unequal <= max(_UNEVEN_TIMES * usual, _UNEVEN_DEPTH * depth))
 
 
 def _scale_space(image: Floats, polarity: str) -> list[tuple[float, Floats]]:

@@ -122,11 +122,11 @@ def test_the_stated_deviations_of_the_video_are_those_of_its_true_motion(tmp_pat
         **{name: [
             float((((rows := moved(f"{name}.csv")[lambda each: each.index.str.startswith("p")])
                     .down_px - true[299] * (rows.y_px - upper_px)) ** 2 / rows.std_px ** 2).sum()),
-            len(rows)] for name in ("all", "chosen")},
+            len(rows)] for name in ("all", "by-hand")},
     }""")  # fmt: skip
     # 0.1 % of all videos would have more errors outside of the interval of 95 %.
     assert found["outside"] <= binom.ppf(0.999, found["frames"], 0.05)
-    for name, is_right in (("all", False), ("chosen", True)):
+    for name, is_right in (("all", True), ("by-hand", False)):
         squares, count = found[name]
         assert bool(squares < chi2.ppf(0.999, count)) == is_right, name
 

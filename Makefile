@@ -14,6 +14,14 @@ WORKERS ?= $(shell $(PYTHON) -c 'import os; print(2 + min(os.cpu_count() or 1, 6
 # Neighbouring tests stay on one worker, which then builds what they share once.
 PYTEST  := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 FUZZ_S  ?= 1800
+# A virtual environment works no more once its folder is moved or its Python is gone or upgraded. Its
+# scripts name the folder, which $(VENV)/.tools records.
+WORKS   := $(BIN)/python -c 'import os, sysconfig as s; os.listdir(s.get_path("purelib"))' && \
+  { [ ! -s $(VENV)/.tools ] || [ "$$(cat $(VENV)/.tools)" = "$$(pwd -P)" ]; }
+ifeq ($(shell [ ! -e $(VENV) ] || { $(WORKS); } 2>/dev/null || echo no),no)
+  $(info setup: $(VENV) was moved, or its Python is gone; it is created again)
+  $(shell rm -rf $(VENV))
+endif
 NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] native/*/*/*.[ch] native/*/*.cpp)
 
 # The tests start hundreds of processes; without its cache each would compile the package anew.
@@ -114,13 +122,16 @@ $(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
 	  sys.exit(not os.path.exists(s.get_path("include") + "/Python.h"))' || \
 	  .ci/apt-install python3-dev
 	@echo 'setup: build tools'
+	@# Not there if uv made the environment, or if it was not finished.
+	@pip() { $(BIN)/python -m pip --version >/dev/null 2>&1; }; \
+	pip || { $(BIN)/python -m ensurepip >/dev/null 2>&1; pip; } || $(PYTHON) -m venv --clear $(VENV)
 	@$(PIP) install --no-compile --only-binary :all: uv || echo 'setup: uv could not be installed; using pip' >&2
 	@set -- 'scikit-build-core>=1.1' 'nanobind>=2.7' 'setuptools-scm>=8' 'setuptools>=70.1' wheel; \
 	case "$$(cmake --version 2>/dev/null | sed -n '1s/.* //p')" in \
 	  3.2[0-9].*|3.3[0-9].*|[4-9].*) ;; *) set -- "$$@" 'cmake>=3.20' ;; esac; \
 	command -v ninja >/dev/null || set -- "$$@" ninja; \
 	$(UV) "$$@" || $(PIP) install "$$@"
-	@touch $@
+	@pwd -P >$@
 
 # Packages are downloaded while the extensions are compiled. scikit-build-core keeps its build folder,
 # so a later call compiles only what changed.

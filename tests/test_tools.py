@@ -160,3 +160,31 @@ def test_the_end_of_a_run_lists_what_was_skipped_and_why(tmp_path: Path) -> None
     *_, heading, last = end_of("-k", "three")
     assert " nothing skipped " in heading
     assert last.startswith("1 passed")
+
+
+@pytest.mark.parametrize(
+    ("fault", "kept"),
+    [("none", True), ("set up before the folder was recorded", True), ("moved", False),
+     ("Python upgraded", False), ("Python gone", False)],
+)  # fmt: skip
+def test_an_environment_that_works_no_more_is_created_again(
+    fault: str, kept: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "Makefile").write_bytes((ROOT / "Makefile").read_bytes())
+    venv = tmp_path / ".venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
+    (venv / ".tools").write_text(f"{tmp_path.resolve()}\n", encoding="utf-8")
+    if fault == "set up before the folder was recorded":
+        (venv / ".tools").write_bytes(b"")
+    elif fault == "moved":
+        (venv / ".tools").write_text("/another/folder\n", encoding="ascii")
+    elif fault == "Python upgraded":
+        (venv / "lib").rename(venv / "lib of the last version")
+    elif fault == "Python gone":
+        (venv / "bin" / "python").unlink()
+        (venv / "bin" / "python").symlink_to("/no/such/python")
+    done = subprocess.run(
+        ["make", "help"], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=True
+    )
+    assert venv.exists() == kept
+    assert ("is created again" in done.stdout) != kept

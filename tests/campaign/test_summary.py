@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from haselab.base import InputError
+from haselab.campaign.folder import TABLE, read_results
 from haselab.campaign.summary import (
     compared,
     draws_are_independent,
@@ -213,3 +217,10 @@ repeats = 8
     rows = [CaseRow(f"{k}", k, plan.values(k), {"y": 1.0}) for k in range(plan.count)]
     labels = [group.label for group in groups_of(plan.campaign, rows)]
     assert labels == ["twin.viscosity.share.0 = 0.1", "twin.viscosity.share.0 = 0.2"]
+
+
+def test_a_comparison_without_pyarrow_names_the_extra(tmp_path: Path, monkeypatch: Any) -> None:
+    (tmp_path / TABLE).touch()
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"pip install 'haselab\[campaign\]'"):
+        read_results(tmp_path)

@@ -1,6 +1,8 @@
 """Training: the same network from the same seed, and the same numbers as the controller's."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -133,3 +135,12 @@ def test_an_actuator_that_networks_are_not_trained_on_is_refused() -> None:
     for use in (controller.start, controller.c_text, NETWORK.design):
         with pytest.raises(InputError, match=r"planar-hasel.*but this one is a dea-stack\."):
             use(setting)
+
+
+def test_without_its_extra_the_package_says_how_to_install_it() -> None:
+    code = "import sys; sys.modules['gymnasium'] = None; import haselab.learning"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1] == (
+        "ModuleNotFoundError: haselab.learning needs gymnasium, which is not installed. "
+        "Run: pip install 'haselab[learning]'"
+    )

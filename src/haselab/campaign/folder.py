@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from haselab.campaign.plan import Plan
 from haselab.store.campaign.shards import CaseRow, Shards
 from haselab.store.claim import is_occupied
 from haselab.store.folder import drafted, json_text, read_json, write_new, write_text
+from haselab.store.optional import library
 
 __all__ = [
     "CAMPAIGN", "FAILED", "TABLE", "described_in", "finished_rows", "open_folder", "plan_of",
@@ -136,8 +136,8 @@ def write_table(plan: Plan, rows: Sequence[CaseRow], folder: Path) -> None:
     Raises:
         DeviceError: the disk refuses.
     """
-    arrow: Any = importlib.import_module("pyarrow")
-    parquet: Any = importlib.import_module("pyarrow.parquet")
+    arrow: Any = library("pyarrow", "campaign")
+    parquet: Any = library("pyarrow.parquet", "campaign")
     columns: dict[str, list[Json]] = {
         "case": [row.case for row in rows],
         "index": [row.index for row in rows],
@@ -175,8 +175,8 @@ def read_results(folder: Path) -> dict[str, NDArray[np.float64]]:
             f"This folder has no {TABLE}, so there is no finished campaign to compare with. Name "
             f"the folder of one. {folder}"
         )
-    arrow: Any = importlib.import_module("pyarrow")
-    parquet: Any = importlib.import_module("pyarrow.parquet")
+    arrow: Any = library("pyarrow", "campaign")
+    parquet: Any = library("pyarrow.parquet", "campaign")
     try:
         table = parquet.read_table(path)
     except (arrow.ArrowException, OSError) as error:

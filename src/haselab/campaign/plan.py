@@ -208,7 +208,7 @@ def _unit(campaign: Campaign) -> Floats:
     if design.kind == "random":
         return rng.random((samples, width))
     if design.kind == "saltelli":
-        sample = library("SALib.sample.sobol", "haselab[campaign]").sample
+        sample = library("SALib.sample.sobol", "campaign").sample
         bounds = {"num_vars": width, "names": [str(k) for k in range(width)],
                   "bounds": [[0.0, 1.0]] * width}  # fmt: skip
         seed = int(rng.integers(2**31))

@@ -263,7 +263,7 @@ def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonOb
     whole = blocks[np.isfinite(blocks).all(axis=1)]
     if whole.shape[0] < LEAST_CASES or np.ptp(whole) == 0.0:
         return []
-    analyse = library("SALib.analyze.sobol", "haselab[campaign]").analyze
+    analyse = library("SALib.analyze.sobol", "campaign").analyze
     bounds = {"num_vars": len(paths), "names": list(paths), "bounds": [[0.0, 1.0]] * len(paths)}
     found = analyse(
         bounds, whole.reshape(-1), calc_second_order=False, num_resamples=200, seed=_SEED

@@ -3,7 +3,14 @@
 Importing this package registers `haselab/Track-v0`, `haselab/Hold-v0` and `haselab/Gait-v0`.
 """
 
-import gymnasium
+try:
+    import gymnasium
+except ModuleNotFoundError:
+    raise ModuleNotFoundError(
+        "haselab.learning needs gymnasium, which is not installed. "
+        "Run: pip install 'haselab[learning]'",
+        name="gymnasium",
+    ) from None
 
 from haselab.learning.environment import StrainEnv
 from haselab.learning.tasks import TASKS, LearningTask

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from haselab.controllers.network.weights import (
     features_of,
 )
 from haselab.learning.simulation import StrainSimulation
+from haselab.store.optional import library
 
 __all__ = ["WEIGHTS", "Progress", "changes", "train"]
 
@@ -177,11 +179,11 @@ def train(
     Returns:
         The mean network of the last generation's search.
     Raises:
-        InputError: An argument is out of range.
+        InputError: An argument is out of range, or cma is not installed.
     Source:
         Hansen, N. The CMA evolution strategy: a tutorial. arXiv:1604.00772, 2016.
     """
-    import cma
+    cma: Any = library("cma", "learning")
 
     if not 0.0 <= overshoot_cost <= 100.0:
         raise InputError(f"overshoot_cost is {overshoot_cost:g}. State 0 to 100.")

@@ -89,8 +89,8 @@ def to_control(model: RationalModel, form: str = "tf", *, delay_order: int = 0) 
         control = importlib.import_module("control")
     except ImportError as error:
         raise InputError(
-            "python-control is not installed; version 0.10 or later is required. Install it with "
-            "pip install haselab[control]."
+            "This needs python-control 0.10 or later, which is not installed. "
+            "Run: pip install 'haselab[control]'"
         ) from error
     rational = _delay_free(model, delay_order, "python-control")
     names = {"inputs": model.input_name, "outputs": model.output_name}

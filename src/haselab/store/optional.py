@@ -10,12 +10,12 @@ from haselab.base import InputError
 __all__ = ["library"]
 
 
-def library(name: str, extra: str = "haselab[frames]") -> ModuleType:
+def library(name: str, extra: str) -> ModuleType:
     """Import a library such as pandas.
 
     Args:
         name: of its module.
-        extra: what to install if it is missing.
+        extra: of haselab that installs it, such as `frames`.
     Returns:
         The module.
     Raises:
@@ -25,5 +25,6 @@ def library(name: str, extra: str = "haselab[frames]") -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         raise InputError(
-            f"This needs {name.partition('.')[0]}, which is not installed. Install {extra}."
+            f"This needs {name.partition('.')[0]}, which is not installed. "
+            f"Run: pip install 'haselab[{extra}]'"
         ) from None

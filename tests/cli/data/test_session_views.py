@@ -92,7 +92,7 @@ def test_a_missing_library_names_the_extra(session, monkeypatch, function, libra
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(InputError, match=rf"needs {library}, .* Install haselab\[frames\]"):
+    with pytest.raises(InputError, match=rf"needs {library}, .* pip install .haselab\[frames\]"):
         function(session, "step-1")
 
 

@@ -162,7 +162,7 @@ def test_a_missing_library_is_one_line(session, tmp_path, monkeypatch, form):
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(InputError, match=r"Install haselab\[formats\], or use --to"):
+    with pytest.raises(InputError, match=r"pip install 'haselab\[formats\]', or use --to"):
         export_session(session, form, tmp_path / f"s.{form}")
 
 

@@ -20,7 +20,7 @@ from haselab.store.optional import library
 __all__ = ["LOCAL", "DaskExecutor"]
 
 LOCAL = "local"  # in place of an address
-_EXTRA = "haselab[dask]"
+_EXTRA = "dask"
 _CONNECT_S = 20.0
 _LEAST_SLOTS = 2  # while workers are still coming, so that an adaptive cluster sees work
 _GRACE_S = 5.0

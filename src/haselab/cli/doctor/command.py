@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.util
 import json
 import operator
 import platform
@@ -56,9 +57,26 @@ _PACKAGES = (
     "jinja2",
     "av",
     "tifffile",
+    "tomlkit",
+    "pillow",
+    "starlette",
+    "uvicorn",
+    "websockets",
 )
-# package: what it is for
-_OPTIONAL = {"nptdms": "reading .tdms files", "pyMRAW": "checking .mraw files"}
+# package: what it is for, and the extra that installs it
+_OPTIONAL = {
+    "nptdms": (".tdms files", "formats"),
+    "pyMRAW": ("checking .mraw files", "formats"),
+    "pynwb": ("NWB files", "formats"),
+    "pyarrow": ("campaigns and Parquet files", "campaign"),
+    "SALib": ("sensitivity indices of campaigns", "campaign"),
+    "distributed": ("campaigns on a cluster", "dask"),
+    "pandas": ("tables in Python", "frames"),
+    "xarray": ("data sets in Python", "frames"),
+    "control": ("models in python-control", "control"),
+    "gymnasium": ("learning environments", "learning"),
+    "cma": ("training a network", "learning"),
+}
 # program: what it is for, and the Debian package
 _TOOLS = {
     "avr-gcc": ("building the firmware", "gcc-avr avr-libc"),
@@ -72,6 +90,14 @@ def _package(name: str, kind: str, advice: str) -> Finding:
         return Finding(kind, name, True, metadata.version(name))
     except metadata.PackageNotFoundError:
         return Finding(kind, name, False, "not installed", advice)
+
+
+def _opencv() -> Finding:
+    """Check OpenCV, which comes in packages of several names."""
+    if importlib.util.find_spec("cv2") is None:
+        advice = "For checkerboards: pip install 'haselab[camera]'"
+        return Finding("optional", "OpenCV", False, "not installed", advice)
+    return Finding("optional", "OpenCV", True, "installed")
 
 
 def _extension(name: str) -> Finding:
@@ -175,9 +201,10 @@ def _examine() -> list[Finding]:
         *(_extension(name) for name in _EXTENSIONS),
         *(_package(name, "package", needed) for name in _PACKAGES),
         *(
-            _package(name, "optional", f"For {purpose}: pip install 'haselab[formats]'")
-            for name, purpose in _OPTIONAL.items()
+            _package(name, "optional", f"For {purpose}: pip install 'haselab[{extra}]'")
+            for name, (purpose, extra) in _OPTIONAL.items()
         ),
+        _opencv(),
         *(finding for each in INSTRUMENTS.packages().items() for finding in _driver(*each)),
         *(_tool(name) for name in _TOOLS),
         *extension_findings(),

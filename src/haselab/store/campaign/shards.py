@@ -93,7 +93,8 @@ class Shards:
             self._parquet: Any = importlib.import_module("pyarrow.parquet")
         except ImportError:
             raise InputError(
-                "A campaign needs pyarrow, which is not installed. Install haselab[campaign]."
+                "A campaign needs pyarrow, which is not installed. "
+                "Run: pip install 'haselab[campaign]'"
             ) from None
         self._folder, self._writer, self._count = folder / _FOLDER, writer, 0
         self._small = 0

@@ -86,7 +86,7 @@ class Table:
         Raises:
             InputError: pandas is not installed.
         """
-        frame: pandas.DataFrame = library("pandas").DataFrame(dict(self.columns))
+        frame: pandas.DataFrame = library("pandas", "frames").DataFrame(dict(self.columns))
         if self.rate_hz is not None:
             frame.attrs["rate_hz"] = self.rate_hz
         return frame
@@ -103,7 +103,7 @@ class Table:
         columns = {n: (over, v, _unit_of(n)) for n, v in self.columns.items() if n != over}
         times = {} if self.time_s is None else {over: (over, self.time_s, {"units": "s"})}
         known = {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
-        dataset: xarray.Dataset = library("xarray").Dataset(columns, times, known)
+        dataset: xarray.Dataset = library("xarray", "frames").Dataset(columns, times, known)
         return dataset
 
     def _repr_html_(self) -> str:

@@ -51,7 +51,8 @@ class TdmsArchive(MemberArchive):
             tdms: Any = importlib.import_module("nptdms")
         except ImportError as error:
             raise InputError(
-                f"LabVIEW files need nptdms. Install haselab[formats], or export as CSV: {file}"
+                "LabVIEW files need nptdms, which is not installed. "
+                f"Run: pip install 'haselab[formats]', or export the file as CSV. {file}"
             ) from error
         stream = self._open.enter_context(_Bounded(file))
         groups = self._open.enter_context(tdms.TdmsFile.open(stream)).groups()

@@ -54,7 +54,7 @@ def session_tables(
     Raises:
         InputError: no session, no such experiment, or pandas is not installed.
     """
-    frames = library("pandas")
+    frames = library("pandas", "frames")
     path = session_file(path)
     with SessionReader(path) as reader:
         reader.experiment(experiment)  # refuses an unknown name
@@ -91,7 +91,7 @@ def session_dataset(
     Raises:
         InputError: no session, no such experiment, or xarray is not installed.
     """
-    xarray_library = library("xarray")
+    xarray_library = library("xarray", "frames")
     path = session_file(path)
     with SessionReader(path) as reader:
         record = reader.experiment(experiment)

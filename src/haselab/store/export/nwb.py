@@ -38,7 +38,8 @@ def write_nwb(reader: SessionReader, path: Path, volt_per_code: float, rate_hz: 
         nwb: Any = importlib.import_module("pynwb")
     except ImportError:
         raise InputError(
-            f"NWB files need pynwb. Install haselab[formats], or use --to mat. {path}"
+            "NWB files need pynwb, which is not installed. "
+            f"Run: pip install 'haselab[formats]', or use --to mat. {path}"
         ) from None
     header = json.dumps(reader.header)
     file = nwb.NWBFile(

@@ -260,7 +260,8 @@ def _tdms(source: _Source, out: Path) -> Iterator[Path]:
         tdms: Any = importlib.import_module("nptdms")
     except ImportError:
         raise InputError(
-            f"LabVIEW files need nptdms. Install haselab[formats], or use --to csv. {out}"
+            "LabVIEW files need nptdms, which is not installed. "
+            f"Run: pip install 'haselab[formats]', or use --to csv. {out}"
         ) from None
     scale = {
         "unit_string": "V",

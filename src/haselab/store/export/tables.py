@@ -153,7 +153,8 @@ def write_parquet(table: Table, folder: Path, header: str) -> Path:
         parquet: Any = importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise InputError(
-            f"Parquet files need pyarrow. Install haselab[formats], or use --to csv. {folder}"
+            "Parquet files need pyarrow, which is not installed. "
+            f"Run: pip install 'haselab[formats]', or use --to csv. {folder}"
         ) from None
     path = folder / f"{table.name}.parquet"
     writer: Any = None

@@ -107,7 +107,7 @@ def _opencv() -> Any:
         return importlib.import_module("cv2")
     except ImportError:
         raise InputError(
-            "Checkerboards need OpenCV. Install it with: pip install 'haselab[camera]'"
+            "Checkerboards need OpenCV, which is not installed. Run: pip install 'haselab[camera]'"
         ) from None
 
 

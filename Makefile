@@ -126,7 +126,7 @@ $(VENV)/.tools: pyproject.toml | $(VENV)/bin/python
 	@pip() { $(BIN)/python -m pip --version >/dev/null 2>&1; }; \
 	pip || { $(BIN)/python -m ensurepip >/dev/null 2>&1; pip; } || $(PYTHON) -m venv --clear $(VENV)
 	@$(PIP) install --no-compile --only-binary :all: uv || echo 'setup: uv could not be installed; using pip' >&2
-	@set -- 'scikit-build-core>=1.1' 'nanobind>=2.7' 'setuptools-scm>=8' 'setuptools>=70.1' wheel; \
+	@set -- 'scikit-build-core>=1.1' 'nanobind>=2.7' 'setuptools-scm>=9.2' 'setuptools>=70.1' wheel; \
 	case "$$(cmake --version 2>/dev/null | sed -n '1s/.* //p')" in \
 	  3.2[0-9].*|3.3[0-9].*|[4-9].*) ;; *) set -- "$$@" 'cmake>=3.20' ;; esac; \
 	command -v ninja >/dev/null || set -- "$$@" ninja; \

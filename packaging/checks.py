@@ -13,8 +13,9 @@ from pathlib import Path
 from wheels import ROOT
 
 __all__ = [
-    "CheckError", "check_abi3", "check_contents", "check_digest", "check_install", "check_metadata",
-    "check_old_processor", "check_platform", "check_sdist", "check_size", "is_abi3",
+    "CheckError", "check_abi3", "check_citation", "check_contents", "check_digest",
+    "check_install", "check_metadata", "check_old_processor", "check_platform", "check_sdist",
+    "check_size", "is_abi3",
 ]  # fmt: skip
 
 _LARGEST_MB = 5.0
@@ -67,6 +68,20 @@ def check_metadata(python: Path, files: list[Path]) -> str:
     """The description and the other metadata are accepted by the package index."""
     _run([python, "-m", "twine", "check", "--strict", *files])
     return f"{len(files)} files"
+
+
+def check_citation(sdist: Path) -> str:
+    """CITATION.cff names the version, if it is a release."""
+    version = sdist.name.removeprefix("haselab-").removesuffix(".tar.gz")
+    if "dev" in version:
+        return "not a release"
+    lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    cited = next(
+        line.partition(":")[2].strip(" '\"") for line in lines if line.startswith("version:")
+    )
+    if cited != version:
+        raise CheckError(f"the version in CITATION.cff is {cited}, but the package's is {version}")
+    return version
 
 
 def check_platform(python: Path, wheel: Path) -> str:

@@ -55,6 +55,7 @@ def _interpreter(versions: list[str]) -> str:
 def planned(tools: Path, sdist: Path, wheels: dict[Path, Path]) -> Iterator[Check]:
     """The checks, in their order: subject, name, call."""
     yield "all", "metadata", lambda: checks.check_metadata(tools, [sdist, *wheels])
+    yield "sdist", "citation", lambda: checks.check_citation(sdist)
     for wheel, python in wheels.items():
         name = "-".join(wheel.name.split("-")[2:4]) + wheel.stem.rpartition("manylinux_2_17")[2]
         folder = WORK / "installed" / name

@@ -1,6 +1,7 @@
 """Packages: the version, what a wheel contains, and processors without AVX."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -68,6 +69,9 @@ def test_the_version_comes_from_the_tag(tmp_path: Path, installed: Installed) ->
     assert run(ask, tmp_path) == "0.2.0"
     run([*git, "commit", "--quiet", "--allow-empty", "-m", "two"], tmp_path)
     assert run(ask, tmp_path) == "0.2.1.dev1"
+    for other in ("paper-2026", "iros2018", "nightly"):
+        run([*git, "tag", other], tmp_path)
+        assert run(ask, tmp_path) == "0.2.1.dev1"
 
 
 def test_a_wheel_contains_everything_that_runs(
@@ -98,6 +102,15 @@ def test_a_missing_file_is_found(wheel: Path, checks: ModuleType, tmp_path: Path
                 part.writestr(name, whole.read(name))
     with pytest.raises(checks.CheckError, match=r"such as haselab/sources/firmware/app/main\.c"):
         checks.check_contents(lacking)
+
+
+def test_a_release_is_not_cited_as_another_version(checks: ModuleType) -> None:
+    cited = re.search(r"(?m)^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited is not None
+    assert checks.check_citation(Path(f"haselab-{cited[1]}.tar.gz")) == cited[1]
+    assert checks.check_citation(Path("haselab-9.0.0.dev3.tar.gz")) == "not a release"
+    with pytest.raises(checks.CheckError, match=r"but the package's is 9\.0\.0"):
+        checks.check_citation(Path("haselab-9.0.0.tar.gz"))
 
 
 OLD_PROCESSOR = """

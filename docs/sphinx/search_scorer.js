@@ -3,9 +3,10 @@
 var Scorer = {
   score: ([page, title, anchor, about, score, file, kind]) => {
     const isHistory = /^(CHANGELOG|CONTRIBUTING|ARCHITECTURE|docs\/adr\/|docs\/project\/|benchmarks\/)/;
-    const isStart = /^docs\/(start\/|how-to\/|faq)/;
+    const isStart = /^docs\/(start\/|concepts\/|hardware|control\/control)/;
     if (kind === "object" || /^docs\/reference\/api/.test(page)) return score - 20;
     if (/(^|\/)(index|README)$/.test(page)) return score - 3;
+    if (page === "docs/bench/safety") return score + 6;
     return score + (isHistory.test(page) ? -10 : 0) + (isStart.test(page) ? 4 : 0);
   },
   objNameMatch: 11,

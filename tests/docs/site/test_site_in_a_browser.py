@@ -55,7 +55,10 @@ FIRST = {
     "hysteresis": "identify/hysteresis-and-creep",
     "National Instruments": "hardware",
     "quick start": "start/twin-in-five-minutes",
-    "emergency stop": "bench/panel",
+    "emergency stop": "bench/safety",
+    "creep": "concepts/why-creep",
+    "uncertainty": "concepts/what-an-interval-means",
+    "ESP32": "hardware",
 }
 
 

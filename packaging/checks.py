@@ -14,8 +14,8 @@ from wheels import ROOT
 
 __all__ = [
     "CheckError", "check_abi3", "check_citation", "check_contents", "check_digest",
-    "check_install", "check_metadata", "check_old_processor", "check_platform", "check_sdist",
-    "check_size", "is_abi3",
+    "check_install", "check_loads", "check_metadata", "check_old_processor", "check_platform",
+    "check_sdist", "check_size", "is_abi3",
 ]  # fmt: skip
 
 _LARGEST_MB = 5.0
@@ -156,14 +156,24 @@ def check_old_processor(folder: Path) -> str:
 
 
 def check_sdist(python: Path, sdist: Path, compilers: tuple[str, str], folder: Path) -> str:
-    """The source distribution builds with these compilers, and the wheel is complete."""
+    """The source distribution builds with these compilers; the wheel is complete, and loads."""
     shutil.rmtree(folder, ignore_errors=True)
     environment = {**os.environ, "CC": compilers[0], "CXX": compilers[1]}
     _run([python, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
           "--wheel-dir", folder, sdist], environment)  # fmt: skip
     wheel = next(folder.glob("*.whl"))
     check_contents(wheel)
+    check_loads(python, wheel, folder / "unpacked")
     return wheel.name
+
+
+def check_loads(python: Path, wheel: Path, folder: Path) -> str:
+    """The linker finds all symbols of every extension module."""
+    shutil.unpack_archive(wheel, folder, "zip")
+    modules = sorted(folder.glob("haselab/*.so"))
+    code = "import ctypes, os, sys; [ctypes.CDLL(path, os.RTLD_NOW) for path in sys.argv[1:]]"
+    _run([python, "-c", code, *modules])
+    return f"{len(modules)} modules"
 
 
 def _programs(folder: Path) -> Path:

@@ -104,6 +104,22 @@ def test_a_missing_file_is_found(wheel: Path, checks: ModuleType, tmp_path: Path
         checks.check_contents(lacking)
 
 
+def test_a_module_that_does_not_load_is_found(
+    wheel: Path, checks: ModuleType, tmp_path: Path
+) -> None:
+    assert (
+        checks.check_loads(Path(sys.executable), wheel, tmp_path / "whole")
+        == f"{len(checks._MODULES)} modules"
+    )
+    source, broken = tmp_path / "a.c", tmp_path / wheel.name
+    source.write_text("int absent(void); int present(void) { return absent(); }", encoding="ascii")
+    run(["cc", "-shared", "-fPIC", source, "-o", tmp_path / "_a.so"])
+    with zipfile.ZipFile(broken, "w") as part:
+        part.write(tmp_path / "_a.so", "haselab/_a.so")
+    with pytest.raises(checks.CheckError, match="undefined symbol: absent"):
+        checks.check_loads(Path(sys.executable), broken, tmp_path / "broken")
+
+
 def test_a_release_is_not_cited_as_another_version(checks: ModuleType) -> None:
     cited = re.search(r"(?m)^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert cited is not None

@@ -62,6 +62,7 @@ _PACKAGES = (
     "starlette",
     "uvicorn",
     "websockets",
+    "pyserial",
 )
 # package: what it is for, and the extra that installs it
 _OPTIONAL = {

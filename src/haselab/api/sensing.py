@@ -17,17 +17,24 @@ from haselab.base import InputError, checked, real_array, shown
 from haselab.pipelines.sensing.series import DEFAULT_REQUEST
 from haselab.pipelines.sensing.source import at_the_actuator, lockin_config
 from haselab.pipelines.sensing.table import columns_of
-from haselab.pipelines.tracking.points import find_points
+from haselab.pipelines.tracking.points import (
+    PILOT_FRAMES,
+    Points,
+    choose_tracker,
+    find_points,
+)
 from haselab.sensing import Lockin
 from haselab.store.columns.table import Table
 from haselab.store.video.opening import open_video
-from haselab.tracking import TrackOptions, Tracks, track_frames
+from haselab.tracking import TrackOptions, Tracks, frames_at_rest, track_frames
+from haselab.tracking.options import Frame
 
 __all__ = ["sense", "track"]
 
 Floats = NDArray[np.float64]
 Frames: TypeAlias = str | Path | Iterable[NDArray[np.uint8]]
-_AUTOMATIC = 200  # points at most
+_AUTOMATIC = 300  # points at most, as of `haselab track`
+_SUBSET_PX = 15  # as of `haselab track --points`
 
 
 @checked
@@ -125,8 +132,10 @@ def track(
             `y_px`, or an array of shape `(P, 2)`. None: found in the first frame.
         rate_hz: frames a second, in Hz. None: as the file states it; frames count from 0.
         scale_mm_per_px: adds `x_mm` and `y_mm`.
-        rest_frames: first frames, at rest, that are averaged as the reference.
-        options: how to track.
+        rest_frames: first frames, at rest, that are averaged as the reference; those after the
+            first motion are left out.
+        options: how to track. None: as `haselab track` with its model `auto`, which lets subsets
+            deform as their neighbours move.
     Returns:
         A row for each point in each frame: `frame`, `time_s`, `point`, `x_px`, `y_px`,
         `std_x_px`, `std_y_px`, `quality`, `valid`.
@@ -144,7 +153,8 @@ def track(
                     times.append(time_s)
                     yield frame
 
-            tracks = _tracked(frames(), points, rest_frames, options)
+            lossy = bool(reader.lossy)
+            tracks = _tracked(frames(), points, rest_frames, options, lossy)
     else:
         times, tracks = [], _tracked(video, points, rest_frames, options)
     count, each = tracks.x_px.shape
@@ -179,20 +189,31 @@ def _tracked(
     points: Any,
     rest_frames: int,
     options: TrackOptions | None,
+    lossy: bool = False,
 ) -> Tracks:
     stream = map(_frame, frames)
-    head = list(islice(stream, 1))
+    head: list[Frame] = list(islice(stream, max(rest_frames, PILOT_FRAMES)))
     if not head:
         raise InputError("The video holds no frame. Give a video with frames.")
     if points is None:
         found = find_points(head[0], _AUTOMATIC, None)
-        place, options = found.place_px, options or TrackOptions(subset_px=found.subset_px)
     else:
         place = _place(points)
-    return track_frames(chain(head, stream), place, options, rest_frames)
+        found = Points([str(number) for number in range(len(place))], place, _SUBSET_PX)
+    if options is not None or not 1 <= rest_frames <= len(head):
+        chosen = options or TrackOptions(subset_px=found.subset_px)
+        return track_frames(chain(head, stream), found.place_px, chosen, rest_frames)
+    usual = TrackOptions(subset_px=found.subset_px)
+    rest = head[: frames_at_rest(head[:rest_frames], found.place_px, usual)]
+    choice = choose_tracker(head, rest, found, usual, "auto", lossy=lossy)
+    state, rows = choice.state, []
+    for frame in chain(head, stream):
+        state, seen = choice.tracker.step(state, frame)  # type: ignore[arg-type]
+        rows.append(seen)
+    return Tracks.stack(rows)
 
 
-def _frame(frame: NDArray[Any]) -> NDArray[np.uint8]:
+def _frame(frame: NDArray[Any]) -> Frame:
     """A frame of the kind that the tracker takes."""
     if not isinstance(frame, np.ndarray) or frame.ndim != 2 or frame.dtype.kind != "u":
         raise InputError(

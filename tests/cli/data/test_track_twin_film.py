@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import tifffile
 
+import haselab as hl
 from haselab.cli.main import main
 from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 
@@ -54,6 +55,25 @@ def test_a_stretching_sheet_beside_clamps_is_tracked_within_the_stated_deviation
     assert 0.6 < np.sqrt(np.mean((error / std) ** 2)) < 1.25
     assert np.abs(error).max() < 0.25
     assert "notes" not in answer and "stretch" not in said
+
+
+def test_python_tracks_as_the_command_does(film, tmp_path, capsys):
+    for options, given in (((), None), (("--points",), [[200.0, 100.0], [256.0, 110.0]])):
+        named = []
+        if options:
+            rows = "".join(f"p{k},{x},{y}\n" for k, (x, y) in enumerate(given))
+            (tmp_path / "points.csv").write_text(f"point,x_px,y_px\n{rows}")
+            named = [*options, tmp_path / "points.csv"]
+        out = tmp_path / f"{len(named)}.csv"
+        with pytest.raises(SystemExit):
+            words = [film, "--rest-frames", "5", "--rate-hz", "100", "--out", out, *named]
+            main(["track", *map(str, words)])
+        capsys.readouterr()
+        table = pd.read_csv(out)
+        found = hl.track(film, None if given is None else np.array(given), rest_frames=5)
+        assert np.array_equal(found["valid"], table.valid)
+        for column in ("x_px", "std_y_px"):
+            assert np.allclose(found[column], table[column], atol=1e-5, equal_nan=True)
 
 
 def test_subsets_that_do_not_stretch_are_said_to_be_wrong_by_as_much_as_they_are(

@@ -485,3 +485,24 @@ def test_frames_that_do_not_fit_are_refused():
         tracker.step(state, TEXTURE.astype(float))
     with pytest.raises(InputError, match="2 frames, but 5 rest frames"):
         track_frames([TEXTURE, TEXTURE], np.array([[45.0, 45.0]]), rest_frames=5)
+
+
+def test_points_whose_deviation_is_too_large_are_called_uncertain():
+    """Two bodies in one field: neighbours contradict each other, and the deviations grow."""
+    rng = np.random.default_rng(8)
+    x, y = np.meshgrid(np.arange(30.0, 271.0, 24.0), np.arange(30.0, 271.0, 24.0))
+    place = np.stack([x.ravel(), y.ravel()], axis=1)
+    columns, rows = np.meshgrid(np.arange(300.0), np.arange(300.0))
+    images = []
+    for apart_px in (0.0, 0.0, 1.0, 2.0, 3.0):
+        image = np.full((300, 300), 160.0)
+        moves = np.where((np.arange(len(place)) % 2 == 0)[:, None], apart_px, -apart_px)
+        for cx, cy in place + 0.5 * moves:
+            image -= 80 * np.exp(-((columns - cx) ** 2 + (rows - cy) ** 2) / 8)
+        images.append(np.rint(rng.normal(image, 1.0)).clip(0, 255).astype(np.uint8))
+    tracks = track_frames(images, place, TrackOptions(subset_px=15, model="neighbours"), 2)
+    lost = ~tracks.valid
+    uncertain = (tracks.reason & LossReason.UNCERTAIN) != 0
+    assert uncertain.any() and (lost[uncertain]).all()
+    assert (tracks.quality[uncertain] > 0.6).all()  # they look like the reference
+    assert ((tracks.reason != 0) == lost).all()

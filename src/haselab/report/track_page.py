@@ -39,6 +39,7 @@ _FEWEST_FOR_FIELD = 12
 _WRONG_PX = 0.5
 _WORDS = {
     LossReason.UNLIKE: "too unlike the reference",
+    LossReason.UNCERTAIN: "position too uncertain",
     LossReason.LEFT: "outside the frame",
     LossReason.BENT: "deformed too far",
     LossReason.UNSETTLED: "no convergence",

@@ -28,6 +28,8 @@ class Attempt:
         summary: what needs further checks.
         believed: number of points that were found.
         surprise_px: median distance from the positions expected by the velocities.
+        uncertain: points that were found, but are not valid because of their deviation; their
+            `reason` is UNLIKE. None: there are none. Shape `(P,)`.
     """
 
     poses: Poses
@@ -40,6 +42,7 @@ class Attempt:
     summary: Summary
     believed: int
     surprise_px: float
+    uncertain: NDArray[np.bool_] | None = None
 
     @property
     def missed(self) -> int:
@@ -53,7 +56,10 @@ class Attempt:
     def tracks(self) -> FrameTracks:
         """Tracks of the points in this frame."""
         (x, y), (std_x, std_y) = self.position_px, self.std_px
-        return FrameTracks(x, y, std_x, std_y, self.quality, self.reason == 0, self.reason)
+        reason = self.reason.astype(np.uint16)
+        if self.uncertain is not None:
+            reason[self.uncertain] = LossReason.UNCERTAIN
+        return FrameTracks(x, y, std_x, std_y, self.quality, reason == 0, reason)
 
 
 def surprise_px(state: TrackState, made: Attempt) -> float:

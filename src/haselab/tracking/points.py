@@ -258,7 +258,7 @@ class PointTracker:
             # this many are not outliers but the tails of errors common to all points
             spread = JUMP_PX / float(np.nanmedian(attempt.std_px))
             scatter = max(scatter, strayed * spread**2)
-        if scatter > 1.0 and attempt.believed:
+        if scatter > 1.0 and np.isfinite(attempt.std_px).any():
             # all points of a frame share common disturbances, whatever their own noise
             common = (scatter - 1.0) * np.nanmean(attempt.std_px**2)
             attempt.std_px = np.sqrt(attempt.std_px**2 + common)
@@ -272,7 +272,7 @@ class PointTracker:
         if coarse.any():
             if 3 * np.count_nonzero((attempt.reason == 0) & ~coarse) < len(coarse):
                 coarse = attempt.reason == 0
-            attempt.reason[coarse] = LossReason.UNLIKE
+            attempt.reason[coarse], attempt.uncertain = LossReason.UNLIKE, coarse
             attempt.position_px[:, coarse] = attempt.std_px[:, coarse] = np.nan
 
     def _take_light_out(self, reference: Reference, frame: Frame, attempt: Attempt) -> None:

@@ -21,12 +21,14 @@ class LossReason(IntFlag):
     """Why a point is not valid in a frame; several bits may be set.
 
     UNLIKE: the correlation is below the minimum quality, the contrast is not above that of noise
-    alone, or the position is known to a pixel at best. LEFT: the subset extends beyond the edge of
-    the frame. BENT: it is deformed beyond a factor 1.8. UNSETTLED: the solve did not converge.
-    STRAYED: it is not where its neighbours predict it. COVERED: its residual or contrast differs
-    from those of other points, so something else is in the subset. UNTIED: it was found, but no
-    fixed point was, so the motion of the stand is not known. AMBIGUOUS: the pattern of
-    the points repeats itself, and another position explains the frame equally well.
+    alone, or the position is known to a pixel at best. UNCERTAIN: it was found, but its standard
+    deviation is so large that too many positions would be wrong (`TrackOptions.most_wrong`). LEFT:
+    the subset extends beyond the edge of the frame. BENT: it is deformed beyond a factor 1.8.
+    UNSETTLED: the solve did not converge. STRAYED: it is not where its neighbours predict it.
+    COVERED: its residual or contrast differs from those of other points, so something else is in
+    the subset. UNTIED: it was found, but no fixed point was, so the motion of the stand is not
+    known. AMBIGUOUS: the pattern of the points repeats itself, and another position explains the
+    frame equally well.
     """
 
     UNLIKE = 1
@@ -37,6 +39,7 @@ class LossReason(IntFlag):
     COVERED = 32
     UNTIED = 64
     AMBIGUOUS = 128
+    UNCERTAIN = 256
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class FrameTracks:
     std_y_px: Floats
     quality: Floats
     valid: NDArray[np.bool_]
-    reason: NDArray[np.uint8] | None = None
+    reason: NDArray[np.uint16] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ class Tracks:
     std_y_px: Floats
     quality: Floats
     valid: NDArray[np.bool_]
-    reason: NDArray[np.uint8] | None = None
+    reason: NDArray[np.uint16] | None = None
 
     @classmethod
     def stack(cls, frames: Sequence[FrameTracks]) -> Tracks:

@@ -129,6 +129,15 @@ def records(tmp_path_factory):
     return folder
 
 
+def remove_results(records, arguments):
+    """Remove what an earlier command left under the names that this one writes."""
+    for option in ("--out", "--overlay", "--report"):
+        if option in arguments:
+            path = records / arguments[arguments.index(option) + 1]
+            for old in (path, path.with_name(f"{path.stem}-strain.csv")):
+                old.unlink(missing_ok=True)
+
+
 @pytest.mark.parametrize("line", COMMANDS)
 def test_every_command_of_the_page_runs(records, monkeypatch, line):
     if "board" in line:
@@ -138,13 +147,10 @@ def test_every_command_of_the_page_runs(records, monkeypatch, line):
     assert program == "haselab"
     if "tracks-lens.json" in line and not (records / "tracks-lens.json").is_file():
         pytest.importorskip("cv2")  # the command before makes it; it may run in another process
-        before = COMMANDS[COMMANDS.index(line) - 1]
-        cli.main(shlex.split(before)[1:], standalone_mode=False)
-    for option in ("--out", "--overlay", "--report"):
-        if option in arguments:
-            path = records / arguments[arguments.index(option) + 1]
-            for old in (path, path.with_name(f"{path.stem}-strain.csv")):
-                old.unlink(missing_ok=True)
+        before = shlex.split(COMMANDS[COMMANDS.index(line) - 1])[1:]
+        remove_results(records, before)
+        cli.main(before, standalone_mode=False)
+    remove_results(records, arguments)
     cli.main(arguments, standalone_mode=False)
     for option in ("--out", "--overlay", "--report"):
         if option in arguments:

@@ -78,7 +78,7 @@ def link_clip(
         for k in range(0, len(particles), _FRAMES_AT_ONCE):
             part = slice(bounds[k], bounds[min(k + _FRAMES_AT_ONCE, len(particles))])
             frame = np.asarray(linked.frame[part], np.intp)
-            found = np.zeros(frame.size, np.uint8)
+            found = np.zeros(frame.size, np.uint16)
             point = np.asarray(linked.particle[part], np.intp)
             file.write(
                 rows.rows(

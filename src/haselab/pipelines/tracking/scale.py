@@ -247,7 +247,7 @@ class Correction:
             )
             x, y, std_x, std_y = motion.undo(x, y, std_x, std_y)
         valid = t.valid & np.isfinite(x)
-        untied = np.where(t.valid & ~valid, np.uint8(LossReason.UNTIED), np.uint8(0))
+        untied = np.where(t.valid & ~valid, np.uint16(LossReason.UNTIED), np.uint16(0))
         tracks = replace(
             t,
             x_px=x,

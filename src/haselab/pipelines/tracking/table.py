@@ -133,7 +133,7 @@ class TrackRows:
         """Format all points of some frames, frame by frame. `rest_px` has the shape `(P, 2)`."""
         frames, points = block.tracks.x_px.shape
         tracks = block.tracks
-        reason = np.zeros(tracks.valid.shape, np.uint8) if tracks.reason is None else tracks.reason
+        reason = np.zeros(tracks.valid.shape, np.uint16) if tracks.reason is None else tracks.reason
         numbers = (tracks.x_px, tracks.y_px, tracks.std_x_px, tracks.std_y_px, tracks.quality)
         return self.rows(
             np.repeat(block.number, points),
@@ -150,7 +150,7 @@ class TrackRows:
         time_s: Floats,
         point: NDArray[np.intp],
         numbers: Floats,
-        reason: NDArray[np.uint8],
+        reason: NDArray[np.uint16],
         rest_px: Floats,
     ) -> bytes:
         """Format any rows, in the order of the frames.

@@ -202,9 +202,9 @@ class ParticleTracker:
         start = self._tracker.placed(state.inner, place)
         inner, made = self._tracker.step(start, frame)
         away = np.hypot(made.x_px - place[:, 0], made.y_px - place[:, 1])
-        reason = np.zeros(len(place), np.uint8) if made.reason is None else made.reason.copy()
+        reason = np.zeros(len(place), np.uint16) if made.reason is None else made.reason.copy()
         reason[(reason == 0) & ~(found & (away < _REFINED_PX))] = LossReason.STRAYED
-        reason[near_px <= self._overlap_px] |= np.uint8(LossReason.COVERED)
+        reason[near_px <= self._overlap_px] |= np.uint16(LossReason.COVERED)
         reason[~certain] = LossReason.AMBIGUOUS
         keep = reason == 0
         columns = (made.x_px, made.y_px, made.std_x_px, made.std_y_px)

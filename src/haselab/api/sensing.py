@@ -124,7 +124,7 @@ def track(
     rest_frames: int = 1,
     options: TrackOptions | None = None,
 ) -> Table:
-    """Displacements of points through a video.
+    """Positions of points through a video.
 
     Args:
         video: a file or folder that `haselab track` reads, or frames, shape `(H, W)` each.

@@ -188,8 +188,6 @@ def over_trials(
 ) -> Estimate:
     """Mean of repeated trials with Student's interval; NaN spread for a single trial.
 
-    The interval of times that are all positive ends at 0: too few trials would let it go below.
-
     Args:
         values: one value per trial. Shape `(trials,)`.
         unit: SI unit.
@@ -203,10 +201,7 @@ def over_trials(
         return Estimate(mean, math.nan, (math.nan, math.nan), unit)
     std = float(known.std(ddof=1)) / math.sqrt(values.size)
     half = float(stdtrit(known.size - 1, 0.975)) * std
-    low = mean - half
-    if unit == "s" and (values >= 0.0).all():
-        low = max(low, 0.0)
-    return Estimate(mean, std, (low, mean + half), unit)
+    return Estimate(mean, std, (mean - half, mean + half), unit)
 
 
 def _checked(

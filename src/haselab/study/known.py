@@ -10,6 +10,7 @@ from haselab.controllers import CONTROLLERS, KnownActuator, known_actuator
 from haselab.models.actuator import ActuatorTables
 from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
+from haselab.study.fits.resolution import ZERO_PX
 from haselab.study.tables import Control, OperatingPoint
 
 __all__ = ["known_values", "with_actuator_tables"]
@@ -31,7 +32,7 @@ def known_values(tables: ActuatorTables) -> dict[type, object]:
             found[KnownActuator] = actuator
     if length_m is None or tables.sensing.strain_map is None or drive.voltage_map is None:
         return found
-    maps = Maps(length_m, tables.voltage_map(), tables.strain_map(), {}, {}, {})
+    maps = Maps(length_m, tables.voltage_map(), tables.strain_map(), {}, {}, {}, ZERO_PX)
     return found | {Maps: maps}
 
 

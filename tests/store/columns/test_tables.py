@@ -166,3 +166,24 @@ def test_a_cell_of_very_many_digits_is_examined_without_delay(tmp_path):
     file.write_text(f"u,y\n1,2\n{'1' * 300_000}.0.1,3\n4,5\n")
     with pytest.raises(InputError, match=r"^Column u has .* in line 3"):
         read_table(file, ["u", "y"])
+
+
+def test_names_may_follow_a_preamble_of_numbers(tmp_path):
+    rows = "".join(f"{k};{k % 7};{k % 5}\n" for k in range(40))
+    path = tmp_path / "a.csv"
+    for above in ("1;2;3\n", "2024;11;28\n7;8;9\n", "1;2;3\nlog of a bench\n"):
+        path.write_text(f"{above}t [ms];U [V];x [mm]\n{rows}")
+        found = read_table(path, ["U", "x"])
+        assert found["x"].size == 40 and found.rate_hz == pytest.approx(1000.0)
+    # A gap that a program fills with the same word is no header.
+    path.write_text("t;U;x\n0;1;2\ngap;gap;gap\n" + "".join(f"{k};1;2\n" for k in range(1, 40)))
+    with pytest.raises(InputError, match=r"'gap' in line 3"):
+        read_table(path, ["U", "x"])
+
+
+def test_times_with_thousands_separators_are_named_as_the_reason(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = "".join(f"{k:,};{k % 7};x{k % 5}\n" for k in range(960, 1010)).replace("x", "0.")
+    path.write_text(f"t [ms];U;x\n{rows}")
+    with pytest.raises(InputError, match=r"'1,000' in line 42|thousands separators"):
+        read_table(path, ["U", "x"])

@@ -70,8 +70,8 @@ def feedback_of(held: ControllerSection, rate_hz: float) -> PidGains | LinearCon
     if not isinstance(controller, LinearisableController):
         raise InputError(
             f"Controllers of kind {held.kind!r} have no method linear_feedback, so their margins "
-            "cannot be computed. Add it to the class (docs/extend/add-a-controller.md), or test "
-            "the loop on the twin with: haselab run STUDY.toml --rig RIG.toml --actuator A.toml"
+            "cannot be computed. Add it to the class (see 'Add your own controller' in the docs), "
+            "or test the loop on the twin: haselab run STUDY.toml --rig RIG.toml --actuator A.toml"
         )
     with _named_failures(held.kind):
         numerator, denominator = map(tuple, controller.linear_feedback(1.0 / rate_hz))

@@ -13,6 +13,7 @@ from haselab.report.style import GREEN, GREY, PALETTE, band, label_text, legend_
 __all__ = ["PLAN"]
 
 _SAMPLES_DRAWN = 2500
+_COLOURS = tuple(colour for colour in PALETTE if colour != GREEN)  # that of the desired strain
 
 
 def _groups(section: Section) -> dict[str, Section]:
@@ -34,7 +35,7 @@ def _overview(host: FigureBase, run: RunFolder) -> None:
     axes = host.subplots()
     _desired(axes, section, time_s)
     for at, (name, group) in enumerate(_groups(section).items()):
-        colour = PALETTE[at % len(PALETTE)]
+        colour = _COLOURS[at % len(_COLOURS)]
         mean = 100.0 * group.array("mean", like=time_s)
         std = group.optional("std", like=time_s)
         axes.plot(time_s[step], mean[step], color=colour, linewidth=1.8, label=label_text(name))
@@ -51,7 +52,7 @@ def _each_group(host: FigureBase, run: RunFolder) -> None:
     groups = _groups(section)
     rows = host.subplots(len(groups), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for at, (axes, (name, group)) in enumerate(zip(rows, groups.items(), strict=True)):
-        colour = PALETTE[at % len(PALETTE)]
+        colour = _COLOURS[at % len(_COLOURS)]
         _desired(axes, section, time_s)
         if "trials" in group:
             trials = 100.0 * group.rows("trials", length=time_s.size)

@@ -280,7 +280,7 @@ class ColumnStream(Closing):
             self._archive.rows([*self._names, full])
             (head,) = self._archive.start([full])(_HEAD_ROWS)
         except InputError:
-            if self._options.time is not None or full == "time_s":
+            if self._options.time is not None or full == "time_s" or unit is not None:
                 raise
             return  # a column that is only called like one of times
         self._time_factor = 1.0 if unit is None else unit.factor

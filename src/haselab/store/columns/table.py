@@ -225,10 +225,14 @@ def _column(
     try:
         if archive.locate(name) is None:
             return None
-        stream = ColumnStream(archive, [name], use_times=False, options=options)
-        return np.concatenate([chunk for (chunk,) in stream.chunks(_CHUNK_ROWS)])
+        return _numbers(archive, name, options)
     except InputError:
         return None
+
+
+def _numbers(archive: Archive, name: str, options: ColumnOptions) -> NDArray[Any]:
+    stream = ColumnStream(archive, [name], use_times=False, options=options)
+    return np.concatenate([chunk for (chunk,) in stream.chunks(_CHUNK_ROWS)])
 
 
 def _times(
@@ -238,7 +242,10 @@ def _times(
     name = time_column(archive, options, beside=archive.locate_all(beside))
     if name is None:
         return None, None
-    times = _column(archive, name, options)
+    if name == "time_s" or stated_unit(archive, name, options):  # certainly times, so they must be
+        times: NDArray[Any] | None = _numbers(archive, name, options)
+    else:
+        times = _column(archive, name, options)
     if times is None or times.size != kept.size or not np.isfinite(times[kept]).all():
         if options.time is not None:
             raise InputError(

@@ -23,6 +23,7 @@ _NUMBER = re.compile(
     re.IGNORECASE,
 )
 _MOST_SPOILT = 3
+_LATEST_HEADER = 12  # row of a preamble of numbers that the names follow at the latest
 _LEAST_SHARE = 0.5  # of cells that are numbers, where white space separates them
 _RULER = re.compile(r"[-=_*\s;,\t|]*")
 _DELIMITERS = (";", "\t", ",", "|", None)
@@ -180,12 +181,19 @@ def _guess(lines: Sequence[str], delimiter: str | None) -> _Guess | None:
     first = next((n for n, _ in rows if all(numeric[n][k] for k in columns)), None)
     if first is None:
         return None
+    late = next((n for n, row in rows[:_LATEST_HEADER] if n > first and _is_names(row)), -1)
+    first = next((n for n, _ in rows if n > late and all(numeric[n][k] for k in columns)), first)
     names, units, first = _header(lines, numbered, columns, first, delimiter)
     data = [cells for number, cells in rows if number >= first]
     filled = sum(bool(cell) for cells in data for cell in cells)
     good = sum(is_number(cell) for cells in data for cell in cells)
     halved = delimiter == "," and not names and _is_halved(numbered, first, most)
     return _Guess(delimiter, names, units, most, first, data, good / filled, halved)
+
+
+def _is_names(cells: Sequence[str]) -> bool:
+    """Whether the cells can be the names below a preamble of numbers; words of gaps are equal."""
+    return len(set(cells)) == len(cells) > 1 and all(cells) and not any(map(is_number, cells))
 
 
 def _is_halved(numbered: Sequence[tuple[int, list[str]]], first: int, cells: int) -> bool:

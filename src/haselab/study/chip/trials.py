@@ -26,6 +26,7 @@ from haselab.store.session.writer import (
 from haselab.study.definition import StepStudy
 from haselab.study.experiments.steps import step_reference
 from haselab.study.fits.observe import Observation, gauge_length, point_spread
+from haselab.study.fits.resolution import ZERO_PX
 from haselab.study.fits.trials import Comparison, collect_trials, make_comparison
 from haselab.study.folder import marked_unverified
 from haselab.study.player import UPDATE_HZ
@@ -155,7 +156,7 @@ def _compare(
         f"{row}.error": group.metrics.steady_state_error,
     }
     per_px = rig.scale_m_per_px / chip.zero_length_m
-    return make_comparison({_GROUP: group}, quantities, study.step_trials, per_px, _GROUP)
+    return make_comparison({_GROUP: group}, quantities, study.step_trials, per_px, _GROUP, ZERO_PX)
 
 
 def run_on_chip(

@@ -72,7 +72,9 @@ def further_trials(
         )
         quantities |= {
             f"{row}.rise_{name}": with_camera_resolution(rise, steps, strain_per_px),
-            f"{row}.error_{name}": with_camera_resolution(error, steps, strain_per_px),
+            f"{row}.error_{name}": with_camera_resolution(
+                error, steps, strain_per_px, maps.zero_px
+            ),
         }
         note = _scatter_note(len(trials.strain), 0 if pi is None else len(pi.strain))
         notes |= {f"{row}.rise_{name}": note, f"{row}.error_{name}": note}

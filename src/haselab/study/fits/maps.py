@@ -36,6 +36,8 @@ class Maps:
         quantities: results by id.
         notes: by id, remarks for the reader.
         figures: sections of analysis.json.
+        zero_px: standard deviation of the length of zero strain against the lengths of the study,
+            in px: 0 if the same session gives both.
     """
 
     length_m: float
@@ -44,6 +46,7 @@ class Maps:
     quantities: dict[str, Estimate]
     notes: dict[str, str]
     figures: JsonObject
+    zero_px: float = 0.0
 
 
 def fit_maps(cycles: Cycles, baseline_v: float) -> Maps:

@@ -17,7 +17,7 @@ from haselab.runtime.closed_loop import setting_on_rig
 from haselab.runtime.loop import LoopSettings, RunningController
 from haselab.study.experiment import Chart, Curve
 from haselab.study.fits.observe import Observation
-from haselab.study.fits.resolution import POSITION_PX, with_resolution
+from haselab.study.fits.resolution import POSITION_PX, ZERO_PX, with_resolution
 from haselab.study.fits.trials import (
     ONE_TRIAL,
     Trials,
@@ -99,8 +99,9 @@ def step_results(
         for name, estimate in metrics.items():
             key = group.rows.format(name)
             found[key] = with_camera_resolution(
-                normal_equivalent(estimate), settings, scale_m_per_px / zero_m
-            )
+                normal_equivalent(estimate), settings, scale_m_per_px / zero_m,
+                ZERO_PX if name == "error" else 0.0,
+            )  # fmt: skip
             if len(group.trials) == 1:
                 notes[key] = ONE_TRIAL
         curves.append(_curve(group.name, seen, settings))
@@ -209,7 +210,7 @@ def outer_results(
     """
     time_s = seen.frame_time_s - seen.block_start_s[0]
     strain = seen.length_m / zero_m - 1.0
-    resolution = POSITION_PX * scale_m_per_px / zero_m
+    resolution = math.hypot(POSITION_PX, ZERO_PX) * scale_m_per_px / zero_m
     errors, overshoots = [], []
     for k, point in enumerate(points):
         end_s = (k + 1) * settings.hold_s

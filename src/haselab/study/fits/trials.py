@@ -169,7 +169,8 @@ def compare_trials(
         notes[key] = f"{note}; {notes[key]}" if key in notes else note
     named = {str(study.control.kind) if name == OWN else name: g for name, g in groups.items()}
     shown = "PI" if "PI" in named else list(named)[-1]
-    found = make_comparison(named, quantities, study.steps, scale_m_per_px / maps.length_m, shown)
+    strain_per_px = scale_m_per_px / maps.length_m
+    found = make_comparison(named, quantities, study.steps, strain_per_px, shown, maps.zero_px)
     return replace(found, notes=notes)
 
 
@@ -180,21 +181,28 @@ def _group_of(key: str) -> str:
     return "open loop" if "_open" in key else "PI"
 
 
-def with_camera_resolution(estimate: Estimate, steps: StepTimes, strain_per_px: float) -> Estimate:
+def with_camera_resolution(
+    estimate: Estimate, steps: StepTimes, strain_per_px: float, zero_px: float = 0.0
+) -> Estimate:
     """Add the camera's resolution to a metric, a time or a fraction of the step.
 
     Args:
         estimate: in s, or dimensionless.
         steps: the step, rate of the frames.
         strain_per_px: of the camera.
+        zero_px: standard deviation of the length of zero strain, in px, for a metric that depends
+            on it.
     Returns:
-        The estimate with the resolution in its interval; unchanged if it has no value.
+        The estimate with the resolution in its interval, which for a time does not begin before 0;
+        unchanged if it has no value.
     """
     if math.isnan(estimate.value):
         return estimate
     if estimate.unit == "s":
-        return with_resolution(estimate, math.sqrt(2.0 / 12.0) / steps.frame_rate_hz)
-    return with_resolution(estimate, POSITION_PX * strain_per_px / abs(steps.step))
+        found = with_resolution(estimate, math.sqrt(2.0 / 12.0) / steps.frame_rate_hz)
+        return replace(found, ci95=(max(found.ci95[0], 0.0), found.ci95[1]))
+    place_px = math.hypot(POSITION_PX, zero_px)
+    return with_resolution(estimate, place_px * strain_per_px / abs(steps.step))
 
 
 def make_comparison(
@@ -203,6 +211,7 @@ def make_comparison(
     steps: StepTimes,
     strain_per_px: float,
     shown: str,
+    zero_px: float,
 ) -> Comparison:
     """Add the camera's resolution to the results, and make the figures.
 
@@ -212,12 +221,15 @@ def make_comparison(
         steps: the step.
         strain_per_px: of the camera.
         shown: the group whose first trial is used to compare self-sensing and camera.
+        zero_px: standard deviation of the length of zero strain, on which errors depend, in px.
     """
 
-    def seen(estimate: Estimate) -> Estimate:
-        return with_camera_resolution(normal_equivalent(estimate), steps, strain_per_px)
+    def seen(estimate: Estimate, zero_px: float = 0.0) -> Estimate:
+        return with_camera_resolution(normal_equivalent(estimate), steps, strain_per_px, zero_px)
 
-    quantities = {key: seen(value) for key, value in quantities.items()}
+    quantities = {
+        key: seen(value, zero_px if ".error" in key else 0.0) for key, value in quantities.items()
+    }
     camera = np.concatenate([g.strain.ravel() for g in groups.values()])
     sensed = np.concatenate([g.sensed.ravel() for g in groups.values()])
     error = float(np.sqrt(np.mean((sensed - camera) ** 2)) / np.ptp(camera))
@@ -226,7 +238,7 @@ def make_comparison(
         name: {
             "rise_time_s": seen(g.metrics.rise_time_s),
             "overshoot": seen(g.metrics.overshoot),
-            "error": seen(g.metrics.steady_state_error),
+            "error": seen(g.metrics.steady_state_error, zero_px),
             "settling_time_s": seen(g.metrics.settling_time_s),
         }
         for name, g in groups.items()

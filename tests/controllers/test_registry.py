@@ -100,7 +100,7 @@ def test_the_summary_has_kind_values_and_units():
         ({"kind": "pi", "kp": 1.0}, r"ki \(1/s\) is missing"),
         ({"kind": "pi", "kp": -1.0, "ki": 2.0}, r"kp = -1 is outside 0 to 1e\+09"),
         ({"kind": "pi", "kp": math.nan, "ki": 2.0}, r"kp = nan is outside"),
-        ({"kind": "pi", "kp": True, "ki": "2"}, r"kp = 'True' is not a number; ki = '2' is not"),
+        ({"kind": "pi", "kp": True, "ki": "2"}, r"kp = True is not a number; ki = '2' is not"),
         ({"kind": "pi", "kp": 1.0, "ki": 2.0, "kd": 0.1},
          r"kd is not a parameter; the parameters are kp, ki"),
         ({"kind": "open-loop", "kp": 1.0}, r"the parameters are none"),

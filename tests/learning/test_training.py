@@ -120,7 +120,7 @@ def test_a_file_gives_its_network_back_and_a_bad_one_is_refused(tmp_path: Path) 
     path.write_text("{}")
     with pytest.raises(InputError, match="No network can be read"):
         Network.load(path)
-    with pytest.raises(InputError, match="A weight is outside -127 to 127"):
+    with pytest.raises(InputError, match="a weight of 128. All weights must be whole"):
         Network(((128,) * (FEATURES + 1),) * HIDDEN, (0,) * (HIDDEN + 1))
 
 

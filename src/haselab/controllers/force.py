@@ -128,7 +128,7 @@ class ForceController:
         strain = known.strain(length_m)
         if self._wanted is None:
             self._begin(strain, length_m, measurement.voltage_v)
-        wanted, wanted_per_s, wanted_per_s2 = self._smooth(reference)
+        wanted, wanted_per_s, wanted_per_s2 = self._smooth(known.limited_strain(reference))
         slope = (strain - self._last) / self._period_s
         self._rate = self._keep * self._rate + (1.0 - self._keep) * slope
         self._last = strain

@@ -225,7 +225,27 @@ class KnownActuator:
         found = self.strain(float(lengths[first])), self.strain(float(lengths[last]))
         return min(found), max(found)
 
+    def limited_strain(self, strain: float) -> float:
+        """A desired strain, at most the width of the reachable range beyond its ends.
+
+        An actuator that cannot reach a strain goes to the end of its range. Farther away, the
+        plans and integrators of a controller lose their accuracy.
+
+        Args:
+            strain: desired, also in percent by mistake.
+        """
+        low, high = self._wanted_ends
+        return min(max(strain, low), high)
+
     # ---- tables ------------------------------------------------------------------------------
+
+    @cached_property
+    def _wanted_ends(self) -> tuple[float, float]:
+        try:
+            low, high = self.reachable()
+        except InputError:
+            return -math.inf, math.inf
+        return low - (high - low), high + (high - low)
 
     @cached_property
     def table(self) -> LawTable:

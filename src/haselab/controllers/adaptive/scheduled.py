@@ -182,6 +182,7 @@ class ScheduledController:
         slope = (length_m - self._last_m) / period_s
         self._rate = self._keep * self._rate + (1.0 - self._keep) * slope
         self._last_m = length_m
+        reference = known.limited_strain(reference)
         self._wanted = reference + self._smooth * (self._wanted - reference)
         self._coming = self._wanted + self._smooth * (self._coming - self._wanted)
         kp, ki, kd = self._gains()

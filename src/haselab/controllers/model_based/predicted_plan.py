@@ -118,8 +118,7 @@ class PredictedPlan(ReferencePlan):
             acts_s: from the end of that block to the effect of the drive.
             state: then.
         """
-        samples = [self._last_m, *wanted_m]
-        self._last_m = wanted_m[0]
+        samples = self._samples_m(wanted_m)
         place = acts_s / self._period_s + 2.0  # of the samples, the drive's effect
         at = min(int(place + 1e-9), len(samples) - 1)
         # a plan that asks for more than the limits starts again where the actuator is

@@ -1,4 +1,4 @@
-"""Controllers in a loop whose outputs wait: for a delay of whole blocks, or queued in the device."""
+"""Controllers in a loop whose outputs wait: for whole blocks, or queued in the device."""
 
 from __future__ import annotations
 
@@ -86,3 +86,26 @@ def test_a_desired_strain_far_out_of_reach_is_as_one_just_beyond_the_range(known
     middle = 0.5 * sum(low_high)
     assert (ends[0][59] > middle) == (far > 0.0)
     np.testing.assert_allclose(ends[0][100:], 0.0, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [100, 250, 1000])
+def test_no_rate_of_the_updates_lets_a_plan_move_before_a_step(known, rate_hz):
+    """At 1 kHz, the 50 desired strains that are known in advance show the step long before."""
+    chosen, period_s = CONTROLLERS.find("mpc").choose(CHOSEN["mpc"]), 1.0 / rate_hz
+    start_v = known.static_drive_v(0.0)
+    setting = replace(setting_for(chosen, HOST, known, start_v), period_s=period_s, delay_s=0.0)
+    controller, model = chosen.make(), MotionModel(known)
+    controller.start(replace(setting, sensed_before_s=0.0))
+    ahead, state, drive_v = chosen.kind.preview_steps(period_s), [], start_v
+    wanted = [0.0] * (rate_hz // 10) + [0.05] * (rate_hz // 5 + ahead)
+    state = model.at_rest(known.length_m(0.0), start_v)
+    strains = []
+    for k in range(len(wanted) - ahead):
+        preview = tuple(wanted[k + 1 : k + 1 + ahead])
+        sensed = Measurement(known.strain(state[0]), float("nan"), drive_v, 0.0, preview=preview)
+        drive_v = controller.step(wanted[k], sensed)
+        state = model.moved(state, drive_v, period_s)
+        strains.append(known.strain(state[0]))
+    first = rate_hz // 10
+    np.testing.assert_allclose(strains[: first - 3], 0.0, rtol=0, atol=1e-6)
+    assert strains[-1] > 0.04

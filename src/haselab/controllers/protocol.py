@@ -82,7 +82,7 @@ def waiting_drives(setting: ControllerSetting) -> int:
     Args:
         setting: of the loop.
     Example:
-        >>> waiting_drives(ControllerSetting(0.01, 0.0, 1.0, delay_s=0.0156, sensed_before_s=0.0036))
+        >>> waiting_drives(ControllerSetting(0.01, 0.0, 1.0, delay_s=0.016, sensed_before_s=0.004))
         1
     """
     period_s = setting.period_s

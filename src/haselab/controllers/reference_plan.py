@@ -118,10 +118,17 @@ class ReferencePlan:
         )
         return not alone and max(rises) <= self._most_m
 
-    def jumps(self, first_m: float, before_m: float, after_m: float) -> bool:
-        """Whether the second of two rises may be the beginning of a step."""
-        rise, last = abs(before_m - first_m), abs(after_m - before_m)
-        return last > _ALONE * rise + _SMALL * self._most_m
+    def before_step(self, samples: list[float], at: int) -> list[float]:
+        """The samples before the first step that `smooth` does not see, because it comes later.
+
+        The last rise may be the beginning of a step.
+        """
+        rises = [*(abs(b - a) for a, b in pairwise(samples)), 0.0]
+        for k in range(at + 3, len(rises) - 1):
+            alone = _ALONE * max(rises[k - 1], rises[k + 1]) + _SMALL * self._most_m
+            if rises[k] > min(alone, self._most_m):
+                return samples[: k + 1]
+        return samples
 
     def _plan(self, start: tuple[float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits, else the one that exceeds them least."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,8 +113,10 @@ class ClosedLoop:
             raise safety.trip(fault)
         if desired == desired:
             try:
-                coming = accumulate((desired, *preview), lambda a, b: b if b == b else a)
-                measured = self._measured(strain, tuple(coming)[1:])
+                coming = [desired]
+                for value in preview:
+                    coming.append(value if value == value else coming[-1])
+                measured = self._measured(strain, tuple(coming[1:]))
                 drive = self._controller.step(desired, measured)
             except SafetyError as error:
                 raise safety.trip(str(error)) from error

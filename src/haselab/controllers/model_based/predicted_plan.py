@@ -125,8 +125,7 @@ class PredictedPlan(ReferencePlan):
         here, target_m = (state[0], state[1]) if self._beyond else self._here, samples[at]
         self._beyond = False
         if len(samples) > at + 4 and self.smooth(samples, at):
-            if self.jumps(*samples[-3:]):  # which may be followed by others that make it smooth
-                samples = samples[:-1]
+            samples = self.before_step(samples, at)
             reference = self._followed(samples, place)
             rests = max(samples) - min(samples) < self._near_m
         else:

@@ -62,15 +62,15 @@ class PredictedPlan(ReferencePlan):
         reserve: share of the force's range that a plan leaves to the feedback.
         rate_v_per_s: fastest change of the drive.
         pole_rad_s: of the planned motion where no limit acts.
-        stage_s: duration of a stage, not below the period.
+        stage_s: duration of a stage; the nearest whole number of periods is used.
     """
 
     def __init__(
         self, model: MotionModel, known: KnownActuator, period_s: float, reserve: float,
         rate_v_per_s: float, pole_rad_s: float, stage_s: float,
     ) -> None:  # fmt: skip
-        self._pole, self._stage_s = pole_rad_s, max(stage_s, period_s)
-        self._steps = max(round(self._stage_s / period_s), 1)
+        self._pole, self._steps = pole_rad_s, max(round(stage_s / period_s), 1)
+        self._stage_s = self._steps * period_s
         super().__init__(model, known, period_s, reserve, rate_v_per_s)
 
     def exchange(self, model: MotionModel, known: KnownActuator) -> None:

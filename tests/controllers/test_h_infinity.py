@@ -13,6 +13,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from haselab.base import ResultError
 from haselab.controllers import CONTROLLERS, KnownActuator, Measurement
+from haselab.controllers.linear_loop import refuse_missed
 from haselab.controllers.model_based.coprime import (
     Sampled,
     guaranteed_margins,
@@ -210,3 +211,18 @@ def test_it_reaches_the_goals_at_100_hz(known, task, goals):
         score = chosen.score(trace, scenario)
         assert trace.failure == ""
         assert {key: score[key] for key in goals if score[key] > goals[key]} == {}
+
+
+def test_a_mode_that_the_plant_hardly_shows_is_refused():
+    """It is unstable, and rounding errors exceed a stability margin of 1e-8."""
+    hidden = Sampled(np.diag([1.5, 0.5]), np.array([1e-8, 1.0]), np.array([1.0, 1.0]))
+    with pytest.raises(ResultError, match=r"gives no stable loop|have no solution"):
+        robust_controller(hidden)
+
+
+def test_a_design_that_misses_a_demand_says_which_and_by_how_much():
+    kept = {"the peak sensitivity": 1.04, "the noise of the drive": 0.2}
+    refuse_missed([kept, kept], "gains", 0.01, "Use another.")
+    missed = kept | {"the noise of the drive": 6.32}
+    with pytest.raises(ResultError, match=r"the noise of the drive is 6\.32 times its limit\. Use"):
+        refuse_missed([kept, missed], "gains", 0.01, "Use another.")

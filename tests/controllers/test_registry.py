@@ -100,7 +100,7 @@ def test_the_summary_has_kind_values_and_units():
         ({"kind": "pi", "kp": 1.0}, r"ki \(1/s\) is missing"),
         ({"kind": "pi", "kp": -1.0, "ki": 2.0}, r"kp = -1 is outside 0 to 1e\+09"),
         ({"kind": "pi", "kp": math.nan, "ki": 2.0}, r"kp = nan is outside"),
-        ({"kind": "pi", "kp": True, "ki": "2"}, r"kp = 'True' is not a number; ki = '2' is not"),
+        ({"kind": "pi", "kp": True, "ki": "2"}, r"kp = True is not a number; ki = '2' is not"),
         ({"kind": "pi", "kp": 1.0, "ki": 2.0, "kd": 0.1},
          r"kd is not a parameter; the parameters are kp, ki"),
         ({"kind": "open-loop", "kp": 1.0}, r"the parameters are none"),
@@ -151,3 +151,13 @@ def test_a_built_in_name_cannot_be_taken(installed):
     installed(pid=f"{__name__}:FOREIGN")
     with pytest.raises(InputError, match=r"'pid' is .* more than once, by haselab and theirs 1\.0"):
         CONTROLLERS.find("pid")
+
+
+def test_a_parameter_takes_numbers_of_numpy_and_no_number_that_a_double_cannot_hold():
+    kind = CONTROLLERS.find("pi")
+    assert kind.choose({"kp": np.int64(1), "ki": np.float32(0.5)}).values == (
+        ("kp", 1.0),
+        ("ki", 0.5),
+    )
+    with pytest.raises(InputError, match=r"kp = 1000.* is not a number"):
+        kind.choose({"kp": 10**400, "ki": 1.0})

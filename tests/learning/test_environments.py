@@ -152,9 +152,9 @@ def test_a_frame_shows_the_actuator_of_the_camera() -> None:
     ("options", "message"),
     [
         ({"task": "walk"}, "No task 'walk'. The tasks are track, hold, gait."),
-        ({"devices": 0}, "The number of devices is 0. State 1 to 100000."),
+        ({"devices": 0}, "The number of devices is 0. State a whole number from 1 to"),
         ({"devices": []}, "No devices are given."),
-        ({"episode_s": 0.0}, "The episode lasts 0 s. State 0.1 to 3600 s."),
+        ({"episode_s": 0.0}, "The episode lasts 0.0 s. State 0.1 to 3600 s."),
         (
             {"devices": [find_device("hz"), replace(find_device("hz"), high_v=1.5)]},
             "The devices have high_v from 1.5 to 2. Devices of one environment must share",
@@ -166,3 +166,45 @@ def test_a_frame_shows_the_actuator_of_the_camera() -> None:
 def test_bad_arguments_are_refused_in_one_line(options: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match="^" + message.replace("[", r"\[").split("(")[0]):
         StrainEnv(**{"task": "track", **options})
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.array([np.nan]), "An action is NaN"),
+        (np.zeros(2), r"an array of shape \(2,\).*State 1 number"),
+        (None, "The action is None"),
+    ],
+)
+def test_an_action_that_is_none_is_refused(action: object, message: str) -> None:
+    """Before, a NaN counted as a breakdown of the device, and the observation was NaN."""
+    env = StrainEnv("track", devices=1)
+    env.reset(seed=1)
+    with pytest.raises(InputError, match=message):
+        env.step(action)  # type: ignore[arg-type]
+    assert np.isfinite(env.step(np.ones(1, np.float32))[0]).all()
+
+
+def test_a_step_outside_of_an_episode_is_refused() -> None:
+    env, action = StrainEnv("track", devices=1, episode_s=0.1), np.zeros(1, np.float32)
+    for begun in (env, StrainVectorEnv(1, "track", devices=1)):
+        with pytest.raises(InputError, match="has not begun"):
+            begun.step(action)
+    env.reset(seed=1)
+    while not env.step(action)[3]:
+        pass
+    with pytest.raises(InputError, match="is over"):
+        env.step(action)
+
+
+def test_seeds_of_numpy_are_seeds_and_none_is_random() -> None:
+    envs = StrainVectorEnv(2, "track", devices=1)
+
+    def first(seed: object) -> list[float]:
+        return envs.reset(seed=seed)[0][:, 0].tolist()
+
+    assert first(np.int64(5)) == first(5)
+    assert first([None, None]) != first([None, None])
+    for wrong in (-1, 1.5, True, [1, "a"]):
+        with pytest.raises(InputError, match="The seed is"):
+            first(wrong)

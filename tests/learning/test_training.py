@@ -3,14 +3,16 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from haselab.actuators import DeaStack
+from haselab.actuators import DeaStack, PlanarHasel
 from haselab.base import InputError
 from haselab.controllers import ControllerSetting, KnownActuator, Measurement
 from haselab.controllers.network import (
@@ -122,8 +124,66 @@ def test_a_file_gives_its_network_back_and_a_bad_one_is_refused(tmp_path: Path) 
     path.write_text("{}")
     with pytest.raises(InputError, match="No network can be read"):
         Network.load(path)
-    with pytest.raises(InputError, match="A weight is outside -127 to 127"):
+    with pytest.raises(InputError, match=r"a weight of 128\. All weights must be whole"):
         Network(((128,) * (FEATURES + 1),) * HIDDEN, (0,) * (HIDDEN + 1))
+    for wrong in ("1.7", "NaN", "Infinity", "true", '"5"'):
+        path.write_text(json.dumps(network(1).to_dict()).replace("[[", f"[[{wrong},", 1))
+        text = path.read_text().split(", ")
+        path.write_text(", ".join([text[0], *text[2:]]))
+        with pytest.raises(InputError, match=r"All weights must be whole numbers .*\.json"):
+            Network.load(path)
+
+
+def test_a_network_keeps_to_the_drive_and_the_rate_that_it_is_trained_for() -> None:
+    """On a drive of both signs, its lowest output is 0 V: below, the force would rise again."""
+    planar = KnownActuator(PlanarHasel(), 0.25, 0.051, -2.0, 1.2, 5000.0)
+    highest = []
+    for low_v, asked in ((-2.0, -0.5), (0.0, -0.5), (0.0, 0.5)):
+        controller, drive_v = NETWORK.make(), 0.6
+        controller.start(ControllerSetting(0.01, low_v, 1.2, actuator=planar))
+        for k in range(60):
+            drive_v = controller.step(asked, Measurement(0.0, 6e-10, drive_v, 0.01 * k))
+            assert 0.0 <= drive_v <= 1.2  # 1.2 is 1.2000000477 in single precision
+        highest.append(drive_v)
+    assert highest == [0.0, 0.0, 1.2]
+    both = ControllerSetting(0.01, -2.0, 1.2, actuator=planar)
+    assert NETWORK.make().c_text(both) == NETWORK.make().c_text(replace(both, drive_low=0.0))
+    with pytest.raises(InputError, match=r"those of this loop last 0\.02 s"):
+        NETWORK.make().start(replace(both, period_s=0.02))
+    with pytest.raises(InputError, match=r"limited to -2 to 0 V\. Use another"):
+        NETWORK.make().start(replace(both, drive_high=0.0))
+
+
+def test_a_training_neither_uses_nor_changes_the_random_numbers_of_its_caller() -> None:
+    """And what it reports is the network so far, with which an interrupted one goes on."""
+    before = np.random.get_state(legacy=False)  # noqa: NPY002
+    reported: list[Network] = []
+
+    def report(progress: Progress) -> None:
+        reported.append(progress.network)
+        np.random.seed(7)  # noqa: NPY002
+
+    alone = train(**SMALL, seed=1)
+    after = np.random.get_state(legacy=False)  # noqa: NPY002
+    np.testing.assert_equal(after, before)
+    assert train(**SMALL, seed=1, report=report) == alone == reported[-1]
+    shorter = {**SMALL, "generations": 2}
+    assert train(**shorter, seed=1) == reported[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"generations": 0}, "generations is 0"),
+        ({"population": 1}, "population is 1"),
+        ({"loops": 2.5}, r"loops is 2\.5"),
+        ({"seed": -1}, "seed is -1"),
+        ({"tasks": ()}, "No tasks are given"),
+    ],
+)
+def test_a_training_that_cannot_be_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        train(**{**SMALL, **options})
 
 
 def test_an_actuator_that_networks_are_not_trained_on_is_refused() -> None:

@@ -17,10 +17,11 @@ from haselab.controllers import (
     Measurement,
     Parameter,
 )
+from haselab.controllers.protocol import waiting_drives
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.rig.twin.config import twin_of_reading
-from haselab.rig.twin.twin_bench import TwinBench, rig_of
+from haselab.rig.twin.twin_bench import TwinBench, describe, rig_of
 from haselab.runtime.camera_recorder import CameraRecorder
 from haselab.runtime.lockin import counted_s, lockin_of
 from haselab.runtime.loop import LoopSettings, RunningController
@@ -49,8 +50,8 @@ class Spy:
 class Scene:
     """A twin with a session and a runner."""
 
-    def __init__(self, folder) -> None:
-        config = twin_of_reading("hz")
+    def __init__(self, folder, config=None) -> None:
+        config = config or twin_of_reading("hz")
         self.twin = TwinBench(config, 5)
         self.rig = rig_of(self.twin, config)
         self.session = SessionWriter(
@@ -103,6 +104,33 @@ def test_a_controller_gets_period_limits_and_each_block_s_measurement(scene):
     assert all(m.valid for m in got)
     steps_s = np.diff([m.time_s for m in got])
     np.testing.assert_allclose(steps_s, scene.rig.description.block_s, rtol=1e-9)
+
+
+@pytest.mark.parametrize("queued", [0, 1])
+def test_a_controller_gets_the_drive_that_acts_while_outputs_wait_in_the_device(tmp_path, queued):
+    config = twin_of_reading("hz")
+    plain, about = config.acquisition, describe(config)
+    late = plain.model_copy(
+        update={"output_delay_s": plain.output_delay_s + queued * about.block_s}
+    )
+    scene = Scene(tmp_path, config.model_copy(update={"acquisition": late}))
+    spy = Spy(0.0)
+    spy.step = lambda reference, measured: spy.seen.append((0, measured)) or 0.002 * len(spy.seen)
+    scene.play(lambda: spy, [0.0] * 20)
+    drive_v = scene.session.experiment("x").drive_v
+    got = [measured.voltage_v for _, measured in spy.seen]
+    assert got[queued:] == drive_v[: drive_v.size - queued].tolist()
+    assert len(set(got)) == 20  # each output differs
+    assert waiting_drives(spy.setting) == queued
+
+
+def test_a_preview_beyond_the_closed_part_of_a_reference_stays(scene):
+    """Where the reference is NaN, the loop is open: the last desired strain goes on."""
+    spy = Spy(0.0)
+    kind = ControllerKind("spy", lambda: spy, preview_s=0.03)
+    scene.play_kind(kind, [0.0] * 40 + [0.01] + [math.nan] * 3)
+    got = [measured.preview for _, measured in spy.seen][36:]
+    assert got == [(0.0, 0.0, 0.0), (0.0, 0.0, 0.01), (0.0, 0.01, 0.01), *[(0.01,) * 3] * 2]
 
 
 def test_the_drive_of_a_step_is_the_voltage_of_the_next_block(scene):

@@ -52,6 +52,12 @@ class Greedy(OpenLoop):
         return 2.5
 
 
+class BadLoad(OpenLoop):
+    @property
+    def estimated_load_kg(self):
+        raise LookupError("no load")
+
+
 class Late(OpenLoop):
     def step(self, reference, measurement):
         time.sleep(0.06)
@@ -72,6 +78,7 @@ OTHERS = {
     "raises": ControllerKind("raises", Raises),
     "nan": ControllerKind("nan", Nan),
     "greedy": ControllerKind("greedy", Greedy, output="voltage"),
+    "bad-load": ControllerKind("bad-load", BadLoad),
     "late": ControllerKind("late", Late),
     "bad-design": ControllerKind(
         "bad-design", OpenLoop, (Parameter("k"),), design=lambda setting: {"k": 1.0 / 0.0}
@@ -99,17 +106,19 @@ def installed(monkeypatch):
 
 
 def test_a_controller_that_fails_ends_its_task_and_the_others_go_on(truth, installed):
-    names = ("raises", "nan", "greedy", "late", "bad-design", "open-loop", "their-feed-forward")
+    names = ("raises", "nan", "greedy", "late", "bad-load", "bad-design", "open-loop",
+             "their-feed-forward")  # fmt: skip
     game = play_board(Plan(names, ("T4",), ("host-100hz",), seeds=2))
     reasons = {one.controller: one.failure for one in game.played}
     assert "ZeroDivisionError: division by zero" in reasons["raises"]
     assert "returned nan" in reasons["nan"]
     assert "2.5 V, outside its limits of 0 to 2 V" in reasons["greedy"]
+    assert reasons["bad-load"] == "estimated_load_kg failed: LookupError: no load"
     assert reasons["late"] == "5 steps in a row took longer than 5 periods"
     assert reasons["bad-design"] == "no design: ZeroDivisionError: float division by zero"
     assert reasons["open-loop"] == reasons["their-feed-forward"] == ""
     rows = {(row.controller, row.metric): row for row in board_rows(game)}
-    for name in names[:5]:
+    for name in names[:6]:
         row = rows[name, "peak"]
         assert (row.median, row.worst, row.ratio_to_bound, row.seeds) == (None, None, 0.0, 2)
         assert row.violations == (0 if name == "bad-design" else 2)

@@ -30,6 +30,7 @@ from haselab.controllers.linear_loop import (
     Demands,
     LinearLoop,
     penalty,
+    refuse_missed,
     shares_of,
     squared_error,
 )
@@ -46,7 +47,6 @@ _AUTHORITY = 0.5  # of the force beyond equilibrium that a step of the reference
 _STEP = 0.04
 _ERROR = 0.01  # strain that the proportional part may answer with all the spare force
 _LEAST_FILTER = 0.05  # of a period
-_MISSED = 1.05  # of a demand, by gains that are still used
 _GAIN = 1e6
 
 
@@ -128,7 +128,7 @@ class ForceController:
         strain = known.strain(length_m)
         if self._wanted is None:
             self._begin(strain, length_m, measurement.voltage_v)
-        wanted, wanted_per_s, wanted_per_s2 = self._smooth(reference)
+        wanted, wanted_per_s, wanted_per_s2 = self._smooth(known.limited_strain(reference))
         slope = (strain - self._last) / self._period_s
         self._rate = self._keep * self._rate + (1.0 - self._keep) * slope
         self._last = strain
@@ -345,20 +345,16 @@ def _refuse_missed(
     known = setting.actuator
     assert known is not None
     found = [
-        (share, name)
-        for point in points
-        for name, share in shares_of(
+        shares_of(
             force_loop(point, setting, gains, known), setting.period_s,
             _demands(point, setting, demands),
-        ).items()
-    ]  # fmt: skip
-    share, name = max(found)
-    if share > _MISSED:
-        raise ResultError(
-            f"No gains of the force loop meet all demands with updates of {setting.period_s:g} s: "
-            f"with the best ones found, {name} is {share:.3g} times its limit. Use the "
-            "controller 'observer', slower updates or a sensor with less noise."
         )
+        for point in points
+    ]  # fmt: skip
+    refuse_missed(
+        found, "gains of the force loop", setting.period_s,
+        "Use the controller 'observer', slower updates or a sensor with less noise.",
+    )  # fmt: skip
 
 
 FORCE = ControllerKind(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from haselab.base import InputError
+from haselab.base import InputError, is_real, shown
 from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.protocol import Controller, ControllerSetting
 
@@ -134,8 +134,8 @@ def _fault(parameter: Parameter, value: object) -> str:
     unit = f" {parameter.unit}" if parameter.unit else ""
     if value is None:
         return f"{name}{f' ({parameter.unit})' if unit else ''} is missing"
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return f"{name} = {str(value)[:40]!r} is not a number"
+    if not is_real(value):
+        return f"{name} = {shown(value)} is not a number"
     if not math.isfinite(value) or not parameter.low <= value <= parameter.high:
         return f"{name} = {value:g}{unit} is outside {parameter.low:g} to {parameter.high:g}{unit}"
     return ""

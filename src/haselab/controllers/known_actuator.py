@@ -37,6 +37,7 @@ __all__ = ["KnownActuator", "known_actuator"]
 
 Floats = NDArray[np.float64]
 _USUAL_GAIN = 5000.0
+_FAR = 3.0  # widths of the reachable range: farther, no load moves it
 _USUAL_NOISE = 2e-4  # strain, where it is not known
 _BENCH = ("camera.", "sensing.", "start.")  # parameters of a fit that are none of the law
 
@@ -225,7 +226,27 @@ class KnownActuator:
         found = self.strain(float(lengths[first])), self.strain(float(lengths[last]))
         return min(found), max(found)
 
+    def limited_strain(self, strain: float) -> float:
+        """A desired strain, at most three times the width of the reachable range beyond its ends.
+
+        An actuator that cannot reach a strain goes to the end of its range, and another load moves
+        that range. Farther away, the plans and integrators of a controller lose their accuracy.
+
+        Args:
+            strain: desired, also in percent by mistake.
+        """
+        low, high = self._wanted_ends
+        return min(max(strain, low), high)
+
     # ---- tables ------------------------------------------------------------------------------
+
+    @cached_property
+    def _wanted_ends(self) -> tuple[float, float]:
+        try:
+            low, high = self.reachable()
+        except InputError:
+            return -math.inf, math.inf
+        return low - _FAR * (high - low), high + _FAR * (high - low)
 
     @cached_property
     def table(self) -> LawTable:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from haselab.base import ResultError
 
 __all__ = [
     "UNSTABLE",
     "Demands",
     "LinearLoop",
     "penalty",
+    "refuse_missed",
     "sensitivity_of",
     "shares_of",
     "squared_error",
@@ -25,6 +29,7 @@ _DOUBLINGS, _GONE = 24, 1e-12
 UNSTABLE = 1e60
 _STRICT = 20.0  # by 1 % missed, the cost rises by a fifth
 _STEEP, _FARTHEST = 120.0, 1e7  # exponent up to which it does; factor at most from there on
+_MISSED = 1.05  # of a demand, by parameters that are still used
 
 
 @dataclass(frozen=True)
@@ -113,6 +118,27 @@ def shares_of(loop: LinearLoop, period_s: float, demands: Demands) -> dict[str, 
         "the noise of the drive": shaken * demands.noise_m / demands.shaken,
         "the change of the drive by noise": changed * demands.noise_m / demands.changed,
     }
+
+
+def refuse_missed(
+    found: Iterable[Mapping[str, float]], what: str, period_s: float, instead: str
+) -> None:
+    """Refuse parameters with which a loop misses a demand: the search found none that keep all.
+
+    Args:
+        found: of each loop, see `shares_of`.
+        what: was searched, for the message.
+        period_s: of an update.
+        instead: what the user can do, for the message.
+    Raises:
+        ResultError: A demand is missed by more than 5 %.
+    """
+    share, name = max((share, name) for shares in found for name, share in shares.items())
+    if share > _MISSED:
+        raise ResultError(
+            f"No {what} meet all demands with updates of {period_s:g} s: with the best ones found, "
+            f"{name} is {share:.3g} times its limit. {instead}"
+        )
 
 
 def squared_error(loop: LinearLoop, period_s: float) -> float:

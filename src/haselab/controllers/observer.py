@@ -23,7 +23,7 @@ import math
 from haselab.actuators import GRAVITY_M_S2
 from haselab.controllers.known_actuator import KnownActuator
 from haselab.controllers.observer_law import ObserverLaw
-from haselab.controllers.protocol import ControllerSetting, Measurement
+from haselab.controllers.protocol import ControllerSetting, Measurement, waiting_drives
 from haselab.controllers.reference_plan import ReferencePlan
 
 __all__ = ["ObserverController"]
@@ -56,6 +56,7 @@ class ObserverController:
         self._acts_s = max(law.delay_s - age_s, 0.0)  # after the end of a block
         self._most_v = setting.highest_rate_per_s * period_s
         self._past_v = [setting.drive_start] * (law.whole + 2)  # the latest first
+        self._waiting = waiting_drives(setting)
         self._plan = self._new_plan(law, setting)
         self._state: list[float] | None = None
         self._load_mean_n, self._forget = 0.0, math.exp(-period_s / _WEIGHED_S)
@@ -73,7 +74,7 @@ class ObserverController:
     def step(self, reference: float, measurement: Measurement) -> float:
         """See `Controller`; without a valid measurement the observer goes on alone."""
         past_v, law = self._past_v, self._law
-        past_v[0] = measurement.voltage_v
+        past_v[self._waiting] = measurement.voltage_v
         length_m = math.nan
         if measurement.valid:
             length_m = self._sensed_m(measurement)
@@ -90,7 +91,7 @@ class ObserverController:
         wanted_now = self._plan.next(wanted, self._acts_s, ahead)
         most_v = self._most_v
         drive_v = law.drive_v(ahead, wanted_now, (past_v[0] - most_v, past_v[0] + most_v))
-        past_v.insert(0, drive_v)
+        past_v.insert(0, drive_v if measurement.valid else past_v[0])  # else the output is kept
         past_v.pop()
         return drive_v
 

@@ -14,6 +14,7 @@ __all__ = [
     "ControllerSetting",
     "LinearisableController",
     "Measurement",
+    "waiting_drives",
 ]
 
 
@@ -71,6 +72,23 @@ class Measurement:
     valid: bool = True
     in_range: bool = True
     preview: tuple[float, ...] = ()
+
+
+def waiting_drives(setting: ControllerSetting) -> int:
+    """Drives that a controller has put out and that do not act yet at the end of a block.
+
+    `Measurement.voltage_v` is the drive before these.
+
+    Args:
+        setting: of the loop.
+    Example:
+        >>> waiting_drives(ControllerSetting(0.01, 0.0, 1.0, delay_s=0.016, sensed_before_s=0.004))
+        1
+    """
+    period_s = setting.period_s
+    delay_s = 0.5 * period_s if setting.delay_s is None else setting.delay_s
+    age_s = 0.5 * period_s if setting.sensed_before_s is None else setting.sensed_before_s
+    return max(int((delay_s - age_s) / period_s + 1e-9), 0)
 
 
 class Controller(Protocol):

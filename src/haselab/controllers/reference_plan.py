@@ -49,6 +49,8 @@ class ReferencePlan:
             known: limits of drive and field.
         """
         self._model, self._known = model, known
+        ends = known.limited_strain(-math.inf), known.limited_strain(math.inf)
+        self._ends_m = known.length_m(ends[0]), known.length_m(ends[1])
         lengths_m = [known.length_m(strain) for strain in np.linspace(*known.reachable(), 9)]
         most_n = max(
             abs(model.pull_n(length_m, known.highest_drive_v(length_m))) for length_m in lengths_m
@@ -75,8 +77,7 @@ class ReferencePlan:
             state: then.
         """
         period_s = self._period_s
-        samples = [self._last_m, *wanted_m]
-        self._last_m = wanted_m[0]
+        samples = self._samples_m(wanted_m)
         place = acts_s / period_s + 2.0  # of the samples, the drive's effect
         at = min(int(place + 1e-9), len(samples) - 1)
         target_m, here = samples[at], self._here
@@ -98,6 +99,13 @@ class ReferencePlan:
             self._here = here[0] + 0.5 * period_s * (here[1] + speed), speed
         return (*here, (self._here[1] - here[1]) / period_s)
 
+    def _samples_m(self, wanted_m: list[float]) -> list[float]:
+        """The desired lengths, limited, after the one of the update before."""
+        (low_m, high_m), before_m = self._ends_m, self._last_m
+        limited_m = [min(max(length_m, low_m), high_m) for length_m in wanted_m]
+        self._last_m = limited_m[0]
+        return [before_m, *limited_m]
+
     def smooth(self, samples: list[float], at: int) -> bool:
         """Whether the samples about one are neither a step nor faster than the force of the field.
 
@@ -110,10 +118,17 @@ class ReferencePlan:
         )
         return not alone and max(rises) <= self._most_m
 
-    def jumps(self, first_m: float, before_m: float, after_m: float) -> bool:
-        """Whether the second of two rises may be the beginning of a step."""
-        rise, last = abs(before_m - first_m), abs(after_m - before_m)
-        return last > _ALONE * rise + _SMALL * self._most_m
+    def before_step(self, samples: list[float], at: int) -> list[float]:
+        """The samples before the first step that `smooth` does not see, because it comes later.
+
+        The last rise may be the beginning of a step.
+        """
+        rises = [*(abs(b - a) for a, b in pairwise(samples)), 0.0]
+        for k in range(at + 3, len(rises) - 1):
+            alone = _ALONE * max(rises[k - 1], rises[k + 1]) + _SMALL * self._most_m
+            if rises[k] > min(alone, self._most_m):
+                return samples[: k + 1]
+        return samples
 
     def _plan(self, start: tuple[float, float], target_m: float, state: list[float]) -> None:
         """Plan the fastest polynomial within the limits, else the one that exceeds them least."""

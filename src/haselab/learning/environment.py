@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from haselab.base import InputError, JsonObject
+from haselab.base import InputError, JsonObject, shown
 from haselab.learning.simulation import LARGEST_OBSERVATION, OBSERVATIONS, StrainSimulation
 from haselab.rig.twin.camera import TwinCamera
 from haselab.scoreboard.devices import find_device
 
-__all__ = ["StrainEnv", "action_space", "observation_space"]
+__all__ = ["StrainEnv", "action_space", "actions_of", "observation_space"]
 
 
 def observation_space() -> spaces.Box[np.float32]:
@@ -25,6 +25,24 @@ def observation_space() -> spaces.Box[np.float32]:
 def action_space() -> spaces.Box[np.float32]:
     """The drive voltage, from the lowest (-1) to the highest (1)."""
     return spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+def actions_of(action: object, count: int) -> NDArray[np.float64]:
+    """The actions as numbers, one for each loop.
+
+    Args:
+        action: of a policy.
+        count: number of loops.
+    Raises:
+        InputError: They are not numbers, or not as many.
+    """
+    found = np.asarray(action)
+    if found.dtype.kind not in "iuf" or found.size != count:
+        raise InputError(
+            f"The action is {shown(action)}. State {count} "
+            f"{'number' if count == 1 else 'numbers'} from -1 to 1."
+        )
+    return found.astype(np.float64).reshape(count)
 
 
 class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -59,6 +77,7 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = render_mode
         self._camera: TwinCamera | None = None
         self._frames = 0
+        self._ended = False
 
     def reset(
         self, *, seed: int | None = None, options: JsonObject | None = None
@@ -66,14 +85,22 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Begin an episode, see `gymnasium.Env.reset`."""
         super().reset(seed=seed)
         self._simulation.reset(np.zeros(1, dtype=np.int64), self.np_random)
+        self._ended = False
         return self._simulation.observe()[0], self._info()
 
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, JsonObject]:
-        """Let 10 ms pass, see `gymnasium.Env.step`."""
-        actions = np.asarray(action, dtype=np.float64).reshape(1)
+        """Let 10 ms pass, see `gymnasium.Env.step`.
+
+        Raises:
+            InputError: The action is not one number, or the episode has not begun or is over.
+        """
+        if self._ended:
+            raise InputError("The episode is over. Call reset() before step().")
+        actions = actions_of(action, 1)
         rewards, terminated, truncated = self._simulation.step(actions, self.np_random)
+        self._ended = bool(terminated[0] or truncated[0])
         return (
             self._simulation.observe()[0], float(rewards[0]), bool(terminated[0]),
             bool(truncated[0]), self._info(),

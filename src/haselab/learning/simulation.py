@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from haselab import _twin
 from haselab.actuators import GRAVITY_M_S2
-from haselab.base import InputError
+from haselab.base import InputError, is_real, shown
 from haselab.controllers.network.controller import STRAIN_PER_ONE
 from haselab.learning.tasks import find_task
 from haselab.rig.twin.twin_bench import native_bench
@@ -19,7 +19,7 @@ from haselab.scoreboard.devices import ZERO_LENGTH_M, Device, drawn, find_device
 from haselab.scoreboard.knowledge import TRAINED
 from haselab.scoreboard.loop_class import CARRIER_HZ, CARRIER_V, CLASSES, STEP_S, noise_of
 
-__all__ = ["LARGEST_OBSERVATION", "OBSERVATIONS", "StrainSimulation"]
+__all__ = ["LARGEST_OBSERVATION", "OBSERVATIONS", "StrainSimulation", "whole_number"]
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -37,6 +37,22 @@ _TRAIN_S, _REST_S = 20.0, 60.0
 _MAP_KNOTS = 200
 _USED = 0.85  # of the drive's range: no drawn device breaks down there
 _REACH_UPDATES = 200
+
+
+def whole_number(name: str, value: object, low: int, high: int) -> None:
+    """Refuse what is not a whole number within limits.
+
+    Args:
+        name: of the value, for the message.
+        value: anything.
+        low: lowest number.
+        high: highest one.
+    Raises:
+        InputError: It is none, or outside.
+    """
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or not low <= int(value) <= high:  # type: ignore[call-overload]
+        raise InputError(f"{name} is {shown(value)}. State a whole number from {low} to {high}.")
 
 
 @dataclass(frozen=True)
@@ -77,10 +93,9 @@ class StrainSimulation:
         episode_s: float = _EPISODE_S,
     ) -> None:
         self.task = find_task(task)
-        if slots < 1:
-            raise InputError(f"The number of environments is {slots}. State at least 1.")
-        if not 0.1 <= episode_s <= 3600.0:
-            raise InputError(f"The episode lasts {episode_s:g} s. State 0.1 to 3600 s.")
+        whole_number("The number of environments", slots, 1, 1_000_000)
+        if not is_real(episode_s) or not 0.1 <= episode_s <= 3600.0:
+            raise InputError(f"The episode lasts {shown(episode_s)} s. State 0.1 to 3600 s.")
         self._pool = _pool(devices, devices_seed)
         window = (_LOOP.steps, _LOOP.first, _LOOP.last)
         self._ensemble = _twin.Ensemble(self._pool.benches, self._pool.switch_at, slots, window)
@@ -95,6 +110,7 @@ class StrainSimulation:
         self._strain = np.zeros((3, slots))
         self._capacitance_f, self.length_m = np.zeros(slots), np.zeros(slots)
         self._row = np.arange(slots)
+        self._begun = np.zeros(slots, dtype=bool)
         nominal = find_device("hz").law
         lengths = np.linspace(0.85, 1.35, _MAP_KNOTS) * ZERO_LENGTH_M
         self._map_f = nominal.capacitance_f(lengths) / nominal.capacitance_f(ZERO_LENGTH_M)
@@ -132,6 +148,7 @@ class StrainSimulation:
         chosen = rng.integers(len(pool.benches), size=which.size)
         self._ensemble.reset(which, chosen)
         self._device[which], self._update[which] = chosen, 0
+        self._begun[which] = True
         self._drive_v[:, which] = pool.zero_v
         self.length_m[which] = pool.zero_m[chosen]
         low, high = self._reach
@@ -155,6 +172,7 @@ class StrainSimulation:
         device = np.tile(self._device[:size], groups)
         self._ensemble.reset(np.arange(self.slots), device)
         self._device[:], self._update[:] = device, 0
+        self._begun[:] = True
         for values in (self._reference, self._pull_n):
             values[:] = np.tile(values[:size], (groups, 1))
         self._drive_v[:] = self._pool.zero_v
@@ -170,8 +188,16 @@ class StrainSimulation:
             rng: of the noise.
         Returns:
             Rewards; whether a device no longer works; whether the episode is at its end.
+        Raises:
+            InputError: An action is NaN, or an episode has not begun or is over.
         """
         pool, drive = self._pool, self._drive_v
+        if np.isnan(actions).any():
+            raise InputError("An action is NaN. Actions are numbers from -1 to 1.")
+        if not self._begun.all():
+            raise InputError("The episode has not begun. Call reset() before step().")
+        if (self._update > self._updates).any():
+            raise InputError("The episode is over. Call reset() before step().")
         scale = 0.5 * (pool.high_v - pool.low_v)
         drive[1] = drive[0]
         drive[0] = pool.low_v + scale * (np.clip(actions, -1.0, 1.0) + 1.0)
@@ -216,13 +242,19 @@ class StrainSimulation:
 
 
 def _pool(devices: int | Sequence[Device], seed: int) -> _Pool:
-    if isinstance(devices, int):
-        if not 1 <= devices <= 100_000:
-            raise InputError(f"The number of devices is {devices}. State 1 to 100000.")
+    if not isinstance(devices, Sequence) or isinstance(devices, str):
+        whole_number("The number of devices", devices, 1, 100_000)
+        whole_number("devices_seed", seed, 0, 2**63 - 1)
         rng = np.random.default_rng(seed)
         devices = [drawn(rng) for _ in range(devices)]
     if not devices:
         raise InputError("No devices are given. State at least one.")
+    for device in devices:
+        if not isinstance(device, Device):
+            raise InputError(
+                f"The devices contain {shown(device)}. State a number of devices, or objects of "
+                "haselab.scoreboard.devices.Device."
+            )
     first = devices[0]
     if other := {device.config.kind for device in devices} - {find_device("hz").config.kind}:
         raise InputError(

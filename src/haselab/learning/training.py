@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from haselab.controllers.network.weights import (
     Network,
     features_of,
 )
-from haselab.learning.simulation import StrainSimulation
+from haselab.learning.simulation import StrainSimulation, whole_number
 from haselab.store.optional import library
 
 __all__ = ["WEIGHTS", "Progress", "changes", "train"]
@@ -30,6 +30,7 @@ Floats = NDArray[np.float64]
 WEIGHTS = HIDDEN * (FEATURES + 1) + HIDDEN + 1
 _FIRST_SIGMA, _NEXT_SIGMA = 0.2, 0.1
 _EPISODE_S = 3.0
+_MOST = 1_000_000
 # The longer the reference is constant, the more an error counts: up to 1 + `_MOST_PATIENCE` times.
 _PATIENCE, _MOST_PATIENCE = 0.1, 4.0
 _JUMP, _CONSTANT = 5e-3, 1e-9  # changes per update: a larger one is a step, a smaller one none
@@ -43,11 +44,14 @@ class Progress:
         generation: that has ended, from 1.
         best: mean objective of an update, of its best network.
         median: the same of the median network.
+        network: mean one of the search so far, as `train` would return it. Keep it if the training
+            may be interrupted: another one can start from it.
     """
 
     generation: int
     best: float
     median: float
+    network: Network
 
 
 def _first_guess() -> Floats:
@@ -145,12 +149,31 @@ class _Loops:
         return np.asarray(total.reshape(shape).mean(axis=1) / count)
 
 
+class _OwnRandom:
+    """Random numbers of `numpy.random` that neither change those of the caller nor depend on them.
+
+    CMA-ES draws from the global generator of numpy.
+    """
+
+    def __init__(self) -> None:
+        self._own: dict[str, Any] | None = None
+
+    def __enter__(self) -> None:
+        self._callers = np.random.get_state(legacy=False)  # noqa: NPY002
+        if self._own is not None:
+            np.random.set_state(self._own)  # noqa: NPY002
+
+    def __exit__(self, *_: object) -> None:
+        self._own = np.random.get_state(legacy=False)  # noqa: NPY002
+        np.random.set_state(self._callers)  # noqa: NPY002
+
+
 def _to_one(values: NDArray[np.floating]) -> NDArray[np.int32]:
     return np.rint(ONE * values.astype(np.float64)).astype(np.int32)
 
 
 def train(
-    tasks: tuple[str, ...] = ("track", "gait"),
+    tasks: Sequence[str] = ("track", "gait"),
     *,
     seed: int = 1,
     generations: int = 400,
@@ -167,7 +190,7 @@ def train(
     grows, to five times after 0.4 s, so that steps settle.
 
     Args:
-        tasks: names, which count alike.
+        tasks: names, which count alike; or one name.
         seed: of devices, episodes and search.
         generations: of the search.
         population: networks in a generation.
@@ -187,6 +210,13 @@ def train(
 
     if not 0.0 <= overshoot_cost <= 100.0:
         raise InputError(f"overshoot_cost is {overshoot_cost:g}. State 0 to 100.")
+    tasks = (tasks,) if isinstance(tasks, str) else tuple(tasks)
+    if not tasks:
+        raise InputError("No tasks are given. State at least one.")
+    whole_number("seed", seed, 0, 2**32 - 2)
+    whole_number("generations", generations, 1, _MOST)
+    whole_number("population", population, 2, _MOST)
+    whole_number("loops", loops, 1, _MOST)
     simulations = [
         StrainSimulation(
             task, population * loops, devices=devices, devices_seed=seed, episode_s=_EPISODE_S
@@ -195,15 +225,20 @@ def train(
     ]
     tried = _Loops(simulations, population, overshoot_cost)
     bound = LARGEST_WEIGHT / WEIGHT_ONE
-    search = cma.CMAEvolutionStrategy(
-        *((_first_guess(), _FIRST_SIGMA) if start is None else (start.to_vector(), _NEXT_SIGMA)),
-        {"seed": seed + 1, "popsize": population, "bounds": [-bound, bound], "verbose": -9},
-    )  # fmt: skip
+    first = (_first_guess(), _FIRST_SIGMA) if start is None else (start.to_vector(), _NEXT_SIGMA)
+    options = {"seed": seed + 1, "popsize": population, "bounds": [-bound, bound], "verbose": -9}
+    random = _OwnRandom()
+    with random:
+        search = cma.CMAEvolutionStrategy(*first, options)
     for generation in range(generations):
-        asked = np.array(search.ask())
+        with random:
+            asked = np.array(search.ask())
         weights = np.clip(np.rint(WEIGHT_ONE * asked), -LARGEST_WEIGHT, LARGEST_WEIGHT)
         returns = tried.returns(weights.astype(np.int32), 1000 * seed + generation)
-        search.tell(list(asked), (-returns).tolist())
+        with random:
+            search.tell(list(asked), (-returns).tolist())
+        network = Network.from_vector(np.asarray(search.result.xfavorite))
         if report is not None:
-            report(Progress(generation + 1, float(returns.max()), float(np.median(returns))))
-    return Network.from_vector(np.asarray(search.result.xfavorite))
+            best, median = float(returns.max()), float(np.median(returns))
+            report(Progress(generation + 1, best, median, network))
+    return network

@@ -11,8 +11,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from haselab.base import JsonObject
-from haselab.learning.environment import action_space, observation_space
-from haselab.learning.simulation import StrainSimulation
+from haselab.learning.environment import action_space, actions_of, observation_space
+from haselab.learning.simulation import StrainSimulation, whole_number
 
 __all__ = ["StrainVectorEnv"]
 
@@ -51,19 +51,23 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)
 
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: Any = None
-    ) -> tuple[Observed, JsonObject]:
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Observed, JsonObject]:
         """Begin all episodes.
 
         Args:
-            seed: of all loops together; several are combined.
+            seed: of all loops together; several are combined, without those that are None.
             options: `reset_mask`, shape `(num_envs,)`: which episodes begin; default: all.
+        Raises:
+            InputError: A seed is not a whole number of 0 or more.
         """
         if seed is not None:
-            combined = seed if isinstance(seed, int) else [part or 0 for part in seed]
-            self._np_random = np.random.default_rng(combined)
-            self._np_random_seed = seed if isinstance(seed, int) else None
+            several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
+            parts = [part for part in seed if part is not None] if several else [seed]
+            for part in parts:
+                whole_number("The seed", part, 0, 2**63 - 1)
+            # without any number, the operating system gives one
+            self._np_random = np.random.default_rng((parts or None) if several else parts[0])
+            self._np_random_seed = None if several else int(parts[0])
         mask = (options or {}).get("reset_mask")
         which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         self._simulation.reset(which.astype(np.int64), self.np_random)
@@ -74,7 +78,7 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         self, actions: Observed
     ) -> tuple[Observed, NDArray[np.float64], Flags, Flags, JsonObject]:
         """Let 10 ms pass in all loops."""
-        flat = np.asarray(actions, dtype=np.float64).reshape(self.num_envs)
+        flat = actions_of(actions, self.num_envs)
         began = self._ended
         rewards, terminated, truncated = self._simulation.step(flat, self.np_random)
         if began.any():

@@ -68,6 +68,9 @@ class ClosedLoop:
         rig.description.drive_limits.check(voltages)
         self._output_v = self._voltage(0.0)
         self._waiting = deque([self._output_v] * loop.extra_delay_blocks)
+        # the drives of the last blocks; the oldest one acts, the others are queued in the device
+        queued = rig.description.switch_sample // rig.description.block_samples
+        self._drives_v = deque([rig.present_drive_v] * (queued + 1), queued + 1)
 
     @property
     def preview_blocks(self) -> int:
@@ -92,12 +95,14 @@ class ClosedLoop:
         Args:
             codes: the block just read.
             desired: strain; NaN: the loop is still open.
-            preview: the next desired strains, `preview_blocks` of them.
+            preview: the next desired strains, `preview_blocks` of them; where one is NaN, the
+                controller gets the one before.
         Raises:
             SafetyError: The sensor was lost, the watchdog found a fault, or the controller failed.
         """
         sensor, safety = self._sensor, self._rig.safety
         strain = sensor.strain(codes)
+        self._drives_v.append(self._rig.present_drive_v)
         self._lost = 0 if strain == strain else self._lost + 1
         self._outside += not sensor.in_range
         if self._lost >= PATIENCE_BLOCKS:
@@ -108,7 +113,11 @@ class ClosedLoop:
             raise safety.trip(fault)
         if desired == desired:
             try:
-                drive = self._controller.step(desired, self._measured(strain, preview))
+                coming = [desired]
+                for value in preview:
+                    coming.append(value if value == value else coming[-1])
+                measured = self._measured(strain, tuple(coming[1:]))
+                drive = self._controller.step(desired, measured)
             except SafetyError as error:
                 raise safety.trip(str(error)) from error
             if drive is not None:
@@ -144,7 +153,7 @@ class ClosedLoop:
         return Measurement(
             strain=strain,
             capacitance_f=math.nan if farad is None else farad,
-            voltage_v=self._rig.present_drive_v,
+            voltage_v=self._drives_v[0],
             time_s=self._rig.acquisition.time_s,
             valid=not math.isnan(strain),
             in_range=self._sensor.in_range,

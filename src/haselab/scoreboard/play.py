@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError, SafetyError
+from haselab.base import InputError, SafetyError, described, is_real
+from haselab.base.exits import no_exit
 from haselab.controllers import (
     ChosenController,
     ControllerSetting,
@@ -166,9 +167,17 @@ class _Player:
         return self.drive_v
 
     def estimated_kg(self) -> float:
-        """Hung mass, as the controller estimates it."""
-        found = getattr(self._running.controller, "estimated_load_kg", math.nan)
-        return float(found) if isinstance(found, (int, float)) else math.nan
+        """Hung mass, as the controller estimates it.
+
+        Raises:
+            SafetyError: The attribute of the controller raises an exception.
+        """
+        try:
+            with no_exit():
+                found = getattr(self._running.controller, "estimated_load_kg", math.nan)
+        except Exception as error:  # code of another package may raise anything
+            raise SafetyError(f"estimated_load_kg failed: {described(error)}") from error
+        return float(found) if is_real(found) else math.nan
 
 
 def play(
@@ -224,10 +233,10 @@ def play(
         )  # fmt: skip
         try:
             player.step(wanted[k], measured)
+            estimates[k] = player.estimated_kg()
         except SafetyError as error:
             failure = str(error)
             break
-        estimates[k] = player.estimated_kg()
     if done:
         spent_s = player.spent_s / done
     parts = (update_s[:done], reference[:done], drives_v[:done], estimates[:done])

@@ -49,6 +49,7 @@ _QUIETER = 8.0  # of the expected load: changes that repeat are learned
 _SHRINKS = 1.0  # |1 - T| of a harmonic that is learned is below
 _POINTS = (0.1, 0.5, 0.9)  # of the reachable range
 _SPREAD = ((1.0, 0.0), (1.1, 0.0), (0.9, 0.2), (1.0, 0.5))  # stiffness; longer delay, of it
+_HIGHEST_HZ = 40.0  # faster waves of all frequencies together are no smooth reference
 _TRIED_S, _PERIODS, _WAVE, _HIGHEST = 0.5, 3, 3e-5, 0.4  # strain; of the rate of the updates
 
 
@@ -183,10 +184,11 @@ def answer_of_reference(
         strain: about which it moves.
         other: stiffness of the actuator over the identified one; delay beyond the stated one, s.
     Returns:
-        Frequencies in Hz, up to 0.4 of the rate of the updates, and the response there.
+        Frequencies in Hz, up to 0.4 of the rate of the updates and to 40 Hz, and the response
+        there.
     """
     count = round(_TRIED_S / setting.period_s)
-    last = int(_HIGHEST * count)
+    last = min(int(_HIGHEST * count), round(_HIGHEST_HZ * count * setting.period_s))
     order = np.arange(1, last + 1)
     turns = np.outer(np.arange(count) / count, order) + 0.5 * order**2 / last  # Schroeder
     wave = _WAVE * np.cos(2.0 * np.pi * turns).sum(axis=1)

@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.controllers.motion_model import MotionModel
-from haselab.controllers.protocol import Controller, ControllerSetting, Measurement
+from haselab.controllers.protocol import (
+    Controller,
+    ControllerSetting,
+    Measurement,
+    waiting_drives,
+)
 
 __all__ = ["play_on_model"]
 
@@ -38,13 +43,14 @@ def play_on_model(
     whole = int(delay_s / period_s + 1e-9)
     late_s = delay_s - whole * period_s
     past_v, state = [drive_v] * (whole + 2), model.at_rest(length_m, drive_v)
+    waiting = waiting_drives(setting)
     controller.start(replace(setting, drive_start=drive_v))
     values = [*wanted.tolist(), *[float(wanted[-1])] * ahead]
     found = np.empty(wanted.size)
     for k in range(wanted.size):
         found[k] = known.strain(state[0])
         measured = Measurement(
-            float(found[k]), float("nan"), past_v[0], (k + 1.0) * period_s,
+            float(found[k]), float("nan"), past_v[waiting], (k + 1.0) * period_s,
             preview=tuple(values[k + 1 : k + 1 + ahead]),
         )  # fmt: skip
         past_v = [controller.step(values[k], measured), *past_v[:-1]]

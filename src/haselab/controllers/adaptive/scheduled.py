@@ -31,7 +31,15 @@ from haselab.base import InputError, LimitError, ResultError
 from haselab.controllers.force import force_loop
 from haselab.controllers.kind import ControllerKind, Parameter
 from haselab.controllers.known_actuator import KnownActuator
-from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, squared_error
+from haselab.controllers.linear_loop import (
+    UNSTABLE,
+    Demands,
+    LinearLoop,
+    penalty,
+    refuse_missed,
+    shares_of,
+    squared_error,
+)
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.sampled_point import SampledPoint, sampled_point
 
@@ -182,6 +190,7 @@ class ScheduledController:
         slope = (length_m - self._last_m) / period_s
         self._rate = self._keep * self._rate + (1.0 - self._keep) * slope
         self._last_m = length_m
+        reference = known.limited_strain(reference)
         self._wanted = reference + self._smooth * (self._wanted - reference)
         self._coming = self._wanted + self._smooth * (self._coming - self._wanted)
         kp, ki, kd = self._gains()
@@ -245,7 +254,7 @@ def design_scheduled(setting: ControllerSetting) -> Mapping[str, float]:
     Returns:
         The parameters of `ScheduledController`.
     Raises:
-        ResultError: No poles keep the loop stable.
+        ResultError: No poles keep the loop stable, or all demands.
     """
     SCHEDULED.check(setting)
     assert setting.actuator is not None
@@ -282,7 +291,15 @@ def design_scheduled(setting: ControllerSetting) -> Mapping[str, float]:
             "delay."
         )
     names = [parameter.name for parameter in SCHEDULED.parameters]
-    return {name: float(f"{v:.4g}") for name, v in zip(names, values(best.x), strict=True)}
+    found = [float(f"{value:.4g}") for value in values(best.x)]
+    shares = [
+        shares_of(loop_at(point, sampled, setting, tuple(found)), setting.period_s,
+                  _demands(point, sampled))
+        for point, sampled in points
+    ]  # fmt: skip
+    refuse_missed(shares, "poles of the scheduled PID", setting.period_s,
+                  "Use the controller observer, or shorten the delay.")  # fmt: skip
+    return dict(zip(names, found, strict=True))
 
 
 def _sampled(setting: ControllerSetting, point: GridPoint) -> list[SampledPoint]:
@@ -299,15 +316,18 @@ def _cost(
     point: GridPoint, sampled: SampledPoint, setting: ControllerSetting, values: tuple[float, ...]
 ) -> tuple[float, float]:
     """Factor by the demands that are missed, and error after a step of the load."""
+    loop = loop_at(point, sampled, setting, values)
+    factor = penalty(loop, setting.period_s, _demands(point, sampled))
+    return factor, 0.0 if factor > UNSTABLE else squared_error(loop, setting.period_s)
+
+
+def _demands(point: GridPoint, sampled: SampledPoint) -> Demands:
     known = point.known
     per_v2 = 0.5 / math.sqrt(sampled.volt2) / known.gain_v_per_v  # V of drive per V^2
-    demands = Demands(
+    return Demands(
         known.length_noise_m(sampled.strain), _SHAKEN * known.high_v / per_v2, _PEAK_SENSITIVITY,
         _NOISE,
     )  # fmt: skip
-    loop = loop_at(point, sampled, setting, values)
-    factor = penalty(loop, setting.period_s, demands)
-    return factor, 0.0 if factor > UNSTABLE else squared_error(loop, setting.period_s)
 
 
 SCHEDULED = ControllerKind(

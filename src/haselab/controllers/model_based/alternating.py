@@ -70,6 +70,8 @@ class AlternatingController:
             valid=measurement.valid and not changed,
         )  # fmt: skip
         drive_v = self._inner.step(reference, seen)
+        if measurement.valid:
+            self._inner.put_out(drive_v)  # in the block that is not sensed, too
         self._count += 1
         if self._count >= self._blocks:
             self._count, self._sign = 0, -self._sign

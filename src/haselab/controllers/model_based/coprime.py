@@ -84,17 +84,29 @@ def robust_controller(shaped: Sampled, slack: float = 1.1) -> tuple[Sampled, flo
         The controller $K$ of positive feedback, $u = K y$; its margin $\epsilon$, at least; and
         the largest margin that any controller has.
     Raises:
-        ResultError: The equations have no solution.
+        ResultError: The equations have no solution, or one that rounding errors spoil.
     """
+    try:
+        found, epsilon, largest = _solved(shaped, slack)
+        poles = np.linalg.eigvals(_closed(shaped, found))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ResultError(f"The equations of the loop shaping have no solution: {error}") from error
+    if not np.abs(poles).max() < 1.0:
+        raise ResultError(
+            f"The loop shaping gives no stable loop: with a stability margin of {epsilon:.2g}, "
+            "rounding errors spoil it. Change the weight."
+        )
+    return found, epsilon, largest
+
+
+def _solved(shaped: Sampled, slack: float) -> tuple[Sampled, float, float]:
+    """See `robust_controller`; rounding errors may leave the loop unstable."""
     a, b, c, d = _to_continuous(shaped)
     s, r = 1.0 + d * d, 1.0 + d * d
     drift = a - np.outer(b, c) * (d / s)
     one = np.eye(1)
-    try:
-        x = solve_continuous_are(drift, b[:, None], np.outer(c, c) / r, s * one)
-        z = solve_continuous_are(drift.T, c[:, None], np.outer(b, b) / s, r * one)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ResultError(f"The equations of the loop shaping have no solution: {error}") from error
+    x = solve_continuous_are(drift, b[:, None], np.outer(c, c) / r, s * one)
+    z = solve_continuous_are(drift.T, c[:, None], np.outer(b, b) / s, r * one)
     least = math.sqrt(1.0 + float(np.abs(np.linalg.eigvals(x @ z)).max()))
     gamma = slack * least
     f = -(d * c + b @ x) / s
@@ -103,6 +115,16 @@ def robust_controller(shaped: Sampled, slack: float = 1.1) -> tuple[Sampled, flo
     closed = a + np.outer(b, f) + np.outer(inject, c + d * f)
     found = _to_sampled(closed, inject, b @ x, -d)
     return found, 1.0 / gamma, 1.0 / least
+
+
+def _closed(shaped: Sampled, controller: Sampled) -> Floats:
+    """Matrix of the closed loop of positive feedback."""
+    share = 1.0 / (1.0 - shaped.d * controller.d)
+    k = controller
+    return np.block([
+        [shaped.a + share * k.d * np.outer(shaped.b, shaped.c), share * np.outer(shaped.b, k.c)],
+        [share * np.outer(k.b, shaped.c), k.a + share * shaped.d * np.outer(k.b, k.c)],
+    ])  # fmt: skip
 
 
 def stability_margin(shaped: Sampled, controller: Sampled) -> float:

@@ -11,7 +11,15 @@ from scipy.optimize import minimize
 
 from haselab.base import LimitError, ResultError
 from haselab.controllers.kind import ControllerKind, Parameter
-from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, timed_error
+from haselab.controllers.linear_loop import (
+    UNSTABLE,
+    Demands,
+    LinearLoop,
+    penalty,
+    refuse_missed,
+    shares_of,
+    timed_error,
+)
 from haselab.controllers.model_based.coprime import guaranteed_margins
 from haselab.controllers.model_based.h_infinity import (
     HInfinityController,
@@ -50,7 +58,7 @@ def design_h_infinity(setting: ControllerSetting) -> Mapping[str, float]:
     Returns:
         The parameters of `HInfinityController`.
     Raises:
-        ResultError: No weight keeps the loop stable.
+        ResultError: No weight keeps the loop stable, or all demands.
     """
     H_INFINITY.check(setting)
     known = setting.actuator
@@ -84,6 +92,16 @@ def design_h_infinity(setting: ControllerSetting) -> Mapping[str, float]:
         )
     found = {name: float(f"{value:.4g}")
              for name, value in zip(_NAMES, np.exp(best.x).tolist(), strict=True)}  # fmt: skip
+    designed = synthesis(setting, found)
+    shares = [
+        shares_of(loop_of(point, designed), setting.period_s, _demands(setting, point, peak))
+        for point, peak in points
+    ]
+    refuse_missed(
+        [*shares, {"the inverse of the stability margin": _LEAST_EPSILON / designed.epsilon}],
+        "weights of the loop shaping", setting.period_s,
+        "Use the controller 'observer', or shorten the delay.",
+    )  # fmt: skip
     return {**found, "reserve": RESERVE}
 
 

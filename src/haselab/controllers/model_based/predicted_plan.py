@@ -62,15 +62,15 @@ class PredictedPlan(ReferencePlan):
         reserve: share of the force's range that a plan leaves to the feedback.
         rate_v_per_s: fastest change of the drive.
         pole_rad_s: of the planned motion where no limit acts.
-        stage_s: duration of a stage, not below the period.
+        stage_s: duration of a stage; the nearest whole number of periods is used.
     """
 
     def __init__(
         self, model: MotionModel, known: KnownActuator, period_s: float, reserve: float,
         rate_v_per_s: float, pole_rad_s: float, stage_s: float,
     ) -> None:  # fmt: skip
-        self._pole, self._stage_s = pole_rad_s, max(stage_s, period_s)
-        self._steps = max(round(self._stage_s / period_s), 1)
+        self._pole, self._steps = pole_rad_s, max(round(stage_s / period_s), 1)
+        self._stage_s = self._steps * period_s
         super().__init__(model, known, period_s, reserve, rate_v_per_s)
 
     def exchange(self, model: MotionModel, known: KnownActuator) -> None:
@@ -118,16 +118,14 @@ class PredictedPlan(ReferencePlan):
             acts_s: from the end of that block to the effect of the drive.
             state: then.
         """
-        samples = [self._last_m, *wanted_m]
-        self._last_m = wanted_m[0]
+        samples = self._samples_m(wanted_m)
         place = acts_s / self._period_s + 2.0  # of the samples, the drive's effect
         at = min(int(place + 1e-9), len(samples) - 1)
         # a plan that asks for more than the limits starts again where the actuator is
         here, target_m = (state[0], state[1]) if self._beyond else self._here, samples[at]
         self._beyond = False
         if len(samples) > at + 4 and self.smooth(samples, at):
-            if self.jumps(*samples[-3:]):  # which may be followed by others that make it smooth
-                samples = samples[:-1]
+            samples = self.before_step(samples, at)
             reference = self._followed(samples, place)
             rests = max(samples) - min(samples) < self._near_m
         else:

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError, JsonObject
+from haselab.base import InputError, JsonObject, described, shown
 
 __all__ = [
     "FEATURES",
@@ -42,7 +42,7 @@ class Network:
         hidden: weights of the features and, last, the bias. Shape `(HIDDEN, FEATURES + 1)`.
         output: weights of the hidden units and the bias. Shape `(HIDDEN + 1,)`.
     Raises:
-        InputError: A shape is wrong, or a weight is outside -127 to 127.
+        InputError: A shape is wrong, or a weight is not a whole number from -127 to 127.
     """
 
     hidden: tuple[tuple[int, ...], ...]
@@ -56,8 +56,12 @@ class Network:
                 f"The network has rows of {sizes} weights. It must have {HIDDEN} rows of "
                 f"{FEATURES + 1}, and an output of {HIDDEN + 1}."
             )
-        if any(abs(weight) > LARGEST_WEIGHT for row in rows for weight in row):
-            raise InputError(f"A weight is outside -{LARGEST_WEIGHT} to {LARGEST_WEIGHT}.")
+        for weight in (weight for row in rows for weight in row):
+            if type(weight) is not int or abs(weight) > LARGEST_WEIGHT:
+                raise InputError(
+                    f"The network has a weight of {shown(weight)}. All weights must be whole "
+                    f"numbers from -{LARGEST_WEIGHT} to {LARGEST_WEIGHT}."
+                )
 
     @classmethod
     def from_vector(cls, values: NDArray[np.float64]) -> Network:
@@ -105,11 +109,15 @@ class Network:
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
             return cls(
-                tuple(tuple(int(w) for w in row) for row in data["hidden"]),
-                tuple(int(w) for w in data["output"]),
+                tuple(tuple(row) for row in data["hidden"]),
+                tuple(data["output"]),
             )
+        except InputError as error:
+            raise InputError(f"{error} {path}") from None
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"No network can be read ({error}). Train one. {path}") from None
+            raise InputError(
+                f"No network can be read ({described(error)}). Train one. {path}"
+            ) from None
 
 
 Number = TypeVar("Number", int, NDArray[np.int32])

@@ -197,7 +197,7 @@ class FunctionGenerator(Protocol):
         """Put out a sine of this frequency and peak amplitude; an amplitude of 0 is `off`.
 
         Raises:
-            LimitError: A frequency or amplitude outside the limits, or NaN; the output is unchanged.
+            LimitError: Frequency or amplitude outside the limits, or NaN; the output is unchanged.
         """
 
     def off(self) -> None:

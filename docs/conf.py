@@ -89,6 +89,7 @@ html_show_sourcelink = False
 html_search_scorer = str(Path(__file__).parent / "sphinx/search_scorer.js")
 html_show_search_summary = False  # a page from file:// may not read the others
 html_copy_source = False
+html_sidebars = {f"docs/{page}": [] for page in ("faq", "gallery", "hardware")}  # no pages below
 html_last_updated_fmt = None
 html_theme_options = {
     "logo": {"text": "haselab"},

@@ -194,7 +194,11 @@ class FunctionGenerator(Protocol):
     """The sensing signal, which is added to the drive."""
 
     def sine(self, frequency_hz: float, amplitude_v: float) -> None:
-        """Put out a sine of this frequency and peak amplitude."""
+        """Put out a sine of this frequency and peak amplitude; an amplitude of 0 is `off`.
+
+        Raises:
+            LimitError: Frequency or amplitude outside the limits, or NaN; the output is unchanged.
+        """
 
     def off(self) -> None:
         """Switch the output off and discard all earlier requests. Never raises."""

@@ -90,5 +90,5 @@ def test_what_cannot_be_taken_is_refused_with_a_reason(monkeypatch):
     with pytest.raises(InputError, match="form = zpk; it must be one of tf, ss"):
         to_control(MODEL, "zpk")
     monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(InputError, match=r"not installed; .* pip install 'haselab\[control\]'"):
+    with pytest.raises(InputError, match=r"not installed\. Run: pip install 'haselab\[control\]'"):
         to_control(MODEL)

@@ -112,16 +112,20 @@ def recorded_calls(factory: pytest.TempPathFactory, *arguments: float) -> list[C
     )
     recorded = {"LD_PRELOAD": str(library), "RECORDED_FILE": str(path.resolve()),
                 "RECORDED_LOG": str(folder / "log")}  # fmt: skip
-    subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(_WRITER), path, *map(str, arguments)],
-        check=True, env=os.environ | recorded, stdout=subprocess.DEVNULL, timeout=300,
-    )  # fmt: skip
-    found = list(parsed((folder / "log").read_bytes()))
-    image = bytearray()
-    for call in found:
-        call.apply(image)
-    assert bytes(image) == path.read_bytes()  # nothing was written in another way
-    return found
+    for _ in range(3):  # the kill may come between a write of another thread and its entry
+        subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(_WRITER), path, *map(str, arguments)],
+            check=True, env=os.environ | recorded, stdout=subprocess.DEVNULL, timeout=300,
+        )  # fmt: skip
+        found = list(parsed((folder / "log").read_bytes()))
+        image = bytearray()
+        for call in found:
+            call.apply(image)
+        if bytes(image) == path.read_bytes():
+            return found
+        path.unlink()
+        (folder / "log").unlink()
+    raise AssertionError("something was written in another way")
 
 
 def states(calls: list[Call]) -> Iterator[tuple[int, bytearray]]:

@@ -120,6 +120,11 @@ class RigDescription:
         """Sample of every block at which the output changes."""
         return self.switch_sample % self.block_samples
 
+    @property
+    def queued_blocks(self) -> int:
+        """Outputs that are queued in the device and not in force yet."""
+        return self.switch_sample // self.block_samples
+
 
 class Frames:
     """Images with the middle of each exposure on the acquisition's clock.

@@ -69,7 +69,7 @@ class ClosedLoop:
         self._output_v = self._voltage(0.0)
         self._waiting = deque([self._output_v] * loop.extra_delay_blocks)
         # the drives of the last blocks; the oldest one acts, the others are queued in the device
-        queued = rig.description.switch_sample // rig.description.block_samples
+        queued = rig.description.queued_blocks
         self._drives_v = deque([rig.present_drive_v] * (queued + 1), queued + 1)
 
     @property

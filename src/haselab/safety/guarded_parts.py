@@ -52,7 +52,7 @@ class GuardedBench:
         self.rig, self.safety = rig, safety
         self.preloads = rig.source if isinstance(rig.source, PreloadsOutputs) else None
         self.watch = BlockWatch(rig.description, s)
-        queued = rig.description.switch_sample // rig.description.block_samples
+        queued = rig.description.queued_blocks
         deadline_s = (1 + queued) * rig.description.block_s
         self.deadlines = Deadlines(deadline_s, s.missed_limit, s.late_limit, clock)
         self.requested_v = 0.0  # last accepted

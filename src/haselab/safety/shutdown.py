@@ -212,10 +212,7 @@ class Shutdown:
 
     def _by_blocks(self) -> OutputState:
         """The output by the voltage monitor, for a source without a meter."""
-        blocks = (
-            _READ_BACK_BLOCKS
-            + self._rig.description.switch_sample // self._rig.description.block_samples
-        )
+        blocks = _READ_BACK_BLOCKS + self._rig.description.queued_blocks
         left_v = math.inf
         try:
             for _ in range(blocks):

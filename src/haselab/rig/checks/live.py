@@ -283,7 +283,7 @@ def _step(rig: Rig, step_v: float) -> _Step:
     keep(rig, True)
     rest_v = _means(rig)
     rig.source.write(step_v)
-    queued = d.switch_sample // d.block_samples + _LATE_BLOCKS
+    queued = d.queued_blocks + _LATE_BLOCKS
     blocks = [rig.acquisition.read() for _ in range(queued + 2)]
     change_v = _means(rig) - rest_v
     keep(rig, False)

@@ -39,7 +39,7 @@ class BlockWatch:
             rig.switch_in_block + math.ceil(settings.settle_s * rig.rate_hz), rig.block_samples
         )
         # Outputs, newest request last: those before, the one in force, those still queued.
-        self._queued = rig.switch_sample // rig.block_samples
+        self._queued = rig.queued_blocks
         kept = self._queued + 2 + math.ceil(settings.settle_s / rig.block_s)
         self._requested_v: deque[float] = deque([0.0] * kept, maxlen=kept)
         self._code_per_v = rig.amplifier_gain * rig.v_monitor_v_per_v / rig.volt_per_code

@@ -97,7 +97,7 @@ def loop_model(
         carrier_v=abs(carrier[1]),
         code_per_v=rig.amplifier_gain * rig.v_monitor_v_per_v / rig.volt_per_code,
         level=slice(rig.block_samples - counted, rig.block_samples),
-        queued=rig.switch_sample // rig.block_samples,
+        queued=rig.queued_blocks,
         capacitance_map=capacitance_map,
         capacitance_f=capacitance_f,
     )

@@ -11,7 +11,7 @@ __all__ = ["POSITION_PX", "ZERO_PX", "with_resolution"]
 
 POSITION_PX = 0.01  # sub-pixel bias of a tracked length, equal in all trials
 # Of a zero strain from another session: both lengths at rest have an error, equal in all trials of
-# a session. Measured with the twin's camera at 40 lengths: 0.007 px rms, and 0.018 px at the worst.
+# a session. Measured with the twin's camera at 40 lengths: 0.007 px rms; in one study: 0.018 px.
 ZERO_PX = 0.02
 
 

@@ -68,6 +68,8 @@ def test_points_follow_a_moving_pattern():
     assert (off < 5.0 * np.maximum(frame["std_x_px"], 0.005)).all()
     assert frame["time_s"].iloc[-1] == pytest.approx(3 / 50.0)
     assert np.array_equal(frame["x_mm"], 0.1 * frame["x_px"])
+    assert np.allclose(frame["displacement_x_m"], 1e-4 * moved_px, rtol=0.0, atol=1e-12)
+    assert np.abs(frame["displacement_y_m"]).max() < 1e-4 * 0.05
 
 
 def test_a_file_gives_the_tracks_of_its_frames_and_its_own_times(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain, islice
@@ -23,6 +24,7 @@ from haselab.pipelines.tracking.points import (
     choose_tracker,
     find_points,
 )
+from haselab.pipelines.tracking.stretch import stretch_note
 from haselab.sensing import Lockin
 from haselab.store.columns.table import Table
 from haselab.store.video.opening import open_video
@@ -131,7 +133,8 @@ def track(
         points: positions in the first frame, in px: a DataFrame or dictionary with `x_px` and
             `y_px`, or an array of shape `(P, 2)`. None: found in the first frame.
         rate_hz: frames a second, in Hz. None: as the file states it; frames count from 0.
-        scale_mm_per_px: adds `x_mm` and `y_mm`.
+        scale_mm_per_px: adds `x_mm` and `y_mm`, and the displacement from rest in
+            `displacement_x_m` and `displacement_y_m`.
         rest_frames: first frames, at rest, that are averaged as the reference; those after the
             first motion are left out.
         options: how to track. None: as `haselab track` with its model `auto`, which lets subsets
@@ -144,9 +147,9 @@ def track(
     """
     for name, given in (("rate_hz", rate_hz), ("scale_mm_per_px", scale_mm_per_px)):
         _positive(name, given)
+    times: list[float] = []
     if isinstance(video, (str, Path)):
         with open_video(video) as reader:
-            times: list[float] = []
 
             def frames() -> Iterable[NDArray[Any]]:
                 for time_s, frame in reader.timed():
@@ -154,9 +157,9 @@ def track(
                     yield frame
 
             lossy = bool(reader.lossy)
-            tracks = _tracked(frames(), points, rest_frames, options, lossy)
+            tracks, rest_px = _tracked(frames(), points, rest_frames, options, lossy)
     else:
-        times, tracks = [], _tracked(video, points, rest_frames, options)
+        tracks, rest_px = _tracked(video, points, rest_frames, options)
     count, each = tracks.x_px.shape
     number = np.repeat(np.arange(count, dtype=np.float64), each)
     time_s = np.repeat(times, each) if times else number
@@ -176,6 +179,10 @@ def track(
     if scale_mm_per_px is not None:
         columns["x_mm"] = scale_mm_per_px * columns["x_px"]
         columns["y_mm"] = scale_mm_per_px * columns["y_px"]
+        moved_px = np.stack([tracks.x_px, tracks.y_px]) - rest_px.T[:, None]
+        columns["displacement_x_m"], columns["displacement_y_m"] = (
+            1e-3 * scale_mm_per_px * each_px.ravel() for each_px in moved_px
+        )
     return Table(columns, rate_hz)
 
 
@@ -190,7 +197,8 @@ def _tracked(
     rest_frames: int,
     options: TrackOptions | None,
     lossy: bool = False,
-) -> Tracks:
+) -> tuple[Tracks, Floats]:
+    """The tracks, and the points at rest in px, shape `(P, 2)`."""
     stream = map(_frame, frames)
     head: list[Frame] = list(islice(stream, max(rest_frames, PILOT_FRAMES)))
     if not head:
@@ -202,7 +210,10 @@ def _tracked(
         found = Points([str(number) for number in range(len(place))], place, _SUBSET_PX)
     if options is not None or not 1 <= rest_frames <= len(head):
         chosen = options or TrackOptions(subset_px=found.subset_px)
-        return track_frames(chain(head, stream), found.place_px, chosen, rest_frames)
+        tracks = track_frames(chain(head, stream), found.place_px, chosen, rest_frames)
+        if note := stretch_note(found.place_px, tracks, chosen):
+            warnings.warn(f"{note} Use the model neighbours.", stacklevel=4)
+        return tracks, found.place_px
     usual = TrackOptions(subset_px=found.subset_px)
     rest = head[: frames_at_rest(head[:rest_frames], found.place_px, usual)]
     choice = choose_tracker(head, rest, found, usual, "auto", lossy=lossy)
@@ -210,7 +221,7 @@ def _tracked(
     for frame in chain(head, stream):
         state, seen = choice.tracker.step(state, frame)  # type: ignore[arg-type]
         rows.append(seen)
-    return Tracks.stack(rows)
+    return Tracks.stack(rows), found.place_px
 
 
 def _frame(frame: NDArray[Any]) -> Frame:

@@ -87,3 +87,9 @@ def test_subsets_that_do_not_stretch_are_said_to_be_wrong_by_as_much_as_they_are
     last = table[table.valid == 1].frame.max()
     at_most = error[table[(table.valid == 1) & (table.frame >= 5)].frame == last]
     assert 0.5 * stated_px < np.sqrt(np.mean(at_most**2)) < 1.5 * stated_px
+
+
+def test_python_warns_of_subsets_that_do_not_follow_the_stretch(film):
+    options = hl.tracking.TrackOptions(model="translation", subset_px=21)
+    with pytest.warns(UserWarning, match=r"move apart by up to \d+\.\d %"):
+        hl.track(film, options=options)

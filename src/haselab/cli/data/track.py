@@ -58,7 +58,7 @@ from haselab.pipelines.tracking.stream import (
     read_ahead,
     read_clock,
 )
-from haselab.pipelines.tracking.stretch import largest_stretch
+from haselab.pipelines.tracking.stretch import stretch_note
 from haselab.pipelines.tracking.table import Block, TrackRows
 from haselab.pipelines.tracking.track_collector import TrackCollector
 from haselab.store.manifest import check_recorded
@@ -70,7 +70,6 @@ from haselab.tracking.particles.follow import ParticleTracker
 __all__ = ["command"]
 
 _MANY_LOST = 0.1
-_ERROR_OF_STRETCH = 0.07  # rms error per stretch and side of the subset, with dots of the twin
 _TURN_S = 0.5e-3
 
 
@@ -238,17 +237,10 @@ def _answer(points: Points, choice: Choice, kept: TrackCollector) -> dict[str, A
 
 def _stretch_line(points: Points, choice: Choice, tracks: Tracks) -> str:
     """A warning about subsets that do not stretch with the sheet; empty if there is no need."""
-    if choice.options.model != "translation" or isinstance(choice.tracker, ParticleTracker):
+    if isinstance(choice.tracker, ParticleTracker):
         return ""
-    stretch = largest_stretch(points.place_px, tracks)
-    wrong_px = _ERROR_OF_STRETCH * stretch * choice.options.subset_px
-    if not tracks.valid.any() or wrong_px < np.median(tracks.std_x_px[tracks.valid]):
-        return ""
-    return (
-        f"The points move apart by up to {100 * stretch:.1f} %, which the subsets of the model "
-        f"translation do not follow. Positions may be wrong by {wrong_px:.1g} px rms, which the "
-        "standard deviations do not include. Use --model neighbours."
-    )
+    note = stretch_note(points.place_px, tracks, choice.options)
+    return f"{note} Use --model neighbours." if note else ""
 
 
 def _loss_line(video: VideoReader) -> str:

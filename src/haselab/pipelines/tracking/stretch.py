@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.tracking import Tracks
+from haselab.tracking import TrackOptions, Tracks
 
-__all__ = ["largest_stretch"]
+__all__ = ["largest_stretch", "stretch_note"]
 
 _LEAST_POINTS = 6  # six numbers describe an affine motion in the plane; each point gives two
+_ERROR = 0.07  # rms error per stretch and side of the subset, measured with dots of the twin
 _COMMON = 0.9  # share of the squared displacements that the affine motion explains
 
 
@@ -46,3 +47,24 @@ def largest_stretch(place_px: NDArray[np.float64], tracks: Tracks) -> float:
         stretches = np.linalg.svd(np.eye(2) + fit[:2].T, compute_uv=False)
         found = max(found, float(np.abs(stretches - 1.0).max()))
     return found
+
+
+def stretch_note(place_px: NDArray[np.float64], tracks: Tracks, options: TrackOptions) -> str:
+    """A warning about subsets that do not stretch with the sheet; empty if there is no need.
+
+    Args:
+        place_px: points at rest, `[x, y]`, in px. Shape `(N, 2)`.
+        tracks: positions in the frames. Shape `(F, N)`.
+        options: with which they were tracked.
+    """
+    if options.model != "translation" or not tracks.valid.any():
+        return ""
+    stretch = largest_stretch(place_px, tracks)
+    wrong_px = _ERROR * stretch * options.subset_px
+    if wrong_px < np.median(tracks.std_x_px[tracks.valid]):
+        return ""
+    return (
+        f"The points move apart by up to {100 * stretch:.1f} %, which the subsets of the model "
+        f"translation do not follow. Positions may be wrong by {wrong_px:.1g} px rms, which the "
+        "standard deviations do not include."
+    )

@@ -179,3 +179,10 @@ def test_a_lost_connection_is_no_reader_that_has_seen_enough(
     monkeypatch.setattr(entry._Root, "get_command", lambda self, context, name: failing)
     assert run(["design"]) == 4
     assert "A connection was lost (Broken pipe)" in capsys.readouterr().err
+
+
+def test_python_runs_the_package_as_the_console_script():
+    line = [sys.executable, "-m", "haselab", "no-such-command"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "haselab: No such command 'no-such-command'. See 'haselab --help'.\n"

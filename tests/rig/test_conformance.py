@@ -21,7 +21,7 @@ from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.gate import Gate
-from haselab.testing.bench_conformance import CARRIER_HZ, CARRIER_V, carrier_v, drive_v, pass_queue
+from haselab.testing.conformance.bench import CARRIER_HZ, CARRIER_V, carrier_v, drive_v, pass_queue
 from haselab.testing.conformance import (
     BenchConformance,
     GeneratorConformance,

@@ -1,4 +1,4 @@
-"""Conformance tests of a whole bench, for any instruments: see `conformance`."""
+"""Conformance tests of a whole bench, for any instruments."""
 
 from __future__ import annotations
 

@@ -1,18 +1,4 @@
-"""Conformance tests for instrument drivers, as pytest classes to derive from.
-
-Derive a class from the one for your instrument, and give it a fixture `rig_file`:
-
-    from haselab.testing.conformance import SupplyConformance
-
-    class TestMySupply(SupplyConformance):
-        @pytest.fixture
-        def rig_file(self, tmp_path):
-            ...  # write RIG.toml with your section, and return its path
-            return path
-
-THE TESTS PUT OUT VOLTAGES. Run them on an emulator. On a real instrument, disconnect the actuator
-and the amplifier first, and keep clear.
-"""
+"""Tests of one instrument: registry, identification, output, shutdown."""
 
 from __future__ import annotations
 
@@ -38,10 +24,8 @@ from haselab.rig.instruments.instrument import (
 )
 from haselab.rig.instruments.registry import instrument_of
 from haselab.rig.rig_file import load_rig
-from haselab.testing.bench_conformance import BenchConformance
 
 __all__ = [
-    "BenchConformance",
     "BlockTimer",
     "CameraConformance",
     "GeneratorConformance",

@@ -136,6 +136,32 @@ def test_the_charging_energy_is_limited() -> None:
     assert "full charges per second (" in fault
 
 
+@pytest.mark.parametrize(
+    ("gain", "swing_v", "declared", "reason"),
+    [
+        (1.0, 0.0, True, ""),
+        (1.0, 0.0, False, "Output oscillates"),
+        (-1.0, 0.0, True, "moves against the drive"),
+        (1.0, 0.7, True, "Output oscillates"),  # of its magnitude
+    ],
+)
+def test_a_declared_alternation_is_judged_by_its_magnitude(gain, swing_v, declared, reason) -> None:
+    """The sign changes every 5 blocks, where the strain is nonsense; the voltage steps once."""
+    blocks = np.arange(200)
+    asked_v = np.where(blocks < 60, 1.0, 1.3)
+    magnitude_v = asked_v + swing_v * (blocks // 2 % 2)
+    drives = magnitude_v * np.where(blocks // 5 % 2, -1.0, 1.0)
+    model = replace(MODEL, alternates=declared)
+    asked, static = np.interp([asked_v, magnitude_v], MODEL.map_drive_v, MODEL.map_strain)
+    strains = second_order(static - static[0], 33.0, 0.3, gain) + static[0]
+    strains += 1e-4 * np.random.default_rng(9).standard_normal(200)
+    if declared:
+        strains[5::5] = 0.5
+    settings = WatchdogSettings(charges_per_s=100.0)
+    _, fault = watched(strains, drives, asked, LoopWatchdog(model, settings))
+    assert fault == "" if not reason else reason in fault
+
+
 @pytest.mark.parametrize(("late", "trips"), [(0, False), (1, False), (2, True), (7, True)])
 def test_a_monitor_that_lags_behind_is_found_in_the_noise_of_a_hold(late, trips) -> None:
     rng = np.random.default_rng(7)

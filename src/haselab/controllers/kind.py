@@ -59,6 +59,9 @@ class ControllerKind:
             docstring of `design` states all.
         loop: setting of the only loop that the kind is designed for; None: that of the caller.
         preview_s: how far the controller looks ahead in the reference, see `Measurement.preview`.
+        alternates: whether the sign of the voltage alternates on purpose. The watchdog of a bench
+            then compares its magnitude with the strain, and ignores the strain of blocks in which
+            the sign changes.
     """
 
     name: str
@@ -73,6 +76,7 @@ class ControllerKind:
     )
     loop: Callable[[KnownActuator], ControllerSetting] | None = None
     preview_s: float = 0.0
+    alternates: bool = False
 
     def check(self, setting: ControllerSetting) -> None:
         """Refuse a setting that lacks what the kind needs.

@@ -207,6 +207,7 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         settings.settle_s,
         None if by_video else loop.strain_map.coefficients,
         0.5 * (range_f[0] + range_f[1]),
+        loop.controller.kind.alternates,
     )
     return LoopWatchdog(
         model, settings.loop, settings.rating, rig.present_drive_v, rig.bench.is_settled

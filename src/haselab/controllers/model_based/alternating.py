@@ -139,4 +139,5 @@ ALTERNATING = ControllerKind(
     needs_actuator=True,
     design=design_alternating,
     preview_s=OBSERVER.preview_s,
+    alternates=True,
 )

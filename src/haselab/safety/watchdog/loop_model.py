@@ -37,6 +37,7 @@ class LoopModel:
         capacitance_map: coefficients of the strain map, see `capacitance_range`; None if the
             strain does not come from the capacitance.
         capacitance_f: a capacitance in the range of the map; 0: unknown.
+        alternates: whether the sign of the drive alternates on purpose.
     """
 
     block_s: float
@@ -52,6 +53,7 @@ class LoopModel:
     queued: int
     capacitance_map: tuple[float, float, float, float] | None
     capacitance_f: float
+    alternates: bool = False
 
     @property
     def range(self) -> float:
@@ -67,6 +69,7 @@ def loop_model(
     settle_s: float,
     capacitance_map: tuple[float, float, float, float] | None,
     capacitance_f: float = 0.0,
+    alternates: bool = False,
 ) -> LoopModel:
     """Build the model of a loop on a rig.
 
@@ -78,6 +81,7 @@ def loop_model(
         settle_s: settling time of the output.
         capacitance_map: see `LoopModel`.
         capacitance_f: see `LoopModel`.
+        alternates: see `LoopModel`.
     """
     low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
     strain = np.linspace(low, high, _GRID)
@@ -100,6 +104,7 @@ def loop_model(
         queued=rig.queued_blocks,
         capacitance_map=capacitance_map,
         capacitance_f=capacitance_f,
+        alternates=alternates,
     )
 
 

@@ -163,11 +163,19 @@ class Swings:
         gain: of the amplifier.
         range_: width of the strain range.
         settings: limits.
+        alternates: whether the sign of the drive alternates on purpose: only its magnitude swings.
     """
 
     def __init__(
-        self, block_s: float, reach_v: float, gain: float, range_: float, settings: WatchdogSettings
+        self,
+        block_s: float,
+        reach_v: float,
+        gain: float,
+        range_: float,
+        settings: WatchdogSettings,
+        alternates: bool = False,
     ) -> None:
+        self._alternates = alternates
         self._block_s, self._reach_v, self._gain = block_s, reach_v, gain
         self._settings = settings
         self._drive = _Reversals(settings.swing_share * reach_v)
@@ -184,7 +192,8 @@ class Swings:
     def fault(self, drive_v: float, reference: float, capacitance_f: float | None) -> str:
         """Return why the loop must stop, or an empty text."""
         self._count += 1
-        change = self._drive.happened(drive_v) - _ASKED * (
+        acting_v = abs(drive_v) if self._alternates else drive_v
+        change = self._drive.happened(acting_v) - _ASKED * (
             reference == reference and self._reference.happened(reference)
         )
         return self._swinging(change) or self._charging(drive_v, capacitance_f)

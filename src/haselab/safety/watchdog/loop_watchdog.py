@@ -107,7 +107,10 @@ class LoopWatchdog:
         # The loop's first output is a step from equilibrium. A sensing chain without blanking
         # mistakes that step for a change of strain, in the block in which it leaves the queue.
         self._stepping = model.queued + 1
-        self._swings = Swings(model.block_s, model.drive_reach_v, model.gain, model.range, settings)
+        self._swings = Swings(
+            model.block_s, model.drive_reach_v, model.gain, model.range, settings, model.alternates
+        )
+        self._before_v = 0.0
         self._delay = Delay(model, settings)
         self._reaction = Reaction(
             model.range,
@@ -138,6 +141,10 @@ class LoopWatchdog:
 
     def _sensor(self, sample: LoopSample) -> str:
         strain = sample.strain
+        if self._changes_sign(sample.drive_v):
+            self._held += 1
+            self._lost.append(True)
+            return self._gaps() or self._late(sample)
         stepping, self._stepping = self._stepping > 0, max(self._stepping - 1, 0)
         self._lost.append(math.isnan(strain))
         if self._lost[-1]:
@@ -156,9 +163,14 @@ class LoopWatchdog:
             or self._reaction.fault(self._static(sample.drive_v), strain)
         )
 
+    def _changes_sign(self, drive_v: float) -> bool:
+        """Whether an alternating voltage passes zero in this block, which gives no strain then."""
+        before_v, self._before_v = self._before_v, drive_v
+        return self._model.alternates and drive_v * before_v < 0.0
+
     def _static(self, drive_v: float) -> float:
         """Static strain of a drive, by the voltage map."""
-        return float(np.interp(drive_v, self._model.map_drive_v, self._model.map_strain))
+        return float(np.interp(abs(drive_v) if self._model.alternates else drive_v, self._model.map_drive_v, self._model.map_strain))
 
     def _gaps(self) -> str:
         lost, window = sum(self._lost), self._lost.maxlen or 1

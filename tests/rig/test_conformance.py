@@ -21,13 +21,13 @@ from haselab.rig.twin.serve.ni.devices import DEVICES
 from haselab.rig.twin.serve.server import ServedTwin
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.gate import Gate
-from haselab.testing.conformance.bench import CARRIER_HZ, CARRIER_V, carrier_v, drive_v, pass_queue
 from haselab.testing.conformance import (
     BenchConformance,
     GeneratorConformance,
     InstrumentConformance,
     SupplyConformance,
 )
+from haselab.testing.conformance.bench import CARRIER_HZ, CARRIER_V, carrier_v, drive_v, pass_queue
 
 FRAME_RATE_HZ = 100.0
 

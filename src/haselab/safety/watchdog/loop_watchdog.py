@@ -170,7 +170,8 @@ class LoopWatchdog:
 
     def _static(self, drive_v: float) -> float:
         """Static strain of a drive, by the voltage map."""
-        return float(np.interp(abs(drive_v) if self._model.alternates else drive_v, self._model.map_drive_v, self._model.map_strain))
+        acting_v = abs(drive_v) if self._model.alternates else drive_v
+        return float(np.interp(acting_v, self._model.map_drive_v, self._model.map_strain))
 
     def _gaps(self) -> str:
         lost, window = sum(self._lost), self._lost.maxlen or 1

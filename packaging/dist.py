@@ -65,6 +65,12 @@ def planned(tools: Path, sdist: Path, wheels: dict[Path, Path]) -> Iterator[Chec
         if checks.is_abi3(wheel):
             yield name, "abi3audit", lambda wheel=wheel: checks.check_abi3(tools, wheel)
         if not name.endswith("x86_64"):
+            root = WORK / f"root-{name}"
+            if root.is_dir():
+                yield (
+                    name, "emulated",
+                    lambda w=wheel, p=python, root=root: checks.check_emulated(p, w, root),
+                )  # fmt: skip
             continue
         yield name, "install", lambda w=wheel, p=python, f=folder: checks.check_install(p, w, f)
         yield name, "bits", lambda folder=folder: checks.check_digest(folder)

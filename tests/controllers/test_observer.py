@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from haselab.actuators import CurlingHasel, DeaStack, Drive, PeanoHasel, PlanarHasel, SampledLaw
+from haselab.base import ResultError
 from haselab.controllers import CONTROLLERS, KnownActuator
 from haselab.controllers.linear_loop import (
     Demands,
@@ -22,7 +23,7 @@ from haselab.controllers.linear_loop import (
     timed_error,
 )
 from haselab.controllers.motion_model import MotionModel
-from haselab.controllers.observer_design import linear_loop
+from haselab.controllers.observer_design import best_parameters, linear_loop
 from haselab.controllers.observer_law import ObserverLaw
 from haselab.controllers.reference_plan import ReferencePlan
 from haselab.scoreboard import CLASSES, TASKS
@@ -231,3 +232,15 @@ def test_it_reaches_the_goals_at_100_hz(known, task, goals):
         score = chosen.score(trace, scenario)
         assert trace.failure == ""
         assert {key: score[key] for key in goals if score[key] > goals[key]} == {}
+
+
+def test_a_demand_that_no_parameters_keep_is_refused(known):
+    """A drive without noise cannot follow a noisy length."""
+    setting = setting_for(DESIGNED, HOST, known, 0.0)
+
+    def loops(bandwidth: float, load_n: float):
+        law = ObserverLaw(setting, bandwidth, load_n, 0.01)
+        yield linear_loop(law, setting, 0.05, (1.0, 0.0)), Demands(1e-6, 1e-9, 9.0, 9.0)
+
+    with pytest.raises(ResultError, match=r"parameters of the observer .* noise of the drive is"):
+        best_parameters(loops, setting, evaluations=3)

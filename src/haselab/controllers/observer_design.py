@@ -13,7 +13,15 @@ from scipy.optimize import minimize
 from haselab.actuators import GRAVITY_M_S2
 from haselab.base import ResultError
 from haselab.controllers.kind import ControllerKind, Parameter
-from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penalty, timed_error
+from haselab.controllers.linear_loop import (
+    UNSTABLE,
+    Demands,
+    LinearLoop,
+    penalty,
+    refuse_missed,
+    shares_of,
+    timed_error,
+)
 from haselab.controllers.observer import ObserverController
 from haselab.controllers.observer_law import ObserverLaw
 from haselab.controllers.protocol import ControllerSetting
@@ -55,7 +63,7 @@ def design_observer(setting: ControllerSetting) -> Mapping[str, float]:
     Returns:
         The parameters of `ObserverController`.
     Raises:
-        ResultError: No parameters keep the loop stable.
+        ResultError: No parameters keep the loop stable, or meet all demands within 5 %.
     """
     OBSERVER.check(setting)
     return dict(_design(setting))
@@ -99,7 +107,7 @@ def best_parameters(
         evaluations: at most.
         fastest_rad_s: highest bandwidth.
     Raises:
-        ResultError: No parameters keep the loop stable.
+        ResultError: No parameters keep the loop stable, or meet all demands within 5 %.
     """
     known = setting.actuator
     assert known is not None
@@ -126,6 +134,11 @@ def best_parameters(
             "Shorten the delay."
         )
     bandwidth, load_n = np.exp(found.x).tolist()
+    refuse_missed(
+        [shares_of(loop, setting.period_s, demands) for loop, demands in loops(bandwidth, load_n)],
+        "parameters of the observer", setting.period_s,
+        "Shorten the delay, or use a sensor with less noise.",
+    )  # fmt: skip
     return {"bandwidth_rad_s": float(f"{bandwidth:.4g}"), "load_n": float(f"{load_n:.4g}"),
             "shake_m_s2": SHAKE_M_S2, "reserve": RESERVE}  # fmt: skip
 

@@ -86,6 +86,21 @@ def test_grid_scores_agree_with_the_exact_margins():
 
 
 @pytest.mark.long
+def test_a_plant_in_other_units_gets_the_same_loop():
+    """From volts to metres instead of from strain to strain: gains and limits are divided by it."""
+    scale, loops = 1.7e-3, []
+    for factor in (1.0, scale):
+        limits = Saturation(-0.1 / factor, 0.1 / factor)
+        scaled = Plant(0.9 * factor, 21.0, 0.22, 0.015)
+        setting = LoopSetting(saturation=limits)
+        found = design_pid(scaled, DesignSpec(step=0.04), setting, rng=np.random.default_rng(3))
+        assert not found.shortfalls
+        loops.append((found.nominal.step.rise_time_s, found.gains.jump_gain(100.0) * factor))
+        expected = 15.0 / (0.9 * factor) if factor < 0.1 else 15.0
+        assert found.spec.noise_gain == pytest.approx(expected, rel=1e-12)
+    assert loops[1] == pytest.approx(loops[0], rel=0.1)  # the search ends within that
+
+
 def test_same_seed_same_gains():
     first = design_pi(HZ, DesignSpec(), LATE, rng=np.random.default_rng(3))
     again = design_pi(HZ, DesignSpec(), LATE, rng=np.random.default_rng(3))

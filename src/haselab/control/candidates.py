@@ -33,6 +33,7 @@ _UNSTABLE = 1e3
 _MET = 1e-9
 _LARGEST_EXCESS = 1e12
 _UNASKED = 2.0  # larger than any miss of a share
+_NOISE_GAIN = 15.0  # of a plant from strain to strain
 _LONGEST_WINDOW = 250  # largest number of samples of half a period of ringing
 
 
@@ -71,6 +72,15 @@ class Task:
         if self.spec.step is None:
             return default_step(self.plant, self.setting.saturation)
         return self.spec.step
+
+    @cached_property
+    def noise_gain(self) -> float:
+        """Largest change of the controller's output if one measurement changes by 1."""
+        if self.spec.noise_gain is not None:
+            return self.spec.noise_gain
+        gain = abs(PlantScale.of(self.plant).gain)
+        scaled = not 0.1 <= gain <= 10.0 and 0.0 < gain < math.inf
+        return _NOISE_GAIN / gain if scaled else _NOISE_GAIN
 
     def horizon_s(self) -> float:
         """Length of the simulated step, in s: several rise times, and the slow modes."""
@@ -122,7 +132,7 @@ def score(candidates: Sequence[PidGains], task: Task) -> CandidateScores:
         missed[~found.stable] = _UNSTABLE
         miss, peak = np.maximum(miss, missed), np.maximum(peak, found.peak_sensitivity)
     jump = [gains.jump_gain(task.setting.rate_hz) for gains in candidates]
-    miss = miss + _over(np.array(jump), spec.noise_gain)
+    miss = miss + _over(np.array(jump), task.noise_gain)
     calm = np.flatnonzero(miss < 0.5 * _UNSTABLE)
     if calm.size:
         miss[calm] += _step_miss([candidates[index] for index in calm.tolist()], plants, task)

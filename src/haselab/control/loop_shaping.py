@@ -314,7 +314,7 @@ def evaluate_gains(task: Task, gains: PidGains) -> Design:
         predict(plant, gains, task.setting, step=task.step, record_s=task.horizon_s())
         for plant in task.plants()
     )
-    spec = dataclasses.replace(task.spec, step=task.step)
+    spec = dataclasses.replace(task.spec, step=task.step, noise_gain=task.noise_gain)
     return Design(gains, spec, task.setting, spread[0], spread, _shortfalls(task, gains, spread))
 
 
@@ -392,7 +392,7 @@ def _shortfalls(task: Task, gains: PidGains, spread: tuple[Prediction, ...]) -> 
             max(p.margins.peak_sensitivity for p in spread),
             spec.peak_sensitivity,
         ),
-        ("noise gain", gains.jump_gain(rate_hz), spec.noise_gain),
+        ("noise gain", gains.jump_gain(rate_hz), task.noise_gain),
         (
             "steady-state error",
             max(abs(p.step.steady_state_error) for p in spread),

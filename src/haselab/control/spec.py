@@ -29,7 +29,9 @@ class DesignSpec:
         phase_margin_deg: smallest phase margin over all crossovers, in degrees.
         gain_margin_db: smallest gain margin, in dB.
         peak_sensitivity: largest peak sensitivity.
-        noise_gain: largest change of the output when one measurement changes by 1.
+        noise_gain: largest change of the controller's output when one measurement changes by 1, in
+            the plant's input unit per output unit; None: 15, and if the magnitude of the plant's
+            static gain is below 0.1 or above 10, 15 over it.
         frequency_spread: relative uncertainty of the natural frequency, up and down.
         keep_crossover: whether the highest crossover must be at least the plant's own.
         step: reference step of the simulated experiments, in the unit of the plant's output,
@@ -49,7 +51,7 @@ class DesignSpec:
     phase_margin_deg: float = 50.0
     gain_margin_db: float = 6.0
     peak_sensitivity: float = 2.0
-    noise_gain: float = 15.0
+    noise_gain: float | None = None
     frequency_spread: float = 0.15
     keep_crossover: bool = False
     step: float | None = None
@@ -64,7 +66,7 @@ class DesignSpec:
             "phase_margin_deg": (0.0, 90.0),
             "gain_margin_db": (0.0, 60.0),
             "peak_sensitivity": (1.0, 1e3),
-            "noise_gain": (0.0, 1e6),
+            "noise_gain": (0.0, _LARGEST),
             "frequency_spread": (0.0, 0.9),
         }
         for name, (low, high) in ranges.items():

@@ -59,6 +59,8 @@ FIRST = {
     "creep": "concepts/why-creep",
     "uncertainty": "concepts/what-an-interval-means",
     "ESP32": "hardware",
+    "--count": "reference/commands/track",
+    "delay-s": "reference/commands/design",
 }
 
 

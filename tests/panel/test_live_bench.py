@@ -140,7 +140,7 @@ def test_a_command_is_carried_out_before_the_next_block(tmp_path: Path) -> None:
         stepping = threading.Thread(target=lambda: [live.step() for _ in range(2)])
         stepping.start()
         assert entered.wait(WAIT_S)
-        command = threading.Thread(target=live.do, args=("lease", "page", {}))
+        command = threading.Thread(target=live.do, args=("disarm", "page", {}))
         command.start()
         while not live._turn.locked():
             time.sleep(1e-3)

@@ -133,7 +133,7 @@ def test_every_end_of_a_study_is_at_zero_with_the_reason_and_the_data(
     panel = started(lease_s=1.5 if how == "lost page" else 10.0)
     said = {
         "end": "The study was ended from a page", "stop": "STOP", "signal": "The panel has ended",
-        "lost page": "No message from the page",
+        "lost page": "The page that started the study has gone",
     }[how]  # fmt: skip
 
     async def play_and_end() -> None:

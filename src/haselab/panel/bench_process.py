@@ -5,8 +5,9 @@ recordings are new folders in RUNS. FOLDER is private to one panel and holds
 
 - `live`: the signals, see `columns`;
 - `camera.jpg`: the last frame of the camera;
-- `bench.sock`: commands of the web server, one JSON object per line, each with an `id`; the state
-  of the bench is sent 20 times a second;
+- `bench.sock`: commands of the web server, one JSON object per line, each with an `id` and the time
+  `at_s` of the data that its page had seen; the state of the bench is sent 20 times a second, with
+  the time `clock_s`;
 - `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
 
 It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import selectors
 import signal
@@ -46,6 +48,7 @@ from haselab.runtime.scheduling import with_priority
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.guardian.client import Guardians, guardian_command
+from haselab.safety.interlock import lease_clock_s
 from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import Safety
 
@@ -81,7 +84,8 @@ class _Link:
             now_s = time.monotonic()
             if now_s >= next_s:
                 next_s = now_s + 1.0 / _STATES_HZ
-                self._send(client, {"state": asdict(self._bench.state)})
+                state = {"state": asdict(self._bench.state), "clock_s": lease_clock_s()}
+                self._send(client, state)
             if not waiting.select(max(next_s - time.monotonic(), 0.0)):
                 continue
             data = client.recv(_MOST_BYTES)
@@ -104,7 +108,11 @@ class _Link:
         try:
             given = command.get("values")
             values = given if isinstance(given, dict) else {}
-            answer = self._bench.do(str(command.get("do")), str(command.get("holder")), values)
+            at_s = command.get("at_s")
+            answer = self._bench.do(
+                str(command.get("do")), str(command.get("holder")), values,
+                float(at_s) if isinstance(at_s, int | float) else -math.inf,
+            )  # fmt: skip
         except HaselabError as error:
             return {"id": number, "error": str(error)}
         except Exception as error:  # other commands must still be answered
@@ -125,7 +133,11 @@ def _stops(folder: Path, bench: LiveBench) -> None:
         box.bind(str(folder / "stop.sock"))
         while True:
             data, sender = box.recvfrom(512)
-            bench.stop(data.decode(errors="replace"))
+            try:
+                bench.stop(data.decode(errors="replace"))
+            except BaseException:  # no answer: the guardians act; the next STOP must work too
+                traceback.print_exc()
+                continue
             with contextlib.suppress(OSError):
                 box.sendto(b"0 V commanded", sender)
 

@@ -90,6 +90,7 @@ class _Handler(BaseHTTPRequestHandler):
             origin is None or origin in self.server.origins
         )
         if not mine:
+            self.close_connection = True  # what it sent besides is not read as a further request
             self._reply(403, {"error": "Only the panel's own page may use this port."})
         return mine
 

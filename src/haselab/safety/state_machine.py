@@ -22,6 +22,7 @@ from enum import Enum
 from haselab.base import HaselabError, SafetyError
 from haselab.safety.gate import Gate
 from haselab.safety.guardian.client import UNARMED_S, Guardians
+from haselab.safety.interlock import lease_clock_s
 from haselab.safety.watchdog.settings import (
     FieldRating,
     WatchdogSettings,
@@ -289,6 +290,17 @@ class Safety:
     def _expired(self) -> str:
         return permit_expired(self._clock() - self._armed_s, self.settings.permit_age_s)
 
+    def _lease_ended(self) -> str:
+        """Why no heartbeat may extend the lease: it has ended already. After a pause of the whole
+        computer, the guardians may notice this later than the program."""
+        late_s = lease_clock_s() - self.gate.interlock.lease_end_s
+        if late_s <= 0.0:
+            return ""
+        return (
+            f"The lease (lease_s) of this program ended {late_s:.2g} s ago: the program, or the "
+            "whole computer, did not run."
+        )
+
     def run(self) -> None:
         """Go from armed to running.
 
@@ -388,12 +400,14 @@ class Safety:
         Args:
             for_s: time until the next heartbeat, in s, beyond the lease.
         Raises:
-            SafetyError: The bench was made safe by others, a guardian is lost, or the arming has
-                expired.
+            SafetyError: The bench was made safe by others, the lease has ended, a guardian is
+                lost, or the arming has expired.
         """
         if self._stage not in LIVE:
             return
         if why := self.revoked_by_others:
+            raise self.trip(why)
+        if self.guardians is not None and (why := self._lease_ended()):
             raise self.trip(why)
         self.gate.interlock.lease(for_s + self.settings.lease_s)
         if self.guardians is not None and (lost := self.guardians.lost()):

@@ -20,7 +20,7 @@ def test_a_command_that_is_not_answered_is_reported_with_the_age_of_its_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The bench process refuses it later by this age, see test_old_commands."""
-    monkeypatch.setattr(web, "_BENCH_S", 0.2)
+    monkeypatch.setattr(web, "_ARM_S", 0.2)
     received: list[dict[str, Any]] = []
     ended = asyncio.Event()
 

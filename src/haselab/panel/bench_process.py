@@ -10,7 +10,8 @@ recordings are new folders in RUNS. FOLDER is private to one panel and holds
   the time `clock_s`;
 - `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
 
-It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends.
+It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends or its parent has
+gone.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import contextlib
 import json
 import math
 import os
+import select
 import selectors
 import signal
 import socket
@@ -57,6 +59,7 @@ __all__ = ["main"]
 _STATES_HZ = 20.0
 _BEHIND_S = 0.2  # a simulated bench that is further behind real time does not catch up
 _MOST_BYTES = 65536  # of one command
+_PARENT_S = 0.2  # between two looks at the parent
 
 
 class _Link:
@@ -195,9 +198,13 @@ def _end_study_at(ended: threading.Event, bench: LiveBench) -> None:
     bench.end_study("The panel has ended.")
 
 
-def _watch_stdin(ended: threading.Event) -> None:
-    """End the process when the panel has ended."""
-    sys.stdin.read()
+def _watch_parent(parent: int, ended: threading.Event) -> None:
+    """End the process when the panel has ended: its stdin ends, or its parent changes, even if
+    another process still has the other end of the pipe."""
+    while os.getppid() == parent:
+        ready, _, _ = select.select([0], [], [], _PARENT_S)
+        if ready and not os.read(0, 4096):
+            break
     ended.set()
 
 
@@ -217,7 +224,8 @@ def main(words: list[str]) -> int:
     for name in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, lambda *_: ended.set())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the panel ends this process by its stdin
-    threading.Thread(target=_watch_stdin, args=(ended,), daemon=True).start()
+    watched = (os.getppid(), ended)
+    threading.Thread(target=_watch_parent, args=watched, daemon=True).start()
     try:
         _loop_of(actuator)  # a file that is not valid is refused before the bench is opened
         file = load_rig(path)

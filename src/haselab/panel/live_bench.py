@@ -111,6 +111,7 @@ class LiveBench:
         self._end_study = ""  # why the study must end; empty: it may go on
         self._extrapolated = False  # the strain of the last block
         self._unexpected = 0  # blocks in a row with a voltage that nobody has requested
+        self._over = False  # the panel ends: no command is carried out any more
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
         rig.bench.on_block = self._on_block
         self._settled = about.switch_in_block + round(1e-3 * about.rate_hz)
@@ -282,8 +283,8 @@ class LiveBench:
             return {"folder": str(job.options.folder)}
         try:
             self._rig.safety.run()
-            self._rig.check_idle()
             self._rig.begin()
+            self._rig.check_idle()
             self._rig.generator.sine(CARRIER_HZ, CARRIER_V)
             if self._picture is not None:
                 self._rig.camera.start(_PICTURES_HZ)
@@ -299,7 +300,9 @@ class LiveBench:
         return {}
 
     def _check_turn(self, what: str, holder: str) -> None:
-        """Refuse a command of a page while another one has armed the bench."""
+        """Refuse a command of a page while another one has armed the bench, and at the end."""
+        if self._over:
+            raise SafetyError("The panel has ended. No command is carried out.")
         if self._holder and holder != self._holder and what not in ("disarm", "leave", "cancel"):
             raise SafetyError("Another page has armed the bench. It must disarm the bench first.")
 
@@ -425,8 +428,9 @@ class LiveBench:
                 self._end(self._rig.safety.reason)
 
     def close(self) -> None:
-        """End at 0 V."""
+        """End at 0 V; a command that comes later is refused."""
         with self._mutex:
+            self._over = True
             self._end("The panel has ended.")
 
     def _failed(self, error: HaselabError) -> None:

@@ -15,7 +15,7 @@ from haselab.safety.interlock import lease_clock_s
 
 __all__ = ["PageLeases"]
 
-_LATE_S = 9.0  # longest time of a command, which the web server reports as failed after 10 s
+_LATE_S = 27.0  # longest time to arm, which the web server reports as failed after 30 s
 
 
 class PageLeases:
@@ -65,7 +65,7 @@ class PageLeases:
         self._require(at_s, self.lease_s)
 
     def require_in_time(self, at_s: float | None) -> None:
-        """Refuse a command that took so long that its page was told that it failed.
+        """Refuse to arm if that took so long that the page is told that it failed.
 
         Args:
             at_s: as above.

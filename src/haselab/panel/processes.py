@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
 import os
 import socket
 import subprocess
@@ -22,7 +23,7 @@ from haselab.panel.web import WebSettings, application
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
 
-__all__ = ["Panel", "running_panel"]
+__all__ = ["Panel", "running_panel", "stop_answers"]
 
 _START_S = 60.0  # for the drivers of a bench
 _END_S = 10.0  # for the bench process to go to 0 V
@@ -35,6 +36,7 @@ class Panel(NamedTuple):
         address: to open in a browser; it holds the token.
         bench: its bench process.
         stop: its stop process.
+        stop_port: TCP port of STOP.
         server: its web server, to be run by the caller.
         listener: socket of the web server.
     """
@@ -42,8 +44,25 @@ class Panel(NamedTuple):
     address: str
     bench: subprocess.Popen[str]
     stop: subprocess.Popen[str]
+    stop_port: int
     server: uvicorn.Server
     listener: socket.socket
+
+
+def stop_answers(port: int, within_s: float) -> bool:
+    """Whether STOP answers a page.
+
+    Args:
+        port: TCP port of STOP.
+        within_s: longest wait, in s.
+    """
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=within_s)
+    with contextlib.closing(connection):
+        try:
+            connection.request("GET", "/ready")
+            return connection.getresponse().status == 200
+        except (OSError, http.client.HTTPException):
+            return False
 
 
 def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
@@ -120,4 +139,4 @@ def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Ite
                 ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             )
         )  # fmt: skip
-        yield Panel(access.address, bench, stop, server, listener)
+        yield Panel(access.address, bench, stop, settings.stop_port, server, listener)

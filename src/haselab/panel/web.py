@@ -50,6 +50,7 @@ _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
 _COLUMN_STEP = 100  # so that windows of almost the same width share their frames
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
+_ARM_S = 30.0  # the same for arming, where a study is checked first; see `page_leases`
 _HEAD = struct.Struct("<HHIddddII")
 
 
@@ -150,15 +151,15 @@ class _Bench:
                 "bench is at 0 V, then start the panel again."
             }
         self._number += 1
-        number = self._number
+        number, wait_s = self._number, _ARM_S if what == "arm" else _BENCH_S
         answer = self._waiting[number] = asyncio.get_running_loop().create_future()
         command = {"id": number, "do": what, "holder": holder, "values": values, "at_s": at_s}
         self._writer.write(json.dumps(command).encode() + b"\n")
         try:
-            return await asyncio.wait_for(answer, _BENCH_S)
+            return await asyncio.wait_for(answer, wait_s)
         except TimeoutError:
             self._waiting.pop(number, None)
-            return {"error": f"No answer from the bench process for {_BENCH_S:g} s. Press STOP."}
+            return {"error": f"No answer from the bench process for {wait_s:g} s. Press STOP."}
 
 
 class _View(NamedTuple):

@@ -73,6 +73,11 @@ class StopServer(ThreadingHTTPServer):
                     old.shutdown(socket.SHUT_RDWR)  # its thread then closes it
         super().process_request(request, client_address)
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print what went wrong, unless the other side has only closed the connection."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
     def shutdown_request(self, request: Any) -> None:
         """Close a connection."""
         with self._turn:

@@ -247,7 +247,10 @@ class LiveBench:
     ) -> JsonObject:
         """Arm the bench for a page that is still there and waits for the answer."""
         if at_s is not None and self._leases.is_lost(holder):
-            raise SafetyError("The page that wanted to arm the bench has gone. Nothing was armed.")
+            raise SafetyError(
+                "No message from the page that wanted to arm the bench for "
+                f"{self._leases.lease_s:g} s. Nothing was armed."
+            )
         self._leases.require_in_time(at_s)
         answer = self._arm(holder, values, job)
         if job is None:  # an instrument may have been slow

@@ -88,7 +88,9 @@ def test_stop_works_while_another_process_is_frozen(panel: RunningPanel, frozen:
     asyncio.run(armed())
 
 
-def test_a_page_that_goes_takes_the_bench_to_zero_and_nobody_else_drives_it(impatient_panel: RunningPanel) -> None:
+def test_a_page_that_goes_takes_the_bench_to_zero_and_nobody_else_drives_it(
+    impatient_panel: RunningPanel,
+) -> None:
     async def play() -> None:
         async with connected(impatient_panel) as second:
             async with connected(impatient_panel) as first:

@@ -10,8 +10,8 @@ recordings are new folders in RUNS. FOLDER is private to one panel and holds
   the time `clock_s`;
 - `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
 
-It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends or its parent has
-gone.
+It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends or
+its parent has gone.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ class _Link:
             now_s = time.monotonic()
             if now_s >= next_s:
                 next_s = now_s + 1.0 / _STATES_HZ
-                state = {"state": asdict(self._bench.state), "clock_s": lease_clock_s()}
+                state: JsonObject = {"state": asdict(self._bench.state)}
+                state["clock_s"] = lease_clock_s()
                 self._send(client, state)
             if not waiting.select(max(next_s - time.monotonic(), 0.0)):
                 continue

@@ -483,8 +483,7 @@ class LiveBench:
             time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
         if self._leases.is_lost(self._holder):
             return (
-                "No message from the page that started the study for "
-                f"{self._leases.lease_s:g} s."
+                f"No message from the page that started the study for {self._leases.lease_s:g} s."
             )
         return self._end_study
 

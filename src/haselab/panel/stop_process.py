@@ -62,7 +62,6 @@ class StopServer(ThreadingHTTPServer):
         """TCP port."""
         return int(self.server_address[1])
 
-
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serve a connection; too many others lose the oldest one, so that STOP can connect."""
         with self._turn:

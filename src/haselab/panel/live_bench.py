@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import (
+    DeviceError,
     HaselabError,
     InputError,
     JsonObject,
     LimitError,
     SafetyError,
+    described,
     shown,
 )
 from haselab.panel.bench_state import BenchState
@@ -420,13 +422,16 @@ class LiveBench:
         with self._mutex:
             try:
                 self._block()
+                if self._closed is not None:
+                    self._target_v = self._drive_v
+                if self._holder and self._picture is not None:
+                    self._look(self._picture)
             except HaselabError as error:
                 self._failed(error)
                 return
-            if self._closed is not None:
-                self._target_v = self._drive_v
-            if self._holder and self._picture is not None:
-                self._look(self._picture)
+            except Exception as error:  # of any driver, as when STOP interrupts its call
+                self._failed(DeviceError(f"A driver failed: {described(error)}."))
+                return
             if self._holder and self._rig.safety.stage is Stage.TRIPPED:
                 self._end(self._rig.safety.reason)
 
@@ -461,6 +466,9 @@ class LiveBench:
             reason = (
                 f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"
             )
+            self._rig.safety.trip(reason)
+        except Exception as error:  # of any driver, as when STOP interrupts its call
+            reason = f"A driver or an experiment failed: {described(error)}."
             self._rig.safety.trip(reason)
         finally:
             over.set()
@@ -526,11 +534,7 @@ class LiveBench:
 
     def _look(self, path: Path) -> None:
         """Keep the last frame that has arrived, if there is a new one."""
-        try:
-            frames = self._rig.camera.take()
-        except HaselabError as error:
-            self._failed(error)
-            return
+        frames = self._rig.camera.take()
         if frames is not None and len(frames.time_s):
             save_last(frames, path)
 

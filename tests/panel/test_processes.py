@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -13,7 +16,8 @@ import pytest
 
 from haselab.base import DeviceError
 from haselab.cli.bench import panel as command
-from haselab.panel import bench_process
+from haselab.panel import bench_process, processes
+from haselab.panel.files import PanelFiles
 from haselab.panel.processes import stop_answers
 from haselab.panel.stop_process import StopServer
 from tests.panel.running import WAIT_S
@@ -90,3 +94,28 @@ def test_the_bench_process_ends_when_its_parent_has_gone(monkeypatch: pytest.Mon
     monkeypatch.setattr(bench_process.select, "select", lambda *_: ([], [], []))
     bench_process._watch_parent(7, ended)
     assert ended.is_set()
+
+
+def test_the_bench_is_at_zero_before_stop_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends: list[str] = []
+    rig = tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+
+    def start(words: list[str], what: str) -> tuple[Any, str]:
+        return what, "1"
+
+    monkeypatch.setattr(processes, "_started", start)
+    monkeypatch.setattr(processes, "_end", lambda process, within_s=0.0: ends.append(process))
+    with processes.running_panel(PanelFiles(rig, None, tmp_path)):
+        assert not ends
+    assert ends[0] == "bench process" and "stop process" in ends
+
+
+def test_a_stop_process_that_hangs_is_killed() -> None:
+    hangs = [sys.executable, "-c", "import time; time.sleep(600)"]
+    process = subprocess.Popen(hangs, stdin=subprocess.PIPE, text=True)
+    processes._end(process, 0.1)
+    processes._end(process, 0.1)
+    assert process.returncode == -signal.SIGKILL

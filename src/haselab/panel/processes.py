@@ -27,6 +27,7 @@ __all__ = ["Panel", "running_panel", "stop_answers"]
 
 _START_S = 60.0  # for the drivers of a bench
 _END_S = 10.0  # for the bench process to go to 0 V
+_END_STOP_S = 1.0  # the stop process has nothing to end
 
 
 class Panel(NamedTuple):
@@ -90,13 +91,13 @@ def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
     return process, rest
 
 
-def _end(process: subprocess.Popen[str]) -> None:
-    """End a process by its stdin; kill it if it does not end."""
+def _end(process: subprocess.Popen[str], within_s: float = _END_S) -> None:
+    """End a process by its stdin; kill it if it does not end. Safe to call twice."""
     with contextlib.suppress(OSError):
         assert process.stdin is not None
         process.stdin.close()
     try:
-        process.wait(_END_S)
+        process.wait(within_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -131,7 +132,8 @@ def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Ite
         real = [str(files.rig)] if isinstance(load_rig(files.rig), BenchConfig) else []
         words = ["0", str(folder), key, ",".join(access.origins), *real]
         stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
-        opened.callback(_end, stop)
+        opened.callback(_end, stop, _END_STOP_S)
+        opened.callback(_end, bench)  # first: STOP works until the bench is at 0 V
         settings.stop_port = int(stop_port)
         server = WebServer(
             uvicorn.Config(

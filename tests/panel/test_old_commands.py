@@ -226,3 +226,13 @@ def test_no_command_is_carried_out_once_the_panel_has_ended(
     with pytest.raises(SafetyError, match="The panel has ended"):
         live.do("arm", "page", {"number": number, "limit_v": 1.5}, clock.now_s)
     assert not rig.safety.live
+
+
+def test_a_study_whose_page_goes_says_so(bench: tuple[LiveBench, GuardedRig], clock: Clock) -> None:
+    live, _ = bench
+    live._mode, live._holder = "study", "page"
+    live._leases.begin("page")
+    assert live._why_not() == ""
+    live.do("leave", "page", {}, clock.now_s)
+    assert live._why_not() == "The page that started the study has gone."
+    live._mode, live._holder = "idle", ""

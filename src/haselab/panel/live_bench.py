@@ -487,9 +487,9 @@ class LiveBench:
 
     def _why_not(self) -> str:
         """Why the study must end; empty while it may go on."""
-        if self._leases.is_lost(self._holder):
+        if not self._end_study and self._leases.is_lost(self._holder):
             time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
-        if self._leases.is_lost(self._holder):
+        if not self._end_study and self._leases.is_lost(self._holder):
             return (
                 f"No message from the page that started the study for {self._leases.lease_s:g} s."
             )

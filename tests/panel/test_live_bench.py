@@ -90,6 +90,8 @@ def test_a_study_that_computes_with_an_output_is_taken_to_zero_when_it_must_end(
             if how == "ended":
                 live.do("lease", "page", {})  # the page is there
             time.sleep(0.05)
+        while rig.bench.requested_v != 0.0 and time.monotonic() < end_s:
+            time.sleep(0.01)  # 0 V is commanded just after the permission has ended
         seen.append(rig.bench.requested_v)
         rig.source.write(1.5)  # refused
 

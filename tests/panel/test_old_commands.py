@@ -235,4 +235,6 @@ def test_a_study_whose_page_goes_says_so(bench: tuple[LiveBench, GuardedRig], cl
     assert live._why_not() == ""
     live.do("leave", "page", {}, clock.now_s)
     assert live._why_not() == "The page that started the study has gone."
+    live.end_study("The panel has ended.")
+    assert live._why_not() == "The page that started the study has gone.", "the first reason"
     live._mode, live._holder = "idle", ""

@@ -210,9 +210,9 @@ class LiveBench:
         """End a study that is being played; the bench goes to 0 V and the recording is kept.
 
         Args:
-            reason: one sentence.
+            reason: one sentence; the first one is kept.
         """
-        self._end_study = reason
+        self._end_study = self._end_study or reason
 
     def _note(self, what: str) -> None:
         self._events.append((self._rig.bench.time_s, what))

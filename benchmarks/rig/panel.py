@@ -60,6 +60,7 @@ class Page:
         self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._framed, self._number = asyncio.Event(), 0
         self.state: dict[str, Any] = {}
+        self._clock_s = 0.0  # of the bench process, for commands
 
     async def receive(self) -> None:
         """Receive frames and answers until it is cancelled."""
@@ -75,7 +76,7 @@ class Page:
             if about["written_s"] is not None:
                 self._ages_s.append(time.monotonic() - about["written_s"])
             await self._socket.send(json.dumps({"ack": int.from_bytes(message[4:8], "little")}))
-            self.state = about["state"]
+            self.state, self._clock_s = about["state"], about["clock_s"]
             self._framed.set()
 
     async def ask(self, what: str, **values: object) -> dict[str, Any]:
@@ -83,7 +84,8 @@ class Page:
         self._number += 1
         number = self._number
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
-        await self._socket.send(json.dumps({"id": number, "do": what, "values": values}))
+        command = {"id": number, "do": what, "values": values, "at_s": self._clock_s}
+        await self._socket.send(json.dumps(command))
         found = await answer
         if "error" in found:
             raise RuntimeError(found["error"])

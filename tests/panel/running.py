@@ -59,7 +59,7 @@ class Page:
     def __init__(self, socket: websockets.ClientConnection) -> None:
         self._socket, self._number = socket, 0
         self.holder, self.state, self.end_s = "", {}, None
-        self.frames = 0
+        self.frames, self.clock_s = 0, 0.0
         self.acknowledges = True
 
     async def receive(self) -> dict[str, Any] | None:
@@ -72,7 +72,7 @@ class Page:
         size = int.from_bytes(message[40:44], "little")
         about = json.loads(message[48 : 48 + size])
         self.frames += 1
-        self.state, self.end_s = about["state"], about["end_s"]
+        self.state, self.end_s, self.clock_s = about["state"], about["end_s"], about["clock_s"]
         return None
 
     async def send(self, message: object) -> None:
@@ -80,7 +80,10 @@ class Page:
 
     async def ask(self, what: str, **values: object) -> dict[str, Any]:
         self._number += 1
-        await self.send({"id": self._number, "do": what, "values": values})
+        while not self.clock_s:  # as a page, which shows no button before its first frame
+            await self.receive()
+        at_s = values.pop("at_s", self.clock_s)
+        await self.send({"id": self._number, "do": what, "values": values, "at_s": at_s})
         while True:
             answer = await self.receive()
             if answer is not None and answer.get("id") == self._number:

@@ -90,6 +90,8 @@ def test_a_study_that_computes_with_an_output_is_taken_to_zero_when_it_must_end(
             if how == "ended":
                 live.do("lease", "page", {})  # the page is there
             time.sleep(0.05)
+        while rig.bench.requested_v != 0.0 and time.monotonic() < end_s:
+            time.sleep(0.01)  # 0 V is commanded just after the permission has ended
         seen.append(rig.bench.requested_v)
         rig.source.write(1.5)  # refused
 
@@ -140,7 +142,7 @@ def test_a_command_is_carried_out_before_the_next_block(tmp_path: Path) -> None:
         stepping = threading.Thread(target=lambda: [live.step() for _ in range(2)])
         stepping.start()
         assert entered.wait(WAIT_S)
-        command = threading.Thread(target=live.do, args=("lease", "page", {}))
+        command = threading.Thread(target=live.do, args=("disarm", "page", {}))
         command.start()
         while not live._turn.locked():
             time.sleep(1e-3)
@@ -165,6 +167,21 @@ def test_a_folder_that_goes_while_a_study_is_played_trips_the_bench(
     live.step()
     assert live.state.stage == "tripped" and live.state.mode == "idle"
     assert "The recording cannot be written (No such file" in live.state.reason
+    assert rig.bench.requested_v == 0.0 and not rig.safety.live
+
+
+def test_a_driver_that_fails_in_its_own_way_ends_the_study_and_not_the_panel(
+    bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live, rig = bench
+
+    def failing(*given: Any) -> None:
+        raise ZeroDivisionError("float division by zero")
+
+    monkeypatch.setattr(live._player, "play", failing)
+    live.step()
+    assert live.state.stage == "tripped" and live.state.mode == "idle"
+    assert "float division by zero" in live.state.reason
     assert rig.bench.requested_v == 0.0 and not rig.safety.live
 
 
@@ -331,3 +348,44 @@ def test_a_driver_that_fails_in_its_own_way_while_arming_leaves_zero(tmp_path: P
         assert not rig.safety.live and live.state.mode == "idle"
         assert rig.bench.requested_v == 0.0
         live.close()
+
+
+@pytest.mark.parametrize("what", ["read", "take"])
+def test_a_call_that_stop_interrupts_in_its_own_way_does_not_end_the_panel(
+    tmp_path: Path, what: str
+) -> None:
+    """Switching off changes what the call of another thread works with."""
+    twin = make_twin(twin_of_reading("hz"), 1)
+    bench: Any = twin.acquisition
+    method, live_benches = getattr(bench, what), []
+
+    def interrupted(*given: Any) -> Any:
+        if live_benches:
+            live_benches.pop().stop("STOP was pressed")
+            raise ZeroDivisionError("float division by zero")
+        return method(*given)
+
+    setattr(bench, what, interrupted)
+    rig = guard(twin)
+    about = rig.description
+    with LiveWriter(tmp_path / "live", about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
+        live = LiveBench(rig, writer, picture=tmp_path / "camera.jpg")
+        number = live.do("request", "page", {})["number"]
+        live.do("arm", "page", {"number": number, "limit_v": 1.5})
+        live_benches.append(live)
+        for _ in range(3):
+            live.step()
+        assert live.state.stage == "tripped" and live.state.mode == "idle"
+        assert live.state.reason.startswith("STOP was pressed")
+        assert rig.bench.requested_v == 0.0 and not rig.safety.live
+        live.close()
+
+
+def test_a_camera_of_the_twin_that_is_stopped_during_a_call_gives_no_frame() -> None:
+    twin = make_twin(twin_of_reading("hz"), 1)
+    bench: Any = twin.acquisition
+    bench.start(5.0)
+    for _ in range(30):
+        bench.read()
+    bench._frame_rate_hz = 0.0  # the first thing that `stop` does
+    assert bench.take() is None

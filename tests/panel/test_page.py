@@ -82,6 +82,21 @@ def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
     expect(page.get_by_text("Armed by this page")).to_be_visible(timeout=WAIT_MS)
 
 
+def test_stop_needs_nothing_but_its_page_and_acts_on_a_click_without_a_pointer(
+    browser: Browser, panel: RunningPanel
+) -> None:
+    """The web server hangs once it has sent the page; voice control and screen readers click."""
+    with browser.new_context() as context:
+        found = context.new_page()
+        found.route("**/about", lambda route: None)  # never answered
+        found.goto(panel.address)
+        state = found.locator("#emergency-state")
+        expect(state).to_have_text("STOP: ready", timeout=WAIT_MS)
+        found.locator("#emergency").evaluate("button => button.click()")
+        expect(state).to_have_text("STOP: 0 V commanded", timeout=WAIT_MS)
+        expect(found.locator("header")).to_contain_text("Bench: tripped", timeout=WAIT_MS)
+
+
 def test_a_typed_drive_needs_enter_and_a_refused_one_is_not_shown(page: Page) -> None:
     """A press on Disarm takes the focus from the field; it must not put out what was typed."""
     arm(page)

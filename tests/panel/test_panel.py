@@ -88,7 +88,9 @@ def test_stop_works_while_another_process_is_frozen(panel: RunningPanel, frozen:
     asyncio.run(armed())
 
 
-def test_a_lost_page_ends_its_lease_and_nobody_else_takes_it(impatient_panel: RunningPanel) -> None:
+def test_a_page_that_goes_takes_the_bench_to_zero_and_nobody_else_drives_it(
+    impatient_panel: RunningPanel,
+) -> None:
     async def play() -> None:
         async with connected(impatient_panel) as second:
             async with connected(impatient_panel) as first:
@@ -100,7 +102,7 @@ def test_a_lost_page_ends_its_lease_and_nobody_else_takes_it(impatient_panel: Ru
                     assert answer["error"].startswith("Another page has armed the bench")
             state = await second.until(lambda state: not state["holder"])
             assert state["stage"] == "off" and state["drive_v"] == 0.0
-            assert state["reason"].startswith("No message from the page that armed the bench")
+            assert state["reason"] == "The page that armed the bench has gone."
             assert "error" not in await second.arm()
 
     asyncio.run(play())

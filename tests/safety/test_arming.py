@@ -248,3 +248,53 @@ def test_a_reason_that_comes_while_arming_is_requested_is_not_acknowledged_unrea
     with pytest.raises(SafetyError, match=r"after arming was requested: Smoke \(on "):
         rig.safety.arm(request)
     assert interlock.reason.startswith("Smoke (on ")
+
+
+def test_a_trip_at_any_moment_of_arming_wins(
+    twin: TwinBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """STOP comes from another thread, here while the second step of arming is carried out."""
+    rig = guarded(twin)
+    interlock, stops = rig.safety.gate.interlock, []
+    acknowledge = interlock.acknowledge
+
+    def interrupted(revision: int) -> None:
+        stops.append(threading.Thread(target=rig.safety.trip, args=("STOP was pressed",)))
+        stops[0].start()
+        stops[0].join(0.1)  # it may come to its end here, or wait until the step is complete
+        acknowledge(revision)
+
+    monkeypatch.setattr(interlock, "acknowledge", interrupted)
+    arm(rig)
+    stops[0].join()
+    assert rig.safety.stage is Stage.TRIPPED and not rig.safety.live
+    assert rig.safety.reason == "STOP was pressed"
+    with pytest.raises(SafetyError, match="STOP was pressed"):
+        rig.source.write(0.5)
+    rig.safety.end_run()
+    with pytest.raises(SafetyError, match="Remove the cause"):
+        arm(rig)
+
+
+class Watching:
+    """Guardians that have noticed nothing yet."""
+
+    def lost(self) -> str:
+        return ""
+
+    def make_safe(self, reason: str) -> None:
+        """See `Guardians`."""
+
+
+def test_a_lease_that_has_ended_is_not_renewed(twin: TwinBench) -> None:
+    """After a pause of the whole computer, the program may run before its guardians do."""
+    rig = guarded(twin)
+    rig.safety.guardians = Watching()  # type: ignore[assignment]
+    arm(rig)
+    rig.source.write(0.5)
+    rig.safety.gate.interlock.lease(-3600.0)
+    with pytest.raises(SafetyError, match=r"of this program ended 3\.6e"):
+        rig.source.write(0.6)
+    rig.acquisition.read()
+    assert abs(twin.output_v) < 50.0
+    assert rig.safety.stage is Stage.TRIPPED and not rig.safety.live

@@ -9,6 +9,7 @@ import shutil
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from haselab.base import SafetyError
 from haselab.safety import interlock as interlock_module
 from haselab.safety.gate import Gate
 from haselab.safety.guardian.heartbeat import SILENT_S, Heartbeat
-from haselab.safety.interlock import Interlock, InterlockBusyError
+from haselab.safety.interlock import Interlock, InterlockBusyError, lease_clock_s
 from haselab.safety.state_machine import Safety, SafetySettings
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="forks and signals are POSIX's")
@@ -390,3 +391,22 @@ def test_a_program_that_shares_an_instrument_is_refused_and_reached(tmp_path: Pa
     assert [each.key for each in theirs.sharing(("/dev/ttyACM0",))] == ["NI_01A2B3C4"]
     ours.close()
     assert theirs.sharing(("/dev/ttyACM0",)) == []
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="a clock of Linux")
+def test_a_lease_counts_while_the_computer_sleeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A suspended computer stops all its programs, but the output of a board stays."""
+    found, slept_s = Interlock(KEY, tmp_path), [0.0]
+    clock = time.clock_gettime
+
+    def sleeping(which: int) -> float:
+        return clock(which) + slept_s[0] * (which == time.CLOCK_BOOTTIME)
+
+    monkeypatch.setattr(time, "clock_gettime", sleeping)
+    found.lease(600.0)
+    assert lease_clock_s() < found.lease_end_s
+    slept_s[0] = 3600.0
+    assert lease_clock_s() > found.lease_end_s
+    found.close()

@@ -5,18 +5,22 @@ recordings are new folders in RUNS. FOLDER is private to one panel and holds
 
 - `live`: the signals, see `columns`;
 - `camera.jpg`: the last frame of the camera;
-- `bench.sock`: commands of the web server, one JSON object per line, each with an `id`; the state
-  of the bench is sent 20 times a second;
+- `bench.sock`: commands of the web server, one JSON object per line, each with an `id` and the time
+  `at_s` of the data that its page had seen; the state of the bench is sent 20 times a second, with
+  the time `clock_s`;
 - `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
 
-It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends.
+It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends or
+its parent has gone.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
+import select
 import selectors
 import signal
 import socket
@@ -46,6 +50,7 @@ from haselab.runtime.scheduling import with_priority
 from haselab.safety.gate import Gate
 from haselab.safety.guarded import guard
 from haselab.safety.guardian.client import Guardians, guardian_command
+from haselab.safety.interlock import lease_clock_s
 from haselab.safety.rig_limits import safety_of
 from haselab.safety.state_machine import Safety
 
@@ -54,6 +59,7 @@ __all__ = ["main"]
 _STATES_HZ = 20.0
 _BEHIND_S = 0.2  # a simulated bench that is further behind real time does not catch up
 _MOST_BYTES = 65536  # of one command
+_PARENT_S = 0.2  # between two looks at the parent
 
 
 class _Link:
@@ -81,7 +87,9 @@ class _Link:
             now_s = time.monotonic()
             if now_s >= next_s:
                 next_s = now_s + 1.0 / _STATES_HZ
-                self._send(client, {"state": asdict(self._bench.state)})
+                state: JsonObject = {"state": asdict(self._bench.state)}
+                state["clock_s"] = lease_clock_s()
+                self._send(client, state)
             if not waiting.select(max(next_s - time.monotonic(), 0.0)):
                 continue
             data = client.recv(_MOST_BYTES)
@@ -104,7 +112,11 @@ class _Link:
         try:
             given = command.get("values")
             values = given if isinstance(given, dict) else {}
-            answer = self._bench.do(str(command.get("do")), str(command.get("holder")), values)
+            at_s = command.get("at_s")
+            answer = self._bench.do(
+                str(command.get("do")), str(command.get("holder")), values,
+                float(at_s) if isinstance(at_s, int | float) else -math.inf,
+            )  # fmt: skip
         except HaselabError as error:
             return {"id": number, "error": str(error)}
         except Exception as error:  # other commands must still be answered
@@ -125,7 +137,11 @@ def _stops(folder: Path, bench: LiveBench) -> None:
         box.bind(str(folder / "stop.sock"))
         while True:
             data, sender = box.recvfrom(512)
-            bench.stop(data.decode(errors="replace"))
+            try:
+                bench.stop(data.decode(errors="replace"))
+            except BaseException:  # no answer: the guardians act; the next STOP must work too
+                traceback.print_exc()
+                continue
             with contextlib.suppress(OSError):
                 box.sendto(b"0 V commanded", sender)
 
@@ -183,9 +199,13 @@ def _end_study_at(ended: threading.Event, bench: LiveBench) -> None:
     bench.end_study("The panel has ended.")
 
 
-def _watch_stdin(ended: threading.Event) -> None:
-    """End the process when the panel has ended."""
-    sys.stdin.read()
+def _watch_parent(parent: int, ended: threading.Event) -> None:
+    """End the process when the panel has ended: its stdin ends, or its parent changes, even if
+    another process still has the other end of the pipe."""
+    while os.getppid() == parent:
+        ready, _, _ = select.select([0], [], [], _PARENT_S)
+        if ready and not os.read(0, 4096):
+            break
     ended.set()
 
 
@@ -205,7 +225,8 @@ def main(words: list[str]) -> int:
     for name in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, lambda *_: ended.set())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the panel ends this process by its stdin
-    threading.Thread(target=_watch_stdin, args=(ended,), daemon=True).start()
+    watched = (os.getppid(), ended)
+    threading.Thread(target=_watch_parent, args=watched, daemon=True).start()
     try:
         _loop_of(actuator)  # a file that is not valid is refused before the bench is opened
         file = load_rig(path)

@@ -7,21 +7,24 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import (
+    DeviceError,
     HaselabError,
     InputError,
     JsonObject,
     LimitError,
     SafetyError,
+    described,
     shown,
 )
+from haselab.panel.bench_state import BenchState
 from haselab.panel.columns import LiveWriter
+from haselab.panel.page_leases import PageLeases
 from haselab.panel.pages.study_job import StudyJob
 from haselab.panel.pages.values import number
 from haselab.panel.study_player import StudyPlayer, save_last
@@ -30,9 +33,9 @@ from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
 from haselab.safety.guarded import GuardedRig
-from haselab.safety.state_machine import ArmingRequest, Stage
+from haselab.safety.state_machine import LIVE, ArmingRequest, Stage
 
-__all__ = ["BenchState", "LiveBench"]
+__all__ = ["LiveBench"]
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # of the reference study
 _RAMP_V_PER_S = 1.0  # at the amplifier's input: 5 kV/s with a gain of 5000
@@ -41,59 +44,8 @@ _PICTURES_HZ = 5.0
 _CATCH_UP_S, _WATCH_S = 0.2, 0.1
 _COMPUTES_S = 0.5  # without a block, after which a study does not look whether it must end
 _MOST_EVENTS = 40  # that a page shows
-
-
-@dataclass(frozen=True)
-class BenchState:
-    """What the pages show of the bench.
-
-    Args:
-        stage: of the safety chain: off, requested, armed, running or tripped. It is tripped until
-            somebody arms the bench and acknowledges the reason.
-        mode: `idle`, `drive` (manual), `loop` or `study`.
-        drive_v: drive of the last block, in V.
-        target_v: drive to which the ramp leads, in V.
-        reference: desired strain; None: the loop is open.
-        limit_v: highest drive that was typed when the bench was armed, in V.
-        holder: page that armed the bench; empty: none.
-        reason: of the last trip, or why the last run ended.
-        low_v: lowest drive of the rig, in V.
-        high_v: highest drive of the rig, in V.
-        gain: of the amplifier.
-        loop: limits of the desired strain; None: the actuator file has no complete controller.
-        name: of the rig.
-        simulated: whether it is a twin.
-        task: what a study does now; empty without a study.
-        done: share of the study's time that has passed, 0 to 1.
-        prompt: step that a person must do and confirm; empty: none.
-        events: the last ones, each with its time on the clock of the rig, in s.
-        recorded: folder of the last study that was played to its end; empty: none.
-        recording: folder of the study that is being played; empty: none.
-        extrapolated: whether the capacitance is outside the range in which the strain map was
-            fitted, so that the band of the strain is not valid.
-    """
-
-    stage: str
-    mode: str
-    drive_v: float
-    target_v: float
-    reference: float | None
-    limit_v: float
-    holder: str
-    reason: str
-    low_v: float
-    high_v: float
-    gain: float
-    loop: tuple[float, float] | None
-    name: str
-    simulated: bool
-    task: str
-    done: float
-    prompt: str
-    events: tuple[tuple[float, str], ...]
-    recorded: str
-    recording: str
-    extrapolated: bool
+_RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old one could energise the bench late
+_IDLE_BLOCKS = 20  # with a voltage that nobody has requested, in a row, which trip the bench
 
 
 class _NoCamera:
@@ -138,7 +90,7 @@ class LiveBench:
         player: StudyPlayer | None = None,
         lease_s: float = 1.5,
     ) -> None:
-        self._lease_s = lease_s
+        self._leases = PageLeases(lease_s)
         self._rig, self._writer, self._picture = rig, writer, picture
         self._read_loop, self._loop = read_loop, read_loop()
         about = rig.description
@@ -152,7 +104,7 @@ class LiveBench:
         self._reference: float | None = None
         self._limit_v = 0.0
         self._closed: ClosedLoop | None = None
-        self._seen_s = self._beat_s = 0.0
+        self._beat_s = 0.0
         self._prepare, self._player = prepare, player or StudyPlayer()
         self._player.note = self._note
         self._job: StudyJob | None = None
@@ -160,6 +112,8 @@ class LiveBench:
         self._recorded = ""  # folder of the last study that was played to its end
         self._end_study = ""  # why the study must end; empty: it may go on
         self._extrapolated = False  # the strain of the last block
+        self._unexpected = 0  # blocks in a row with a voltage that nobody has requested
+        self._over = False  # the panel ends: no command is carried out any more
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
         rig.bench.on_block = self._on_block
         self._settled = about.switch_in_block + round(1e-3 * about.rate_hz)
@@ -181,36 +135,50 @@ class LiveBench:
             stage.value, self._mode, self._drive_v, self._target_v, self._reference,
             self._limit_v, self._holder, latched or self._reason, low, high,
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
-            self._player.done, self._player.prompt, tuple(self._events),
+            self._player.done, self._player.prompt, self._player.step, tuple(self._events),
             self._recorded, "" if self._job is None else self._job.options.folder.name,
             self._extrapolated,
         )  # fmt: skip
 
-    def do(self, what: str, holder: str, values: JsonObject) -> JsonObject:
+    def do(
+        self, what: str, holder: str, values: JsonObject, at_s: float | None = None
+    ) -> JsonObject:
         """Carry out a command of a page.
 
         Args:
-            what: `request`, `cancel`, `arm`, `drive`, `loop`, `open`, `confirm`, `disarm` or
-                `lease`.
+            what: `request`, `cancel`, `arm`, `drive`, `loop`, `open`, `confirm`, `disarm`, `lease`
+                or `leave`.
             holder: the page.
             values: arguments of the command.
+            at_s: time of the data that the page had seen, or of its sign of life; see
+                `page_leases`. None: a call in this process.
         Returns:
             The answer.
         Raises:
             InputError: There is no such command, or an argument is missing or of a wrong type.
             LimitError: A value is outside the limits.
-            SafetyError: Another page has armed the bench, or it is not armed.
+            SafetyError: Another page has armed the bench, it is not armed, or the command is too
+                old.
         """
         commands = {
             "request": self._request_arming, "cancel": self._cancel_request, "arm": self._arm,
             "drive": self._drive_to,
             "loop": self._close_loop, "open": self._open_loop, "disarm": self._disarm,
-            "lease": self._lease, "confirm": self._confirm,
+            "leave": self._leave, "confirm": self._confirm,
         }  # fmt: skip
+        if what == "lease":
+            self._leases.renew(holder, at_s)
+            return {}
         if what not in commands:
             raise InputError(
                 f"There is no command {shown(what)}. Use one of: {', '.join(commands)}."
             )
+        # Ramping to 0 V and switching off never come too late.
+        recent = what in _RECENT and not (what == "drive" and values.get("value_v") == 0)
+        if recent:
+            self._leases.require_recent(at_s)
+        if what == "arm":
+            self._leases.begin(holder)
         job = None
         if what == "arm" and values.get("study") is not None:
             with self._turn, self._mutex:
@@ -223,7 +191,11 @@ class LiveBench:
             if what == "request" and not self._holder:
                 self._loop = found
             self._check_turn(what, holder)
-            return self._arm(holder, values, job) if job else commands[what](holder, values)
+            if what == "arm":  # checking a study takes a while
+                return self._arm_for(holder, values, job, at_s)
+            if recent:  # it may have waited for its turn
+                self._leases.require_recent(at_s)
+            return commands[what](holder, values)
 
     def stop(self, reason: str) -> None:
         """Take the bench to 0 V at once and latch the reason. Never waits for a command.
@@ -238,9 +210,9 @@ class LiveBench:
         """End a study that is being played; the bench goes to 0 V and the recording is kept.
 
         Args:
-            reason: one sentence.
+            reason: one sentence; the first one is kept.
         """
-        self._end_study = reason
+        self._end_study = self._end_study or reason
 
     def _note(self, what: str) -> None:
         self._events.append((self._rig.bench.time_s, what))
@@ -262,6 +234,35 @@ class LiveBench:
             self._rig.safety.end_run()
         return {}
 
+    def _leave(self, holder: str, values: JsonObject) -> JsonObject:
+        """A page has gone: nobody can see what its commands do."""
+        self._leases.end(holder)
+        self._cancel_request(holder, values)
+        if holder == self._holder and self._mode == "study":
+            self.end_study("The page that started the study has gone.")
+        elif holder == self._holder:
+            self._end("The page that armed the bench has gone.")
+        return {}
+
+    def _arm_for(
+        self, holder: str, values: JsonObject, job: StudyJob | None, at_s: float | None
+    ) -> JsonObject:
+        """Arm the bench for a page that is still there and waits for the answer."""
+        if at_s is not None and self._leases.is_lost(holder):
+            raise SafetyError(
+                "No message from the page that wanted to arm the bench for "
+                f"{self._leases.lease_s:g} s. Nothing was armed."
+            )
+        self._leases.require_in_time(at_s)
+        answer = self._arm(holder, values, job)
+        if job is None:  # an instrument may have been slow
+            try:
+                self._leases.require_in_time(at_s)
+            except SafetyError:
+                self._end("Arming took too long, so the bench was taken to 0 V again.")
+                raise
+        return answer
+
     def _arm(self, holder: str, values: JsonObject, job: StudyJob | None = None) -> JsonObject:
         self._require_idle()
         limit_v, request = number(values, "limit_v"), self._find_request(values)
@@ -280,13 +281,15 @@ class LiveBench:
         self._request = None
         self._rig.safety.arm(request, str(values.get("acknowledged", "")))
         self._note("armed")
-        self._reason, self._seen_s, self._end_study = "", time.monotonic(), ""
+        self._reason, self._end_study = "", ""
+        self._leases.begin(holder)
         if job is not None:  # `step` plays it
             self._mode, self._holder, self._limit_v, self._job = "study", holder, limit_v, job
             return {"folder": str(job.options.folder)}
         try:
             self._rig.safety.run()
             self._rig.begin()
+            self._rig.check_idle()
             self._rig.generator.sine(CARRIER_HZ, CARRIER_V)
             if self._picture is not None:
                 self._rig.camera.start(_PICTURES_HZ)
@@ -297,12 +300,15 @@ class LiveBench:
             raise
         self._mode, self._holder, self._limit_v, self._reason = "drive", holder, limit_v, ""
         self._drive_v = self._target_v = 0.0
-        self._seen_s = self._beat_s = time.monotonic()
+        self._leases.begin(holder)  # an instrument may have been slow
+        self._beat_s = time.monotonic()
         return {}
 
     def _check_turn(self, what: str, holder: str) -> None:
-        """Refuse a command of a page while another one has armed the bench."""
-        if self._holder and holder != self._holder and what not in ("disarm", "lease", "cancel"):
+        """Refuse a command of a page while another one has armed the bench, and at the end."""
+        if self._over:
+            raise SafetyError("The panel has ended. No command is carried out.")
+        if self._holder and holder != self._holder and what not in ("disarm", "leave", "cancel"):
             raise SafetyError("Another page has armed the bench. It must disarm the bench first.")
 
     def _find_request(self, values: JsonObject) -> ArmingRequest:
@@ -319,6 +325,8 @@ class LiveBench:
     def _confirm(self, holder: str, values: JsonObject) -> JsonObject:
         if self._mode != "study" or holder != self._holder:
             raise SafetyError("Only the page that started the study can confirm this step.")
+        if values.get("step") != self._player.step or not self._player.prompt:
+            raise SafetyError("This step is over. Read the next one, then confirm it.")
         self._player.confirm()
         return {}
 
@@ -374,11 +382,6 @@ class LiveBench:
             self._end("The bench was disarmed.")
         return {}
 
-    def _lease(self, holder: str, values: JsonObject) -> JsonObject:
-        if holder == self._holder:
-            self._seen_s = time.monotonic()
-        return {}
-
     def _require_idle(self) -> None:
         if self._holder:
             raise SafetyError("The bench is armed already. Disarm it first.")
@@ -411,27 +414,31 @@ class LiveBench:
 
     def step(self) -> None:
         """Put out the next drive and read one block; or play the study that is due."""
-        if self._job is not None:
-            self._play(self._job)
+        if (job := self._job) is not None:
+            self._play(job)
             return
         with self._turn:  # a thread that releases a lock and takes it again keeps others waiting
             pass
         with self._mutex:
             try:
                 self._block()
+                if self._closed is not None:
+                    self._target_v = self._drive_v
+                if self._holder and self._picture is not None:
+                    self._look(self._picture)
             except HaselabError as error:
                 self._failed(error)
                 return
-            if self._closed is not None:
-                self._target_v = self._drive_v
-            if self._holder and self._picture is not None:
-                self._look(self._picture)
+            except Exception as error:  # of any driver, as when STOP interrupts its call
+                self._failed(DeviceError(f"A driver failed: {described(error)}."))
+                return
             if self._holder and self._rig.safety.stage is Stage.TRIPPED:
                 self._end(self._rig.safety.reason)
 
     def close(self) -> None:
-        """End at 0 V."""
+        """End at 0 V; a command that comes later is refused."""
         with self._mutex:
+            self._over = True
             self._end("The panel has ended.")
 
     def _failed(self, error: HaselabError) -> None:
@@ -460,6 +467,9 @@ class LiveBench:
                 f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"
             )
             self._rig.safety.trip(reason)
+        except Exception as error:  # of any driver, as when STOP interrupts its call
+            reason = f"A driver or an experiment failed: {described(error)}."
+            self._rig.safety.trip(reason)
         finally:
             over.set()
             self._rig.safety.record_with(lambda what: None)  # the recording is closed
@@ -477,18 +487,21 @@ class LiveBench:
 
     def _why_not(self) -> str:
         """Why the study must end; empty while it may go on."""
-        if time.monotonic() > self._seen_s + self._lease_s:
+        if not self._end_study and self._leases.is_lost(self._holder):
             time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
-        if time.monotonic() > self._seen_s + self._lease_s:
-            return f"No message from the page that started the study for {self._lease_s:g} s."
+        if not self._end_study and self._leases.is_lost(self._holder):
+            return (
+                f"No message from the page that started the study for {self._leases.lease_s:g} s."
+            )
         return self._end_study
 
     def _block(self) -> None:
         rig = self._rig
         if self._holder:
             now_s = time.monotonic()
-            if now_s > self._seen_s + self._lease_s:
-                self._end(f"No message from the page that armed the bench for {self._lease_s:g} s.")
+            if self._leases.is_lost(self._holder):
+                silent_s = self._leases.lease_s
+                self._end(f"No message from the page that armed the bench for {silent_s:g} s.")
             elif now_s > self._beat_s + _HEARTBEAT_S:
                 self._beat_s = now_s
                 rig.safety.heartbeat(0.0)
@@ -498,14 +511,30 @@ class LiveBench:
         codes = rig.acquisition.read()
         if self._closed is not None and self._reference is not None:
             self._closed.step(codes, self._reference)
+        if not self._holder and self._rig.safety.stage not in LIVE:
+            self._watch_idle(codes)
+
+    def _watch_idle(self, codes: NDArray[np.int16]) -> None:
+        """Trip if a bench that should be at 0 V shows a voltage: an instrument may have put it out
+        by itself."""
+        rig = self._rig
+        limit_v, left_v = rig.safety.settings.residual_v, rig.bench.watch.residual_v(codes)
+        watched = rig.safety.settings.read_back and left_v >= limit_v
+        self._unexpected = self._unexpected + 1 if watched else 0
+        if self._unexpected == _IDLE_BLOCKS:
+            reason = (
+                f"Output of {left_v:.4g} V while nothing was requested (limit {limit_v:g} V). "
+                "Switch the high voltage off by hand, then check the instruments and the monitor "
+                "cables."
+            )
+            rig.safety.trip(reason)
+            if rig.safety.guardians is not None:
+                rig.safety.guardians.make_safe(reason)
+            self._end(reason)
 
     def _look(self, path: Path) -> None:
         """Keep the last frame that has arrived, if there is a new one."""
-        try:
-            frames = self._rig.camera.take()
-        except HaselabError as error:
-            self._failed(error)
-            return
+        frames = self._rig.camera.take()
         if frames is not None and len(frames.time_s):
             save_last(frames, path)
 

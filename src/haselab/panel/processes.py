@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
 import os
 import socket
 import subprocess
@@ -22,10 +23,11 @@ from haselab.panel.web import WebSettings, application
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
 
-__all__ = ["Panel", "running_panel"]
+__all__ = ["Panel", "running_panel", "stop_answers"]
 
 _START_S = 60.0  # for the drivers of a bench
 _END_S = 10.0  # for the bench process to go to 0 V
+_END_STOP_S = 1.0  # the stop process has nothing to end
 
 
 class Panel(NamedTuple):
@@ -35,6 +37,7 @@ class Panel(NamedTuple):
         address: to open in a browser; it holds the token.
         bench: its bench process.
         stop: its stop process.
+        stop_port: TCP port of STOP.
         server: its web server, to be run by the caller.
         listener: socket of the web server.
     """
@@ -42,8 +45,25 @@ class Panel(NamedTuple):
     address: str
     bench: subprocess.Popen[str]
     stop: subprocess.Popen[str]
+    stop_port: int
     server: uvicorn.Server
     listener: socket.socket
+
+
+def stop_answers(port: int, within_s: float) -> bool:
+    """Whether STOP answers a page.
+
+    Args:
+        port: TCP port of STOP.
+        within_s: longest wait, in s.
+    """
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=within_s)
+    with contextlib.closing(connection):
+        try:
+            connection.request("GET", "/ready")
+            return connection.getresponse().status == 200
+        except (OSError, http.client.HTTPException):
+            return False
 
 
 def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
@@ -71,13 +91,13 @@ def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
     return process, rest
 
 
-def _end(process: subprocess.Popen[str]) -> None:
-    """End a process by its stdin; kill it if it does not end."""
+def _end(process: subprocess.Popen[str], within_s: float = _END_S) -> None:
+    """End a process by its stdin; kill it if it does not end. Safe to call twice."""
     with contextlib.suppress(OSError):
         assert process.stdin is not None
         process.stdin.close()
     try:
-        process.wait(_END_S)
+        process.wait(within_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -112,7 +132,8 @@ def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Ite
         real = [str(files.rig)] if isinstance(load_rig(files.rig), BenchConfig) else []
         words = ["0", str(folder), key, ",".join(access.origins), *real]
         stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
-        opened.callback(_end, stop)
+        opened.callback(_end, stop, _END_STOP_S)
+        opened.callback(_end, bench)  # first: STOP works until the bench is at 0 V
         settings.stop_port = int(stop_port)
         server = WebServer(
             uvicorn.Config(
@@ -120,4 +141,4 @@ def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Ite
                 ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             )
         )  # fmt: skip
-        yield Panel(access.address, bench, stop, server, listener)
+        yield Panel(access.address, bench, stop, settings.stop_port, server, listener)

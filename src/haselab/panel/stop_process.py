@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 from haselab.safety.interlock import Interlock
 
@@ -33,6 +34,7 @@ _REASON = "STOP was pressed on the panel"
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
 _PROMPT_S = 0.5  # after which the guardians are called
+_MOST_CONNECTIONS = 128  # of pages; more than any number of pages needs
 
 
 class StopServer(ThreadingHTTPServer):
@@ -45,18 +47,41 @@ class StopServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
-    request_queue_size = 64
+    request_queue_size = 128
 
     def __init__(
         self, port: int, stop: Callable[[], dict[str, object]], origins: tuple[str, ...]
     ) -> None:
         self.stop, self.origins = stop, origins
+        self._open: dict[int, socket.socket] = {}  # connections, the oldest first
+        self._turn = threading.Lock()
         super().__init__(("127.0.0.1", port), _Handler)
 
     @property
     def port(self) -> int:
         """TCP port."""
         return int(self.server_address[1])
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection; too many others lose the oldest one, so that STOP can connect."""
+        with self._turn:
+            self._open[id(request)] = request
+            excess = list(self._open)[: max(len(self._open) - _MOST_CONNECTIONS, 0)]
+            for old in [self._open.pop(number) for number in excess]:
+                with contextlib.suppress(OSError):
+                    old.shutdown(socket.SHUT_RDWR)  # its thread then closes it
+        super().process_request(request, client_address)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print what went wrong, unless the other side has only closed the connection."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._turn:
+            self._open.pop(id(request), None)
+        super().shutdown_request(request)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -90,6 +115,7 @@ class _Handler(BaseHTTPRequestHandler):
             origin is None or origin in self.server.origins
         )
         if not mine:
+            self.close_connection = True  # what it sent besides is not read as a further request
             self._reply(403, {"error": "Only the panel's own page may use this port."})
         return mine
 

@@ -90,7 +90,7 @@ class StudyPlayer:
         self._total = self._passed = 0.0
         self._confirmed = threading.Event()
         self._why_not: Callable[[], str] = lambda: ""
-        self.task, self.prompt = "", ""
+        self.task, self.prompt, self.step = "", "", 0
         self.operator = PageOperator(self._show, self._wait)
 
     @property
@@ -141,6 +141,7 @@ class StudyPlayer:
 
     def _show(self, prompt: str) -> None:
         self._confirmed.clear()
+        self.step += 1
         self.prompt = prompt
 
     def _wait(self) -> bool:

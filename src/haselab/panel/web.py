@@ -26,7 +26,7 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -37,6 +37,7 @@ from haselab.panel.page_server import NO_TOKEN, STATIC, Access, OnlyOwnPages, ro
 from haselab.panel.pages.camera import CameraPicture
 from haselab.panel.pages.recordings import analyse_recorded
 from haselab.panel.pages.requests import REQUESTS
+from haselab.safety.interlock import lease_clock_s
 
 __all__ = ["SCHEMA", "WebSettings", "application"]
 
@@ -49,7 +50,7 @@ _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
 _COLUMN_STEP = 100  # so that windows of almost the same width share their frames
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
-_ENERGISING = ("arm", "drive", "loop")
+_ARM_S = 30.0  # the same for arming, where a study is checked first; see `page_leases`
 _HEAD = struct.Struct("<HHIddddII")
 
 
@@ -85,6 +86,7 @@ class _Bench:
         self.state: dict[str, Any] | None = None
         self.state_s = -math.inf  # when it arrived
         self.state_text = "{}"  # as JSON, made once for all pages
+        self.clock_s = 0.0  # when the bench process sent it; see `page_leases`
         self.reader: LiveReader | None = None
 
     def age_s(self) -> float:
@@ -106,6 +108,8 @@ class _Bench:
         self.reader = LiveReader(self._folder / "live")
         while line := await reader.readline():
             message = json.loads(line)
+            if "clock_s" in message:
+                self.clock_s = float(message["clock_s"])
             if "state" in message:
                 await self._take(message["state"])
             answer = self._waiting.pop(message.get("id", -1), None)
@@ -137,33 +141,25 @@ class _Bench:
                 )
         self._waiting.clear()
 
-    async def ask(self, what: str, holder: str, values: dict[str, Any]) -> dict[str, Any]:
-        """Send a command and wait for its answer."""
+    async def ask(
+        self, what: str, holder: str, values: dict[str, Any], at_s: object
+    ) -> dict[str, Any]:
+        """Send a command and wait for its answer. The bench process refuses one that is too old."""
         if self._writer is None:
             return {
                 "error": "There is no connection to the bench process. Check that the "
                 "bench is at 0 V, then start the panel again."
             }
-        number = self._send(what, holder, values)
+        self._number += 1
+        number, wait_s = self._number, _ARM_S if what == "arm" else _BENCH_S
         answer = self._waiting[number] = asyncio.get_running_loop().create_future()
+        command = {"id": number, "do": what, "holder": holder, "values": values, "at_s": at_s}
+        self._writer.write(json.dumps(command).encode() + b"\n")
         try:
-            return await asyncio.wait_for(answer, _BENCH_S)
+            return await asyncio.wait_for(answer, wait_s)
         except TimeoutError:
             self._waiting.pop(number, None)
-            error = f"No answer from the bench process for {_BENCH_S:g} s. Press STOP."
-            # A command that was reported as failed must not energise the bench later.
-            if what in _ENERGISING:
-                self._send("disarm", holder, {})
-                error += " If the command is carried out late, the bench is disarmed at once."
-            return {"error": error}
-
-    def _send(self, what: str, holder: str, values: dict[str, Any]) -> int:
-        """Send a command; returns its number."""
-        self._number += 1
-        command = {"id": self._number, "do": what, "holder": holder, "values": values}
-        if self._writer is not None:
-            self._writer.write(json.dumps(command).encode() + b"\n")
-        return self._number
+            return {"error": f"No answer from the bench process for {wait_s:g} s. Press STOP."}
 
 
 class _View(NamedTuple):
@@ -182,6 +178,7 @@ class _Page:
     holder: str = field(default_factory=lambda: secrets.token_hex(8))
     view: _View = field(default_factory=lambda: _View(10.0, None, 600))
     unacknowledged: list[int] = field(default_factory=list)  # frames
+    arms: int = 0  # commands to arm the bench that are not answered yet
 
 
 class _Server:
@@ -204,7 +201,8 @@ class _Server:
             task.cancel()
 
     async def page(self, request: Request) -> Response:
-        return FileResponse(STATIC / "index.html")
+        text = (STATIC / "index.html").read_text()
+        return HTMLResponse(text.replace('data-port=""', f'data-port="{self._settings.stop_port}"'))
 
     async def about(self, request: Request) -> Response:
         return JSONResponse(
@@ -285,9 +283,14 @@ class _Server:
 
     async def _command(self, page: _Page, message: dict[str, Any]) -> None:
         values = message.get("values")
-        answer = await self._bench.ask(
-            str(message["do"]), page.holder, values if isinstance(values, dict) else {}
-        )
+        what, at_s = str(message["do"]), message.get("at_s")
+        page.arms += what == "arm"
+        try:
+            answer = await self._bench.ask(
+                what, page.holder, values if isinstance(values, dict) else {}, at_s
+            )
+        finally:
+            page.arms -= what == "arm"
         answer["id"] = message.get("id")
         with contextlib.suppress(RuntimeError, OSError, WebSocketDisconnect):
             await page.socket.send_text(json.dumps(answer))
@@ -306,7 +309,8 @@ class _Server:
                 if len(page.unacknowledged) > 1:
                     continue
                 state = self._bench.state or {}
-                if state.get("holder") == page.holder and loop.time() > lease_s:
+                mine = page.arms > 0 or state.get("holder") == page.holder
+                if mine and loop.time() > lease_s:
                     lease_s = loop.time() + 0.4
                     self._start(self._renew(page))
                 blocks = self._bench.reader.blocks if self._bench.reader else -1
@@ -326,11 +330,11 @@ class _Server:
         task.add_done_callback(self._tasks.discard)
 
     async def _renew(self, page: _Page) -> None:
-        await self._bench.ask("lease", page.holder, {})
+        await self._bench.ask("lease", page.holder, {}, lease_clock_s())
 
     async def _leave(self, page: _Page) -> None:
-        """Withdraw the arming request of a page that has gone."""
-        await self._bench.ask("cancel", page.holder, {})
+        """Withdraw what a page that has gone requested or armed."""
+        await self._bench.ask("leave", page.holder, {}, lease_clock_s())
 
     def _frame(self, tick: int, view: _View) -> bytes:
         """The frame of a view at a tick, made once for all pages that show it."""
@@ -353,6 +357,7 @@ class _Server:
             signals = reader.signals(shown_s - view.span_s, shown_s, view.columns)
         gap_s = reader.gap_s if reader is not None else math.nan
         times = {
+            "clock_s": self._bench.clock_s,
             "end_s": None if math.isnan(end_s) else end_s,
             "gap_s": None if math.isnan(gap_s) else gap_s,
             "age_s": min(self._bench.age_s(), 1e9),

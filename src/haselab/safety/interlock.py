@@ -38,7 +38,7 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-__all__ = ["HEARTBEATS", "Interlock", "InterlockBusyError", "interlock_folder"]
+__all__ = ["HEARTBEATS", "Interlock", "InterlockBusyError", "interlock_folder", "lease_clock_s"]
 
 HEARTBEATS = 2  # of the two guardians
 DAMAGED = -1  # revision of a damaged file: no permission has it
@@ -56,6 +56,17 @@ _T = TypeVar("_T")
 
 class InterlockBusyError(OSError):
     """Another program uses the bench."""
+
+
+def lease_clock_s() -> float:
+    """Clock of all leases, in s: common to all processes, and it counts while the computer sleeps.
+
+    `time.monotonic` stands still in a suspended computer, whose output keeps its voltage: a lease
+    on that clock would still be valid hours later.
+    """
+    boot = getattr(time, "CLOCK_BOOTTIME", None)  # Linux; on macOS CLOCK_MONOTONIC counts
+    clock = getattr(time, "CLOCK_MONOTONIC", None) if boot is None else boot
+    return time.monotonic() if clock is None else time.clock_gettime(clock)
 
 
 def interlock_folder() -> Path:
@@ -521,11 +532,11 @@ class Interlock:
 
     def lease(self, for_s: float) -> None:
         """Give the owner's heartbeat and the latest time of the next one."""
-        self._store(_LEASE, struct.pack("d", time.monotonic() + for_s))
+        self._store(_LEASE, struct.pack("d", lease_clock_s() + for_s))
 
     @property
     def lease_end_s(self) -> float:
-        """Time on the monotonic clock at which the owner's lease ends, in s."""
+        """Time of `lease_clock_s` at which the owner's lease ends, in s."""
         return self._number(_LEASE)
 
 

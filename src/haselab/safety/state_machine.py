@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from enum import Enum
 from haselab.base import HaselabError, SafetyError
 from haselab.safety.gate import Gate
 from haselab.safety.guardian.client import UNARMED_S, Guardians
+from haselab.safety.interlock import lease_clock_s
 from haselab.safety.watchdog.settings import (
     FieldRating,
     WatchdogSettings,
@@ -161,6 +163,7 @@ class Safety:
         self._limits = ""
         self._clock = clock
         self._stage = Stage.OFF
+        self._changing = threading.RLock()  # held for a moment: STOP comes from another thread
         self._reason = ""
         self._trips = 0
         self._number = 0
@@ -272,22 +275,34 @@ class Safety:
                 "The bench is being made safe by another program. Request arming again."
             )
         interlock = self.gate.interlock
-        if interlock.revision != request.revision:
-            self._stage = Stage.TRIPPED
-            self._reason = interlock.reason
-            raise SafetyError(
-                "The bench was made safe after arming was requested: "
-                f"{interlock.reason.rstrip('.')}. Request arming again."
-            )
-        interlock.acknowledge(request.revision)
-        self._reason = ""
-        self._to(Event.ARM)
-        self._armed_s = self._clock()
-        interlock.lease(self.settings.idle_s)
-        self.gate.permit(request.revision, self._expired)
+        with self._changing:
+            if interlock.revision != request.revision or self._stage is not Stage.REQUESTED:
+                self._stage = Stage.TRIPPED
+                self._reason = interlock.reason
+                raise SafetyError(
+                    "The bench was made safe after arming was requested: "
+                    f"{interlock.reason.rstrip('.')}. Request arming again."
+                )
+            interlock.acknowledge(request.revision)
+            self._reason = ""
+            self._to(Event.ARM)
+            self._armed_s = self._clock()
+            interlock.lease(self.settings.idle_s)
+            self.gate.permit(request.revision, self._expired)
 
     def _expired(self) -> str:
         return permit_expired(self._clock() - self._armed_s, self.settings.permit_age_s)
+
+    def _lease_ended(self) -> str:
+        """Why no heartbeat may extend the lease: it has ended already. After a pause of the whole
+        computer, the guardians may notice this later than the program."""
+        late_s = lease_clock_s() - self.gate.interlock.lease_end_s
+        if late_s <= 0.0:
+            return ""
+        return (
+            f"The lease (lease_s) of this program ended {late_s:.2g} s ago: the program, or the "
+            "whole computer, did not run."
+        )
 
     def run(self) -> None:
         """Go from armed to running.
@@ -295,9 +310,10 @@ class Safety:
         Raises:
             SafetyError: The bench is not armed.
         """
-        if self._stage is not Stage.ARMED or not self.gate.permitted:
-            raise self.refusal()
-        self._to(Event.RUN)
+        with self._changing:
+            if self._stage is not Stage.ARMED or not self.gate.permitted:
+                raise self.refusal()
+            self._to(Event.RUN)
 
     def end_run(self) -> None:
         """End the run; the next one needs a new arming. A trip remains.
@@ -314,7 +330,8 @@ class Safety:
             if self._stage in LIVE or self._stage is Stage.TRIPPED:
                 self._confirm()
         finally:
-            self._to(Event.END)
+            with self._changing:
+                self._to(Event.END)
             self._open = None
             self.gate.end()
             self.gate.interlock.lease(UNARMED_S)
@@ -366,21 +383,22 @@ class Safety:
     @property
     def revoked_by_others(self) -> str:
         """What made the bench safe while this program had a permission; empty if nothing did."""
-        if self._stage not in LIVE or not self.gate.revoked:
-            return ""
-        return f"Another program made the bench safe: {self.gate.revoked.rstrip('.')}."
+        why = self.gate.revoked if self._stage in LIVE else ""
+        return f"Another program made the bench safe: {why.rstrip('.')}." if why else ""
 
     def _trip_once(self, reason: str) -> bool:
         """Revoke the permission before anything else; return whether this is the first reason."""
-        first = self._stage is not Stage.TRIPPED
-        self.gate.end_permission()
-        with contextlib.suppress(OSError):  # a failing interlock must not prevent 0 V
-            self.gate.interlock.revoke(reason)
-        self._to(Event.TRIP)
-        if first:
-            self._reason = reason
-            self._trips += 1
-        return first
+        self.gate.end_permission()  # waits for nothing
+        with self._changing:
+            first = self._stage is not Stage.TRIPPED
+            self.gate.end_permission()
+            with contextlib.suppress(OSError):  # a failing interlock must not prevent 0 V
+                self.gate.interlock.revoke(reason)
+            self._to(Event.TRIP)
+            if first:
+                self._reason = reason
+                self._trips += 1
+            return first
 
     def heartbeat(self, for_s: float) -> None:
         """Send the guardians a heartbeat, and check whether the bench was made safe by others.
@@ -388,12 +406,14 @@ class Safety:
         Args:
             for_s: time until the next heartbeat, in s, beyond the lease.
         Raises:
-            SafetyError: The bench was made safe by others, a guardian is lost, or the arming has
-                expired.
+            SafetyError: The bench was made safe by others, the lease has ended, a guardian is
+                lost, or the arming has expired.
         """
         if self._stage not in LIVE:
             return
         if why := self.revoked_by_others:
+            raise self.trip(why)
+        if self.guardians is not None and (why := self._lease_ended()):
             raise self.trip(why)
         self.gate.interlock.lease(for_s + self.settings.lease_s)
         if self.guardians is not None and (lost := self.guardians.lost()):

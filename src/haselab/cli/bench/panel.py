@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import threading
+import time
 import webbrowser
 from pathlib import Path
 
@@ -15,10 +16,12 @@ from haselab.cli.common import Real
 from haselab.cli.options import shared_option
 from haselab.panel.files import PanelFiles
 from haselab.panel.page_server import serve
-from haselab.panel.processes import Panel, running_panel
+from haselab.panel.processes import Panel, running_panel, stop_answers
 from haselab.store.folder import write_new
 
 __all__ = ["command"]
+
+_STOP_S, _STOP_TRIALS = 4.0, 3  # a bench without STOP goes to 0 V
 
 
 @click.command("panel")
@@ -74,12 +77,21 @@ def command(
 
 
 def _serve(panel: Panel) -> None:
-    """Serve the page until Ctrl-C, or until the bench process or STOP has ended.
+    """Serve the page until Ctrl-C, or until the bench process or STOP has ended or STOP hangs.
 
     Raises:
-        DeviceError: the bench process or the stop process ended by itself.
+        DeviceError: the bench process or the stop process ended by itself, or STOP does not answer.
     """
     lost: list[str] = []
+
+    def watch_stop() -> None:
+        failed = 0
+        while not panel.server.should_exit:
+            failed = 0 if stop_answers(panel.stop_port, _STOP_S) else failed + 1
+            if failed == _STOP_TRIALS and not panel.server.should_exit:
+                lost.append("stop process does not answer")
+                panel.server.should_exit = True
+            time.sleep(1.0)
 
     def watch() -> None:
         while not panel.server.should_exit:
@@ -87,16 +99,17 @@ def _serve(panel: Panel) -> None:
                 with contextlib.suppress(Exception):
                     process.wait(0.1)
                 if process.poll() is not None and not panel.server.should_exit:
-                    lost.append(name)
+                    lost.append(f"{name} has ended")
                     panel.server.should_exit = True
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
+    threading.Thread(target=watch_stop, daemon=True).start()
     serve(panel.server, panel.listener)
     panel.server.should_exit = True
     watcher.join()
     if lost:
         raise DeviceError(
-            f"The {lost[0]} has ended, so the panel ends too. Check that the bench is at 0 V, then "
+            f"The {lost[0]}, so the panel ends too. Check that the bench is at 0 V, then "
             "start the panel again."
         )

@@ -54,12 +54,12 @@ export function Progress({ state }) {
 
 // A study that this page has started: what it does, what a person must do, and how to end it.
 export function Playing({ state, link, say }) {
-  const ask = (what) => link.ask(what).then((found) => say(found.error || ""));
+  const ask = (what, values = {}) => link.ask(what, values).then((found) => say(found.error || ""));
   return html`
     <p class="badge live">Playing a study, up to ${kilo(state.limit_v, state.gain)}</p>
     <${Progress} state=${state} />
     ${state.prompt && html`<div class="card warning" role="alert"><p>${state.prompt}</p>
-      <button type="button" onClick=${() => ask("confirm")}>Done</button></div>`}
+      <button type="button" onClick=${() => ask("confirm", { step: state.step })}>Done</button></div>`}
     <div class="row"><button type="button" onClick=${() => ask("disarm")}>End the study</button></div>
     <p>Keep this page open. If it is closed, the study ends at 0 V.</p>`;
 }

@@ -1,10 +1,13 @@
-// STOP. It depends on nothing else of the page: its own script, port and connection.
+// STOP. It depends on nothing else of the page: its own script, port and connection. The port is in
+// the page, so that STOP works even if the web server hangs from the moment at which it has sent it.
 "use strict";
 (() => {
   const button = document.getElementById("emergency");
   const state = document.getElementById("emergency-state");
-  let address = null;
+  const address = `http://${location.hostname}:${button.dataset.port}`;
+  const ANSWER_MS = 3000; // the stop process waits 2 s for the bench process
   let pressed = false;
+  let pressedAt = -Infinity;
 
   const show = (text, bad) => {
     if (state.textContent !== text) state.textContent = text;
@@ -13,10 +16,6 @@
 
   async function ready() {
     try {
-      if (address === null) {
-        const about = await (await fetch("/about")).json();
-        address = `http://${location.hostname}:${about.stop_port}`;
-      }
       const answer = await fetch(`${address}/ready`, { signal: AbortSignal.timeout(2000) });
       if (!answer.ok) throw new Error(answer.statusText);
       if (!pressed) show("STOP: ready", false);
@@ -28,10 +27,11 @@
 
   async function stop() {
     pressed = true;
+    pressedAt = performance.now();
     button.classList.add("pressed");
     show("STOP: sent", false);
     try {
-      const answer = await fetch(`${address}/stop`, { method: "POST", keepalive: true });
+      const answer = await fetch(`${address}/stop`, { method: "POST", keepalive: true, signal: AbortSignal.timeout(ANSWER_MS) });
       const found = await answer.json();
       show(found.commanded ? "STOP: 0 V commanded" : "THE BENCH PROCESS DOES NOT ANSWER. Press the emergency stop of the bench.", !found.commanded);
     } catch {
@@ -45,6 +45,8 @@
   button.addEventListener("keydown", (event) => {
     if ((event.key === "Enter" || event.key === " ") && !event.repeat) stop();
   });
+  // Voice control, screen readers and switches only click.
+  button.addEventListener("click", () => { if (performance.now() - pressedAt > 1000) stop(); });
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape" && !event.repeat) stop();
   }, true);

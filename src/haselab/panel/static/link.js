@@ -14,6 +14,7 @@ export class Link extends Requests {
     this.problem = "";
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
+    this.clock = 0; // of the bench process in the last frame, in s: it refuses commands that are too old
     this.waiting = new Map();
     this.number = 0;
     this.open();
@@ -98,6 +99,7 @@ export class Link extends Requests {
     }
     this.framedAt = performance.now();
     this.blockAge = about.age_s;
+    this.clock = about.clock_s;
     this.send({ ack: number });
     this.onFrame({ ...about, monitors, signals });
   }
@@ -117,7 +119,7 @@ export class Link extends Requests {
     }
     this.number += 1;
     const id = this.number;
-    this.send({ id, do: what, values });
+    this.send({ id, do: what, values, at_s: this.clock });
     return new Promise((resolve) => this.waiting.set(id, resolve));
   }
 }

@@ -349,19 +349,20 @@ class TwinBench:
 
         For the camera model and for the noise-free truth of a study; never for an analysis.
         """
-        if not self._trace:
+        rate_hz, trace = self._frame_rate_hz, self._trace  # STOP of another thread may clear them
+        if not trace or rate_hz <= 0.0:
             return None
-        lengths = np.concatenate(self._trace)
+        lengths = np.concatenate(trace)
         sampled_s = self._trace_start_s + self._step_s * np.arange(1, lengths.size + 1)
         exposure_s = self._config.camera.exposure_s
         over_s = float(sampled_s[-1]) - exposure_s - self._next_frame_s
-        count = math.floor(over_s * self._frame_rate_hz) + 1  # exposures that have ended
+        count = math.floor(over_s * rate_hz) + 1  # exposures that have ended
         if count < 1:
             return None
-        starts_s = self._next_frame_s + np.arange(count) / self._frame_rate_hz
+        starts_s = self._next_frame_s + np.arange(count) / rate_hz
         wanted_s = self._camera.exposure_times_s(starts_s + 0.5 * exposure_s)
         positions = np.interp(wanted_s, sampled_s, lengths)
-        self._next_frame_s = float(starts_s[-1]) + 1.0 / self._frame_rate_hz
+        self._next_frame_s = float(starts_s[-1]) + 1.0 / rate_hz
         keep = int(np.searchsorted(sampled_s, self._next_frame_s - self._step_s))
         keep = max(0, min(keep, lengths.size - 1))
         self._trace_start_s += keep * self._step_s

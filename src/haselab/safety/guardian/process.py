@@ -33,7 +33,7 @@ from haselab.rig.instruments.registry import daq_of, reported_faults
 from haselab.rig.rig_file import load_rig
 from haselab.safety.guardian.heartbeat import SILENT_S, Heartbeat
 from haselab.safety.guardian.make_safe import make_safe
-from haselab.safety.interlock import HEARTBEATS, Interlock
+from haselab.safety.interlock import HEARTBEATS, Interlock, lease_clock_s
 
 __all__ = ["main"]
 
@@ -95,7 +95,7 @@ class _Guardian:
         now_s = time.monotonic()
         if not self.interlock.live:
             return ""
-        if now_s > self.interlock.lease_end_s:
+        if lease_clock_s() > self.interlock.lease_end_s:
             return "no heartbeat from the program before its lease (lease_s) ended"
         for slot, heartbeat in self._others.items():
             count = self.interlock.heartbeat_count(slot)

@@ -1,0 +1,121 @@
+"""What ends a panel, and what does not."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from haselab.base import DeviceError
+from haselab.cli.bench import panel as command
+from haselab.panel import bench_process, processes
+from haselab.panel.files import PanelFiles
+from haselab.panel.processes import stop_answers
+from haselab.panel.stop_process import StopServer
+from tests.panel.running import WAIT_S
+
+
+class Process:
+    """A process that runs."""
+
+    def poll(self) -> None:
+        """It has not ended."""
+
+    def wait(self, timeout_s: float) -> None:
+        """It does not end."""
+        time.sleep(timeout_s)
+
+
+def test_a_panel_whose_stop_hangs_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The connection of a stopped process can still be opened, but nothing answers."""
+    monkeypatch.setattr(command, "_STOP_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as hangs:
+        port = hangs.getsockname()[1]
+        server = SimpleNamespace(should_exit=False)
+
+        def until_exit(*_: Any) -> int:
+            end_s = time.monotonic() + WAIT_S
+            while not server.should_exit and time.monotonic() < end_s:
+                time.sleep(0.01)
+            return 0
+
+        monkeypatch.setattr(command, "serve", until_exit)
+        panel: Any = SimpleNamespace(
+            bench=Process(), stop=Process(), stop_port=port, server=server, listener=None
+        )
+        with pytest.raises(DeviceError, match="The stop process does not answer, so the panel"):
+            command._serve(panel)
+
+
+def test_stop_that_works_answers() -> None:
+    server = StopServer(0, dict, ())
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    assert stop_answers(server.port, WAIT_S)
+    server.shutdown()
+    server.server_close()
+    assert not stop_answers(server.port, WAIT_S)
+
+
+def test_a_fault_while_stopping_keeps_no_later_stop_from_working(tmp_path: Path) -> None:
+    stopped: list[str] = []
+
+    def stop(reason: str) -> None:
+        stopped.append(reason)
+        if len(stopped) == 1:
+            raise RuntimeError("a driver that haselab does not know")
+
+    bench: Any = SimpleNamespace(stop=stop)
+    job = threading.Thread(target=bench_process._stops, args=(tmp_path, bench), daemon=True)
+    job.start()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as box:
+        box.bind(str(tmp_path / "own"))
+        box.settimeout(WAIT_S)
+        while not (tmp_path / "stop.sock").exists():
+            time.sleep(0.01)
+        for reason in (b"first", b"second"):
+            box.sendto(reason, str(tmp_path / "stop.sock"))
+        assert box.recv(64) == b"0 V commanded"
+    assert stopped == ["first", "second"]
+
+
+def test_the_bench_process_ends_when_its_parent_has_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if another process still has the pipe to its stdin."""
+    ended, parents = threading.Event(), [7, 7, 1]
+    monkeypatch.setattr(bench_process.os, "getppid", lambda: parents.pop(0) if parents else 1)
+    monkeypatch.setattr(bench_process.select, "select", lambda *_: ([], [], []))
+    bench_process._watch_parent(7, ended)
+    assert ended.is_set()
+
+
+def test_the_bench_is_at_zero_before_stop_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends: list[str] = []
+    rig = tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+
+    def start(words: list[str], what: str) -> tuple[Any, str]:
+        return what, "1"
+
+    monkeypatch.setattr(processes, "_started", start)
+    monkeypatch.setattr(processes, "_end", lambda process, within_s=0.0: ends.append(process))
+    with processes.running_panel(PanelFiles(rig, None, tmp_path)):
+        assert not ends
+    assert ends[0] == "bench process" and "stop process" in ends
+
+
+def test_a_stop_process_that_hangs_is_killed() -> None:
+    hangs = [sys.executable, "-c", "import time; time.sleep(600)"]
+    process = subprocess.Popen(hangs, stdin=subprocess.PIPE, text=True)
+    processes._end(process, 0.1)
+    processes._end(process, 0.1)
+    assert process.returncode == -signal.SIGKILL

@@ -343,7 +343,7 @@ def records(
     if isinstance(data, Sequence) and data and all(isinstance(each, Record) for each in data):
         return list(data)
     found = numeric_table(data, (input, output), rate_hz)
-    assumed, hold = hold is None, hold or "zero"
+    assumed, hold = hold is None, "zero" if hold is None else hold
     if found.rate_hz is not None and not is_uneven(found):
         record = Record.sampled(found[input], found[output], found.rate_hz, hold=hold)
         return [replace(record, hold_assumed=assumed)]

@@ -183,7 +183,7 @@ def read_recorded(
         strain = to_volt.strain(table[names[0]])
         table, units = replace(table, columns={**table.columns, names[0]: strain}), ("1", units[1])
     assumed = hold is None and held_at_hz is None and through is None
-    hold = hold or "zero"
+    hold = "zero" if hold is None else hold
     time_s = table.time_s if table.rate_hz is None else None
     if time_s is not None and held_at_hz is None:
         axis = time_axis(time_s, file, table.time_name or "time_s")

@@ -127,7 +127,7 @@ CALLS = {
         "input": ("u", COLUMN),
         "output": ("y", COLUMN),
         "rate_hz": (50.0, without(POSITIVE, "nothing")),
-        "hold": ("zero", WORD),
+        "hold": ("zero", without(WORD, "nothing")),
     },
     hl.table: {
         "data": ({"u": U, "y": Y}, without(DATA, "Series")),
@@ -216,6 +216,8 @@ CALLS = {
         "output_time_s": (TIME_S, VECTOR),
         "input_before": (0.0, NUMBER_OR_NONE),
         "hold": ("zero", WORD),
+        "hold_assumed": (False, FLAG),
+        "notes": ((), {}),
     },
     hl.Record.sampled: {
         "u": (U, VECTOR),

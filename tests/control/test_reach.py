@@ -6,10 +6,18 @@ import pytest
 from haselab.base import InputError, ResultError
 from haselab.control.gains import Saturation
 from haselab.control.reach import reachable_range
+from haselab.control.simulate import LoopSetting
+from haselab.models.actuator import ActuatorTables
 from haselab.models.maps import VoltageMap
+from haselab.rig.chip.design import strains_within
+from haselab.study.definition import Study
+from haselab.study.known import with_actuator_tables
 
 # an actuator whose zero strain is its unloaded length: 14 mV there
 FROM_REST = VoltageMap(3.2434714, 8.6686107, -3.2291820, -65.083499)
+
+# the same, where the fitted map has 0 V at a strain of 0.06 % of its range: -32 mV at zero strain
+BELOW_REST = VoltageMap(1.33632, 4.9019, -1.36828, -39.0907, -0.0175, 0.105)
 
 
 @pytest.mark.parametrize("wanted", [Saturation(), Saturation(-0.03, 0.09), Saturation(0.0, 0.07)])
@@ -28,3 +36,26 @@ def test_a_drive_that_does_not_reach_zero_strain_is_refused_with_its_voltage():
 def test_limits_without_zero_strain_are_refused_as_limits():
     with pytest.raises(InputError, match=r"limits are 0\.01 to 0\.05, but they must contain zero"):
         reachable_range(Saturation(0.01, 0.05), FROM_REST, 0.0, 6.0)
+
+
+def test_a_map_that_passes_0_v_just_beside_zero_strain_starts_its_loops_there():
+    found = reachable_range(Saturation(), BELOW_REST, 0.0, 2.0)
+    assert 0.0 < found.low < 1e-3 and found.start == found.low
+    assert BELOW_REST.voltage_v(found.low) >= 0.0
+    assert reachable_range(found, BELOW_REST, 0.0, 2.0) == found  # a second design
+    assert LoopSetting(100.0, 0.01, found).saturation == found
+    low, high = strains_within((found.low, found.high), BELOW_REST, 1.9)
+    assert low == found.low and float(BELOW_REST.voltage_v(high)) <= 1.9
+
+
+def test_a_study_of_such_an_actuator_has_its_baseline_at_the_lowest_drive():
+    names = ("a1_v", "b1", "a2_v", "b2", "strain_low", "strain_high")
+    section = {name: getattr(BELOW_REST, name) for name in names}
+    drive = {"low_v": 0.0, "high_v": 2.0, "voltage_map": section}
+    steps = {"step": 0.03, "zero_s": 4.0, "step_s": 6.0, "rest_s": 10.0, "frame_rate_hz": 20.0}
+    steps |= {"open_trials": 1, "pi_trials": 0, "pid_trials": 0}
+    study = Study.model_validate({"name": "rest", "steps": steps})
+    known = with_actuator_tables(study, ActuatorTables.model_validate({"drive": drive}))
+    assert known.operating_point.baseline_v is not None
+    # Within one step of the grid of `reach`, 0.1225 / 1500, times the slope of 60 V.
+    assert 0.0 <= known.operating_point.baseline_v < 5e-3

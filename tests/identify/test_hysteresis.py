@@ -269,3 +269,16 @@ def test_a_linear_lag_is_named_and_hysteresis_is_not_one(tau_s):
     assert any("linear first-order lag" in note for note in fit.notes)
     clean = PrandtlIshlinskii(1.0, (0.1, 0.4), (0.5, 0.4)).simulate(TRIANGLES)
     assert fit_hysteresis([LoopRecord(TRIANGLES, clean + noise, 100.0)]).verdict != "linear lag"
+
+
+@pytest.mark.parametrize("digits", [2, 3, 5])
+def test_the_last_digit_of_an_output_decides_no_structure(digits):
+    # Rounding errors repeat with the loop, so they looked like evidence for a further operator.
+    exact = record(PLAYS, noise=0.0)
+    rounded = LoopRecord(exact.u, np.round(exact.y, digits), exact.rate_hz)
+    fit = fit_hysteresis([rounded], "prandtl-ishlinskii")
+    assert sum(name.startswith("threshold") for name in fit.parameters) == 2
+    assert any("rounding of the output" in note for note in fit.notes)
+    assert not any("coloured" in note for note in fit.notes)
+    # An error of a digit at each end of a play moves its threshold by no more than this.
+    assert fit.parameters["threshold_1"].value == pytest.approx(0.15, abs=10.0**-digits)

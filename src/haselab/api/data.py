@@ -317,7 +317,7 @@ def records(
     output: str = "y",
     *,
     rate_hz: float | None = None,
-    hold: str = "zero",
+    hold: str | None = None,
 ) -> list[Record]:
     """Input and output of any source as the fits of `haselab.identify` take them.
 
@@ -327,7 +327,7 @@ def records(
         output: column of the output.
         rate_hz: rows a second, in Hz, which the times must not contradict. None: from the times.
         hold: the input between its rows: "zero" (held), "first" (straight lines) or
-            "band-limited".
+            "band-limited". None: held, which a fit then calls an assumption where it matters.
     Returns:
         One record; several where the times have gaps.
     Raises:
@@ -343,13 +343,15 @@ def records(
     if isinstance(data, Sequence) and data and all(isinstance(each, Record) for each in data):
         return list(data)
     found = numeric_table(data, (input, output), rate_hz)
+    assumed, hold = hold is None, "zero" if hold is None else hold
     if found.rate_hz is not None and not is_uneven(found):
-        return [Record.sampled(found[input], found[output], found.rate_hz, hold=hold)]
+        record = Record.sampled(found[input], found[output], found.rate_hz, hold=hold)
+        return [replace(record, hold_assumed=assumed)]
     if found.time_s is None or found.time_name is None:
         why = f" {found.why_no_times}" if found.why_no_times else ""
         raise InputError(f"The data state no sampling rate.{why} Give rate_hz, or a column time_s.")
     axis = time_axis(found.time_s, Path("data"), found.time_name)
-    kept, _ = records_of(found, (input, output), axis, hold)
+    kept = records_of(found, (input, output), axis, hold, hold_assumed=assumed)
     if not kept:
         raise InputError("Every part between gaps is too short or constant. Record without gaps.")
     return kept

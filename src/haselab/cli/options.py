@@ -40,6 +40,11 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--experiment": ("NAME", "Name the experiment in the session."),
     "--gain-v-per-v": (None, "State the gain of the amplifier in V/V."),
     "--held-at-hz": (None, "State the update rate of the output converter in Hz."),
+    "--hold": (
+        None,
+        "Choose how the input behaves between its samples. zero: it is held; first: straight "
+        "lines; band-limited: it was measured behind an anti-aliasing filter.",
+    ),
     "--i": ("COLUMN", "Name the column of the current monitor, in V."),
     "--input": ("COLUMN", "Name the column of the input."),
     "--keep-means": (None, "Keep the means of the columns instead of subtracting them."),

@@ -40,6 +40,16 @@ class Saturation:
                 "with low < high."
             )
 
+    @property
+    def start(self) -> float:
+        """Strain at which a loop starts: 0, or the end of the range next to it.
+
+        Example:
+            >>> Saturation().start, Saturation(0.001, 0.08).start
+            (0.0, 0.001)
+        """
+        return min(max(0.0, self.low), self.high)
+
 
 @dataclass(frozen=True)
 class PidGains:

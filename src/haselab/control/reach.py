@@ -7,7 +7,7 @@ import math
 from haselab.base import InputError, ResultError
 from haselab.control.gains import Saturation
 from haselab.control.plants.general import AnyPlant, PlantScale
-from haselab.models.maps import VoltageMap
+from haselab.models.maps import VoltageMap, allow_start
 from haselab.models.plant import Plant
 
 __all__ = ["default_step", "integrates", "reachable_range"]
@@ -52,7 +52,8 @@ def reachable_range(
         low_v: lowest drive, in V; None: no limit.
         high_v: highest drive, in V; None: no limit.
     Returns:
-        The limited range.
+        The limited range. It may end next to zero strain, see `allow_start`; a loop then starts
+        at this end.
     Raises:
         InputError: zero strain is outside the wanted range.
         ResultError: the drive does not reach zero strain.
@@ -64,15 +65,16 @@ def reachable_range(
     low_v = -math.inf if low_v is None else low_v
     high_v = math.inf if high_v is None else high_v
     found = to_volt.reach((wanted.low, wanted.high), low_v, high_v)
-    if not wanted.low <= 0.0 <= wanted.high:
+    if not allow_start((wanted.low, wanted.high)):
         raise InputError(
             f"The controller's limits are {wanted.low:g} to {wanted.high:g}, but they must contain "
             "zero strain, where a loop starts. Widen the limits."
         )
-    if found is None or not found[0] <= 0.0 <= found[1]:
+    if found is None or not allow_start(found):
         raise ResultError(
             f"The voltage map has zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
             f"drive is limited to [{low_v:g}, {high_v:g}] V. Change the limits of the drive, or "
-            "measure the voltage map again."
+            "count the strain from a length at a drive within these limits and fit both maps and "
+            "the model again."
         )
     return Saturation(*found)

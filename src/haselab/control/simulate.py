@@ -11,6 +11,7 @@ from haselab import _loops
 from haselab.base import InputError
 from haselab.control.gains import PidGains, Saturation
 from haselab.control.plants.held import HeldPlants
+from haselab.models.maps import allow_start
 from haselab.models.plant import Plant
 
 __all__ = ["LoopSetting", "LoopTrace", "simulate_drive", "simulate_loop"]
@@ -44,13 +45,15 @@ class LoopSetting:
 
     def __post_init__(self) -> None:
         low, high = self.saturation.low, self.saturation.high
+        within = low <= self.initial_u <= high
+        within |= self.initial_u == 0.0 and allow_start((low, high))
         checks = (
             ("rate_hz", self.rate_hz,
              0.0 < self.rate_hz <= _FASTEST_HZ, f"above 0, up to {_FASTEST_HZ:g} Hz"),
             ("measurement_delay_s", self.measurement_delay_s,
              0.0 <= self.measurement_delay_s * self.rate_hz <= _LONGEST_DELAY,
              f"0 to {_LONGEST_DELAY:g} sampling periods"),
-            ("initial_u", self.initial_u, low <= self.initial_u <= high, f"[{low:g}, {high:g}]"),
+            ("initial_u", self.initial_u, within, f"[{low:g}, {high:g}]"),
             ("points_per_sample", self.points_per_sample, self.points_per_sample >= 1, "1 or more"),
         )  # fmt: skip
         for name, value, good, allowed in checks:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from haselab.base import checked
 from haselab.identify.fit import Prediction, several
+from haselab.identify.hold import held_input
 from haselab.identify.record import Record
 from haselab.identify.training_output import TrainingOutput
 from haselab.models.plant import Plant
@@ -92,7 +93,8 @@ def fitted_output(model: Plant | RationalModel, record: Record, free_start: bool
     """
     # with a free start the constant includes the response to the level before the record
     level = float(record.u[0]) if free_start else 0.0
-    output = model.simulate(record.u - level, record.input_rate_hz, record.output_time_s)
+    u, rate_hz = held_input(record)
+    output = model.simulate(u - level, rate_hz, record.output_time_s)
     if not free_start:
         return output
     columns = _free_columns(np.asarray(model.poles), record)

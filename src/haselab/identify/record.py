@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -10,9 +11,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, check_fields, checked, real_array
+from haselab.base import Estimate, InputError, check_fields, checked, real_array
 
-__all__ = ["HOLDS", "Record", "finite_vector"]
+__all__ = ["HOLDS", "Record", "finite_vector", "record_notes"]
 
 Floats = NDArray[np.float64]
 HOLDS = ("zero", "first", "band-limited")
@@ -53,6 +54,8 @@ class Record:
         hold: interpolation of the input between its updates: "zero" (held, as a converter does),
             "first" (straight lines), or "band-limited" (a measured signal without content above
             half its rate).
+        hold_assumed: whether nobody stated `hold`; a fit then says what depends on it.
+        notes: how the record was made, for example of uneven times; a fit repeats them.
     Raises:
         InputError: wrong shapes, NaN, times that do not rise or that have a gap, a constant input
             or output.
@@ -64,6 +67,8 @@ class Record:
     output_time_s: Floats
     input_before: float | None = 0.0
     hold: str = "zero"
+    hold_assumed: bool = False
+    notes: tuple[str, ...] = ()
     made_by: ClassVar[str] = (
         "Make records of two arrays with haselab.records({'u': u, 'y': y}, rate_hz=100), or of a "
         "file with haselab.records(path, input, output)."
@@ -168,3 +173,26 @@ def _check_times(time_s: Floats) -> None:
             f"output_time_s has a gap of {steps[widest]:g} s after {time_s[widest]:g} s; samples "
             f"are {usual_s:g} s apart. Cut the record there and give two records."
         )
+
+
+def record_notes(records: Sequence[Record], delay: Estimate | None) -> tuple[str, ...]:
+    """What a fit says of its records: how they were made, and what depends on an assumed hold.
+
+    Args:
+        records: that were fitted.
+        delay: that was found; None: none.
+    Returns:
+        Each note once.
+    """
+    notes = [note for record in records for note in record.notes]
+    assumed = [record for record in records if record.hold_assumed]
+    sample_s = 1.0 / assumed[0].input_rate_hz if assumed else 0.0
+    # Not where the interval is wider than half a sample, or the delay was not estimated.
+    if assumed and delay is not None and 0.0 < 4.0 * delay.std < sample_s:
+        notes.append(
+            "The input is taken as held from sample to sample, as the output of a converter is. If "
+            "it was measured, such as a monitor voltage, add --hold band-limited (in Python "
+            "hold='band-limited'): otherwise the delay is too short by half a sample, "
+            f"{sample_s / 2:.3g} s."
+        )
+    return tuple(dict.fromkeys(notes))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["TrainingOutput", "hash_output", "is_comparable", "share_used"]
+__all__ = ["TrainingOutput", "grid_step", "hash_output", "is_comparable", "share_used"]
 
 Floats = NDArray[np.float64]
 Hashes = NDArray[np.uint64]
@@ -145,11 +145,20 @@ def _level_step(y: Floats) -> float:
     A slope that was subtracted leaves the differences in steps, a curved map leaves repeated
     values.
     """
-    return max(_grid_step(y), _grid_step(np.diff(y)), _repeated_step(y))
+    return max(grid_step(y), grid_step(np.diff(y)), _repeated_step(y))
 
 
-def _grid_step(values: Floats) -> float:
-    """Step of the grid on which the values lie; 0 if there is none."""
+def grid_step(values: Floats) -> float:
+    """Step of the grid on which values lie, such as a unit of their last digit.
+
+    Args:
+        values: shape `(N,)`.
+    Returns:
+        The step; 0 if there is none.
+    Example:
+        >>> round(grid_step(np.round(np.sin(np.arange(100.0)), 2)), 6)
+        0.01
+    """
     levels = np.unique(values)
     gaps = np.diff(levels)
     gaps = gaps[gaps > _ROUNDING * np.ptp(levels)] if levels.size else gaps

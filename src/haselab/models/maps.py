@@ -9,11 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError, LimitError
 
-__all__ = ["LinearMap", "VoltageMap"]
+__all__ = ["LinearMap", "VoltageMap", "allow_start"]
 
 Floats = NDArray[np.float64]
 _REACH_POINTS = 1501
 _ITERATIONS = 60
+_NEAR_ZERO = 0.02  # of a range of strains: distance of zero at which a loop still starts at its end
 
 
 @dataclass(frozen=True)
@@ -169,3 +170,20 @@ class LinearMap:
                 "Fit the map again."
             )
         return np.asarray((np.asarray(strain, np.float64) - self.offset) / self.slope)
+
+
+def allow_start(strains: tuple[float, float]) -> bool:
+    """Whether a loop can start at zero strain within a range, or at the end next to it.
+
+    Where zero strain is the length at 0 V, a fitted map passes 0 V a little beside zero strain.
+
+    Args:
+        strains: lowest and highest strain.
+    Returns:
+        True if the range contains 0, or ends within 2 % of its width from it.
+    Example:
+        >>> allow_start((-0.03, 0.1)), allow_start((0.0008, 0.08)), allow_start((0.01, 0.08))
+        (True, True, False)
+    """
+    low, high = strains
+    return max(low, -high) <= _NEAR_ZERO * (high - low)

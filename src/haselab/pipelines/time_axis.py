@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -98,9 +98,14 @@ def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:
 
 
 def records_of(
-    table: Table, columns: Sequence[str], axis: TimeAxis, hold: str
-) -> tuple[list[Record], list[str]]:
-    """Split uneven rows into records, and report what was done.
+    table: Table,
+    columns: Sequence[str],
+    axis: TimeAxis,
+    hold: str,
+    *,
+    hold_assumed: bool = False,
+) -> list[Record]:
+    """Split uneven rows into records whose notes say what was done.
 
     The input is assumed to change on the clock; the output is used at its own times. The input of
     up to 3 missing rows in one place is interpolated. After a larger gap a new record begins, with
@@ -111,6 +116,7 @@ def records_of(
         columns: names of input and output.
         axis: times of the rows.
         hold: how the input behaves between its updates, see `Record`.
+        hold_assumed: whether nobody stated it.
     """
     u, y = table[columns[0]], table[columns[1]]
     cuts = np.flatnonzero(np.diff(axis.number) > _FEW_MISSING + 1) + 1
@@ -125,7 +131,7 @@ def records_of(
         times_s = axis.time_s[rows] - first / axis.rate_hz
         times_s = np.where(np.abs(times_s * axis.rate_hz - number) < 1e-6, number / axis.rate_hz,
                            times_s)  # fmt: skip
-        records.append(Record(source, axis.rate_hz, y[rows], times_s, None, hold))
+        records.append(Record(source, axis.rate_hz, y[rows], times_s, None, hold, hold_assumed))
     notes = []
     if axis.missing:
         notes.append(
@@ -143,4 +149,4 @@ def records_of(
             f"{left_out} rows are excluded: their parts between gaps are constant or shorter than "
             f"{_LEAST_ROWS} rows."
         )
-    return records, notes
+    return [replace(record, notes=tuple(notes)) for record in records]

@@ -62,11 +62,12 @@ class ClosedLoop:
         self._sensor = _sensor(rig, camera_recorder, carrier[0], loop)
         self._watchdog = _watchdog(rig, carrier, loop)
         self._lost = self._outside = 0  # blocks
-        ends = (0.0, 0.0) if self._in_volts else (loop.saturation.low, loop.saturation.high)
-        strains = np.linspace(*ends, _REACH_POINTS)  # a voltage is limited in every step
-        voltages = [self._voltage(float(strain)) for strain in (*strains, 0.0)]
+        start, limits = loop.saturation.start, (loop.saturation.low, loop.saturation.high)
+        ends = (start, start) if self._in_volts else limits  # a voltage is limited in every step
+        strains = np.linspace(*ends, _REACH_POINTS)
+        voltages = [self._voltage(float(strain)) for strain in (*strains, start)]
         rig.description.drive_limits.check(voltages)
-        self._output_v = self._voltage(0.0)
+        self._output_v = self._voltage(start)
         self._waiting = deque([self._output_v] * loop.extra_delay_blocks)
         # the drives of the last blocks; the oldest one acts, the others are queued in the device
         queued = rig.description.queued_blocks

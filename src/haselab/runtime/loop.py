@@ -70,7 +70,7 @@ class LoopSettings:
             (low, high), known = drive_limits_v, self.actuator
             if known is not None:
                 low, high = max(low, known.low_v), min(high, known.high_v)
-            start = float(self.voltage_map.voltage_v(0.0))
+            start = float(self.voltage_map.voltage_v(self.saturation.start))
         found = ControllerSetting(
             period_s, low, high, start, delay_s, self.actuator, sensed_before_s
         )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping
 
 from haselab.base import InputError
 from haselab.controllers import CONTROLLERS, KnownActuator, known_actuator
 from haselab.models.actuator import ActuatorTables
+from haselab.models.maps import allow_start
 from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.resolution import ZERO_PX
@@ -52,7 +54,7 @@ def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
     changes: dict[str, object] = {}
     open_point = study.operating_point.baseline_v is None and not study.has("triangle")
     if open_point and tables.drive.voltage_map is not None:
-        baseline_v = float(tables.voltage_map().voltage_v(0.0))
+        baseline_v = _baseline_v(tables)
         changes["operating_point"] = OperatingPoint(baseline_v=baseline_v)
     held = tables.controller
     if study.has("steps") and not study.has("control") and held is not None and held.is_known:
@@ -69,6 +71,20 @@ def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
             saturation_high=held.limits.high,
         )
     return study.model_copy(update=changes)
+
+
+def _baseline_v(tables: ActuatorTables) -> float:
+    """Voltage of zero strain; where the drive ends just before it, that end."""
+    to_volt, (low_v, high_v) = tables.voltage_map(), tables.drive_ends_v()
+    voltage_v = float(to_volt.voltage_v(0.0))
+    reach = to_volt.reach(
+        (to_volt.strain_low, to_volt.strain_high),
+        -math.inf if low_v is None else low_v,
+        math.inf if high_v is None else high_v,
+    )
+    if reach is None or reach[0] <= 0.0 <= reach[1] or not allow_start(reach):
+        return voltage_v
+    return float(to_volt.voltage_v(min(reach, key=abs)))
 
 
 def _given(parameters: Mapping[str, float], kind: str) -> dict[str, object]:

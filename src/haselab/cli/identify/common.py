@@ -137,12 +137,10 @@ class Recorded:
 
     Args:
         records: one for each part without gaps.
-        notes: how uneven times were treated.
         units: SI units of input and output, "1" for a pure number; "" where the file states none.
     """
 
     records: list[Record]
-    notes: list[str]
     units: tuple[str, str]
 
 
@@ -153,7 +151,7 @@ def read_recorded(
     held_at_hz: float | None,
     columns: ColumnOptions,
     *,
-    hold: str = "zero",
+    hold: str | None = None,
     through: Path | None = None,
 ) -> Recorded:
     """Read the records of a file.
@@ -164,10 +162,11 @@ def read_recorded(
         rate_hz: sampling rate; None: that of the file.
         held_at_hz: update rate of the output converter; None: the sampling rate.
         columns: what the user states about the columns.
-        hold: how the input behaves between its updates.
-        through: actuator file whose voltage map converts the input from V to strain.
+        hold: how the input behaves between its updates; None: nobody stated it, so it is held.
+        through: actuator file whose voltage map converts the input from V to strain; its voltage
+            is a command, which is held.
     Returns:
-        The records, and how uneven times were treated.
+        The records.
     Raises:
         InputError: no sampling rate, or no usable data.
         LimitError: a voltage outside the voltage map.
@@ -183,20 +182,23 @@ def read_recorded(
         to_volt = load_actuator(through).voltage_map()
         strain = to_volt.strain(table[names[0]])
         table, units = replace(table, columns={**table.columns, names[0]: strain}), ("1", units[1])
+    assumed = hold is None and held_at_hz is None and through is None
+    hold = "zero" if hold is None else hold
     time_s = table.time_s if table.rate_hz is None else None
     if time_s is not None and held_at_hz is None:
         axis = time_axis(time_s, file, table.time_name or "time_s")
         _check_rate(table, rate_hz, axis.rate_hz, file)
-        records, notes = records_of(table, names, axis, hold)
+        records = records_of(table, names, axis, hold, hold_assumed=assumed)
         if not records:
             raise InputError(
                 f"Every part between gaps of column {table.time_name} is too short or constant. "
                 f"Record without gaps: {file}"
             )
-        return Recorded(records, notes, units)
+        return Recorded(records, units)
     rate = rate_hz_of(table, rate_hz, file)
     u, y = (table[name] for name in names)
-    return Recorded([Record.sampled(u, y, rate, hold=hold, held_at_hz=held_at_hz)], [], units)
+    record = Record.sampled(u, y, rate, hold=hold, held_at_hz=held_at_hz)
+    return Recorded([replace(record, hold_assumed=assumed)], units)
 
 
 def unit_of_name(name: str) -> str:

@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 import numpy as np
-from click.core import ParameterSource
 
 from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator, save_section
@@ -100,11 +99,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     help="Add a nonlinear curve of the input (hammerstein), a cubic spring (duffing) or a curve of "
     "the output (wiener). Default: none.",
 )  # fmt: skip
-@click.option(
-    "--hold", type=click.Choice(HOLDS), default="zero", show_default=True,
-    help="Choose how the input behaves between its samples. zero: it is held; first: straight "
-    "lines; band-limited: it was measured behind an anti-aliasing filter.",
-)  # fmt: skip
+@shared_option("--hold", type=click.Choice(HOLDS), detail="Default: zero.")
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
 @shared_option("--bootstrap", type=click.IntRange(2, 10_000), detail="Default: no bootstrap.")
 @shared_option(
@@ -149,7 +144,6 @@ def transfer(
     if actuator is not None:
         load_actuator(actuator, to_write=True)  # before a long fit
     records: list[Record] = []
-    notes: list[str] = []
     units = ("", "")
     for file in files:
         with name_files_in_errors(file):
@@ -163,7 +157,6 @@ def transfer(
                 through=actuator if options["through_voltage_map"] else None,
             )
             records += found_records.records
-            notes += found_records.notes
             units = _agreed(units, found_records.units, (source, output))
     found: TransferFit | TransferChoice
     fit: TransferFit
@@ -185,12 +178,6 @@ def transfer(
     modelled = "strain" if options["through_voltage_map"] else source
     more: dict[str, Any] = {"input": modelled, "output": output}
     more |= {f"{end}_unit": unit for end, unit in zip(more, units, strict=True) if unit}
-    context = click.get_current_context()
-    is_held = options["held_at_hz"] is not None or options["through_voltage_map"]
-    if not is_held and context.get_parameter_source("hold") is ParameterSource.DEFAULT:
-        notes += _doubts_of_hold(fit)
-    if notes:
-        more["notes"] = [*fit.notes, *notes]
     if options["bootstrap"] is not None and fit.succeeded:
         rng = np.random.default_rng(options["seed"])
         if isinstance(fit, NonlinearFit):
@@ -222,20 +209,6 @@ def _save(
     used = load_actuator(actuator).drive.voltage_map if through_map else None
     section["through_voltage_map"] = None if used is None else used.coefficients
     save_section(actuator, "model", section, files, MODEL_KEYS)
-
-
-def _doubts_of_hold(fit: TransferFit) -> list[str]:
-    """A note where the delay depends on how the input behaves between its samples."""
-    delay = fit.parameters.get("delay_s")
-    sample_s = 1.0 / fit.records[0].input_rate_hz if fit.records else math.nan
-    # Not where the interval is wider than half a sample, or the delay was not estimated.
-    if not fit.succeeded or delay is None or not 0.0 < 4.0 * delay.std < sample_s:
-        return []
-    return [
-        "The input is taken as held from sample to sample, as the output of a converter is. If it "
-        "was measured, such as a monitor voltage, add --hold band-limited: otherwise the delay is "
-        f"too short by half a sample, {sample_s / 2:.3g} s."
-    ]
 
 
 def _agreed(

@@ -37,7 +37,7 @@ from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import predict
-from haselab.identify.record import Record
+from haselab.identify.record import HOLDS, Record
 from haselab.identify.training_output import TrainingOutput, is_comparable
 from haselab.models.actuator.model_tables import OriginTable
 from haselab.pipelines.design.model_file import read_any_plant, read_origin, read_posterior
@@ -65,6 +65,8 @@ _NO_NOISE = (
 )  # fmt: skip
 @shared_option("--at-rest", is_flag=True, detail="Its state and offset are then taken as 0.")
 @shared_option("--through-voltage-map", is_flag=True)
+@shared_option("--hold", type=click.Choice(HOLDS), detail="Default: zero. State what you stated "
+               "to 'identify transfer'.")  # fmt: skip
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
 @shared_option("--experiment", "experiments", multiple=True,
                detail="Repeat the option for more. Default: all.")  # fmt: skip
@@ -97,6 +99,7 @@ def command(
     at_rest: bool,
     through_voltage_map: bool,
     which: str,
+    hold: str | None,
     held_at_hz: float | None,
     experiments: tuple[str, ...],
     free_offset: bool,
@@ -129,6 +132,7 @@ def command(
     worse than the mean of the record.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
+    linear |= hold is not None
     measured = _given(context, "output", output)
     table = TableOptions(
         _given(context, "source", source), () if measured is None else (measured,), rate_hz,
@@ -137,8 +141,8 @@ def command(
     options = PhysicalOptions(experiments, free_offset, longest_m, unverified, table)
     if which == "physical" and linear:
         raise InputError(
-            "--at-rest, --through-voltage-map and --held-at-hz are for linear models. Leave them "
-            "out, or use --model linear."
+            "--at-rest, --through-voltage-map, --hold and --held-at-hz are for linear models. "
+            "Leave them out, or use --model linear."
         )
     if which == "physical" or (which == "auto" and not linear and has_physical_model(model)):
         compare_physical(model, files, options, as_json=as_json, out=out, plot=plot)
@@ -153,7 +157,7 @@ def command(
     for file in files:
         with name_files_in_errors(file):
             found = read_recorded(
-                file, (source, output), rate_hz, held_at_hz, columns, through=through
+                file, (source, output), rate_hz, held_at_hz, columns, hold=hold, through=through
             )
             _check_units(origin, found.units, (source, output), through_voltage_map)
             records += found.records

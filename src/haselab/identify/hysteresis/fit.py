@@ -31,6 +31,7 @@ from haselab.identify.hysteresis.search import (
     PLAYS,
     Candidate,
     rate_spread,
+    rounding_floor,
     search_hysteresis,
 )
 from haselab.identify.model_choice import APART, effective_count, is_decisive
@@ -48,6 +49,8 @@ _ROWS = 20_000
 _HELD_OUT = 0.25
 _MOST_OPERATORS = 20
 _COLOURED = 0.01
+_EXACT = 1e-9  # of the output's span
+_AS_ROUNDING = 1.5  # mean square of residuals over that of rounding errors
 _TOLD = 3.0  # standard deviations of a significant loop width
 LAG = "linear lag"
 _LAG = (
@@ -298,7 +301,7 @@ def _describe(
         parameters=estimates,
         covariance=rescaled(covariance, np.array([entry.std for entry in estimates.values()])),
         residuals=residuals,
-        notes=_notes(records, masks, chosen, estimates, fitted, spread, white, cycles),
+        notes=_notes(records, masks, residuals, chosen, estimates, fitted, spread, white, cycles),
         kind=chosen.kind,
         records=tuple(records),
         cycles=cycles,
@@ -347,9 +350,24 @@ def _validation(
     )
 
 
+def _is_rounding(
+    records: Sequence[LoopRecord],
+    residuals: Sequence[Floats],
+    masks: Sequence[NDArray[np.bool_]],
+) -> bool:
+    """Whether residuals are no larger than the errors by rounding the outputs."""
+    outputs = np.concatenate([record.y for record in records])
+    square = float(
+        np.mean(np.concatenate([e[m] for e, m in zip(residuals, masks, strict=True)]) ** 2)
+    )
+    exact = square < (_EXACT * float(np.ptp(outputs))) ** 2
+    return exact or square < _AS_ROUNDING * rounding_floor(outputs, square)
+
+
 def _notes(
     records: Sequence[LoopRecord],
     masks: Sequence[NDArray[np.bool_]],
+    residuals: Sequence[Floats],
     chosen: Candidate,
     estimates: dict[str, Estimate],
     fitted: Hysteresis,
@@ -365,7 +383,12 @@ def _notes(
             "record loops at two rates or more."
         )
         blind = [name for name in blind if name != "rate_dependence_s"]
-    if white < _COLOURED:
+    if _is_rounding(records, residuals, masks):
+        notes.append(
+            "What the model leaves is the rounding of the output. Smaller effects are not "
+            "identifiable: record more digits."
+        )
+    elif white < _COLOURED:
         notes.append(
             "The residuals are coloured: something other than hysteresis is left, such as creep or "
             "a resonance; the intervals treat it as noise. Record slower loops."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
@@ -20,6 +21,7 @@ from haselab.identify.hysteresis.prandtl_ishlinskii import (
 )
 from haselab.identify.hysteresis.problem import Family, HysteresisProblem, Numbers, Scale, Solved
 from haselab.identify.model_choice import APART, bic, effective_count
+from haselab.identify.training_output import grid_step
 
 __all__ = [
     "BOUC_WEN",
@@ -28,6 +30,7 @@ __all__ = [
     "PLAYS",
     "Candidate",
     "rate_spread",
+    "rounding_floor",
     "search_hysteresis",
 ]
 
@@ -41,6 +44,8 @@ _SPREAD = (3, 6)
 _PATIENCE = 2  # operators in a row that may fail to lower the criterion
 _ROWS = 2500
 _ROUNDING = 1e-18  # mean square of residuals, in units of half the span
+_MOST_DIGITS, _OFF_DIGIT = 9, 1e-4  # of a printed number; distance from whole units
+_OF_STEPS = 0.25  # of the mean square of rounding errors: smaller residuals are of exact outputs
 _FILTER_SAMPLES = 4.0
 _FILTERS = (0.0, 1.0, 2.0, 8.0, 16.0, 32.0, 64.0)
 
@@ -75,18 +80,46 @@ def rate_spread(problem: HysteresisProblem) -> float:
     return float(high / low) if low > 0.0 else float("inf") if high > 0.0 else 1.0
 
 
+def rounding_floor(y: Floats, left: float) -> float:
+    """Mean square of the errors by rounding an output, which repeat with the loop.
+
+    Args:
+        y: output. Shape `(N,)`.
+        left: mean square of the residuals of the best model.
+    Returns:
+        The mean square; 0 where the output has no steps, or the residuals are much smaller.
+    """
+    floor = max(grid_step(y), _last_digit(y)) ** 2 / 12.0
+    return floor if left > _OF_STEPS * floor else 0.0
+
+
+def _last_digit(y: Floats) -> float:
+    """Unit of the last decimal digit of printed numbers; 0 where they have too many digits."""
+    span = float(np.ptp(y))
+    first = math.floor(math.log10(span)) if span > 0.0 else 0
+    for power in range(first, first - _MOST_DIGITS, -1) if span > 0.0 else ():
+        counts = y / 10.0**power
+        if np.abs(counts - np.round(counts)).max() < _OFF_DIGIT:
+            return float(10.0**power)
+    return 0.0
+
+
 class _Judge:
     """The criterion of all candidates, with one effective number of samples."""
 
-    def __init__(self, problem: HysteresisProblem, richest: Solved, family: Family) -> None:
+    def __init__(
+        self, problem: HysteresisProblem, richest: Solved, family: Family, outputs: Floats
+    ) -> None:
         residuals = np.split(problem.residuals(family, richest.numbers), problem.ends)
         self.count = problem.y.size
+        half_y, mean = problem.scale.half_y, richest.cost / self.count
+        self.floor = max(rounding_floor(outputs, mean * half_y**2) / half_y**2, _ROUNDING)
         self.effective = effective_count(residuals)
 
     def rate(self, kind: str, family: Family, solved: Solved) -> Candidate:
         size = solved.numbers.vector.size
         detail, between = (
-            bic(solved.cost, self.count, samples, size, _ROUNDING)
+            bic(solved.cost, self.count, samples, size, self.floor)
             for samples in (self.count, self.effective)
         )
         return Candidate(kind, family, solved, detail, between)
@@ -119,7 +152,8 @@ def search_hysteresis(
     ]
     paths = [_grow(problem, [(none, curve)], _TRIED_WITH) for curve in curves]
     family, richest = min((path[-1] for path in paths), key=lambda entry: entry[1].cost)
-    judge = _Judge(problem, richest, family)
+    outputs = np.concatenate([record.y for record in records])
+    judge = _Judge(problem, richest, family, outputs)
     chosen = min(range(len(_ZONES)), key=lambda k: judge.rate(PLAYS, *paths[k][-1]).detail)
     curved = [judge.rate(CURVE, none, curve) for curve in curves]
     found = {CURVE: _best(curved)}

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from haselab import _identify
 from haselab.base import Estimate, InputError, ResultError, checked
 from haselab.identify.fit import several
+from haselab.identify.hold import fine_input
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, fitted_part, no_fit, remarks
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import TransferStructure, layout_of
-from haselab.identify.transfer.problem import fine_input
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import search_bounds
 

@@ -78,7 +78,7 @@ def coefficients(numbers: Floats, middle: float, half: float) -> tuple[Floats, F
 
 def least_split_reached(search: Floats) -> bool:
     """Whether the two rates came as close as the search allows."""
-    return bool(search[1] <= 1.01 * _LEAST_SPLIT**2)
+    return bool(search[1] <= 1.05 * _LEAST_SPLIT**2)
 
 
 def search_free(x: Floats, v: Floats) -> Solution:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
-from haselab.identify.fit import CurveFit, propagated
+from haselab.identify.fit import CurveFit, propagated, rescaled
 from haselab.identify.noise import coloured_covariance, r_squared
 from haselab.identify.projection import Solution
 from haselab.identify.statics.columns import check_pair, plausible_strain, plausible_voltage
@@ -31,13 +31,15 @@ __all__ = ["VoltageMapFit", "fit_voltage_map"]
 Floats = NDArray[np.float64]
 _NAMES = ("a1_v", "b1", "a2_v", "b2")
 _MARGIN = 0.2  # of the strain's span, on each side
+_APART = 2.0  # standard deviations of the squared split, from which the two rates are told apart
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoltageMapFit(CurveFit):
     """A fitted voltage map; see `Fit` for what all fits have.
 
-    Its `parameters` are `a1_v`, `b1`, `a2_v`, `b2`; the larger rate is `b1`.
+    Its `parameters` are `a1_v`, `b1`, `a2_v`, `b2`; the larger rate is `b1`. Those that the loop
+    does not determine are NaN; `map` has a value for each.
 
     Args:
         monotone: whether the curve rises, or falls, over the whole range of the map.
@@ -136,13 +138,26 @@ class _Curve:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(strain.shape))
 
     def estimates(self) -> tuple[dict[str, Estimate], Floats]:
+        """Coefficients with their covariance.
+
+        Where the data do not separate the two rates, the error of a coefficient is not normal, so
+        it is reported as not identifiable; the curve is known nevertheless.
+        """
         values, slope = coefficients(self.numbers, self.middle, self.half)
         covariance = propagated(slope, self.covariance)
-        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return {
-            name: Estimate.normal(value, spread, "V" if name.endswith("_v") else "")
-            for name, value, spread in zip(_NAMES, values, std, strict=True)
-        }, covariance
+        with np.errstate(invalid="ignore"):
+            std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        split, split_std = float(self.numbers[1]), math.sqrt(float(self.covariance[1, 1]))
+        separate = split > _APART * split_std and not least_split_reached(self.numbers)
+        std = np.where(np.isfinite(std) & separate, std, math.inf)
+        estimates = {}
+        for name, value, spread in zip(_NAMES, values, std, strict=True):
+            unit = "V" if name.endswith("_v") else ""
+            estimates[name] = (
+                Estimate.normal(value, spread, unit) if spread < math.inf
+                else Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
+            )  # fmt: skip
+        return estimates, rescaled(covariance, std)
 
 
 @checked
@@ -208,7 +223,7 @@ def _describe(
         parameters=estimates,
         covariance=covariance,
         residuals=(residuals,),
-        notes=_notes(solution, estimates, limited),
+        notes=_notes(estimates, limited),
         monotone=chart.is_monotone(chart.strain_low, chart.strain_high),
         hysteresis_width=loop_width(e, v, residuals),
         r_squared=r_squared(v, v - residuals),
@@ -218,16 +233,16 @@ def _describe(
     )
 
 
-def _notes(solution: Solution, estimates: dict[str, Estimate], limited: bool) -> tuple[str, ...]:
+def _notes(estimates: dict[str, Estimate], limited: bool) -> tuple[str, ...]:
     notes = []
     if limited:
         notes.append(
             "The best curve turns within the range of the map; the best monotone one is given."
         )
-    if least_split_reached(solution.search):
+    blind = [name for name, estimate in estimates.items() if math.isnan(estimate.value)]
+    if blind:
         notes.append(
-            "The two exponentials meet, so their amplitudes are not identifiable; the curve is."
+            f"Not identifiable from this loop: {', '.join(blind)}, because it does not separate "
+            "two exponentials. The curve is identifiable: use the map."
         )
-    elif any(not e.std < 0.5 * abs(e.value) for e in estimates.values()):
-        notes.append("Not all coefficients are identifiable from this loop; use the curve.")
     return tuple(notes)

@@ -18,7 +18,7 @@ from haselab.identify.fit import Prediction, RecordFit, several
 from haselab.identify.frequency.steady_tone import steady_tone_hz
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.prediction import fitted_output, predict
-from haselab.identify.record import Record, finite_vector
+from haselab.identify.record import Record, finite_vector, record_notes
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.checks.ambiguity import OtherMinimum, ambiguity, find_other_minima
 from haselab.identify.transfer.checks.diagnosis import diagnose
@@ -38,7 +38,7 @@ from haselab.models import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 
-__all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer"]
+__all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer", "with_record_notes"]
 
 Floats = NDArray[np.float64]
 _HELD_OUT = 0.25
@@ -293,6 +293,30 @@ def fit_transfer(
         ('ok', True)
     """
     records, structure = several(records), structure or TransferStructure()
+    return with_record_notes(_fitted(records, structure, applied=applied, near=near), records)
+
+
+def with_record_notes(fit: TransferFit, records: Sequence[Record]) -> TransferFit:
+    """A fit with the notes of its records.
+
+    Args:
+        fit: with or without a result.
+        records: that were fitted.
+    Returns:
+        The same fit with further `notes`; unchanged without a result.
+    """
+    notes = record_notes(records, fit.parameters.get("delay_s")) if fit.succeeded else ()
+    return replace(fit, notes=(*fit.notes, *notes))
+
+
+def _fitted(
+    records: Sequence[Record],
+    structure: TransferStructure,
+    *,
+    applied: bool,
+    near: TransferFit | None,
+) -> TransferFit:
+    """The fit; other explanations of the records are tested where it leaves a doubt."""
     tones = _too_few_tones(layout_of(structure), records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, checked
+from haselab.identify.fit import several
 from haselab.identify.model_choice import APART
 from haselab.identify.noise import fit_percent
 from haselab.identify.nonlinear.hammerstein import DEGREES, fit_hammerstein
@@ -17,7 +18,7 @@ from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit, fitted_count,
 from haselab.identify.nonlinear.oscillator import fit_duffing, fit_output_curve
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.clipping import richer_fits
-from haselab.identify.transfer.fit import TransferFit
+from haselab.identify.transfer.fit import TransferFit, with_record_notes
 from haselab.identify.transfer.layout import TransferStructure, layout_of
 from haselab.identify.transfer.problem import TransferProblem
 from haselab.identify.transfer.search import best_fit
@@ -58,10 +59,19 @@ def fit_nonlinear(
         raise InputError(f"nonlinear = {kind}; it must be one of {', '.join(NONLINEAR)}.")
     family, _, which = kind.partition("-")
     if family == "hammerstein":
-        return fit_hammerstein(records, structure, int(which))
-    if family == "wiener":
-        return fit_output_curve(records, structure)
-    return fit_duffing(records, structure, (2, 3) if which else (3,))
+        fit = fit_hammerstein(records, structure, int(which))
+    elif family == "wiener":
+        fit = fit_output_curve(records, structure)
+    else:
+        fit = fit_duffing(records, structure, (2, 3) if which else (3,))
+    return _noted(fit, several(records))
+
+
+def _noted(fit: NonlinearFit, records: Sequence[Record]) -> NonlinearFit:
+    """A fit with the notes of its records."""
+    noted = with_record_notes(fit, records)
+    assert isinstance(noted, NonlinearFit)
+    return noted
 
 
 def nonlinear_candidates(
@@ -99,7 +109,7 @@ def nonlinear_candidates(
                 fits.append(fit_hammerstein(records, structure, degree, known))
             except InputError as error:
                 fits.append(no_fit(structure, f"hammerstein-{degree}", str(error)))
-    return fits
+    return [_noted(fit, records) for fit in fits]
 
 
 def linear_candidates(linear: TransferFit) -> list[TransferFit]:

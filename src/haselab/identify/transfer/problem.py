@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab import _identify
+from haselab.identify.hold import fine_input
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import Layout
-from haselab.models.filters import resample_poly
 
-__all__ = ["LEAST_GAIN", "Columns", "Found", "TransferProblem", "fine_input"]
+__all__ = ["LEAST_GAIN", "Columns", "Found", "TransferProblem"]
 
 Floats = NDArray[np.float64]
-_FINER = 8  # points per sample of the polygon that represents a band-limited input
 _ITERATIONS = 100
 LEAST_GAIN = 1e-9  # of the cost: a thousandth of a standard deviation with 1,000 outputs
 
@@ -112,17 +111,6 @@ class TransferProblem:
         own = [factors.tolist() for factors in found.own]
         output = self._native.predict(found.search.tolist(), found.shared.tolist(), own)
         return np.split(output, self._ends)
-
-
-def fine_input(record: Record) -> tuple[Floats, float]:
-    """Input and its rate, in Hz; a band-limited input is refined to a polygon."""
-    u, rate_hz = record.u, record.input_rate_hz
-    if record.hold == "band-limited":
-        u = resample_poly(u, _FINER, 1, window=("kaiser", 9.0), padtype="line")
-        # Straight lines damp a tone by 1 - (omega T)^2/12; the second difference corrects that.
-        u[1:-1] -= np.diff(u, 2) / 12.0
-        rate_hz *= _FINER
-    return np.ascontiguousarray(u), rate_hz
 
 
 def _held(record: Record, margin_s: float, cut: int) -> _identify.Record:

@@ -18,7 +18,7 @@ from haselab.firmware import (
 )
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.sections import ControllerSection
-from haselab.models.maps import VoltageMap
+from haselab.models.maps import VoltageMap, allow_start
 from haselab.models.plant import Plant
 from haselab.rig.chip.own_step import controller_step
 from haselab.store.actuator_file import read_run
@@ -187,7 +187,7 @@ def strains_within(
         refuses.
     """
     found = to_volt.reach(limits, low_v, high_v)
-    return limits if found is None or not found[0] <= 0.0 <= found[1] else found
+    return limits if found is None or not allow_start(found) else found
 
 
 def _controller(

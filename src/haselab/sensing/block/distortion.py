@@ -1,4 +1,4 @@
-"""Harmonics of the carrier: of the generator, or of a monitor that saturates."""
+"""A monitor that saturates: by the harmonics of the carrier, or by readings that pile up."""
 
 from __future__ import annotations
 
@@ -7,17 +7,25 @@ from numpy.typing import NDArray
 
 from haselab.sensing.block.segments import HARMONICS
 
-__all__ = ["find_distortion"]
+__all__ = ["at_a_rail", "find_distortion"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _CLEAR = 4.5  # standard deviations of a harmonic's quadrature
+_RUN = 3  # equal readings in a row that count as piled up
+_FEWEST = 6  # readings of a block in such runs
+_PILED = 3.0  # such readings over those just inside them; a sine in coarse steps has at most 1.2
+_JUST_INSIDE = (2.5, 0.02)  # steps, and share of the range
 _IN_PHASE = 0.06  # of a harmonic: tolerance for noise and skew of the phase of a saturation
 
 
 def find_distortion(
-    harmonic: Complexes, std: Floats, voltage: Complexes, current: Complexes
+    harmonic: Complexes,
+    std: Floats,
+    voltage: Complexes,
+    current: Complexes,
+    apart: NDArray[np.bool_],
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Find blocks in which a monitor saturates, and blocks with harmonics of the carrier.
 
@@ -31,6 +39,7 @@ def find_distortion(
         std: standard deviation of one quadrature.
         voltage: phasor of the carrier, `(blocks,)`.
         current: the same for the current.
+        apart: blocks that say nothing about the others, such as those at a rail, `(blocks,)`.
     Returns:
         Two arrays of shape `(blocks,)`.
     """
@@ -40,7 +49,14 @@ def find_distortion(
     harmonic = harmonic * np.conj(carriers / size)[:, :, np.newaxis] ** orders
     single = _saturates(harmonic, _beyond_load(harmonic, carriers, orders), std)
     seen = (np.abs(harmonic) > _CLEAR * std).any(axis=(1, 2))
+    if apart.all():
+        return single, np.asarray(seen)
     # The same for the mean over the record, since noise hides it in one block.
+    kept = ~(apart | single)
+    if not kept.any():
+        kept = ~apart
+    harmonic, std, size = harmonic[kept], std[kept], size[kept]
+    voltage, current = voltage[kept], current[kept]
     typical = np.median(size, axis=0)
     weight = (size[:, :, np.newaxis] / np.maximum(std, 1e-12 * size[:, :, np.newaxis])) ** 2
     total = np.maximum(weight.sum(axis=0), 1e-300)
@@ -80,3 +96,41 @@ def _saturates(harmonic: Complexes, excess: Complexes, std: Floats) -> NDArray[n
     tolerance = np.maximum(_CLEAR * error, _IN_PHASE * size[:, 1, third])
     linear = clear[:, :, third].all(axis=1) & (np.abs(excess[:, third]) < tolerance)
     return np.asarray((aligned & down).any(axis=1) & ~linear)
+
+
+def at_a_rail(cut: Floats, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find blocks whose readings pile up at their largest or smallest value, as at a rail.
+
+    Harmonics miss a rail that is crossed by a drive: it clips most of some periods and none of
+    others.
+
+    Args:
+        cut: readings `(blocks, 2, segments, length)`.
+        used: segments that count, `(blocks, segments)`.
+    Returns:
+        Shape `(blocks,)`.
+    Example:
+        >>> angle = 2 * np.pi * np.arange(1000) / 50
+        >>> wave = np.cos(angle) + 0.01 * np.random.default_rng(1).normal(size=1000)
+        >>> cut = np.stack([np.minimum(wave, 0.9), wave]).reshape(1, 2, 20, 50)
+        >>> at_a_rail(np.concatenate([cut, cut[:, [1, 1]]]), np.ones((2, 20), dtype=bool)).tolist()
+        [True, False]
+    """
+    piled = np.zeros(len(cut), dtype=np.bool_)
+    every = np.repeat(used, cut.shape[3], axis=1)[:, np.newaxis]
+    for sign in (1.0, -1.0):
+        values = sign * cut.reshape(len(cut), 2, -1)
+        below = values.max(axis=2, keepdims=True) - values
+        top = below == 0.0
+        inside = np.where(top, np.inf, below)
+        step = inside.min(axis=2, keepdims=True)
+        width = np.maximum(_JUST_INSIDE[0] * step, _JUST_INSIDE[1] * below.max(2, keepdims=True))
+        ends = [top[..., k : top.shape[2] - _RUN + 1 + k] for k in range(_RUN)]
+        runs = np.logical_and.reduce(ends)
+        inner = np.zeros_like(top)
+        for k in range(_RUN):
+            inner[..., k : top.shape[2] - _RUN + 1 + k] |= runs
+        many = (inner & every).sum(axis=2)
+        near = ((inside <= width) & every).sum(axis=2)
+        piled |= ((many >= _FEWEST) & (many > _PILED * near)).any(axis=1)
+    return piled

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.sensing.block.distortion import find_distortion
+from haselab.sensing.block.distortion import at_a_rail, find_distortion
 from haselab.sensing.block.drive import UNEXPLAINED, DriveLibrary
 from haselab.sensing.block.dropouts import Breaks, find_breaks
 from haselab.sensing.block.ratio import Ratio, ratio_of_segments
@@ -126,7 +126,9 @@ def explain(readings: NDArray[Any], config: LockinConfig) -> Explained | None:
     )
     relative = dearer * ratio.relative_std
     texts = list(found.texts)
-    reason = _judge(readings, config, segments, lines, with_lines, found, ratio, breaks, texts)
+    rail = at_a_rail(cut, breaks.used)
+    judged = (found, ratio, breaks)
+    reason = _judge(readings, config, segments, lines, with_lines, judged, rail, texts)
     if not config.search_updates:
         reason[found.stepped & (reason == 0)] |= _UPDATE
     return Explained(
@@ -227,9 +229,9 @@ def _better(found: _Found, other: _Found, segments: Segments, lines: int) -> NDA
         about = about / np.maximum(least * segments.quadrature, 1e-300) + 2.0 * (
             segments.count - count
         )
-        return np.asarray(
-            one.score * share.mean(axis=1) + (about + freedom * (share - 1.0)).sum(axis=1)
-        )
+        with np.errstate(over="ignore"):  # of noise-free readings, one fit may be exact
+            misfits = about + freedom * (share - 1.0)
+            return np.asarray(one.score * share.mean(axis=1) + misfits.sum(axis=1))
 
     cost = 4.0 * lines * np.log(freedom)
     return np.asarray(misfit(other) + cost < misfit(found), dtype=np.bool_)
@@ -329,15 +331,15 @@ def _judge(
     segments: Segments,
     lines: Lines,
     with_lines: NDArray[np.bool_],
-    found: _Found,
-    ratio: Ratio,
-    breaks: Breaks,
+    judged: tuple[_Found, Ratio, Breaks],
+    rail: NDArray[np.bool_],
     texts: list[str],
 ) -> NDArray[np.uint8]:
     """Determine the reason of each block, and complete the texts."""
+    found, ratio, breaks = judged
     reason = np.zeros(len(texts), dtype=np.uint8)
     flat, harmonic = find_distortion(
-        found.harmonic, found.harmonic_std, ratio.voltage, ratio.current
+        found.harmonic, found.harmonic_std, ratio.voltage, ratio.current, rail
     )
     coarse, step = _coarse(readings, found.variance, ratio)
     far = np.abs(ratio.turn) > _MOST_OFF * segments.turn
@@ -351,7 +353,7 @@ def _judge(
         strict=True,
     )  # fmt: skip
     texts[:] = [words.of(one) for one in seen]
-    wrong = breaks.refused | coarse | off | (flat & nearly_off) | flat | unexplained
+    wrong = breaks.refused | coarse | off | (flat & nearly_off) | flat | rail | unexplained
     for k in np.flatnonzero(wrong).tolist():
         reason[k] = DISTURBED
         if breaks.refused[k]:
@@ -361,7 +363,7 @@ def _judge(
         elif off[k] or (flat[k] and nearly_off[k]):  # its leakage looks like harmonics
             reason[k] = _CARRIER_OFF
             texts[k] = f"by {ratio.turn[k] / (2 * np.pi) * config.rate_hz:.3g} Hz"
-        elif flat[k]:
+        elif flat[k] or rail[k]:
             texts[k] = "flat top: a monitor saturates"
         else:
             near_hz = config.carrier_hz + ratio.strongest[k] * config.rate_hz

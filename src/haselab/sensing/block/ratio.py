@@ -24,6 +24,7 @@ _EVEN = 0.3  # share of the phasors' scatter left after removing a constant freq
 _ALIKE = 2.0  # quartile ratio of the scatter; by chance 1.4 with 20 segments
 _COLOURED = 0.2  # logarithm of a ratio of noise densities that counts as coloured
 _SMALL = 1e-6  # of the carrier: less is rounding
+_NO_CARRIER = 1e-120  # stands for a phasor of exactly 0, as of a carrier below one converter step
 
 
 @dataclass(frozen=True)
@@ -91,14 +92,17 @@ def _fit(v: Complexes, i: Complexes, used: NDArray[np.bool_], segments: Segments
     count = weight.sum(axis=1)
     pairs = v[:, 1:] * np.conj(v[:, :-1]) * (used[:, 1:] & used[:, :-1])
     turn = np.angle(pairs.sum(axis=1)) / segments.length
-    voltage, current = _mean(v, weight), _mean(i, weight)
-    tiny = 1e-300
-    m = v / np.where(np.abs(voltage) > tiny, voltage, tiny)[:, np.newaxis]
-    e = i / np.where(np.abs(current) > tiny, current, tiny)[:, np.newaxis] - m
+    voltage, current = (
+        np.where(np.abs(mean) > _NO_CARRIER, mean, _NO_CARRIER)
+        for mean in (_mean(v, weight), _mean(i, weight))
+    )
+    m, e = v / voltage[:, np.newaxis], i / current[:, np.newaxis]
+    e = e - m
     basis = np.asarray(np.polynomial.legendre.legvander(segments.middles, 2), dtype=np.float64)
     about_v = weight * np.abs(m - 1.0) ** 2
     plain = _trend(e, weight, basis)
     modulated = about_v.sum(axis=1) > _COMMON * (weight * np.abs(plain) ** 2).sum(axis=1)
+    modulated &= np.abs(voltage) > _NO_CARRIER
     own = np.where(modulated[:, np.newaxis], weight * np.abs(m) ** 2, weight)
     shape = np.where(modulated[:, np.newaxis], m, 1.0)
     rest = _trend(e / np.where(shape == 0.0, 1.0, shape), own, basis)
@@ -236,5 +240,5 @@ def _near_carrier(rest: Complexes, blocks: NDArray[np.bool_], segments: Segments
 
 def _white(fit: _Fit, variance: Floats) -> Floats:
     """Relative variance of the ratio for white noise, for a quadrature of variance 1."""
-    sizes = np.maximum(np.abs(np.stack([fit.voltage, fit.current], axis=1)), 1e-300)
+    sizes = np.abs(np.stack([fit.voltage, fit.current], axis=1))
     return np.asarray((variance / sizes**2).sum(axis=1))

@@ -18,6 +18,7 @@ Complexes = NDArray[np.complex128]
 HARMONICS = (2, 3, 4, 5)
 _MOST, _FEWEST, _SHORTEST = 32, 4, 40
 _STUCK, _ALIVE = 1e-6, 0.8  # variance of a segment relative to that of the others, at this quantile
+_ROUNDING = 1e-16  # variance of noise-free readings, relative to the squares of their segment
 
 
 @dataclass(frozen=True)
@@ -78,14 +79,17 @@ class Projected:
             counts: segments that count, `(segments,)`.
         Returns:
             The variance, `(blocks, 2)`, and the segments in which a channel has no noise at all
-            while it has some in others, `(blocks, 2, segments)`.
+            while it has some in others, `(blocks, 2, segments)`. Rounding errors of simulated
+            readings do not count as noise.
         """
         ordered = np.sort(self.rest[:, :, counts], axis=2)
         many = ordered.shape[2]
         median = 0.5 * (ordered[..., (many - 1) // 2] + ordered[..., many // 2])
         least = _STUCK * ordered[..., int(_ALIVE * (many - 1))]
-        stuck = (self.rest < least[..., np.newaxis]) & counts
-        low = median < least
+        size = (self.carrier**2).sum(axis=3) + self.slow[..., 0] ** 2
+        exact = ordered[..., int(_ALIVE * (many - 1))] < _ROUNDING * size.max(axis=2)
+        stuck = (self.rest < least[..., np.newaxis]) & counts & ~exact[..., np.newaxis]
+        low = (median < least) & ~exact
         if low.any():  # most of a block is stuck, so use the other blocks
             moving = np.where(ordered < least[..., np.newaxis], np.nan, ordered)
             median[low] = np.nanmedian(moving[low], axis=1)

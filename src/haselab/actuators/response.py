@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -27,6 +26,7 @@ from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.losses import DRIFTS, drift_pairs
 from haselab.actuators.operating_point import equilibrium_m
 from haselab.actuators.table import at_all_voltages, law_table, solved_voltages
+from haselab.actuators.threads import in_threads
 from haselab.base import InputError, LimitError
 
 __all__ = [
@@ -494,8 +494,7 @@ class SampledLaw:
         if workers == 1:
             found = [part(parts[0])]
         else:
-            with ThreadPoolExecutor(workers) as pool:
-                found = list(pool.map(part, parts))  # all: who stops at the first cancels the rest
+            found = in_threads(part, parts, workers)
         state, (length, speed, mean, drift), total = found[0]
         for _, _, more in found[1:]:
             for by, added in zip(total, more, strict=True):

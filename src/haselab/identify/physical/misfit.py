@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,6 +13,7 @@ from scipy.sparse import csr_array
 
 from haselab import _motion
 from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
+from haselab.actuators.threads import in_threads
 from haselab.base import HaselabError, LimitError
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import (
@@ -363,8 +363,7 @@ class Misfit:
         try:
             if len(self.records) == 1:
                 return [one(self.records[0])]
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
-                return list(pool.map(one, self.records))
+            return in_threads(one, self.records, os.cpu_count() or 1)
         except HaselabError:
             return None
 

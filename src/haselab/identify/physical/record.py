@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -43,6 +44,7 @@ class MotionRecord:
         block: of each capacitance within its experiment, shape `(C,)`; empty if it is not known.
         window_weight: of a second of each interval in its capacitance, shape `(W,)`; empty: all
             weigh the same.
+        voltage_ratio: voltage by its monitor over that of the drive; NaN if nobody measured it.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -65,6 +67,7 @@ class MotionRecord:
     capacitance_later_s: Floats | float = 0.0
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     window_weight: Floats = field(default_factory=lambda: np.zeros(0))
+    voltage_ratio: float = math.nan
 
     @cached_property
     def sensed(self) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from haselab.identify.noise import whiteness_p
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment, least_explained
 from haselab.identify.physical.model_error import excess_energy
+from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.rivals import Rival
 from haselab.identify.physical.search import SearchResult
 
@@ -29,6 +30,7 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
+_MONITOR = 0.01  # error of the voltage's monitor and of the amplifier's gain, of careful ones
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
 _WHITE = 1e-3  # probability of the residuals under white noise
@@ -160,12 +162,24 @@ def status_of(
     return "ok", True
 
 
-def notes_of(error: float) -> tuple[str, ...]:
-    """Remarks for the user on the capacitances; for the error, see `scale_error`."""
-    if error == 0.0:
-        return ()
-    return (
-        f"The capacitances are {math.exp(error):.4g} times those that the forces need. If they are "
-        "well calibrated, the amplifier's gain or a mass is wrong, and so are permittivity and "
-        "stiffness. Their intervals allow for it.",
-    )
+def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
+    """Remarks for the user on the capacitances, and on the monitors of the voltage.
+
+    Args:
+        error: see `scale_error`.
+        records: that were fitted.
+    """
+    notes = [
+        f"{record.name}: the voltage monitor shows {record.voltage_ratio:.4g} times the voltage "
+        "that drive and gain of the amplifier give. Check the gain of the amplifier and the scale "
+        "of the monitor."
+        for record in records
+        if abs(record.voltage_ratio - 1.0) > _MONITOR
+    ]
+    if error != 0.0:
+        notes.append(
+            f"The capacitances are {math.exp(error):.4g} times those that the forces need. If they "
+            "are well calibrated, the amplifier's gain, a mass or the camera's scale is wrong, and "
+            "so are permittivity and stiffness. Their intervals allow for it."
+        )
+    return tuple(notes)

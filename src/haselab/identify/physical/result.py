@@ -271,7 +271,7 @@ def result_of(
     values = covariance * np.outer(slopes, slopes)
     return ActuatorFit(
         status=status,
-        notes=notes_of(error),
+        notes=notes_of(error, misfit.records),
         parameters=parameters,
         covariance=values,
         residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),

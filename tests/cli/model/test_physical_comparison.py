@@ -78,6 +78,17 @@ def test_a_session_that_begins_under_voltage_was_at_rest_at_0_v(session):
 
 
 @pytest.mark.long
+def test_the_voltage_monitor_shows_a_wrong_gain_of_the_amplifier(session):
+    with SessionReader(session) as reader:
+        right = motion_of_session(reader, session)
+        reader.header["rig"]["amplifier_gain"] *= 1.1
+        wrong = motion_of_session(reader, session)
+    # a level is known to a code, 1.5 V, of steps of 1.5 kV and more
+    assert right.voltage_ratio == pytest.approx(1.0, abs=1e-3)
+    assert wrong.voltage_ratio == pytest.approx(right.voltage_ratio / 1.1)
+
+
+@pytest.mark.long
 def test_a_model_error_outside_the_band_ends_with_code_3_and_its_place(session, tmp_path, capsys):
     wrong = written(tmp_path / "B.toml", viscosity__damping_n_s_per_m=2.2)
     code, text, error = run(capsys, "compare", wrong, session, "--json")

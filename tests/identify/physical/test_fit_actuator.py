@@ -23,6 +23,7 @@ from haselab.identify.physical import MotionRecord, fit_actuator
 from haselab.identify.physical.misfit import SHARED_PX, TRACKED_ZERO_M, Misfit, SharedErrors
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widen_std
 from haselab.identify.physical.plausible import find_implausible
+from haselab.identify.physical.residuals import notes_of
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
 MASS_KG = 0.25
@@ -184,6 +185,43 @@ def test_capacitances_that_contradict_the_forces_by_little_have_a_note():
     (note,) = fit.notes
     assert note.startswith("The capacitances are 1.1")
     assert fit.answer()["notes"] == [note]
+
+
+@pytest.mark.long
+def test_intervals_allow_for_an_error_of_the_cameras_scale_that_capacitances_show():
+    seen = record(TRUE, 4, duration_s=15.0)
+    fit = fit_actuator(TRUE, [replace(seen, length_m=1.01 * seen.length_m)], mass_kg=MASS_KG)
+    (note,) = fit.notes
+    assert "a mass or the camera's scale is wrong" in note
+    truth = fitted_parameters(TRUE) | {ADDED_INERTIA: 0.0}
+    outside = {
+        name: found
+        for name, found in fit.parameters.items()
+        if name in truth and not found.ci95[0] <= truth[name] <= found.ci95[1]
+    }
+    assert outside == {}
+    assert fit.parameters["shell.length_m"].value > 1.009 * truth["shell.length_m"]
+
+
+@pytest.mark.long
+def test_lengths_alone_have_a_note_on_what_they_do_not_show():
+    seen, none, no = record(TRUE, 4, duration_s=15.0), np.zeros(0), np.zeros(0, int)
+    alone = replace(
+        seen, window=no, window_of=no, capacitance_f=none, capacitance_std_f=none,
+        capacitance_experiment=no,
+    )  # fmt: skip
+    (note,) = fit_actuator(TRUE, [alone], mass_kg=MASS_KG).notes
+    assert note.startswith("Without capacitances, nothing shows a wrong gain")
+
+
+def test_a_monitor_that_contradicts_the_stated_voltage_is_named():
+    seen = replace(record(TRUE, 4, duration_s=5.0), voltage_ratio=0.98)
+    (note,) = notes_of(0.0, [seen])
+    assert note.startswith("record-4: the voltage monitor shows 0.98 times the voltage that drive ")
+    assert notes_of(0.0, [replace(seen, voltage_ratio=0.995)]) == ()
+    assert notes_of(0.0, [replace(seen, voltage_ratio=math.nan)]) == ()
+    fault = find_implausible(TRUE, [replace(seen, voltage_ratio=0.9)])
+    assert fault.startswith("record-4: the voltage monitor shows 0.9 times the voltage that drive ")
 
 
 @given(st.lists(st.floats(-0.3, 0.3), min_size=23, max_size=23))

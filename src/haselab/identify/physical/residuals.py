@@ -163,7 +163,7 @@ def status_of(
 
 
 def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
-    """Remarks for the user on the capacitances, and on the monitors of the voltage.
+    """Remarks for the user on what may be misstated, by capacitances and monitors of the voltage.
 
     Args:
         error: see `scale_error`.
@@ -181,5 +181,11 @@ def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
             f"The capacitances are {math.exp(error):.4g} times those that the forces need. If they "
             "are well calibrated, the amplifier's gain, a mass or the camera's scale is wrong, and "
             "so are permittivity and stiffness. Their intervals allow for it."
+        )
+    if not any(record.capacitance_f.size for record in records):
+        notes.append(
+            "Without capacitances, nothing shows a wrong gain, mass or scale of the lengths, and "
+            "the intervals do not include it: an error of 1 % of the gain changes the permittivity "
+            "by 2 %."
         )
     return tuple(notes)

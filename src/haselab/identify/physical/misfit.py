@@ -354,7 +354,11 @@ class Misfit:
             by.append(part.capacitance_by / std_f[:, None])
         for name, std in self.known.items():
             by.append(np.where(np.array(unknowns.names) == name, 1.0 / std, 0.0)[None])
-        return self._weighed(found, unknowns), np.vstack(by)
+        columns = np.vstack(by)
+        with np.errstate(over="ignore", invalid="ignore"):
+            usable = np.isfinite((columns**2).sum(axis=0)).all()
+        # after a collapse, derivatives grow without limit
+        return (self._weighed(found, unknowns), columns) if usable else None
 
     def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[ModelledRecord] | None:
         def one(record: MotionRecord) -> ModelledRecord:

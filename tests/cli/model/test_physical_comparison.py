@@ -11,6 +11,7 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.main import main
+from haselab.identify.physical import ActuatorFit
 from haselab.pipelines.motion import motion_of_session
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.session.reader import SessionReader
@@ -86,6 +87,29 @@ def test_the_voltage_monitor_shows_a_wrong_gain_of_the_amplifier(session):
     # a level is known to a code, 1.5 V, of steps of 1.5 kV and more
     assert right.voltage_ratio == pytest.approx(1.0, abs=1e-3)
     assert wrong.voltage_ratio == pytest.approx(right.voltage_ratio / 1.1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("right", "wrong", "named"),
+    [
+        (f"mass_kg = {MASS_KG}", "mass_kg = 0.3", "[actuator] is 0.3 kg, but the sessions state 0.2"),
+        ("gain_v_per_v = 5000.0", "gain_v_per_v = 1e3", "[drive] is 1000 V/V, but the sessions sta"),
+    ],
+)
+def test_a_file_that_contradicts_the_session_is_named(
+    actuator, session, capsys, monkeypatch, right, wrong, named
+):
+    def stopped(*_, **__):
+        return ActuatorFit(status="not fitted here")
+
+    monkeypatch.setattr("haselab.cli.identify.actuator.fit_actuator", stopped)
+    text = actuator.read_text()
+    code, _, error = run(capsys, "identify", "actuator", session, "--actuator", actuator)
+    assert code == 3 and "warning" not in error
+    actuator.write_text(text.replace(right, wrong))
+    code, _, error = run(capsys, "identify", "actuator", session, "--actuator", actuator)
+    assert code == 3 and named in error
 
 
 @pytest.mark.long

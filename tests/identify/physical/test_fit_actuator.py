@@ -224,6 +224,15 @@ def test_a_monitor_that_contradicts_the_stated_voltage_is_named():
     assert fault.startswith("record-4: the voltage monitor shows 0.9 times the voltage that drive ")
 
 
+def test_a_collapse_whose_derivatives_grow_without_limit_is_no_motion():
+    seen = record(TRUE, 1, duration_s=30.0)
+    for permittivity in (12.0, 30.0):  # squares of the derivatives, and these themselves, overflow
+        collapses = {"dielectric.permittivity": permittivity, "dielectric.capacitance_exponent": 4.0}
+        law = with_parameters(TRUE, collapses)
+        unknowns = Unknowns.of(law, added_inertia_kg=0.0, mass_kg=MASS_KG)
+        assert Misfit([seen]).linearised(unknowns) is None
+
+
 @given(st.lists(st.floats(-0.3, 0.3), min_size=23, max_size=23))
 def test_what_varies_is_the_distance(steps):
     start = Unknowns.of(TRUE, added_inertia_kg=0.01, mass_kg=MASS_KG)

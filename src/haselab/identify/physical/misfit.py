@@ -45,6 +45,7 @@ LENGTH, CAPACITANCE = "length", "capacitance"
 TRACKED_ZERO_M = 2e-6  # standard deviation of the zero of lengths from tracks of 0.02 px
 SHARED_PX = 3e-4  # error of tracking that all frames with the same pixels share
 _LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
+_ENDLESS = 1e100  # derivative whose square, over that of a noise, may be too large for a number
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
 
@@ -346,6 +347,14 @@ class Misfit:
         found = self._each(unknowns, derivatives=True)
         if found is None:
             return None
+        # after a collapse, derivatives grow without limit
+        largest = [
+            np.abs(by).max(initial=0.0)
+            for part in found
+            for by in (part.length_by, part.capacitance_by)
+        ]
+        if not all(value < _ENDLESS for value in largest):
+            return None
         by = []
         for part, record, shared in zip(found, self.records, self._shared, strict=True):
             std_m = self.length_factor * record.length_std_m
@@ -354,11 +363,7 @@ class Misfit:
             by.append(part.capacitance_by / std_f[:, None])
         for name, std in self.known.items():
             by.append(np.where(np.array(unknowns.names) == name, 1.0 / std, 0.0)[None])
-        columns = np.vstack(by)
-        with np.errstate(over="ignore", invalid="ignore"):
-            usable = np.isfinite((columns**2).sum(axis=0)).all()
-        # after a collapse, derivatives grow without limit
-        return (self._weighed(found, unknowns), columns) if usable else None
+        return self._weighed(found, unknowns), np.vstack(by)
 
     def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[ModelledRecord] | None:
         def one(record: MotionRecord) -> ModelledRecord:

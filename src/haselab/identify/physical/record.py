@@ -17,6 +17,7 @@ __all__ = ["MotionRecord"]
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+_VOLTAGE_ERROR = 0.01  # of a monitor and an amplifier with a careful calibration
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,17 @@ class MotionRecord:
         found = np.zeros(self.drive.voltage_v.size, dtype=np.bool_)
         found[self.window] = True
         return found
+
+    @property
+    def voltage_remark(self) -> str:
+        """What the user should know if the monitor contradicts the stated voltage; else empty."""
+        if not abs(self.voltage_ratio - 1.0) > _VOLTAGE_ERROR:
+            return ""
+        return (
+            f"{self.name}: the voltage monitor shows {self.voltage_ratio:.4g} times the voltage "
+            "that drive and gain of the amplifier give. Check the gain of the amplifier and the "
+            "scale of the monitor."
+        )
 
     @cached_property
     def _shares(self) -> csr_array:

@@ -30,7 +30,6 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
-_MONITOR = 0.01  # error of the voltage's monitor and of the amplifier's gain, of careful ones
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
 _WHITE = 1e-3  # probability of the residuals under white noise
@@ -169,13 +168,7 @@ def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
         error: see `scale_error`.
         records: that were fitted.
     """
-    notes = [
-        f"{record.name}: the voltage monitor shows {record.voltage_ratio:.4g} times the voltage "
-        "that drive and gain of the amplifier give. Check the gain of the amplifier and the scale "
-        "of the monitor."
-        for record in records
-        if abs(record.voltage_ratio - 1.0) > _MONITOR
-    ]
+    notes = [record.voltage_remark for record in records if record.voltage_remark]
     if error != 0.0:
         notes.append(
             f"The capacitances are {math.exp(error):.4g} times those that the forces need. If they "

@@ -288,7 +288,7 @@ def _voltage_ratio(blocks: Collection[_Blocks], rig: Mapping[str, Any]) -> float
     size = float(away_v @ away_v)
     if size <= (v_per_code / _RATIO_STD) ** 2:  # each level is known to a code or better
         return math.nan
-    return v_per_code * float(away_v @ level) / size
+    return float(v_per_code * (away_v @ level) / size)
 
 
 def _carrier_gain(conditions: NDArray[np.void], blocks: Collection[_Blocks], gain: float) -> float:

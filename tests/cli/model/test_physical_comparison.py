@@ -13,6 +13,7 @@ from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.main import main
 from haselab.identify.physical import ActuatorFit
 from haselab.pipelines.motion import motion_of_session
+from haselab.rig.twin.twin_file import load_twin
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.session.reader import SessionReader
 from tests.cli.model.physical_files import (
@@ -93,8 +94,16 @@ def test_the_voltage_monitor_shows_a_wrong_gain_of_the_amplifier(session):
 @pytest.mark.parametrize(
     ("right", "wrong", "named"),
     [
-        (f"mass_kg = {MASS_KG}", "mass_kg = 0.3", "[actuator] is 0.3 kg, but the sessions state 0.2"),
-        ("gain_v_per_v = 5000.0", "gain_v_per_v = 1e3", "[drive] is 1000 V/V, but the sessions sta"),
+        (
+            f"mass_kg = {MASS_KG}",
+            "mass_kg = 0.3",
+            "[actuator] is 0.3 kg, but the sessions state 0.2",
+        ),
+        (
+            "gain_v_per_v = 5000.0",
+            "gain_v_per_v = 1e3",
+            "[drive] is 1000 V/V, but the sessions sta",
+        ),
     ],
 )
 def test_a_file_that_contradicts_the_session_is_named(
@@ -132,6 +141,22 @@ def test_the_session_of_the_fit_is_no_validation(actuator, session, capsys):
     )
     code, _, error = run(capsys, "compare", actuator, session)
     assert code == 3 and "not a validation: the model was identified from this recording" in error
+
+
+def test_a_width_that_was_changed_after_the_identification_is_refused(actuator, tmp_path, capsys):
+    file = table(tmp_path / "new.csv", unit="m", first_v=0.7)
+    changed = "[actuator.parameters]\nshell.width_m = 0.05\ndielectric.breakdown_v_per_m = 3e7\n"
+    text = actuator.read_text() + "[model.physical.measured]\nshell.width_m = "
+    named = (
+        "shell.width_m is 0.05 in [actuator.parameters], but was 0.0498 when [model.physical] was"
+    )
+    actuator.write_text(f"{text}0.0498\n{changed}")
+    code, _, error = run(capsys, "compare", actuator, file)
+    assert code == 2 and named in error
+    with pytest.raises(InputError, match=r"shell.width_m is 0.05 in \[actuator.parameters\], but"):
+        load_twin(actuator)
+    actuator.write_text(f"{text}0.05\n{changed}")
+    assert load_twin(actuator).shell.width_m == 0.05
 
 
 @pytest.mark.parametrize("unit", ["m", "1", "F"])

@@ -226,8 +226,12 @@ def test_a_monitor_that_contradicts_the_stated_voltage_is_named():
 
 def test_a_collapse_whose_derivatives_grow_without_limit_is_no_motion():
     seen = record(TRUE, 1, duration_s=30.0)
-    for permittivity in (12.0, 30.0):  # squares of the derivatives, and these themselves, overflow
-        collapses = {"dielectric.permittivity": permittivity, "dielectric.capacitance_exponent": 4.0}
+    # 12: the squares of the derivatives overflow, 30: they themselves
+    for permittivity in (12.0, 30.0):
+        collapses = {
+            "dielectric.permittivity": permittivity,
+            "dielectric.capacitance_exponent": 4.0,
+        }
         law = with_parameters(TRUE, collapses)
         unknowns = Unknowns.of(law, added_inertia_kg=0.0, mass_kg=MASS_KG)
         assert Misfit([seen]).linearised(unknowns) is None

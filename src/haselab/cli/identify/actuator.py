@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from haselab.actuators import ACTUATORS, ActuatorLaw, with_stated
+from haselab.actuators import ACTUATORS, ActuatorLaw, measured_parameters, with_stated
 from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
@@ -227,6 +227,7 @@ def section_of_fit(
         "status": fit.status,
         "mass_kg": fit.mass_kg,
         "parameters": {name: estimate.value for name, estimate in fit.parameters.items()},
+        "measured": measured_parameters(fit.law) if fit.law is not None else {},
         "std": {name: estimate.std for name, estimate in fit.parameters.items()},
         "not_identifiable": list(fit.not_identifiable),
         "determined_by": {

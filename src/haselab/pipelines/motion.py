@@ -278,8 +278,11 @@ def _drive(
 def _voltage_ratio(blocks: Collection[_Blocks], rig: Mapping[str, Any]) -> float:
     """Voltage by its monitor over drive times gain; NaN where the drive hardly changes."""
     none = np.zeros(0)
-    drive_v = np.concatenate([none, *(part.drive_v[part.used] for part in blocks)])
-    level = np.concatenate([none, *(part.rise.level[part.used] for part in blocks)])
+    # a carrier that is too small for capacitances does not change the level
+    any_used = any(part.used.any() for part in blocks)
+    chosen = [(part, part.used if any_used else slice(None)) for part in blocks]
+    drive_v = np.concatenate([none, *(part.drive_v[used] for part, used in chosen)])
+    level = np.concatenate([none, *(part.rise.level[used] for part, used in chosen)])
     if drive_v.size < 2:
         return math.nan
     v_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]

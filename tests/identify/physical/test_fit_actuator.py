@@ -24,6 +24,8 @@ from haselab.identify.physical.misfit import SHARED_PX, TRACKED_ZERO_M, Misfit, 
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widen_std
 from haselab.identify.physical.plausible import find_implausible
 from haselab.identify.physical.residuals import notes_of
+from haselab.identify.physical.result import result_of
+from haselab.identify.physical.search import SearchResult
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
 MASS_KG = 0.25
@@ -222,6 +224,24 @@ def test_a_monitor_that_contradicts_the_stated_voltage_is_named():
     assert notes_of(0.0, [replace(seen, voltage_ratio=math.nan)]) == ()
     fault = find_implausible(TRUE, [replace(seen, voltage_ratio=0.9)])
     assert fault.startswith("record-4: the voltage monitor shows 0.9 times the voltage that drive ")
+
+
+@pytest.mark.parametrize(("size", "contradicts"), [(1e-3, False), (10.0, True)])
+def test_a_scale_that_is_hardly_known_is_no_contradiction(size, contradicts):
+    misfit = Misfit([record(TRUE, 1, duration_s=5.0)])
+    unknowns = Unknowns.of(TRUE, added_inertia_kg=0.0, mass_kg=MASS_KG)
+    at = unknowns.names.index("sensing.scale")
+    values = unknowns.values.copy()
+    values[at] = 1.36
+    rng, rows = np.random.default_rng(1), sum(part.rows.size for part in misfit.segments)
+    jacobian = rng.standard_normal((rows, values.size))
+    jacobian[:, at] *= size  # its standard deviation is about 1 / (size sqrt(rows))
+    found = SearchResult(
+        replace(unknowns, values=values), rng.standard_normal(rows), jacobian, 0.0 * values, True, 1
+    )
+    fit = result_of(misfit, found, [], [])
+    assert ("the capacitances are 1.36 times" in fit.status) == contradicts
+    assert ("sensing.scale" in fit.not_identifiable) == (not contradicts)
 
 
 def test_a_collapse_whose_derivatives_grow_without_limit_is_no_motion():

@@ -276,7 +276,8 @@ def test_a_session_of_another_kind_is_warned_of(session, tmp_path, capsys):
         ("dea-stack", "states a planar-hasel, but [actuator]"),
     ):
         known = load_actuator(written(tmp_path / f"{kind}.toml", kind=kind))
-        motion_of_file(session, options, known)
+        record, _ = motion_of_file(session, options, known)
         assert words in capsys.readouterr().err
+        assert record.name == str(session)  # session.h5 would not tell two runs apart
     with pytest.raises(InputError, match=r"--mass-kg is for tables, but a session states this"):
         motion_of_file(session, TableOptions(None, (), None, 0.2, None, None, columns), known)

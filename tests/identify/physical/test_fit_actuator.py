@@ -244,6 +244,19 @@ def test_a_scale_that_is_hardly_known_is_no_contradiction(size, contradicts):
     assert ("sensing.scale" in fit.not_identifiable) == (not contradicts)
 
 
+@pytest.mark.long
+def test_a_camera_that_was_moved_between_two_sessions_is_named():
+    first, second = record(TRUE, 4, duration_s=15.0), record(TRUE, 5, duration_s=15.0)
+    second = replace(second, length_m=second.length_m + 5e-5)
+    unknowns = Unknowns.of(TRUE, added_inertia_kg=0.0, mass_kg=MASS_KG)
+    zeros = Misfit([first, second], known={"camera.offset_m": TRACKED_ZERO_M}).zeros(unknowns)
+    # each has the standard deviation 1
+    assert abs(zeros[0]) < 4.0 and zeros[1] == pytest.approx(5e-5 / TRACKED_ZERO_M, abs=4.0)
+    found = refused([first, second])
+    assert "record-5 are shifted by about 5" in found or "record-4 are shifted by about -5" in found
+    assert "--zero-std-m" in found
+
+
 def test_a_collapse_whose_derivatives_grow_without_limit_is_no_motion():
     seen = record(TRUE, 1, duration_s=30.0)
     # 12: the squares of the derivatives overflow, 30: they themselves

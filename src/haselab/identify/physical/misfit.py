@@ -365,6 +365,25 @@ class Misfit:
             by.append(np.where(np.array(unknowns.names) == name, 1.0 / std, 0.0)[None])
         return self._weighed(found, unknowns), np.vstack(by)
 
+    def zeros(self, unknowns: Unknowns) -> list[float]:
+        """Estimated error of the zero of each record's lengths over its standard deviation.
+
+        Args:
+            unknowns: of the model.
+        Returns:
+            One for each record; 0 of one without lengths, of a single one, or without a motion.
+        """
+        found = self._each(unknowns, derivatives=False)
+        zeros = [0.0] * len(self.records)
+        for k, (record, shared) in enumerate(zip(self.records, self._shared, strict=True)):
+            if found is None or not record.length_m.size or len(shared) < 2:
+                continue
+            std_m = self.length_factor * record.length_std_m
+            off = shared[0].whitened((record.length_m - found[k].length_m) / std_m)
+            weights = shared[1].weights
+            zeros[k] = float((weights @ off)[0] / (1.0 + weights.multiply(weights).sum()))
+        return zeros
+
     def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[ModelledRecord] | None:
         def one(record: MotionRecord) -> ModelledRecord:
             return model_record(unknowns, record, derivatives=derivatives, strict=self.strict)

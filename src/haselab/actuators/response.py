@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -27,6 +26,7 @@ from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.losses import DRIFTS, drift_pairs
 from haselab.actuators.operating_point import equilibrium_m
 from haselab.actuators.table import at_all_voltages, law_table, solved_voltages
+from haselab.actuators.threads import in_threads
 from haselab.base import InputError, LimitError
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "Drive",
     "Response",
     "SampledLaw",
+    "measured_parameters",
     "motion_parameters",
     "with_parameters",
     "with_stated",
@@ -222,6 +223,27 @@ def with_stated(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLaw:
     found = with_parameters(dataclasses.replace(law, **shorter), values)
     _ = found.losses  # refuses lists of different lengths
     return found
+
+
+def measured_parameters(law: ActuatorLaw) -> dict[str, float]:
+    """Parameters that are measured in another way and not fitted, such as a width.
+
+    Args:
+        law: with their values.
+    Returns:
+        Values by name, see `with_parameters`; without those of the circuit, on which no motion
+        depends, such as the field of breakdown.
+    Example:
+        >>> from haselab.actuators import DeaStack
+        >>> measured_parameters(DeaStack())["actuator.layers"]
+        50.0
+    """
+    circuit = {field.name for field in dataclasses.fields(law.circuit)}
+    return {
+        about.key: float(getattr(law, about.name))
+        for about in law.described()
+        if not about.fitted and about.name not in circuit
+    }
 
 
 _LOSSES = (
@@ -491,11 +513,7 @@ class SampledLaw:
 
         workers = min(_CORES, 1 + kinds.size // _COLUMNS_EACH)
         parts = np.array_split(np.arange(kinds.size), workers)
-        if workers == 1:
-            found = [part(parts[0])]
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                found = list(pool.map(part, parts))  # all: who stops at the first cancels the rest
+        found = [part(parts[0])] if workers == 1 else in_threads(part, parts, workers)
         state, (length, speed, mean, drift), total = found[0]
         for _, _, more in found[1:]:
             for by, added in zip(total, more, strict=True):

@@ -26,6 +26,7 @@ from haselab.actuators import (
     LawTable,
     equilibrium_m,
     law_table,
+    measured_parameters,
     with_parameters,
     with_stated,
 )
@@ -315,6 +316,7 @@ def known_actuator(tables: ActuatorTables, source: object = "") -> KnownActuator
     own = {name: value for name, value in model.parameters.items() if not name.startswith(_BENCH)}
     try:
         law = with_stated(ACTUATORS.find(model.kind)(), tables.actuator.parameters)
+        model.check_measured(measured_parameters(law))
         law = with_parameters(law, own)
     except (InputError, LimitError) as error:
         raise InputError(f"[model.physical]: {error}{where}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,7 @@ Floats = NDArray[np.float64]
 _SAME_S = 1e-7  # times closer than that are one
 _LARGE = 300.0  # step in codes, from which its own delay is known to less than a microsecond
 _EMPTY = 0.05  # inertia of an empty clamp, of the largest hung mass
+_RATIO_STD = 1e-3  # up to which the ratio of measured and stated voltage is known
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def _joined(
         np.concatenate(std_f), names, of_length[chosen], np.concatenate(of_block),
         float(rig.get("exposure_s", 0.0)), float(rig["scale_m_per_px"]),
         np.concatenate(later_s),
-        np.concatenate(block), np.concatenate(weight),
+        np.concatenate(block), np.concatenate(weight), _voltage_ratio(blocks.values(), rig),
     )  # fmt: skip
 
 
@@ -273,6 +275,25 @@ def _drive(
     return Drive(edge_s, gain * drive_v, pull_n, mass_kg, 0.5 * carrier_v**2)
 
 
+def _voltage_ratio(blocks: Collection[_Blocks], rig: Mapping[str, Any]) -> float:
+    """Voltage by its monitor over drive times gain; NaN where the drive hardly changes."""
+    none = np.zeros(0)
+    # a carrier that is too small for capacitances does not change the level
+    any_used = any(part.used.any() for part in blocks)
+    chosen = [(part, part.used if any_used else slice(None)) for part in blocks]
+    drive_v = np.concatenate([none, *(part.drive_v[used] for part, used in chosen)])
+    level = np.concatenate([none, *(part.rise.level[used] for part, used in chosen)])
+    if drive_v.size < 2:
+        return math.nan
+    v_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]
+    # a line leaves out the offset of the monitor
+    away_v = float(rig["amplifier_gain"]) * (drive_v - drive_v.mean())
+    size = float(away_v @ away_v)
+    if size <= (v_per_code / _RATIO_STD) ** 2:  # each level is known to a code or better
+        return math.nan
+    return float(v_per_code * (away_v @ level) / size)
+
+
 def _carrier_gain(conditions: NDArray[np.void], blocks: Collection[_Blocks], gain: float) -> float:
     """Of the amplifier at the carrier, in V/V: it resonates or falls there. By its monitor."""
     found = []
@@ -328,6 +349,7 @@ class _Rise:
     """How the voltage monitor follows each switch, in codes and samples, without the carrier.
 
     Args:
+        level: after each switch. Shape `(N,)`.
         change: of the level. Shape `(N,)`.
         area: sum of the blanked samples, less the level that they reach. Shape `(N,)`.
         square_change: of the level's square. Shape `(N,)`.
@@ -338,6 +360,7 @@ class _Rise:
         middle: level between these parts. Shape `(N,)`.
     """
 
+    level: Floats
     change: Floats
     area: Floats
     square_change: Floats
@@ -369,7 +392,7 @@ def _rise(codes: NDArray[np.int16], lockin: Lockin) -> _Rise:
     duration[large] = np.maximum(4.0 * (share * (1.0 - share)).sum(axis=1), 0.0)
     middle = np.sqrt(0.5 * (level**2 + before**2))
     return _Rise(
-        change, (after - level[:, None]).sum(axis=1),
+        level, change, (after - level[:, None]).sum(axis=1),
         square_change, (after**2 - level[:, None] ** 2).sum(axis=1),
         large, duration, np.copysign(middle, level + before),
     )  # fmt: skip

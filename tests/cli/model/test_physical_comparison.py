@@ -11,7 +11,9 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.main import main
+from haselab.identify.physical import ActuatorFit
 from haselab.pipelines.motion import motion_of_session
+from haselab.rig.twin.twin_file import load_twin
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.session.reader import SessionReader
 from tests.cli.model.physical_files import (
@@ -78,6 +80,48 @@ def test_a_session_that_begins_under_voltage_was_at_rest_at_0_v(session):
 
 
 @pytest.mark.long
+def test_the_voltage_monitor_shows_a_wrong_gain_of_the_amplifier(session):
+    with SessionReader(session) as reader:
+        right = motion_of_session(reader, session)
+        reader.header["rig"]["amplifier_gain"] *= 1.1
+        wrong = motion_of_session(reader, session)
+    # a level is known to a code, 1.5 V, of steps of 1.5 kV and more
+    assert right.voltage_ratio == pytest.approx(1.0, abs=1e-3)
+    assert wrong.voltage_ratio == pytest.approx(right.voltage_ratio / 1.1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("right", "wrong", "named"),
+    [
+        (
+            f"mass_kg = {MASS_KG}",
+            "mass_kg = 0.3",
+            "[actuator] is 0.3 kg, but the sessions state 0.2",
+        ),
+        (
+            "gain_v_per_v = 5000.0",
+            "gain_v_per_v = 1e3",
+            "[drive] is 1000 V/V, but the sessions sta",
+        ),
+    ],
+)
+def test_a_file_that_contradicts_the_session_is_named(
+    actuator, session, capsys, monkeypatch, right, wrong, named
+):
+    def stopped(*_, **__):
+        return ActuatorFit(status="not fitted here")
+
+    monkeypatch.setattr("haselab.cli.identify.actuator.fit_actuator", stopped)
+    text = actuator.read_text()
+    code, _, error = run(capsys, "identify", "actuator", session, "--actuator", actuator)
+    assert code == 3 and "warning" not in error
+    actuator.write_text(text.replace(right, wrong))
+    code, _, error = run(capsys, "identify", "actuator", session, "--actuator", actuator)
+    assert code == 3 and named in error
+
+
+@pytest.mark.long
 def test_a_model_error_outside_the_band_ends_with_code_3_and_its_place(session, tmp_path, capsys):
     wrong = written(tmp_path / "B.toml", viscosity__damping_n_s_per_m=2.2)
     code, text, error = run(capsys, "compare", wrong, session, "--json")
@@ -97,6 +141,22 @@ def test_the_session_of_the_fit_is_no_validation(actuator, session, capsys):
     )
     code, _, error = run(capsys, "compare", actuator, session)
     assert code == 3 and "not a validation: the model was identified from this recording" in error
+
+
+def test_a_width_that_was_changed_after_the_identification_is_refused(actuator, tmp_path, capsys):
+    file = table(tmp_path / "new.csv", unit="m", first_v=0.7)
+    changed = "[actuator.parameters]\nshell.width_m = 0.05\ndielectric.breakdown_v_per_m = 3e7\n"
+    text = actuator.read_text() + "[model.physical.measured]\nshell.width_m = "
+    named = (
+        "shell.width_m is 0.05 in [actuator.parameters], but was 0.0498 when [model.physical] was"
+    )
+    actuator.write_text(f"{text}0.0498\n{changed}")
+    code, _, error = run(capsys, "compare", actuator, file)
+    assert code == 2 and named in error
+    with pytest.raises(InputError, match=r"shell.width_m is 0.05 in \[actuator.parameters\], but"):
+        load_twin(actuator)
+    actuator.write_text(f"{text}0.05\n{changed}")
+    assert load_twin(actuator).shell.width_m == 0.05
 
 
 @pytest.mark.parametrize("unit", ["m", "1", "F"])
@@ -216,7 +276,8 @@ def test_a_session_of_another_kind_is_warned_of(session, tmp_path, capsys):
         ("dea-stack", "states a planar-hasel, but [actuator]"),
     ):
         known = load_actuator(written(tmp_path / f"{kind}.toml", kind=kind))
-        motion_of_file(session, options, known)
+        record, _ = motion_of_file(session, options, known)
         assert words in capsys.readouterr().err
+        assert record.name == str(session)  # session.h5 would not tell two runs apart
     with pytest.raises(InputError, match=r"--mass-kg is for tables, but a session states this"):
         motion_of_file(session, TableOptions(None, (), None, 0.2, None, None, columns), known)

@@ -22,6 +22,10 @@ from haselab.base import InputError
 from haselab.identify.physical import MotionRecord, fit_actuator
 from haselab.identify.physical.misfit import SHARED_PX, TRACKED_ZERO_M, Misfit, SharedErrors
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widen_std
+from haselab.identify.physical.plausible import find_implausible
+from haselab.identify.physical.residuals import notes_of
+from haselab.identify.physical.result import result_of
+from haselab.identify.physical.search import SearchResult
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
 
 MASS_KG = 0.25
@@ -110,10 +114,19 @@ def deviations(fit, law):
     return {n: (e.value - truth.get(n, 0.0)) / e.std for n, e in fit.parameters.items()}
 
 
+def with_a_branch_more():
+    shares, times = TRUE.losses.branch_share, TRUE.losses.branch_relaxation_s
+    return replace(TRUE, branch_share=(*shares, 0.05), branch_relaxation_s=(*times, 12.0))
+
+
+def test_creep_does_not_look_like_swapped_masses():
+    # under 2.94 N, soon after a high voltage, the actuator is shorter than later under 2.45 N
+    assert find_implausible(START, [record(with_a_branch_more(), 3)]) == ""
+
+
 @pytest.mark.slow
 def test_a_branch_that_the_law_lacks_is_found():
-    shares, times = TRUE.losses.branch_share, TRUE.losses.branch_relaxation_s
-    more = replace(TRUE, branch_share=(*shares, 0.05), branch_relaxation_s=(*times, 12.0))
+    more = with_a_branch_more()
     fit = fit_actuator(START, [record(more, 3)], mass_kg=MASS_KG)
     assert fit.status == "ok"
     assert fit.rejected_laws[0].law.startswith("without a branch of about ")
@@ -174,6 +187,87 @@ def test_capacitances_that_contradict_the_forces_by_little_have_a_note():
     (note,) = fit.notes
     assert note.startswith("The capacitances are 1.1")
     assert fit.answer()["notes"] == [note]
+
+
+@pytest.mark.long
+def test_intervals_allow_for_an_error_of_the_cameras_scale_that_capacitances_show():
+    seen = record(TRUE, 4, duration_s=15.0)
+    fit = fit_actuator(TRUE, [replace(seen, length_m=1.01 * seen.length_m)], mass_kg=MASS_KG)
+    (note,) = fit.notes
+    assert "a mass or the camera's scale is wrong" in note
+    truth = fitted_parameters(TRUE) | {ADDED_INERTIA: 0.0}
+    outside = {
+        name: found
+        for name, found in fit.parameters.items()
+        if name in truth and not found.ci95[0] <= truth[name] <= found.ci95[1]
+    }
+    assert outside == {}
+    assert fit.parameters["shell.length_m"].value > 1.009 * truth["shell.length_m"]
+
+
+@pytest.mark.long
+def test_lengths_alone_have_a_note_on_what_they_do_not_show():
+    seen, none, no = record(TRUE, 4, duration_s=15.0), np.zeros(0), np.zeros(0, int)
+    alone = replace(
+        seen, window=no, window_of=no, capacitance_f=none, capacitance_std_f=none,
+        capacitance_experiment=no,
+    )  # fmt: skip
+    (note,) = fit_actuator(TRUE, [alone], mass_kg=MASS_KG).notes
+    assert note.startswith("Without capacitances, nothing shows a wrong gain")
+
+
+def test_a_monitor_that_contradicts_the_stated_voltage_is_named():
+    seen = replace(record(TRUE, 4, duration_s=5.0), voltage_ratio=0.98)
+    (note,) = notes_of(0.0, [seen])
+    assert note.startswith("record-4: the voltage monitor shows 0.98 times the voltage that drive ")
+    assert notes_of(0.0, [replace(seen, voltage_ratio=0.995)]) == ()
+    assert notes_of(0.0, [replace(seen, voltage_ratio=math.nan)]) == ()
+    fault = find_implausible(TRUE, [replace(seen, voltage_ratio=0.9)])
+    assert fault.startswith("record-4: the voltage monitor shows 0.9 times the voltage that drive ")
+
+
+@pytest.mark.parametrize(("size", "contradicts"), [(1e-3, False), (10.0, True)])
+def test_a_scale_that_is_hardly_known_is_no_contradiction(size, contradicts):
+    misfit = Misfit([record(TRUE, 1, duration_s=5.0)])
+    unknowns = Unknowns.of(TRUE, added_inertia_kg=0.0, mass_kg=MASS_KG)
+    at = unknowns.names.index("sensing.scale")
+    values = unknowns.values.copy()
+    values[at] = 1.36
+    rng, rows = np.random.default_rng(1), sum(part.rows.size for part in misfit.segments)
+    jacobian = rng.standard_normal((rows, values.size))
+    jacobian[:, at] *= size  # its standard deviation is about 1 / (size sqrt(rows))
+    found = SearchResult(
+        replace(unknowns, values=values), rng.standard_normal(rows), jacobian, 0.0 * values, True, 1
+    )
+    fit = result_of(misfit, found, [], [])
+    assert ("the capacitances are 1.36 times" in fit.status) == contradicts
+    assert ("sensing.scale" in fit.not_identifiable) == (not contradicts)
+
+
+@pytest.mark.long
+def test_a_camera_that_was_moved_between_two_sessions_is_named():
+    first, second = record(TRUE, 4, duration_s=15.0), record(TRUE, 5, duration_s=15.0)
+    second = replace(second, length_m=second.length_m + 5e-5)
+    unknowns = Unknowns.of(TRUE, added_inertia_kg=0.0, mass_kg=MASS_KG)
+    zeros = Misfit([first, second], known={"camera.offset_m": TRACKED_ZERO_M}).zeros(unknowns)
+    # each has the standard deviation 1
+    assert abs(zeros[0]) < 4.0 and zeros[1] == pytest.approx(5e-5 / TRACKED_ZERO_M, abs=4.0)
+    found = refused([first, second])
+    assert "record-5 are shifted by about 5" in found or "record-4 are shifted by about -5" in found
+    assert "--zero-std-m" in found
+
+
+def test_a_collapse_whose_derivatives_grow_without_limit_is_no_motion():
+    seen = record(TRUE, 1, duration_s=30.0)
+    # 12: the squares of the derivatives overflow, 30: they themselves
+    for permittivity in (12.0, 30.0):
+        collapses = {
+            "dielectric.permittivity": permittivity,
+            "dielectric.capacitance_exponent": 4.0,
+        }
+        law = with_parameters(TRUE, collapses)
+        unknowns = Unknowns.of(law, added_inertia_kg=0.0, mass_kg=MASS_KG)
+        assert Misfit([seen]).linearised(unknowns) is None
 
 
 @given(st.lists(st.floats(-0.3, 0.3), min_size=23, max_size=23))

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from haselab.actuators import ACTUATORS, ActuatorLaw, with_stated
+from haselab.actuators import ACTUATORS, ActuatorLaw, measured_parameters, with_stated
 from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
@@ -33,6 +33,7 @@ from haselab.store.toml import validated
 
 __all__ = ["actuator", "law_of_section", "section_of_fit"]
 
+_SAME = 1e-3  # relative difference of stated numbers that mean the same
 _TABLE_ZERO_M = 5e-5  # standard deviation of the zero of a displacement sensor, set by a caliper
 
 
@@ -115,6 +116,7 @@ def actuator(
         )
     inputs = [session_file(file) for file in files]
     _refuse_twice(inputs)
+    _warn_of_stated(files, records, gains_v_per_v, tables, actuator)
     tracked = all(file.is_dir() or is_session(file) for file in files)
     fit = fit_actuator(
         law, records, mass_kg=mass_kg,
@@ -128,6 +130,32 @@ def actuator(
     emit_fit(fit, inputs, as_json, out, listed)
     save_plot(plot, fit.chart)
     save_section(actuator, "model.physical", section, inputs, status=fit.status)
+
+
+def _warn_of_stated(
+    files: Sequence[Path],
+    records: Sequence[MotionRecord],
+    gains_v_per_v: Sequence[float],
+    tables: ActuatorTables,
+    path: Path,
+) -> None:
+    """Warn if no session has the mass, or the gain, that the actuator file states."""
+    sessions = [k for k, file in enumerate(files) if file.is_dir() or is_session(file)]
+    for name, unit, stated, found in (
+        ("mass_kg in [actuator]", "kg", tables.actuator.mass_kg,
+         [float(records[k].drive.mass_kg[0]) for k in sessions]),
+        ("gain_v_per_v in [drive]", "V/V", tables.drive.gain_v_per_v,
+         [gains_v_per_v[k] for k in sessions]),
+    ):  # fmt: skip
+        if stated is None or not found:
+            continue
+        if not any(math.isclose(stated, value, rel_tol=_SAME) for value in found):
+            listed = ", ".join(f"{value:g}" for value in dict.fromkeys(found))
+            click.echo(
+                f"haselab: warning: {name} is {stated:g} {unit}, but the sessions state {listed} "
+                f"{unit}, which the fit uses. Correct the one that is wrong. {path}",
+                err=True,
+            )
 
 
 def _refuse_twice(inputs: Sequence[Path]) -> None:
@@ -199,6 +227,7 @@ def section_of_fit(
         "status": fit.status,
         "mass_kg": fit.mass_kg,
         "parameters": {name: estimate.value for name, estimate in fit.parameters.items()},
+        "measured": measured_parameters(fit.law) if fit.law is not None else {},
         "std": {name: estimate.std for name, estimate in fit.parameters.items()},
         "not_identifiable": list(fit.not_identifiable),
         "determined_by": {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
@@ -108,7 +108,9 @@ def motion_of_file(
             rig = reader.header["rig"]
             _warn_of_kind(rig.get("actuator_kind", PLANAR_HASEL), known.actuator.kind, file)
             gain_v_per_v = float(rig["amplifier_gain"])
-            return motion_of_session(reader, session_file(file)), gain_v_per_v
+            motion = motion_of_session(reader, session_file(file))
+            # every session has the same file name, so messages name what the user typed
+            return replace(motion, name=str(file)), gain_v_per_v
     return _table(file, options, known, std or {})
 
 

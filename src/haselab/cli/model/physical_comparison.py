@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,6 +89,8 @@ def compare_physical(
         )
         if not session:
             _check_noise(record, noise, file)
+        if record.voltage_remark:
+            click.echo(f"haselab: warning: {record.voltage_remark}", err=True)
         prediction = predict_motion(
             model, record, experiments=options.experiments if session else (),
             free_offset=options.free_offset, longest_m=options.longest_m or 0.0,

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from haselab.actuators import ACTUATORS, with_stated
+from haselab.actuators import ACTUATORS, measured_parameters, with_stated
 from haselab.base import InputError, LimitError, table_at
 from haselab.cli.actuator_file import load_actuator
 from haselab.identify.physical import ChannelNoise, IdentifiedModel
@@ -89,6 +89,7 @@ def read_physical_model(path: Path) -> tuple[IdentifiedModel, ActuatorTables]:
     explained = model.status == "ok"
     try:
         law = with_stated(ACTUATORS.find(model.kind)(), about.parameters)
+        model.check_measured(measured_parameters(law))
         found = IdentifiedModel.of(
             law,
             model.parameters,

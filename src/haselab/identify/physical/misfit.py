@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,6 +13,7 @@ from scipy.sparse import csr_array
 
 from haselab import _motion
 from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
+from haselab.actuators.threads import in_threads
 from haselab.base import HaselabError, LimitError
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import (
@@ -45,6 +45,7 @@ LENGTH, CAPACITANCE = "length", "capacitance"
 TRACKED_ZERO_M = 2e-6  # standard deviation of the zero of lengths from tracks of 0.02 px
 SHARED_PX = 3e-4  # error of tracking that all frames with the same pixels share
 _LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
+_ENDLESS = 1e100  # derivative whose square, over that of a noise, may be too large for a number
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
 
@@ -346,6 +347,14 @@ class Misfit:
         found = self._each(unknowns, derivatives=True)
         if found is None:
             return None
+        # after a collapse, derivatives grow without limit
+        largest = [
+            np.abs(by).max(initial=0.0)
+            for part in found
+            for by in (part.length_by, part.capacitance_by)
+        ]
+        if not all(value < _ENDLESS for value in largest):
+            return None
         by = []
         for part, record, shared in zip(found, self.records, self._shared, strict=True):
             std_m = self.length_factor * record.length_std_m
@@ -356,6 +365,25 @@ class Misfit:
             by.append(np.where(np.array(unknowns.names) == name, 1.0 / std, 0.0)[None])
         return self._weighed(found, unknowns), np.vstack(by)
 
+    def zeros(self, unknowns: Unknowns) -> list[float]:
+        """Estimated error of the zero of each record's lengths over its standard deviation.
+
+        Args:
+            unknowns: of the model.
+        Returns:
+            One for each record; 0 of one without lengths, of a single one, or without a motion.
+        """
+        found = self._each(unknowns, derivatives=False)
+        zeros = [0.0] * len(self.records)
+        for k, (record, shared) in enumerate(zip(self.records, self._shared, strict=True)):
+            if found is None or not record.length_m.size or len(shared) < 2:
+                continue
+            std_m = self.length_factor * record.length_std_m
+            off = shared[0].whitened((record.length_m - found[k].length_m) / std_m)
+            weights = shared[1].weights
+            zeros[k] = float((weights @ off)[0] / (1.0 + weights.multiply(weights).sum()))
+        return zeros
+
     def _each(self, unknowns: Unknowns, *, derivatives: bool) -> list[ModelledRecord] | None:
         def one(record: MotionRecord) -> ModelledRecord:
             return model_record(unknowns, record, derivatives=derivatives, strict=self.strict)
@@ -363,8 +391,7 @@ class Misfit:
         try:
             if len(self.records) == 1:
                 return [one(self.records[0])]
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
-                return list(pool.map(one, self.records))
+            return in_threads(one, self.records, os.cpu_count() or 1)
         except HaselabError:
             return None
 

@@ -1,9 +1,9 @@
-r"""How far a misstated gain or mass may have moved the parameters.
+r"""How far a misstated gain, mass or camera's scale may have moved the parameters.
 
 Forces follow from the stated voltages and weights, capacitances from the monitors. If the
-capacitances are a factor $s$ off from those that the forces need, either the monitors, the
-amplifier's gain or a mass is wrong, and the records do not say which. An error $a$ of the gain or
-of a mass changes what the model says by $g\,a$, and so moves the estimates by
+capacitances are a factor $s$ off from those that the forces need, the monitors, the amplifier's
+gain, a mass or the camera's scale is wrong, and the records do not say which. An error $a$ of one
+of these changes what the model says by $g\,a$, and so moves the estimates by
 
 $\delta\theta = (J^\top J)^{-1} J^\top g\,a$
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.search import SearchResult
-from haselab.identify.physical.unknowns import SENSING_SCALE
+from haselab.identify.physical.unknowns import CAMERA_SCALE, SENSING_SCALE
 
 __all__ = ["misstated_std", "scale_error"]
 
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 _CAREFUL = 0.005  # error of the capacitance that a careful calibration has
 _SURE = 2.0  # standard deviations from which an error is one
 _LITTLE = 1e-4  # relative change of gain or mass, for the derivative
-_MOST = 0.2  # error of a gain or a mass
+_MOST = 0.2  # error of a gain, a mass or the camera's scale
 
 
 def scale_error(scale: float, std: float) -> float:
@@ -66,16 +66,28 @@ def misstated_std(misfit: Misfit, found: SearchResult, error: float, prior: Floa
         return largest
     columns = np.vstack([found.jacobian, np.diag(np.sqrt(prior))])
     size = np.linalg.norm(columns, axis=0)
-    for records in _misstated(misfit.records):
-        residuals = replace(misfit, records=records).residuals(unknowns)
-        if residuals is None:
-            continue
-        change = np.concatenate([(found.residuals - residuals) / _LITTLE, np.zeros(size.size)])
-        moved = np.linalg.lstsq(columns / size, change, rcond=None)[0] / size
+    for change in _changes(misfit, found):
+        wanted = np.concatenate([change, np.zeros(size.size)])
+        moved = np.linalg.lstsq(columns / size, wanted, rcond=None)[0] / size
         # a mass of one record may hardly change the scale
         share = min(abs(error), _MOST * abs(moved[scale])) / max(abs(moved[scale]), 1e-300)
         largest = np.maximum(largest, share * np.abs(moved))
     return largest
+
+
+def _changes(misfit: Misfit, found: SearchResult) -> Iterator[Floats]:
+    """Change of the modelled over the standard deviation, by each error. Shape `(N,)`."""
+    for records in _misstated(misfit.records):
+        residuals = replace(misfit, records=records).residuals(found.unknowns)
+        if residuals is not None:
+            yield (found.residuals - residuals) / _LITTLE
+    names = found.unknowns.names
+    if CAMERA_SCALE in names:
+        # what is known beforehand of the scale would be wrong
+        known = [part.rows for part in misfit.segments if not part.experiment]
+        change = found.jacobian[:, names.index(CAMERA_SCALE)].copy()
+        change[np.concatenate([np.zeros(0, np.int64), *known])] = 0.0
+        yield change
 
 
 def _misstated(records: Sequence[MotionRecord]) -> Iterator[list[MotionRecord]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,7 @@ Floats = NDArray[np.float64]
 
 _LENGTH, _CAPACITANCE = 10.0, 100.0  # factor from the start values that no start explains
 _BREAKDOWN = 3.0  # fields over that of breakdown, likewise
+_MONITOR = 0.05  # largest error of the voltage's monitor and of the amplifier's gain together
 _UNSEEN = 0.01  # motion over the noise of a length
 _STILL = 20.0  # spread of the lengths over their noise, of an actuator that moves
 _FOLLOWS = 0.7  # correlation with the simulated motion, of lengths that follow the drive
@@ -35,6 +37,7 @@ _LOW = 0.3  # of the highest voltage, below which the load decides the length
 _HEAVIER = 1.1  # load over another one, whose lengths are compared
 _REVERSED = 0.25  # of the simulated difference of two lengths
 _LEAST_LENGTHS = 5  # of a load
+_DECIDES = 0.5  # simulated difference over that at rest, which creep does not reverse
 
 
 def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
@@ -47,7 +50,9 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
         What is wrong and what to do; empty if nothing is.
     """
     for record in records:
-        for fault in (_length(law, record), _capacitance(law, record), _field(law, record)):
+        for fault in (
+            _length(law, record), _capacitance(law, record), _field(law, record), _monitor(record),
+        ):  # fmt: skip
             if fault:
                 return f"{record.name}: {fault}"
     beginnings = [_beginning(record) for record in records if _seen_early(record).any()]
@@ -56,7 +61,7 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
         for fault in (_drive(law, record, length_m), _times(law, record), _sign(record, length_m)):
             if fault:
                 return f"{record.name}: {fault}"
-    return _loads(beginnings, lengths)
+    return _loads(law, beginnings, lengths)
 
 
 def _length(law: ActuatorLaw, record: MotionRecord) -> str:
@@ -96,6 +101,16 @@ def _field(law: ActuatorLaw, record: MotionRecord) -> str:
         f"the drive reaches {highest_v:.3g} V, a field of {field_v_m:.3g} V/m, and the "
         f"dielectric breaks down at {law.circuit.breakdown_v_per_m:.3g} V/m. State the volts "
         "at the actuator: check that the amplifier's gain is not counted twice"
+    )
+
+
+def _monitor(record: MotionRecord) -> str:
+    if not abs(record.voltage_ratio - 1.0) > _MONITOR:
+        return ""
+    return (
+        f"the voltage monitor shows {record.voltage_ratio:.3g} times the voltage that drive and "
+        "gain of the amplifier give. Check the gain of the amplifier, the scale of its voltage "
+        "monitor, and that it follows the drive"
     )
 
 
@@ -279,7 +294,17 @@ def _levels(record: MotionRecord, simulated_m: Floats) -> Iterator[_Level]:
             )
 
 
-def _loads(records: Sequence[MotionRecord], lengths: Sequence[Floats | None]) -> str:
+def _stretch_m(law: ActuatorLaw, light_n: float, heavy_n: float) -> float:
+    """By how much a heavier load stretches the actuator at rest; infinite where nobody knows."""
+    try:
+        return equilibrium_m(law, 0.0, heavy_n) - equilibrium_m(law, 0.0, light_n)
+    except LimitError:
+        return math.inf
+
+
+def _loads(
+    law: ActuatorLaw, records: Sequence[MotionRecord], lengths: Sequence[Floats | None]
+) -> str:
     """Whether the actuator is shorter under a heavier load, at a low voltage."""
     levels = [
         level
@@ -292,7 +317,10 @@ def _loads(records: Sequence[MotionRecord], lengths: Sequence[Floats | None]) ->
         if heavy.load_n < _HEAVIER * light.load_n or longer_m <= 0.0:
             continue
         shorter_m = light.seen_m - heavy.seen_m
-        if shorter_m > max(_REVERSED * longer_m, _STILL * light.noise_m):
+        if shorter_m <= max(_REVERSED * longer_m, _STILL * light.noise_m):
+            continue
+        # creep of what came before may be larger than the difference of two similar loads
+        if longer_m > _DECIDES * _stretch_m(law, light.load_n, heavy.load_n):
             return (
                 f"{heavy.name}: the length is {1e3 * heavy.seen_m:.4g} mm under "
                 f"{heavy.load_n:.3g} N, but {1e3 * light.seen_m:.4g} mm under {light.load_n:.3g} N "

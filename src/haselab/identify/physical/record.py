@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -16,6 +17,7 @@ __all__ = ["MotionRecord"]
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+_VOLTAGE_ERROR = 0.01  # of a monitor and an amplifier with a careful calibration
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class MotionRecord:
         block: of each capacitance within its experiment, shape `(C,)`; empty if it is not known.
         window_weight: of a second of each interval in its capacitance, shape `(W,)`; empty: all
             weigh the same.
+        voltage_ratio: voltage by its monitor over that of the drive; NaN if nobody measured it.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -65,6 +68,7 @@ class MotionRecord:
     capacitance_later_s: Floats | float = 0.0
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     window_weight: Floats = field(default_factory=lambda: np.zeros(0))
+    voltage_ratio: float = math.nan
 
     @cached_property
     def sensed(self) -> NDArray[np.bool_]:
@@ -72,6 +76,17 @@ class MotionRecord:
         found = np.zeros(self.drive.voltage_v.size, dtype=np.bool_)
         found[self.window] = True
         return found
+
+    @property
+    def voltage_remark(self) -> str:
+        """What the user should know if the monitor contradicts the stated voltage; else empty."""
+        if not abs(self.voltage_ratio - 1.0) > _VOLTAGE_ERROR:
+            return ""
+        return (
+            f"{self.name}: the voltage monitor shows {self.voltage_ratio:.4g} times the voltage "
+            "that drive and gain of the amplifier give. Check the gain of the amplifier and the "
+            "scale of the monitor."
+        )
 
     @cached_property
     def _shares(self) -> csr_array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from haselab.identify.noise import whiteness_p
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment, least_explained
 from haselab.identify.physical.model_error import excess_energy
+from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.rivals import Rival
 from haselab.identify.physical.search import SearchResult
 
@@ -160,12 +161,24 @@ def status_of(
     return "ok", True
 
 
-def notes_of(error: float) -> tuple[str, ...]:
-    """Remarks for the user on the capacitances; for the error, see `scale_error`."""
-    if error == 0.0:
-        return ()
-    return (
-        f"The capacitances are {math.exp(error):.4g} times those that the forces need. If they are "
-        "well calibrated, the amplifier's gain or a mass is wrong, and so are permittivity and "
-        "stiffness. Their intervals allow for it.",
-    )
+def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
+    """Remarks for the user on what may be misstated, by capacitances and monitors of the voltage.
+
+    Args:
+        error: see `scale_error`.
+        records: that were fitted.
+    """
+    notes = [record.voltage_remark for record in records if record.voltage_remark]
+    if error != 0.0:
+        notes.append(
+            f"The capacitances are {math.exp(error):.4g} times those that the forces need. If they "
+            "are well calibrated, the amplifier's gain, a mass or the camera's scale is wrong, and "
+            "so are permittivity and stiffness. Their intervals allow for it."
+        )
+    if not any(record.capacitance_f.size for record in records):
+        notes.append(
+            "Without capacitances, nothing shows a wrong gain, mass or scale of the lengths, and "
+            "the intervals do not include it: an error of 1 % of the gain changes the permittivity "
+            "by 2 %."
+        )
+    return tuple(notes)

@@ -219,14 +219,15 @@ def result_of(
     seen = channel_residuals(misfit, found)
     lengths, capacitances = seen.lengths, seen.capacitances
     length_noise, capacitance_noise = noise_of(lengths), noise_of(capacitances)
-    status, usable = status_of(
-        seen, unknowns.value(SENSING_SCALE), preferred, converged=found.converged
-    )
-    if not usable:
-        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
     prior = vague_information(unknowns)
     covariance = _covariance(found, segments, prior)
     own_std = np.sqrt(np.diag(covariance))
+    scale = unknowns.value(SENSING_SCALE)
+    if scale_error(scale, float(own_std[unknowns.names.index(SENSING_SCALE)])) == 0.0:
+        scale = 1.0  # one voltage and load hardly determine it: no contradiction
+    status, usable = status_of(seen, scale, preferred, converged=found.converged)
+    if not usable:
+        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
     white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
     energy = seen.excess_energy if status != "ok" else 0.0
     if status != "ok":
@@ -271,7 +272,7 @@ def result_of(
     values = covariance * np.outer(slopes, slopes)
     return ActuatorFit(
         status=status,
-        notes=notes_of(error),
+        notes=notes_of(error, misfit.records),
         parameters=parameters,
         covariance=values,
         residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),

@@ -17,7 +17,6 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +31,7 @@ from haselab.actuators import (
     ActuatorLaw,
     with_parameters,
 )
+from haselab.actuators.threads import in_threads
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.physical.information import vague_information
 from haselab.identify.physical.misfit import Misfit
@@ -164,8 +164,9 @@ def find_extended_law(misfit: Misfit, found: SearchResult) -> ExtendedLaw | None
     """
     best: ExtendedLaw | None = None
     candidates = _candidates(found.unknowns, _duration_s(misfit))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        columns_of = list(pool.map(lambda more: _column(misfit, found, more), candidates))
+    columns_of = in_threads(
+        lambda more: _column(misfit, found, more), candidates, os.cpu_count() or 1
+    )
     for more, column in zip(candidates, columns_of, strict=True):
         if column is None or not column.any():
             continue

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.actuators.threads import in_threads
 from haselab.identify.physical.information import vague_information
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.unknowns import Unknowns
@@ -163,8 +163,7 @@ def _first_stage(misfit: Misfit, start: Unknowns, noise: float) -> tuple[_State 
         start.moved(_DRAWN * start.widths * rng.standard_normal(start.widths.size))
         for _ in range(_TRIALS)
     ]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(misfit.residuals, trials))
+    found = in_threads(misfit.residuals, trials, os.cpu_count() or 1)
     costs = [np.inf if part is None else _bounded(part, noise) for part in found]
     best: tuple[float, _State] | None = None
     count = len(trials)

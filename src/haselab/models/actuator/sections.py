@@ -6,7 +6,9 @@ not listed here are kept unchanged.
 
 from __future__ import annotations
 
+import math
 import operator
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
@@ -46,6 +48,7 @@ __all__ = [
     "missing",
 ]
 
+_SAME = 1e-9  # relative difference of numbers that were written and read
 _Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
 _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
 _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
@@ -289,6 +292,8 @@ class PhysicalTable(_Section):
     parameters: Annotated[dict[str, Number], BeforeValidator(_by_full_name)] = Field(
         description="values by the names of TWIN.toml", examples=[{"dielectric.permittivity": 3.0}]
     )
+    # those that were not fitted, at the identification; empty in files of older versions
+    measured: Annotated[dict[str, Number], BeforeValidator(_by_full_name)] = {}
     std: Annotated[dict[str, float], BeforeValidator(_by_full_name)] = {}
     not_identifiable: tuple[str, ...] = ()
     # experiments and channels that determine each parameter
@@ -296,6 +301,21 @@ class PhysicalTable(_Section):
     covariance: PhysicalCovariance | None = None
     residuals: ResidualTable = ResidualTable()
     records: PhysicalRecords | None = None
+
+    def check_measured(self, present: Mapping[str, float]) -> None:
+        """Refuse parameters that were changed after the identification, which used them.
+
+        Args:
+            present: parameters that were not fitted, by name.
+        Raises:
+            InputError: One of them has another value than the identification had.
+        """
+        for name, value in self.measured.items():
+            if not math.isclose(value, present.get(name, value), rel_tol=_SAME):
+                raise InputError(
+                    f"{name} is {present[name]:g} in [actuator.parameters], but was {value:g} when "
+                    "[model.physical] was identified. Restore it, or identify the actuator again."
+                )
 
 
 class ModelSection(_Section):

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from haselab.actuators import ACTUATORS, ADDED_INERTIA, DRIFTS, with_parameters, with_stated
+from haselab.actuators import (
+    ACTUATORS,
+    ADDED_INERTIA,
+    DRIFTS,
+    measured_parameters,
+    with_parameters,
+    with_stated,
+)
 from haselab.base import InputError, LimitError
 from haselab.identify.physical.outlook import Outlook
 from haselab.identify.physical.unknowns import Unknowns
@@ -42,6 +49,7 @@ def planner_of(about: ActuatorSection, model: PhysicalTable, ends_v: Ends, path:
         )
     try:
         law = with_stated(ACTUATORS.find(model.kind)(), about.parameters)
+        model.check_measured(measured_parameters(law))
         values = dict(model.parameters)
         own = {about.key for about in law.described()}
         law = with_parameters(law, {k: v for k, v in values.items() if k.partition("[")[0] in own})

@@ -15,6 +15,7 @@ from haselab.actuators import (
     ActuatorLaw,
     Scales,
     draw_parameters,
+    measured_parameters,
     with_parameters,
     with_stated,
 )
@@ -114,6 +115,7 @@ def identified_twin(path: Path, bench: TwinConfig, draw: int | None = None) -> T
         )
     try:
         law = with_stated(ACTUATORS.find(model.kind)(), about.parameters)
+        model.check_measured(measured_parameters(law))
         if draw is None:
             law, added_kg, scale, drift = _with(law, model, model.parameters)
         else:

@@ -79,6 +79,19 @@ class VoltageMapFit(CurveFit):
         """
         return self._fitted().std_v(np.asarray(strain, dtype=np.float64))
 
+    def linear_coefficients(self) -> dict[str, Estimate]:
+        """The coefficients by linear error propagation, those that are not identifiable too.
+
+        Where the loop does not separate the two exponentials, the intervals are too narrow or far
+        too wide. They serve to compare two fits of the same loop, such as one without noise.
+
+        Returns:
+            `a1_v`, `b1`, `a2_v`, `b2`.
+        Raises:
+            ResultError: the fit has no result.
+        """
+        return self._fitted().linear()[0]
+
     def _fitted(self) -> _Curve:
         return self._present(self.curve)
 
@@ -143,21 +156,27 @@ class _Curve:
         Where the data do not separate the two rates, the error of a coefficient is not normal, so
         it is reported as not identifiable; the curve is known nevertheless.
         """
+        linear, covariance = self.linear()
+        std = np.array([estimate.std for estimate in linear.values()])
+        split, split_std = float(self.numbers[1]), math.sqrt(float(self.covariance[1, 1]))
+        separate = split > _APART * split_std and not least_split_reached(self.numbers)
+        std = np.where(np.isfinite(std) & separate, std, math.inf)
+        unknown = math.nan, math.inf, (-math.inf, math.inf)
+        return {
+            name: known if spread < math.inf else Estimate(*unknown, known.unit)
+            for (name, known), spread in zip(linear.items(), std, strict=True)
+        }, rescaled(covariance, std)
+
+    def linear(self) -> tuple[dict[str, Estimate], Floats]:
+        """Coefficients with their covariance, by linear error propagation."""
         values, slope = coefficients(self.numbers, self.middle, self.half)
         covariance = propagated(slope, self.covariance)
         with np.errstate(invalid="ignore"):
             std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        split, split_std = float(self.numbers[1]), math.sqrt(float(self.covariance[1, 1]))
-        separate = split > _APART * split_std and not least_split_reached(self.numbers)
-        std = np.where(np.isfinite(std) & separate, std, math.inf)
-        estimates = {}
-        for name, value, spread in zip(_NAMES, values, std, strict=True):
-            unit = "V" if name.endswith("_v") else ""
-            estimates[name] = (
-                Estimate.normal(value, spread, unit) if spread < math.inf
-                else Estimate(math.nan, math.inf, (-math.inf, math.inf), unit)
-            )  # fmt: skip
-        return estimates, rescaled(covariance, std)
+        return {
+            name: Estimate.normal(value, spread, "V" if name.endswith("_v") else "")
+            for name, value, spread in zip(_NAMES, values, std, strict=True)
+        }, covariance
 
 
 @checked

@@ -16,6 +16,10 @@ __all__ = ["paper_rows", "quantities"]
 _PAPER_WN_RAD_S = math.sqrt(26.14)
 _PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
 _PAPER_PI = PidGains(0.85, 1.5)
+_RISE = (
+    "ringing averaged out; not well defined where the overshoot, with its ringing, is large: "
+    "see the figure of the steps"
+)
 _ERROR = "fraction of the step; negative: beyond the reference"
 _CALIBRATED_ONCE = (
     "The interval includes differences between the trials, but not the error of the chip's "
@@ -373,20 +377,22 @@ def _loops() -> dict[str, Quantity]:
         "S25.derivative_filter": Quantity("PID, time constant of the derivative's filter", "s"),
         "S25.phase_margin": Quantity("PID, phase margin", "deg"),
         "S25.gain_margin": Quantity("PID, gain margin", "dB"),
-        "S25.rise_pid": Quantity("rise time, PID", "s"),
+        "S25.rise_pid": Quantity("rise time, PID", "s", note=_RISE),
         "S25.overshoot_pid": Quantity("overshoot, PID, ringing included", ""),
         "S25.error_pid": Quantity("steady-state error, PID", "", note=_ERROR),
-        "S25.rise_own": Quantity("rise time, controller of [control] kind", "s"),
+        "S25.rise_own": Quantity("rise time, controller of [control] kind", "s", note=_RISE),
         "S25.overshoot_own": Quantity(
             "overshoot, controller of [control] kind, ringing included", ""
         ),
         "S25.error_own": Quantity(
             "steady-state error, controller of [control] kind", "", note=_ERROR
         ),
-        "S25.rise_observer": Quantity("rise time, observer with the physical model", "s"),
+        "S25.rise_observer": Quantity(
+            "rise time, observer with the physical model", "s", note=_RISE
+        ),
         "S25.overshoot_observer": Quantity("overshoot, observer, ringing included", ""),
         "S25.error_observer": Quantity("steady-state error, observer", "", note=_ERROR),
-        "S26.rise": Quantity("rise time, loop on the chip", "s"),
+        "S26.rise": Quantity("rise time, loop on the chip", "s", note=_RISE),
         "S26.settling": Quantity("settling time, loop on the chip", "s"),
         "S26.overshoot": Quantity("overshoot, loop on the chip, ringing included", ""),
         "S26.error": Quantity(
@@ -401,10 +407,10 @@ def _loops() -> dict[str, Quantity]:
             "kg",
             note="the controller was not informed of this mass",
         ),
-        "S27.rise_own": Quantity("rise time, hybrid", "s"),
+        "S27.rise_own": Quantity("rise time, hybrid", "s", note=_RISE),
         "S27.overshoot_own": Quantity("overshoot, hybrid, ringing included", ""),
         "S27.error_own": Quantity("steady-state error, hybrid", "", note=_ERROR),
-        "S27.rise_other": Quantity("rise time, hybrid with the other mass", "s"),
+        "S27.rise_other": Quantity("rise time, hybrid with the other mass", "s", note=_RISE),
         "S27.overshoot_other": Quantity(
             "overshoot, hybrid with the other mass, ringing included", ""
         ),

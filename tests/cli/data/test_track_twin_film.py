@@ -93,3 +93,21 @@ def test_python_warns_of_subsets_that_do_not_follow_the_stretch(film):
     options = hl.tracking.TrackOptions(model="translation", subset_px=21)
     with pytest.warns(UserWarning, match=r"move apart by up to \d+\.\d %"):
         hl.track(film, options=options)
+
+
+def test_a_point_that_stays_covered_is_named(film, tmp_path, capsys):
+    covered = tmp_path / "covered"
+    covered.mkdir()
+    for k, file in enumerate(sorted(film.glob("*.tif"))):
+        frame = tifffile.imread(file)
+        if k >= 5:  # of 16 frames
+            frame[60:160, 150:230] = 0
+        tifffile.imwrite(covered / file.name, frame)
+    rows = "p0,190,100\np1,256,110\np2,300,105\n"
+    (tmp_path / "points.csv").write_text(f"point,x_px,y_px\n{rows}")
+    line = ["track", covered, "--points", tmp_path / "points.csv", "--rest-frames", "5",
+            "--rate-hz", "100", "--out", tmp_path / "tracks.csv", "--json"]  # fmt: skip
+    with pytest.raises(SystemExit):
+        main([str(word) for word in line])
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert any("1 of 3 points were lost and not found again until the end: p0." in n for n in notes)

@@ -70,6 +70,8 @@ from haselab.tracking.particles.follow import ParticleTracker
 __all__ = ["command"]
 
 _MANY_LOST = 0.1
+_GONE, _GONE_SHARE = 10, 0.05  # last frames without a point
+_NAMED = 4
 _TURN_S = 0.5e-3
 
 
@@ -213,7 +215,8 @@ def _answer(points: Points, choice: Choice, kept: TrackCollector) -> dict[str, A
             err=True,
         )
     noise = choice.state.noise
-    notes = [line for line in [_stretch_line(points, choice, thin)] if line]
+    lines = _stretch_line(points, choice, thin), _gone_line(points, thin)
+    notes = [line for line in lines if line]
     for line in notes:
         click.echo(f"haselab: {line}", err=True)
     return {
@@ -241,6 +244,21 @@ def _stretch_line(points: Points, choice: Choice, tracks: Tracks) -> str:
         return ""
     note = stretch_note(points.place_px, tracks, choice.options)
     return f"{note} Use --model neighbours." if note else ""
+
+
+def _gone_line(points: Points, tracks: Tracks) -> str:
+    """A note about points that were followed, but not to the end; empty if there are none."""
+    count = len(tracks.valid)
+    since = np.argmax(tracks.valid[::-1], axis=0)  # frames from the last valid one to the end
+    gone = np.flatnonzero(tracks.valid.any(axis=0) & (since >= max(_GONE, _GONE_SHARE * count)))
+    if gone.size == 0:
+        return ""
+    names = ", ".join(points.names[k] for k in gone[:_NAMED]) + ", ..." * (gone.size > _NAMED)
+    return (
+        f"{gone.size} of {len(points.names)} points were lost and not found again until the end: "
+        f"{names}. The column reason says why. If they were only covered and the sheet moves as a "
+        "whole, try --model neighbours."
+    )
 
 
 def _loss_line(video: VideoReader) -> str:

@@ -37,7 +37,7 @@ help:
 	@echo 'make lint    ruff, mypy, import-linter, which the tests run too'
 	@echo 'make ctest   the C core alone, under the sanitizers'
 	@echo 'make fuzz    mutated input for every parser for FUZZ_S=1800 seconds; continues where it stopped'
-	@echo 'make docs    build the documentation site, out/site/index.html: a minute, and minutes more for new notebooks'
+	@echo 'make docs    build the documentation site, out/site/index.html: 3 minutes, or 5 s after a change of one page'
 	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment, extensions, and the packages that the tests need'

@@ -1,4 +1,4 @@
-"""`python -m haselab`: the command line, where the console script is not on the path."""
+"""`python -m haselab`: the command line, for when the console script is not on the PATH."""
 
 from haselab.cli.entry import main
 

@@ -1,4 +1,4 @@
-"""Calls in threads: their order, their errors, and an interrupt that does not wait for them."""
+"""Calls in threads: order of the results, errors, and Ctrl-C, which does not wait for them."""
 
 import subprocess
 import sys

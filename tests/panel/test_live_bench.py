@@ -99,7 +99,7 @@ def test_a_study_that_computes_with_an_output_is_taken_to_zero_when_it_must_end(
     if how == "ended":
         threading.Timer(0.5, live.do, ("disarm", "page", {})).start()
     live.step()
-    said = {"ended": "The study was ended", "lost page": "No message from the page"}[how]
+    said = {"ended": "The study was ended", "lost page": "No message for "}[how]
     assert live.state.stage == "tripped" and live.state.drive_v == 0.0
     assert said in live.state.reason
     assert seen == [0.0]
@@ -354,7 +354,7 @@ def test_a_driver_that_fails_in_its_own_way_while_arming_leaves_zero(tmp_path: P
 def test_a_call_that_stop_interrupts_in_its_own_way_does_not_end_the_panel(
     tmp_path: Path, what: str
 ) -> None:
-    """Switching off changes what the call of another thread works with."""
+    """Switching off changes the data that a call in another thread uses."""
     twin = make_twin(twin_of_reading("hz"), 1)
     bench: Any = twin.acquisition
     method, live_benches = getattr(bench, what), []

@@ -85,7 +85,7 @@ def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
 def test_stop_needs_nothing_but_its_page_and_acts_on_a_click_without_a_pointer(
     browser: Browser, panel: RunningPanel
 ) -> None:
-    """The web server hangs once it has sent the page; voice control and screen readers click."""
+    """The web server hangs after sending the page; voice control and screen readers click."""
     with browser.new_context() as context:
         found = context.new_page()
         found.route("**/about", lambda route: None)  # never answered

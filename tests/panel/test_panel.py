@@ -102,7 +102,7 @@ def test_a_page_that_goes_takes_the_bench_to_zero_and_nobody_else_drives_it(
                     assert answer["error"].startswith("Another page has armed the bench")
             state = await second.until(lambda state: not state["holder"])
             assert state["stage"] == "off" and state["drive_v"] == 0.0
-            assert state["reason"] == "The page that armed the bench has gone."
+            assert state["reason"] == "The page that armed the bench has disconnected."
             assert "error" not in await second.arm()
 
     asyncio.run(play())

@@ -131,7 +131,7 @@ def test_every_end_of_a_study_is_at_zero_with_the_reason_and_the_data(
     folder: Path, how: str
 ) -> None:
     panel = started(lease_s=1.5 if how == "lost page" else 10.0)
-    gone = "The page that started the study has gone"
+    gone = "The page that started the study has disconnected"
     said = {
         "end": "The study was ended from a page", "stop": "STOP", "lost page": gone,
         "signal": "The panel has ended",

@@ -287,7 +287,7 @@ class Watching:
 
 
 def test_a_lease_that_has_ended_is_not_renewed(twin: TwinBench) -> None:
-    """After a pause of the whole computer, the program may run before its guardians do."""
+    """After the computer slept, the program may run before its guardians do."""
     rig = guarded(twin)
     rig.safety.guardians = Watching()  # type: ignore[assignment]
     arm(rig)

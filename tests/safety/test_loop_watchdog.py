@@ -146,7 +146,7 @@ def test_the_charging_energy_is_limited() -> None:
     ],
 )
 def test_a_declared_alternation_is_judged_by_its_magnitude(gain, swing_v, declared, reason) -> None:
-    """The sign changes every 5 blocks, where the strain is nonsense; the voltage steps once."""
+    """The sign changes every 5 blocks, where the strain is invalid; the voltage steps once."""
     blocks = np.arange(200)
     asked_v = np.where(blocks < 60, 1.0, 1.3)
     magnitude_v = asked_v + swing_v * (blocks // 2 % 2)

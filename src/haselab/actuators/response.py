@@ -226,13 +226,13 @@ def with_stated(law: ActuatorLaw, values: Mapping[str, float]) -> ActuatorLaw:
 
 
 def measured_parameters(law: ActuatorLaw) -> dict[str, float]:
-    """Parameters that are measured in another way and not fitted, such as a width.
+    """Return the parameters that are measured separately and not fitted, such as a width.
 
     Args:
-        law: with their values.
+        law: has their values.
     Returns:
-        Values by name, see `with_parameters`; without those of the circuit, on which no motion
-        depends, such as the field of breakdown.
+        Values by name, see `with_parameters`. Parameters of the circuit, such as the breakdown
+        field, are left out, because the motion does not depend on them.
     Example:
         >>> from haselab.actuators import DeaStack
         >>> measured_parameters(DeaStack())["actuator.layers"]

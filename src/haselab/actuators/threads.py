@@ -1,4 +1,4 @@
-"""Run a function in threads that an interrupt does not wait for."""
+"""Run a function in several threads without delaying Ctrl-C."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Result = TypeVar("Result")
 def in_threads(job: Callable[[Item], Result], items: Iterable[Item], most: int) -> list[Result]:
     """Apply a function to each item, in several threads.
 
-    A `KeyboardInterrupt` leaves this function, and the program, at once. An executor would first
-    wait for all running calls, which may be simulations of many seconds.
+    A `KeyboardInterrupt` ends this function, and the program, at once. A `ThreadPoolExecutor` would
+    first wait for all running calls, which may be simulations of many seconds.
 
     Args:
         job: applied to each item.
-        items: in the order of the results.
-        most: threads at the same time.
+        items: arguments of the calls.
+        most: largest number of threads at the same time.
     Returns:
-        The results.
+        The results, in the order of the items.
     Raises:
-        Exception: the first one that the function raised.
+        Exception: The first one that the function raised.
     Example:
         >>> in_threads(abs, [-1, 2, -3], 2)
         [1, 2, 3]

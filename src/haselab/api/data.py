@@ -327,7 +327,7 @@ def records(
         output: column of the output.
         rate_hz: rows a second, in Hz, which the times must not contradict. None: from the times.
         hold: the input between its rows: "zero" (held), "first" (straight lines) or
-            "band-limited". None: held, which a fit then calls an assumption where it matters.
+            "band-limited". None: assumed to be held; a fit adds a note if its result depends on it.
     Returns:
         One record; several where the times have gaps.
     Raises:

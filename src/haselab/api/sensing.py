@@ -133,7 +133,7 @@ def track(
         points: positions in the first frame, in px: a DataFrame or dictionary with `x_px` and
             `y_px`, or an array of shape `(P, 2)`. None: found in the first frame.
         rate_hz: frames a second, in Hz. None: as the file states it; frames count from 0.
-        scale_mm_per_px: adds `x_mm` and `y_mm`, and the displacement from rest in
+        scale_mm_per_px: adds `x_mm` and `y_mm`, and the displacement from the position at rest,
             `displacement_x_m` and `displacement_y_m`.
         rest_frames: first frames, at rest, that are averaged as the reference; those after the
             first motion are left out.
@@ -198,7 +198,7 @@ def _tracked(
     options: TrackOptions | None,
     lossy: bool = False,
 ) -> tuple[Tracks, Floats]:
-    """The tracks, and the points at rest in px, shape `(P, 2)`."""
+    """Track the points; also return their positions at rest, in px, shape `(P, 2)`."""
     stream = map(_frame, frames)
     head: list[Frame] = list(islice(stream, max(rest_frames, PILOT_FRAMES)))
     if not head:
@@ -212,7 +212,7 @@ def _tracked(
         chosen = options or TrackOptions(subset_px=found.subset_px)
         tracks = track_frames(chain(head, stream), found.place_px, chosen, rest_frames)
         if note := stretch_note(found.place_px, tracks, chosen):
-            warnings.warn(f"{note} Use the model neighbours.", stacklevel=4)
+            warnings.warn(f"{note} Use TrackOptions(model='neighbours').", stacklevel=4)
         return tracks, found.place_px
     usual = TrackOptions(subset_px=found.subset_px)
     rest = head[: frames_at_rest(head[:rest_frames], found.place_px, usual)]

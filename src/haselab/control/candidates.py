@@ -33,7 +33,7 @@ _UNSTABLE = 1e3
 _MET = 1e-9
 _LARGEST_EXCESS = 1e12
 _UNASKED = 2.0  # larger than any miss of a share
-_NOISE_GAIN = 15.0  # of a plant from strain to strain
+_NOISE_GAIN = 15.0  # default for a plant from strain to strain
 _LONGEST_WINDOW = 250  # largest number of samples of half a period of ringing
 
 

@@ -42,7 +42,7 @@ class Saturation:
 
     @property
     def start(self) -> float:
-        """Strain at which a loop starts: 0, or the end of the range next to it.
+        """Strain at which a loop starts: 0, or the end of the range that is nearest to 0.
 
         Example:
             >>> Saturation().start, Saturation(0.001, 0.08).start

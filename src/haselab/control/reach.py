@@ -52,7 +52,7 @@ def reachable_range(
         low_v: lowest drive, in V; None: no limit.
         high_v: highest drive, in V; None: no limit.
     Returns:
-        The limited range. It may end next to zero strain, see `allow_start`; a loop then starts
+        The limited range. It may end close to zero strain, see `allow_start`; a loop then starts
         at this end.
     Raises:
         InputError: zero strain is outside the wanted range.
@@ -74,7 +74,7 @@ def reachable_range(
         raise ResultError(
             f"The voltage map has zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
             f"drive is limited to [{low_v:g}, {high_v:g}] V. Change the limits of the drive, or "
-            "count the strain from a length at a drive within these limits and fit both maps and "
-            "the model again."
+            "define zero strain as the length at a drive within these limits, and fit both maps "
+            "and the model again."
         )
     return Saturation(*found)

@@ -1,4 +1,4 @@
-"""What an input does between its samples, for simulations that take points or held values."""
+"""Convert an input to the points, or the held values, that a simulation takes."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from haselab.models.filters import resample_poly
 __all__ = ["fine_input", "held_input"]
 
 Floats = NDArray[np.float64]
-_FINER = 8  # points per sample of the polygon that represents a band-limited input
-_PIECES = {"first": 8, "band-limited": 2}  # held values for each straight line of a polygon
+_FINER = 8  # points per sample of the straight lines that approximate a band-limited input
+_PIECES = {"first": 8, "band-limited": 2}  # held values for each straight line
 
 
 def fine_input(record: Record) -> tuple[Floats, float]:
-    """Points of the input, and their rate: of a polygon where it is not held.
+    """Return the points of the input and their rate.
 
     Args:
-        record: its input and hold.
+        record: has the input and its hold.
     Returns:
-        Input, and its rate in Hz. A band-limited input is refined.
+        Input, and its rate in Hz. A band-limited input is interpolated to a higher rate.
     """
     u, rate_hz = record.u, record.input_rate_hz
     if record.hold == "band-limited":
@@ -33,10 +33,10 @@ def fine_input(record: Record) -> tuple[Floats, float]:
 
 
 def held_input(record: Record) -> tuple[Floats, float]:
-    """The input as held values, which follow a polygon in small steps where it is not held.
+    """Return the input as held values; an input that is not held is approximated by small steps.
 
     Args:
-        record: its input and hold.
+        record: has the input and its hold.
     Returns:
         Input, and its rate in Hz.
     Example:
@@ -50,6 +50,6 @@ def held_input(record: Record) -> tuple[Floats, float]:
     if record.hold == "zero":
         return u, rate_hz
     count = _PIECES[record.hold]
-    share = (np.arange(count) + 0.5) / count  # the mean of each piece of the line
+    share = (np.arange(count) + 0.5) / count  # the mean of each part of the line
     pieces = u[:-1, np.newaxis] + np.diff(u)[:, np.newaxis] * share
     return np.append(pieces.ravel(), u[-1]), rate_hz * count

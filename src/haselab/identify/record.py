@@ -54,7 +54,7 @@ class Record:
         hold: interpolation of the input between its updates: "zero" (held, as a converter does),
             "first" (straight lines), or "band-limited" (a measured signal without content above
             half its rate).
-        hold_assumed: whether nobody stated `hold`; a fit then says what depends on it.
+        hold_assumed: whether `hold` was not stated; a fit then notes what depends on it.
         notes: how the record was made, for example of uneven times; a fit repeats them.
     Raises:
         InputError: wrong shapes, NaN, times that do not rise or that have a gap, a constant input
@@ -176,13 +176,13 @@ def _check_times(time_s: Floats) -> None:
 
 
 def record_notes(records: Sequence[Record], delay: Estimate | None) -> tuple[str, ...]:
-    """What a fit says of its records: how they were made, and what depends on an assumed hold.
+    """Notes of a fit on its records: how they were made, and what depends on an assumed hold.
 
     Args:
         records: that were fitted.
-        delay: that was found; None: none.
+        delay: that was estimated; None: the model has none.
     Returns:
-        Each note once.
+        The notes, without duplicates.
     """
     notes = [note for record in records for note in record.notes]
     assumed = [record for record in records if record.hold_assumed]
@@ -190,9 +190,9 @@ def record_notes(records: Sequence[Record], delay: Estimate | None) -> tuple[str
     # Not where the interval is wider than half a sample, or the delay was not estimated.
     if assumed and delay is not None and 0.0 < 4.0 * delay.std < sample_s:
         notes.append(
-            "The input is taken as held from sample to sample, as the output of a converter is. If "
-            "it was measured, such as a monitor voltage, add --hold band-limited (in Python "
-            "hold='band-limited'): otherwise the delay is too short by half a sample, "
-            f"{sample_s / 2:.3g} s."
+            "The input is assumed to be held from sample to sample, like the output of a "
+            "converter. If it was measured, such as a monitor voltage, use --hold band-limited (in "
+            "Python: hold='band-limited'). Otherwise the estimated delay is too short by half a "
+            f"sample, {sample_s / 2:.3g} s."
         )
     return tuple(dict.fromkeys(notes))

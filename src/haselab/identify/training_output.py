@@ -149,7 +149,7 @@ def _level_step(y: Floats) -> float:
 
 
 def grid_step(values: Floats) -> float:
-    """Step of the grid on which values lie, such as a unit of their last digit.
+    """Return the step of the grid on which values lie, such as the unit of their last digit.
 
     Args:
         values: shape `(N,)`.

@@ -14,7 +14,7 @@ __all__ = ["LinearMap", "VoltageMap", "allow_start"]
 Floats = NDArray[np.float64]
 _REACH_POINTS = 1501
 _ITERATIONS = 60
-_NEAR_ZERO = 0.02  # of a range of strains: distance of zero at which a loop still starts at its end
+_NEAR_ZERO = 0.02  # of a strain range's width: largest distance from 0 of an end to start at
 
 
 @dataclass(frozen=True)
@@ -173,14 +173,15 @@ class LinearMap:
 
 
 def allow_start(strains: tuple[float, float]) -> bool:
-    """Whether a loop can start at zero strain within a range, or at the end next to it.
+    """Whether a loop can start at zero strain, or at an end of the range close to it.
 
-    Where zero strain is the length at 0 V, a fitted map passes 0 V a little beside zero strain.
+    If zero strain is the length at 0 V, a fitted map gives a strain slightly different from 0 at
+    0 V, so the range of the drive may exclude zero strain.
 
     Args:
         strains: lowest and highest strain.
     Returns:
-        True if the range contains 0, or ends within 2 % of its width from it.
+        True if the range contains 0, or if 0 is outside by at most 2 % of the range's width.
     Example:
         >>> allow_start((-0.03, 0.1)), allow_start((0.0008, 0.08)), allow_start((0.01, 0.08))
         (True, True, False)

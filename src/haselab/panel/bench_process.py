@@ -5,13 +5,13 @@ recordings are new folders in RUNS. FOLDER is private to one panel and holds
 
 - `live`: the signals, see `columns`;
 - `camera.jpg`: the last frame of the camera;
-- `bench.sock`: commands of the web server, one JSON object per line, each with an `id` and the time
-  `at_s` of the data that its page had seen; the state of the bench is sent 20 times a second, with
-  the time `clock_s`;
+- `bench.sock`: commands of the web server, one JSON object per line, each with an `id` and `at_s`,
+  the time of the last data that its page received. The state of the bench is sent 20 times a
+  second, with the time `clock_s`;
 - `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
 
-It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin ends or
-its parent has gone.
+It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin or its
+parent ends.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ __all__ = ["main"]
 _STATES_HZ = 20.0
 _BEHIND_S = 0.2  # a simulated bench that is further behind real time does not catch up
 _MOST_BYTES = 65536  # of one command
-_PARENT_S = 0.2  # between two looks at the parent
+_PARENT_S = 0.2  # between two checks of the parent
 
 
 class _Link:
@@ -139,7 +139,7 @@ def _stops(folder: Path, bench: LiveBench) -> None:
             data, sender = box.recvfrom(512)
             try:
                 bench.stop(data.decode(errors="replace"))
-            except BaseException:  # no answer: the guardians act; the next STOP must work too
+            except BaseException:  # without an answer, the guardians act; the next STOP must work
                 traceback.print_exc()
                 continue
             with contextlib.suppress(OSError):
@@ -200,8 +200,10 @@ def _end_study_at(ended: threading.Event, bench: LiveBench) -> None:
 
 
 def _watch_parent(parent: int, ended: threading.Event) -> None:
-    """End the process when the panel has ended: its stdin ends, or its parent changes, even if
-    another process still has the other end of the pipe."""
+    """End the process when the panel has ended, which means that stdin ends or the parent changes.
+
+    The parent is checked too, because another process may keep the pipe to stdin open.
+    """
     while os.getppid() == parent:
         ready, _, _ = select.select([0], [], [], _PARENT_S)
         if ready and not os.read(0, 4096):

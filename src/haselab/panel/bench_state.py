@@ -1,4 +1,4 @@
-"""What the bench process says of its bench, 20 times a second."""
+"""The state of the bench, which the bench process sends 20 times a second."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["BenchState"]
 
 @dataclass(frozen=True)
 class BenchState:
-    """What the pages show of the bench.
+    """State of the bench that the pages show.
 
     Args:
         stage: of the safety chain: off, requested, armed, running or tripped. It is tripped until
@@ -30,7 +30,7 @@ class BenchState:
         task: what a study does now; empty without a study.
         done: share of the study's time that has passed, 0 to 1.
         prompt: step that a person must do and confirm; empty: none.
-        step: number of the step, which the confirmation repeats.
+        step: number of this step, which the confirmation must contain.
         events: the last ones, each with its time on the clock of the rig, in s.
         recorded: folder of the last study that was played to its end; empty: none.
         recording: folder of the study that is being played; empty: none.

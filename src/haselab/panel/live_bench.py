@@ -44,8 +44,8 @@ _PICTURES_HZ = 5.0
 _CATCH_UP_S, _WATCH_S = 0.2, 0.1
 _COMPUTES_S = 0.5  # without a block, after which a study does not look whether it must end
 _MOST_EVENTS = 40  # that a page shows
-_RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old one could energise the bench late
-_IDLE_BLOCKS = 20  # with a voltage that nobody has requested, in a row, which trip the bench
+_RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old command could energise the bench
+_IDLE_BLOCKS = 20  # this many blocks in a row with an unexpected voltage trip the bench
 
 
 class _NoCamera:
@@ -112,8 +112,8 @@ class LiveBench:
         self._recorded = ""  # folder of the last study that was played to its end
         self._end_study = ""  # why the study must end; empty: it may go on
         self._extrapolated = False  # the strain of the last block
-        self._unexpected = 0  # blocks in a row with a voltage that nobody has requested
-        self._over = False  # the panel ends: no command is carried out any more
+        self._unexpected = 0  # blocks in a row with an unexpected voltage
+        self._over = False  # the panel has ended: commands are refused
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
         rig.bench.on_block = self._on_block
         self._settled = about.switch_in_block + round(1e-3 * about.rate_hz)
@@ -150,7 +150,7 @@ class LiveBench:
                 or `leave`.
             holder: the page.
             values: arguments of the command.
-            at_s: time of the data that the page had seen, or of its sign of life; see
+            at_s: time of the last data that the page received, or of its sign of life; see
                 `page_leases`. None: a call in this process.
         Returns:
             The answer.
@@ -173,7 +173,7 @@ class LiveBench:
             raise InputError(
                 f"There is no command {shown(what)}. Use one of: {', '.join(commands)}."
             )
-        # Ramping to 0 V and switching off never come too late.
+        # Ramping to 0 V and disarming are accepted at any age.
         recent = what in _RECENT and not (what == "drive" and values.get("value_v") == 0)
         if recent:
             self._leases.require_recent(at_s)
@@ -193,7 +193,7 @@ class LiveBench:
             self._check_turn(what, holder)
             if what == "arm":  # checking a study takes a while
                 return self._arm_for(holder, values, job, at_s)
-            if recent:  # it may have waited for its turn
+            if recent:  # the command may have waited for its turn
                 self._leases.require_recent(at_s)
             return commands[what](holder, values)
 
@@ -235,23 +235,23 @@ class LiveBench:
         return {}
 
     def _leave(self, holder: str, values: JsonObject) -> JsonObject:
-        """A page has gone: nobody can see what its commands do."""
+        """Take the bench to 0 V if its page has disconnected: nobody sees what it does."""
         self._leases.end(holder)
         self._cancel_request(holder, values)
         if holder == self._holder and self._mode == "study":
-            self.end_study("The page that started the study has gone.")
+            self.end_study("The page that started the study has disconnected.")
         elif holder == self._holder:
-            self._end("The page that armed the bench has gone.")
+            self._end("The page that armed the bench has disconnected.")
         return {}
 
     def _arm_for(
         self, holder: str, values: JsonObject, job: StudyJob | None, at_s: float | None
     ) -> JsonObject:
-        """Arm the bench for a page that is still there and waits for the answer."""
+        """Arm the bench for a page that is still connected and waits for the answer."""
         if at_s is not None and self._leases.is_lost(holder):
             raise SafetyError(
-                "No message from the page that wanted to arm the bench for "
-                f"{self._leases.lease_s:g} s. Nothing was armed."
+                f"No message for {self._leases.lease_s:g} s from the page that wanted to arm the "
+                "bench. Nothing was armed. Check that the page shows live data, then try again."
             )
         self._leases.require_in_time(at_s)
         answer = self._arm(holder, values, job)
@@ -305,7 +305,7 @@ class LiveBench:
         return {}
 
     def _check_turn(self, what: str, holder: str) -> None:
-        """Refuse a command of a page while another one has armed the bench, and at the end."""
+        """Refuse commands of other pages while a page has armed the bench, and all at the end."""
         if self._over:
             raise SafetyError("The panel has ended. No command is carried out.")
         if self._holder and holder != self._holder and what not in ("disarm", "leave", "cancel"):
@@ -326,7 +326,10 @@ class LiveBench:
         if self._mode != "study" or holder != self._holder:
             raise SafetyError("Only the page that started the study can confirm this step.")
         if values.get("step") != self._player.step or not self._player.prompt:
-            raise SafetyError("This step is over. Read the next one, then confirm it.")
+            raise SafetyError(
+                "This step is no longer current. If the page shows another step, do it, then press "
+                "Done."
+            )
         self._player.confirm()
         return {}
 
@@ -429,14 +432,14 @@ class LiveBench:
             except HaselabError as error:
                 self._failed(error)
                 return
-            except Exception as error:  # of any driver, as when STOP interrupts its call
+            except Exception as error:  # of a driver, for example if STOP interrupts its call
                 self._failed(DeviceError(f"A driver failed: {described(error)}."))
                 return
             if self._holder and self._rig.safety.stage is Stage.TRIPPED:
                 self._end(self._rig.safety.reason)
 
     def close(self) -> None:
-        """End at 0 V; a command that comes later is refused."""
+        """End at 0 V, and refuse all later commands."""
         with self._mutex:
             self._over = True
             self._end("The panel has ended.")
@@ -451,7 +454,7 @@ class LiveBench:
         self._end(self._rig.safety.reason or str(error))
 
     def _play(self, job: StudyJob) -> None:
-        """Play a study. Pages get answers meanwhile: only `_lease`, `_confirm` and `_disarm`."""
+        """Play a study. Meanwhile, pages can confirm a step, disarm, leave and renew leases."""
         about, folder = self._rig.description, job.options.folder
         self._lockin = lockin_of(about, job.study.sensing.carrier_hz)
         reason, over = f"The study has ended. Its recording is in {folder}.", threading.Event()
@@ -467,7 +470,7 @@ class LiveBench:
                 f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"
             )
             self._rig.safety.trip(reason)
-        except Exception as error:  # of any driver, as when STOP interrupts its call
+        except Exception as error:  # of a driver, for example if STOP interrupts its call
             reason = f"A driver or an experiment failed: {described(error)}."
             self._rig.safety.trip(reason)
         finally:
@@ -491,7 +494,7 @@ class LiveBench:
             time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
         if not self._end_study and self._leases.is_lost(self._holder):
             return (
-                f"No message from the page that started the study for {self._leases.lease_s:g} s."
+                f"No message for {self._leases.lease_s:g} s from the page that started the study."
             )
         return self._end_study
 
@@ -501,7 +504,7 @@ class LiveBench:
             now_s = time.monotonic()
             if self._leases.is_lost(self._holder):
                 silent_s = self._leases.lease_s
-                self._end(f"No message from the page that armed the bench for {silent_s:g} s.")
+                self._end(f"No message for {silent_s:g} s from the page that armed the bench.")
             elif now_s > self._beat_s + _HEARTBEAT_S:
                 self._beat_s = now_s
                 rig.safety.heartbeat(0.0)
@@ -515,17 +518,19 @@ class LiveBench:
             self._watch_idle(codes)
 
     def _watch_idle(self, codes: NDArray[np.int16]) -> None:
-        """Trip if a bench that should be at 0 V shows a voltage: an instrument may have put it out
-        by itself."""
+        """Trip if the voltage monitor shows a voltage although the bench is not armed.
+
+        For example, an instrument may have switched itself on.
+        """
         rig = self._rig
         limit_v, left_v = rig.safety.settings.residual_v, rig.bench.watch.residual_v(codes)
         watched = rig.safety.settings.read_back and left_v >= limit_v
         self._unexpected = self._unexpected + 1 if watched else 0
         if self._unexpected == _IDLE_BLOCKS:
             reason = (
-                f"Output of {left_v:.4g} V while nothing was requested (limit {limit_v:g} V). "
-                "Switch the high voltage off by hand, then check the instruments and the monitor "
-                "cables."
+                f"The voltage monitor shows {left_v:.4g} V although the bench is not armed (limit "
+                f"{limit_v:g} V). Switch the high voltage off by hand, then check the instruments "
+                "and the monitor cables."
             )
             rig.safety.trip(reason)
             if rig.safety.guardians is not None:

@@ -1,9 +1,9 @@
-"""Which pages are still there, and which commands are too old to be carried out.
+"""Check which pages are still connected, and which commands are too old to be carried out.
 
-All times are those of `lease_clock_s`, which the processes of a computer share and which counts
-while the computer sleeps. The bench process sends the time with its state, a page returns the last
-one that it has seen with each command, and the web server adds the time to each sign of life. So
-a command that waited anywhere (in a page, in a stopped process, in a socket) is known to be old.
+All times are those of `lease_clock_s`, which is the same in all processes of a computer and keeps
+running while the computer sleeps. The bench process sends the time with its state, a page adds the
+last time that it received to each command, and the web server adds the time to each sign of life.
+So the age of a command is known wherever it waited: in a page, in a stopped process or in a socket.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from haselab.safety.interlock import lease_clock_s
 
 __all__ = ["PageLeases"]
 
-_LATE_S = 27.0  # longest time to arm, which the web server reports as failed after 30 s
+_LATE_S = 27.0  # longest time to arm; after 30 s, the web server reports a failure
 
 
 class PageLeases:
@@ -31,11 +31,11 @@ class PageLeases:
         self._heard_s: dict[str, float] = {}
 
     def begin(self, page: str) -> None:
-        """Begin the lease of a page now."""
+        """Start the lease of a page now."""
         self._heard_s[page] = self._clock()
 
     def renew(self, page: str, at_s: float | None) -> None:
-        """Renew the lease of a page by a sign of life; a lease that had ended then stays ended.
+        """Renew the lease of a page at a sign of life, unless the lease had ended before it.
 
         Args:
             page: whose lease it is.
@@ -58,27 +58,27 @@ class PageLeases:
         """Refuse a command that is older than the lease.
 
         Args:
-            at_s: time of the data that its page has seen; None: a call in this process.
+            at_s: time of the last data that its page received; None: a call in this process.
         Raises:
-            SafetyError: it is too old.
+            SafetyError: It is too old.
         """
         self._require(at_s, self.lease_s)
 
     def require_in_time(self, at_s: float | None) -> None:
-        """Refuse to arm if that took so long that the page is told that it failed.
+        """Refuse to arm if arming took so long that the page reports a failure.
 
         Args:
-            at_s: as above.
+            at_s: see `require_recent`.
         Raises:
-            SafetyError: it took too long.
+            SafetyError: It took too long.
         """
         self._require(at_s, _LATE_S)
 
     def _require(self, at_s: float | None, most_s: float) -> None:
         age_s = 0.0 if at_s is None else self._clock() - at_s
         if not 0.0 <= age_s <= most_s:
-            known = f"is {age_s:.3g} s old" if 0.0 <= age_s < 1e6 else "does not say how old it is"
+            known = f"is {age_s:.3g} s old" if 0.0 <= age_s < 1e6 else "has no valid time"
             raise SafetyError(
-                f"The command {known} (limit {most_s:.3g} s), so it was not carried out. If the "
-                "page shows live data, repeat it."
+                f"The command {known} (limit {most_s:.3g} s), so it was not carried out. Repeat it "
+                "if the page shows live data."
             )

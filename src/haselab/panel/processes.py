@@ -27,7 +27,7 @@ __all__ = ["Panel", "running_panel", "stop_answers"]
 
 _START_S = 60.0  # for the drivers of a bench
 _END_S = 10.0  # for the bench process to go to 0 V
-_END_STOP_S = 1.0  # the stop process has nothing to end
+_END_STOP_S = 1.0  # for the stop process, which controls no instrument
 
 
 class Panel(NamedTuple):
@@ -37,7 +37,7 @@ class Panel(NamedTuple):
         address: to open in a browser; it holds the token.
         bench: its bench process.
         stop: its stop process.
-        stop_port: TCP port of STOP.
+        stop_port: TCP port of the stop process.
         server: its web server, to be run by the caller.
         listener: socket of the web server.
     """
@@ -51,7 +51,7 @@ class Panel(NamedTuple):
 
 
 def stop_answers(port: int, within_s: float) -> bool:
-    """Whether STOP answers a page.
+    """Whether the stop process answers.
 
     Args:
         port: TCP port of STOP.
@@ -133,7 +133,7 @@ def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Ite
         words = ["0", str(folder), key, ",".join(access.origins), *real]
         stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
         opened.callback(_end, stop, _END_STOP_S)
-        opened.callback(_end, bench)  # first: STOP works until the bench is at 0 V
+        opened.callback(_end, bench)  # ends before STOP, which works until the bench is at 0 V
         settings.stop_port = int(stop_port)
         server = WebServer(
             uvicorn.Config(

@@ -34,7 +34,7 @@ _REASON = "STOP was pressed on the panel"
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
 _PROMPT_S = 0.5  # after which the guardians are called
-_MOST_CONNECTIONS = 128  # of pages; more than any number of pages needs
+_MOST_CONNECTIONS = 128  # at the same time; more than the pages need
 
 
 class StopServer(ThreadingHTTPServer):
@@ -63,7 +63,7 @@ class StopServer(ThreadingHTTPServer):
         return int(self.server_address[1])
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection; too many others lose the oldest one, so that STOP can connect."""
+        """Serve a connection; if there are too many, close the oldest, so that STOP can connect."""
         with self._turn:
             self._open[id(request)] = request
             excess = list(self._open)[: max(len(self._open) - _MOST_CONNECTIONS, 0)]
@@ -73,7 +73,7 @@ class StopServer(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print what went wrong, unless the other side has only closed the connection."""
+        """Print the error, unless the other side only closed the connection."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 
@@ -115,7 +115,7 @@ class _Handler(BaseHTTPRequestHandler):
             origin is None or origin in self.server.origins
         )
         if not mine:
-            self.close_connection = True  # what it sent besides is not read as a further request
+            self.close_connection = True  # ignore the rest of what it sent
             self._reply(403, {"error": "Only the panel's own page may use this port."})
         return mine
 

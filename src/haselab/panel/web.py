@@ -50,7 +50,7 @@ _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
 _COLUMN_STEP = 100  # so that windows of almost the same width share their frames
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
-_ARM_S = 30.0  # the same for arming, where a study is checked first; see `page_leases`
+_ARM_S = 30.0  # the same for arming, before which a study is checked; see `page_leases`
 _HEAD = struct.Struct("<HHIddddII")
 
 
@@ -144,7 +144,7 @@ class _Bench:
     async def ask(
         self, what: str, holder: str, values: dict[str, Any], at_s: object
     ) -> dict[str, Any]:
-        """Send a command and wait for its answer. The bench process refuses one that is too old."""
+        """Send a command and wait for its answer; the bench process refuses an old command."""
         if self._writer is None:
             return {
                 "error": "There is no connection to the bench process. Check that the "
@@ -178,7 +178,7 @@ class _Page:
     holder: str = field(default_factory=lambda: secrets.token_hex(8))
     view: _View = field(default_factory=lambda: _View(10.0, None, 600))
     unacknowledged: list[int] = field(default_factory=list)  # frames
-    arms: int = 0  # commands to arm the bench that are not answered yet
+    arms: int = 0  # commands to arm the bench that have no answer yet
 
 
 class _Server:
@@ -333,7 +333,7 @@ class _Server:
         await self._bench.ask("lease", page.holder, {}, lease_clock_s())
 
     async def _leave(self, page: _Page) -> None:
-        """Withdraw what a page that has gone requested or armed."""
+        """Cancel the arming request of a page that has disconnected, or disarm its bench."""
         await self._bench.ask("leave", page.holder, {}, lease_clock_s())
 
     def _frame(self, tick: int, view: _View) -> bytes:

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 _SAME_S = 1e-7  # times closer than that are one
 _LARGE = 300.0  # step in codes, from which its own delay is known to less than a microsecond
 _EMPTY = 0.05  # inertia of an empty clamp, of the largest hung mass
-_RATIO_STD = 1e-3  # up to which the ratio of measured and stated voltage is known
+_RATIO_STD = 1e-3  # largest standard deviation of the ratio of measured and stated voltage
 
 
 @dataclass(frozen=True)
@@ -276,9 +276,9 @@ def _drive(
 
 
 def _voltage_ratio(blocks: Collection[_Blocks], rig: Mapping[str, Any]) -> float:
-    """Voltage by its monitor over drive times gain; NaN where the drive hardly changes."""
+    """Voltage by the monitor over drive times gain; NaN if the drive hardly changes."""
     none = np.zeros(0)
-    # a carrier that is too small for capacitances does not change the level
+    # if no block gives a capacitance, as with a small carrier, the levels are still valid
     any_used = any(part.used.any() for part in blocks)
     chosen = [(part, part.used if any_used else slice(None)) for part in blocks]
     drive_v = np.concatenate([none, *(part.drive_v[used] for part, used in chosen)])
@@ -286,7 +286,7 @@ def _voltage_ratio(blocks: Collection[_Blocks], rig: Mapping[str, Any]) -> float
     if drive_v.size < 2:
         return math.nan
     v_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]
-    # a line leaves out the offset of the monitor
+    # the slope of a line does not depend on the monitor's offset
     away_v = float(rig["amplifier_gain"]) * (drive_v - drive_v.mean())
     size = float(away_v @ away_v)
     if size <= (v_per_code / _RATIO_STD) ** 2:  # each level is known to a code or better

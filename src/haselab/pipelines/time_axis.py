@@ -116,7 +116,7 @@ def records_of(
         columns: names of input and output.
         axis: times of the rows.
         hold: how the input behaves between its updates, see `Record`.
-        hold_assumed: whether nobody stated it.
+        hold_assumed: whether the hold was not stated.
     """
     u, y = table[columns[0]], table[columns[1]]
     cuts = np.flatnonzero(np.diff(axis.number) > _FEW_MISSING + 1) + 1

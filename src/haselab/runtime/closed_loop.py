@@ -63,7 +63,7 @@ class ClosedLoop:
         self._watchdog = _watchdog(rig, carrier, loop)
         self._lost = self._outside = 0  # blocks
         start, limits = loop.saturation.start, (loop.saturation.low, loop.saturation.high)
-        ends = (start, start) if self._in_volts else limits  # a voltage is limited in every step
+        ends = (start, start) if self._in_volts else limits  # a voltage is limited at each step
         strains = np.linspace(*ends, _REACH_POINTS)
         voltages = [self._voltage(float(strain)) for strain in (*strains, start)]
         rig.description.drive_limits.check(voltages)

@@ -59,12 +59,12 @@ class InterlockBusyError(OSError):
 
 
 def lease_clock_s() -> float:
-    """Clock of all leases, in s: common to all processes, and it counts while the computer sleeps.
+    """Time of all leases, in s: the same in all processes, and running while the computer sleeps.
 
-    `time.monotonic` stands still in a suspended computer, whose output keeps its voltage: a lease
-    on that clock would still be valid hours later.
+    `time.monotonic` stops while the computer is suspended, but the output keeps its voltage. A
+    lease on that clock would still be valid hours later.
     """
-    boot = getattr(time, "CLOCK_BOOTTIME", None)  # Linux; on macOS CLOCK_MONOTONIC counts
+    boot = getattr(time, "CLOCK_BOOTTIME", None)  # Linux; on macOS, CLOCK_MONOTONIC keeps running
     clock = getattr(time, "CLOCK_MONOTONIC", None) if boot is None else boot
     return time.monotonic() if clock is None else time.clock_gettime(clock)
 

@@ -163,7 +163,7 @@ class Safety:
         self._limits = ""
         self._clock = clock
         self._stage = Stage.OFF
-        self._changing = threading.RLock()  # held for a moment: STOP comes from another thread
+        self._changing = threading.RLock()  # held briefly: STOP comes from another thread
         self._reason = ""
         self._trips = 0
         self._number = 0
@@ -294,14 +294,16 @@ class Safety:
         return permit_expired(self._clock() - self._armed_s, self.settings.permit_age_s)
 
     def _lease_ended(self) -> str:
-        """Why no heartbeat may extend the lease: it has ended already. After a pause of the whole
-        computer, the guardians may notice this later than the program."""
+        """Why a heartbeat must not renew the lease, because it has ended; empty if it has not.
+
+        After the computer slept, the guardians may notice this later than the program.
+        """
         late_s = lease_clock_s() - self.gate.interlock.lease_end_s
         if late_s <= 0.0:
             return ""
         return (
-            f"The lease (lease_s) of this program ended {late_s:.2g} s ago: the program, or the "
-            "whole computer, did not run."
+            f"The lease (lease_s) of this program ended {late_s:.2g} s before its next heartbeat. "
+            "Check whether the program hung or the computer slept."
         )
 
     def run(self) -> None:
@@ -388,7 +390,7 @@ class Safety:
 
     def _trip_once(self, reason: str) -> bool:
         """Revoke the permission before anything else; return whether this is the first reason."""
-        self.gate.end_permission()  # waits for nothing
+        self.gate.end_permission()  # without waiting for the lock
         with self._changing:
             first = self._stage is not Stage.TRIPPED
             self.gate.end_permission()

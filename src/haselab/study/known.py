@@ -74,7 +74,7 @@ def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
 
 
 def _baseline_v(tables: ActuatorTables) -> float:
-    """Voltage of zero strain; where the drive ends just before it, that end."""
+    """Voltage of zero strain, or the end of the drive if zero strain is just outside."""
     to_volt, (low_v, high_v) = tables.voltage_map(), tables.drive_ends_v()
     voltage_v = float(to_volt.voltage_v(0.0))
     reach = to_volt.reach(

@@ -1,4 +1,4 @@
-"""What a fit says of its records is the same in the command and in Python, and nothing is lost."""
+"""A fit gives the same notes on its records in the command and in Python, and loses none."""
 
 import json
 
@@ -39,7 +39,7 @@ def notes_of(*arguments):
 def test_python_calls_an_unstated_hold_an_assumption_as_the_command_does(tmp_path):
     path = table(tmp_path / "r.csv")
     fit = hl.fit_transfer(hl.records(path))
-    assert any("taken as held from sample to sample" in note for note in fit.notes)
+    assert any("assumed to be held from sample to sample" in note for note in fit.notes)
     assert list(fit.notes) == notes_of(path)
     stated = hl.fit_transfer(hl.records(path, hold="zero"))
     assert not any("held from sample" in note for note in stated.notes)

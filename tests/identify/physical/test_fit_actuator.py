@@ -213,17 +213,17 @@ def test_lengths_alone_have_a_note_on_what_they_do_not_show():
         capacitance_experiment=no,
     )  # fmt: skip
     (note,) = fit_actuator(TRUE, [alone], mass_kg=MASS_KG).notes
-    assert note.startswith("Without capacitances, nothing shows a wrong gain")
+    assert note.startswith("Without capacitances, the fit cannot detect a wrong gain")
 
 
 def test_a_monitor_that_contradicts_the_stated_voltage_is_named():
     seen = replace(record(TRUE, 4, duration_s=5.0), voltage_ratio=0.98)
     (note,) = notes_of(0.0, [seen])
-    assert note.startswith("record-4: the voltage monitor shows 0.98 times the voltage that drive ")
+    assert note.startswith("record-4: the voltage by the monitor is 0.98 times drive times gain")
     assert notes_of(0.0, [replace(seen, voltage_ratio=0.995)]) == ()
     assert notes_of(0.0, [replace(seen, voltage_ratio=math.nan)]) == ()
     fault = find_implausible(TRUE, [replace(seen, voltage_ratio=0.9)])
-    assert fault.startswith("record-4: the voltage monitor shows 0.9 times the voltage that drive ")
+    assert fault.startswith("record-4: the voltage by the monitor is 0.9 times drive times gain")
 
 
 @pytest.mark.parametrize(("size", "contradicts"), [(1e-3, False), (10.0, True)])

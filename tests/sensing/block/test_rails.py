@@ -1,4 +1,4 @@
-"""A converter's rail that the drive crosses; a carrier below a converter step; no noise at all."""
+"""A drive beyond the converter's range; a carrier below one converter step; no noise at all."""
 
 import numpy as np
 import pytest

@@ -21,7 +21,7 @@ from haselab.store.folder import write_new
 
 __all__ = ["command"]
 
-_STOP_S, _STOP_TRIALS = 4.0, 3  # a bench without STOP goes to 0 V
+_STOP_S, _STOP_TRIALS = 4.0, 3  # if STOP answers none of these trials, the panel ends at 0 V
 
 
 @click.command("panel")
@@ -77,7 +77,7 @@ def command(
 
 
 def _serve(panel: Panel) -> None:
-    """Serve the page until Ctrl-C, or until the bench process or STOP has ended or STOP hangs.
+    """Serve the page until Ctrl-C, or until the bench process or STOP has ended, or STOP hangs.
 
     Raises:
         DeviceError: the bench process or the stop process ended by itself, or STOP does not answer.
@@ -110,6 +110,6 @@ def _serve(panel: Panel) -> None:
     watcher.join()
     if lost:
         raise DeviceError(
-            f"The {lost[0]}, so the panel ends too. Check that the bench is at 0 V, then "
+            f"The {lost[0]}, so the panel ends. Check that the bench is at 0 V, then "
             "start the panel again."
         )

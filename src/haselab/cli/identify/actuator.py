@@ -33,7 +33,7 @@ from haselab.store.toml import validated
 
 __all__ = ["actuator", "law_of_section", "section_of_fit"]
 
-_SAME = 1e-3  # relative difference of stated numbers that mean the same
+_SAME = 1e-3  # largest relative difference of stated numbers that count as equal
 _TABLE_ZERO_M = 5e-5  # standard deviation of the zero of a displacement sensor, set by a caliper
 
 
@@ -139,7 +139,7 @@ def _warn_of_stated(
     tables: ActuatorTables,
     path: Path,
 ) -> None:
-    """Warn if no session has the mass, or the gain, that the actuator file states."""
+    """Warn if the mass or the gain in the actuator file differs from those of all sessions."""
     sessions = [k for k, file in enumerate(files) if file.is_dir() or is_session(file)]
     for name, unit, stated, found in (
         ("mass_kg in [actuator]", "kg", tables.actuator.mass_kg,
@@ -153,7 +153,7 @@ def _warn_of_stated(
             listed = ", ".join(f"{value:g}" for value in dict.fromkeys(found))
             click.echo(
                 f"haselab: warning: {name} is {stated:g} {unit}, but the sessions state {listed} "
-                f"{unit}, which the fit uses. Correct the one that is wrong. {path}",
+                f"{unit}. The fit uses the sessions. Correct the wrong value. {path}",
                 err=True,
             )
 

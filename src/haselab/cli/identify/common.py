@@ -162,9 +162,9 @@ def read_recorded(
         rate_hz: sampling rate; None: that of the file.
         held_at_hz: update rate of the output converter; None: the sampling rate.
         columns: what the user states about the columns.
-        hold: how the input behaves between its updates; None: nobody stated it, so it is held.
-        through: actuator file whose voltage map converts the input from V to strain; its voltage
-            is a command, which is held.
+        hold: how the input behaves between its updates; None: not stated, so held is assumed.
+        through: actuator file whose voltage map converts the input from V to strain. The input is
+            then a commanded voltage, which is held.
     Returns:
         The records.
     Raises:

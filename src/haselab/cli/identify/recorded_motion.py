@@ -109,7 +109,7 @@ def motion_of_file(
             _warn_of_kind(rig.get("actuator_kind", PLANAR_HASEL), known.actuator.kind, file)
             gain_v_per_v = float(rig["amplifier_gain"])
             motion = motion_of_session(reader, session_file(file))
-            # every session has the same file name, so messages name what the user typed
+            # all sessions have the same file name, so messages quote the path that the user typed
             return replace(motion, name=str(file)), gain_v_per_v
     return _table(file, options, known, std or {})
 

@@ -65,8 +65,8 @@ _NO_NOISE = (
 )  # fmt: skip
 @shared_option("--at-rest", is_flag=True, detail="Its state and offset are then taken as 0.")
 @shared_option("--through-voltage-map", is_flag=True)
-@shared_option("--hold", type=click.Choice(HOLDS), detail="Default: zero. State what you stated "
-               "to 'identify transfer'.")  # fmt: skip
+@shared_option("--hold", type=click.Choice(HOLDS), detail="Default: zero. Use the same value "
+               "as in 'identify transfer'.")  # fmt: skip
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
 @shared_option("--experiment", "experiments", multiple=True,
                detail="Repeat the option for more. Default: all.")  # fmt: skip

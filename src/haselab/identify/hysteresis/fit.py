@@ -50,7 +50,7 @@ _HELD_OUT = 0.25
 _MOST_OPERATORS = 20
 _COLOURED = 0.01
 _EXACT = 1e-9  # of the output's span
-_AS_ROUNDING = 1.5  # mean square of residuals over that of rounding errors
+_AS_ROUNDING = 1.5  # mean square over that of rounding errors, below which residuals are rounding
 _TOLD = 3.0  # standard deviations of a significant loop width
 LAG = "linear lag"
 _LAG = (
@@ -355,7 +355,7 @@ def _is_rounding(
     residuals: Sequence[Floats],
     masks: Sequence[NDArray[np.bool_]],
 ) -> bool:
-    """Whether residuals are no larger than the errors by rounding the outputs."""
+    """Whether the residuals are no larger than the rounding errors of the outputs."""
     outputs = np.concatenate([record.y for record in records])
     square = float(
         np.mean(np.concatenate([e[m] for e, m in zip(residuals, masks, strict=True)]) ** 2)
@@ -385,7 +385,7 @@ def _notes(
         blind = [name for name in blind if name != "rate_dependence_s"]
     if _is_rounding(records, residuals, masks):
         notes.append(
-            "What the model leaves is the rounding of the output. Smaller effects are not "
+            "The residuals are no larger than the rounding of the output. Smaller effects are not "
             "identifiable: record more digits."
         )
     elif white < _COLOURED:

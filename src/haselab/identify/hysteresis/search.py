@@ -44,8 +44,8 @@ _SPREAD = (3, 6)
 _PATIENCE = 2  # operators in a row that may fail to lower the criterion
 _ROWS = 2500
 _ROUNDING = 1e-18  # mean square of residuals, in units of half the span
-_MOST_DIGITS, _OFF_DIGIT = 9, 1e-4  # of a printed number; distance from whole units
-_OF_STEPS = 0.25  # of the mean square of rounding errors: smaller residuals are of exact outputs
+_MOST_DIGITS, _OFF_DIGIT = 9, 1e-4  # of a printed number; largest distance from a whole unit
+_OF_STEPS = 0.25  # of the mean square of rounding errors; below, the outputs are exact
 _FILTER_SAMPLES = 4.0
 _FILTERS = (0.0, 1.0, 2.0, 8.0, 16.0, 32.0, 64.0)
 
@@ -81,20 +81,20 @@ def rate_spread(problem: HysteresisProblem) -> float:
 
 
 def rounding_floor(y: Floats, left: float) -> float:
-    """Mean square of the errors by rounding an output, which repeat with the loop.
+    """Return the mean square of the rounding errors of an output, which repeat with the loop.
 
     Args:
         y: output. Shape `(N,)`.
         left: mean square of the residuals of the best model.
     Returns:
-        The mean square; 0 where the output has no steps, or the residuals are much smaller.
+        The mean square; 0 if the output has no steps, or if the residuals are much smaller.
     """
     floor = max(grid_step(y), _last_digit(y)) ** 2 / 12.0
     return floor if left > _OF_STEPS * floor else 0.0
 
 
 def _last_digit(y: Floats) -> float:
-    """Unit of the last decimal digit of printed numbers; 0 where they have too many digits."""
+    """Unit of the last decimal digit of printed numbers; 0 if they have too many digits."""
     span = float(np.ptp(y))
     first = math.floor(math.log10(span)) if span > 0.0 else 0
     for power in range(first, first - _MOST_DIGITS, -1) if span > 0.0 else ():

@@ -50,7 +50,7 @@ _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 _APART = 2.0  # rms over noise from which records are compared alone
 _FEW_STEPS = 8  # from what explains one record to what explains all, if that exists
-_MOVED = 4.0  # standard deviations of the zero, from which the lengths of a record are shifted
+_MOVED = 4.0  # standard deviations of the zero; above, the lengths of a record count as shifted
 _LEAST_VALUES = 2  # for each unknown, without which nobody sees the noise
 _CONTRADICT = (
     "the records contradict each other: the law explains each alone, but not all together. Check "
@@ -139,14 +139,14 @@ def fit_actuator(
 
 
 def _moved_zero(misfit: Misfit, found: SearchResult) -> str:
-    """Say which record's lengths are shifted by more than the zero of the camera explains."""
+    """Say which record's lengths are shifted by more than their zero's uncertainty explains."""
     zeros = np.array(misfit.zeros(found.unknowns))
     k = int(np.argmax(np.abs(zeros)))
     if abs(zeros[k]) <= _MOVED:
         return ""
     std_m = misfit.known[CAMERA_OFFSET]
     if not channel_residuals(misfit, found).explained:
-        # another misfit may shift the lengths, too
+        # another error of the model may also shift the lengths
         known = {**misfit.known, CAMERA_OFFSET: _MOVED * abs(float(zeros[k])) * std_m}
         free = replace(misfit, known=known)
         again = refine(free, found.unknowns, found.evaluations)
@@ -154,10 +154,10 @@ def _moved_zero(misfit: Misfit, found: SearchResult) -> str:
             return ""
     shift_um = 1e6 * std_m * float(zeros[k] - np.delete(zeros, k).mean())
     return (
-        f"the lengths of {misfit.records[k].name} are shifted by about {shift_um:.2g} um against "
-        f"those of the other records, but their zero is assumed to be right within {1e6 * std_m:g} "
-        "um (one standard deviation). If the camera or the marks were moved, or the zero is less "
-        "certain, state a larger one with --zero-std-m"
+        f"the lengths of {misfit.records[k].name} are shifted by about {shift_um:.2g} um relative "
+        "to those of the other records, but the assumed standard deviation of their zero is "
+        f"{1e6 * std_m:g} um. If the camera or the marks were moved, or the zero is less certain, "
+        "state a larger value with --zero-std-m (in Python: camera_bias_m)"
     )
 
 

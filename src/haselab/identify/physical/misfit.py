@@ -45,7 +45,7 @@ LENGTH, CAPACITANCE = "length", "capacitance"
 TRACKED_ZERO_M = 2e-6  # standard deviation of the zero of lengths from tracks of 0.02 px
 SHARED_PX = 3e-4  # error of tracking that all frames with the same pixels share
 _LITTLE_N = 1e-4  # change of the load for the derivative of the state at the first edge
-_ENDLESS = 1e100  # derivative whose square, over that of a noise, may be too large for a number
+_ENDLESS = 1e100  # from this derivative on, its square over that of the noise may overflow
 _LIGHTEST = 2e-3  # of the hung mass: an inertia below moves too fast for the steps
 
 
@@ -347,7 +347,7 @@ class Misfit:
         found = self._each(unknowns, derivatives=True)
         if found is None:
             return None
-        # after a collapse, derivatives grow without limit
+        # once the simulated actuator has collapsed, derivatives grow without limit
         largest = [
             np.abs(by).max(initial=0.0)
             for part in found
@@ -366,12 +366,12 @@ class Misfit:
         return self._weighed(found, unknowns), np.vstack(by)
 
     def zeros(self, unknowns: Unknowns) -> list[float]:
-        """Estimated error of the zero of each record's lengths over its standard deviation.
+        """Estimate the error of the zero of each record's lengths, in standard deviations.
 
         Args:
             unknowns: of the model.
         Returns:
-            One for each record; 0 of one without lengths, of a single one, or without a motion.
+            One for each record; 0 if it has no lengths, if it is the only one, or without a motion.
         """
         found = self._each(unknowns, derivatives=False)
         zeros = [0.0] * len(self.records)

@@ -1,4 +1,4 @@
-r"""How far a misstated gain, mass or camera's scale may have moved the parameters.
+r"""How far a misstated gain, mass or scale of the camera may have changed the parameters.
 
 Forces follow from the stated voltages and weights, capacitances from the monitors. If the
 capacitances are a factor $s$ off from those that the forces need, the monitors, the amplifier's
@@ -76,14 +76,14 @@ def misstated_std(misfit: Misfit, found: SearchResult, error: float, prior: Floa
 
 
 def _changes(misfit: Misfit, found: SearchResult) -> Iterator[Floats]:
-    """Change of the modelled over the standard deviation, by each error. Shape `(N,)`."""
+    """Change of the model's output by each error, in standard deviations. Shape `(N,)`."""
     for records in _misstated(misfit.records):
         residuals = replace(misfit, records=records).residuals(found.unknowns)
         if residuals is not None:
             yield (found.residuals - residuals) / _LITTLE
     names = found.unknowns.names
     if CAMERA_SCALE in names:
-        # what is known beforehand of the scale would be wrong
+        # the prior knowledge of the scale would then be wrong
         known = [part.rows for part in misfit.segments if not part.experiment]
         change = found.jacobian[:, names.index(CAMERA_SCALE)].copy()
         change[np.concatenate([np.zeros(0, np.int64), *known])] = 0.0

@@ -37,7 +37,7 @@ _LOW = 0.3  # of the highest voltage, below which the load decides the length
 _HEAVIER = 1.1  # load over another one, whose lengths are compared
 _REVERSED = 0.25  # of the simulated difference of two lengths
 _LEAST_LENGTHS = 5  # of a load
-_DECIDES = 0.5  # simulated difference over that at rest, which creep does not reverse
+_DECIDES = 0.5  # simulated difference over that at rest; above, creep does not reverse it
 
 
 def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
@@ -108,9 +108,9 @@ def _monitor(record: MotionRecord) -> str:
     if not abs(record.voltage_ratio - 1.0) > _MONITOR:
         return ""
     return (
-        f"the voltage monitor shows {record.voltage_ratio:.3g} times the voltage that drive and "
-        "gain of the amplifier give. Check the gain of the amplifier, the scale of its voltage "
-        "monitor, and that it follows the drive"
+        f"the voltage by the monitor is {record.voltage_ratio:.3g} times drive times gain. Check "
+        "the gain of the amplifier, the scale of its voltage monitor, and that the monitor follows "
+        "the drive"
     )
 
 
@@ -295,7 +295,7 @@ def _levels(record: MotionRecord, simulated_m: Floats) -> Iterator[_Level]:
 
 
 def _stretch_m(law: ActuatorLaw, light_n: float, heavy_n: float) -> float:
-    """By how much a heavier load stretches the actuator at rest; infinite where nobody knows."""
+    """By how much a heavier load stretches the actuator at rest; infinite if not computable."""
     try:
         return equilibrium_m(law, 0.0, heavy_n) - equilibrium_m(law, 0.0, light_n)
     except LimitError:
@@ -319,7 +319,7 @@ def _loads(
         shorter_m = light.seen_m - heavy.seen_m
         if shorter_m <= max(_REVERSED * longer_m, _STILL * light.noise_m):
             continue
-        # creep of what came before may be larger than the difference of two similar loads
+        # creep after the previous load may exceed the difference of two similar loads
         if longer_m > _DECIDES * _stretch_m(law, light.load_n, heavy.load_n):
             return (
                 f"{heavy.name}: the length is {1e3 * heavy.seen_m:.4g} mm under "

@@ -17,7 +17,7 @@ __all__ = ["MotionRecord"]
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-_VOLTAGE_ERROR = 0.01  # of a monitor and an amplifier with a careful calibration
+_VOLTAGE_ERROR = 0.01  # of a carefully calibrated monitor and amplifier together
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class MotionRecord:
         block: of each capacitance within its experiment, shape `(C,)`; empty if it is not known.
         window_weight: of a second of each interval in its capacitance, shape `(W,)`; empty: all
             weigh the same.
-        voltage_ratio: voltage by its monitor over that of the drive; NaN if nobody measured it.
+        voltage_ratio: voltage by the monitor over drive times gain; NaN if it was not measured.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -79,13 +79,12 @@ class MotionRecord:
 
     @property
     def voltage_remark(self) -> str:
-        """What the user should know if the monitor contradicts the stated voltage; else empty."""
+        """A warning if the monitor contradicts the stated voltage; empty otherwise."""
         if not abs(self.voltage_ratio - 1.0) > _VOLTAGE_ERROR:
             return ""
         return (
-            f"{self.name}: the voltage monitor shows {self.voltage_ratio:.4g} times the voltage "
-            "that drive and gain of the amplifier give. Check the gain of the amplifier and the "
-            "scale of the monitor."
+            f"{self.name}: the voltage by the monitor is {self.voltage_ratio:.4g} times drive "
+            "times gain. Check the gain of the amplifier and the scale of its voltage monitor."
         )
 
     @cached_property

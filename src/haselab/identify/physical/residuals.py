@@ -162,7 +162,7 @@ def status_of(
 
 
 def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
-    """Remarks for the user on what may be misstated, by capacitances and monitors of the voltage.
+    """Notes on what may be misstated, according to capacitances and voltage monitors.
 
     Args:
         error: see `scale_error`.
@@ -177,8 +177,8 @@ def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
         )
     if not any(record.capacitance_f.size for record in records):
         notes.append(
-            "Without capacitances, nothing shows a wrong gain, mass or scale of the lengths, and "
-            "the intervals do not include it: an error of 1 % of the gain changes the permittivity "
-            "by 2 %."
+            "Without capacitances, the fit cannot detect a wrong gain, mass or scale of the "
+            "lengths, and the intervals do not include such errors. For example, an error of 1 % "
+            "of the gain changes the permittivity by 2 %."
         )
     return tuple(notes)

@@ -224,7 +224,7 @@ def result_of(
     own_std = np.sqrt(np.diag(covariance))
     scale = unknowns.value(SENSING_SCALE)
     if scale_error(scale, float(own_std[unknowns.names.index(SENSING_SCALE)])) == 0.0:
-        scale = 1.0  # one voltage and load hardly determine it: no contradiction
+        scale = 1.0  # poorly determined, as by one voltage and one load: no contradiction
     status, usable = status_of(seen, scale, preferred, converged=found.converged)
     if not usable:
         return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)

@@ -31,15 +31,15 @@ __all__ = ["VoltageMapFit", "fit_voltage_map"]
 Floats = NDArray[np.float64]
 _NAMES = ("a1_v", "b1", "a2_v", "b2")
 _MARGIN = 0.2  # of the strain's span, on each side
-_APART = 2.0  # standard deviations of the squared split, from which the two rates are told apart
+_APART = 2.0  # standard deviations of the squared split; above, the two rates count as different
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoltageMapFit(CurveFit):
     """A fitted voltage map; see `Fit` for what all fits have.
 
-    Its `parameters` are `a1_v`, `b1`, `a2_v`, `b2`; the larger rate is `b1`. Those that the loop
-    does not determine are NaN; `map` has a value for each.
+    Its `parameters` are `a1_v`, `b1`, `a2_v`, `b2`; the larger rate is `b1`. Parameters that
+    the loop does not determine are NaN; `map` has a value for each.
 
     Args:
         monotone: whether the curve rises, or falls, over the whole range of the map.
@@ -151,10 +151,10 @@ class _Curve:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(strain.shape))
 
     def estimates(self) -> tuple[dict[str, Estimate], Floats]:
-        """Coefficients with their covariance.
+        """Return the coefficients with their covariance.
 
-        Where the data do not separate the two rates, the error of a coefficient is not normal, so
-        it is reported as not identifiable; the curve is known nevertheless.
+        If the data do not separate the two rates, the errors of the coefficients are not normal,
+        so they are reported as not identifiable. The curve is still identifiable.
         """
         linear, covariance = self.linear()
         std = np.array([estimate.std for estimate in linear.values()])
@@ -261,7 +261,7 @@ def _notes(estimates: dict[str, Estimate], limited: bool) -> tuple[str, ...]:
     blind = [name for name, estimate in estimates.items() if math.isnan(estimate.value)]
     if blind:
         notes.append(
-            f"Not identifiable from this loop: {', '.join(blind)}, because it does not separate "
-            "two exponentials. The curve is identifiable: use the map."
+            f"Not identifiable from this loop: {', '.join(blind)}, because the loop does not "
+            "separate the two exponentials. The curve is still identifiable: use the map."
         )
     return tuple(notes)

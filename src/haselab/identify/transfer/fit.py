@@ -297,7 +297,7 @@ def fit_transfer(
 
 
 def with_record_notes(fit: TransferFit, records: Sequence[Record]) -> TransferFit:
-    """A fit with the notes of its records.
+    """Add the notes of the records to a fit.
 
     Args:
         fit: with or without a result.
@@ -316,7 +316,7 @@ def _fitted(
     applied: bool,
     near: TransferFit | None,
 ) -> TransferFit:
-    """The fit; other explanations of the records are tested where it leaves a doubt."""
+    """Fit the records; if the result is in doubt, test other explanations of them."""
     tones = _too_few_tones(layout_of(structure), records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)

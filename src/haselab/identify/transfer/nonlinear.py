@@ -68,7 +68,7 @@ def fit_nonlinear(
 
 
 def _noted(fit: NonlinearFit, records: Sequence[Record]) -> NonlinearFit:
-    """A fit with the notes of its records."""
+    """Add the notes of the records to a fit."""
     noted = with_record_notes(fit, records)
     assert isinstance(noted, NonlinearFit)
     return noted

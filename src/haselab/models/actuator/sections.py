@@ -48,7 +48,7 @@ __all__ = [
     "missing",
 ]
 
-_SAME = 1e-9  # relative difference of numbers that were written and read
+_SAME = 1e-9  # largest relative difference by writing and reading a number
 _Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
 _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
 _Share = Annotated[float, Field(strict=True, gt=0, lt=1, allow_inf_nan=False)]
@@ -292,7 +292,7 @@ class PhysicalTable(_Section):
     parameters: Annotated[dict[str, Number], BeforeValidator(_by_full_name)] = Field(
         description="values by the names of TWIN.toml", examples=[{"dielectric.permittivity": 3.0}]
     )
-    # those that were not fitted, at the identification; empty in files of older versions
+    # parameters that were not fitted, at the time of the fit; empty in files of older versions
     measured: Annotated[dict[str, Number], BeforeValidator(_by_full_name)] = {}
     std: Annotated[dict[str, float], BeforeValidator(_by_full_name)] = {}
     not_identifiable: tuple[str, ...] = ()
@@ -303,12 +303,12 @@ class PhysicalTable(_Section):
     records: PhysicalRecords | None = None
 
     def check_measured(self, present: Mapping[str, float]) -> None:
-        """Refuse parameters that were changed after the identification, which used them.
+        """Refuse parameters that were changed after the identification that used them.
 
         Args:
             present: parameters that were not fitted, by name.
         Raises:
-            InputError: One of them has another value than the identification had.
+            InputError: One of them differs from its value at the identification.
         """
         for name, value in self.measured.items():
             if not math.isclose(value, present.get(name, value), rel_tol=_SAME):

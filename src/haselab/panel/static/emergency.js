@@ -1,5 +1,5 @@
-// STOP. It depends on nothing else of the page: its own script, port and connection. The port is in
-// the page, so that STOP works even if the web server hangs from the moment at which it has sent it.
+// STOP depends on nothing else in the page: it has its own script, port and connection. The page
+// contains the port, so that STOP works even if the web server hangs right after it has sent the page.
 "use strict";
 (() => {
   const button = document.getElementById("emergency");
@@ -45,7 +45,7 @@
   button.addEventListener("keydown", (event) => {
     if ((event.key === "Enter" || event.key === " ") && !event.repeat) stop();
   });
-  // Voice control, screen readers and switches only click.
+  // Voice control, screen readers and switch devices send only a click.
   button.addEventListener("click", () => { if (performance.now() - pressedAt > 1000) stop(); });
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape" && !event.repeat) stop();

@@ -14,7 +14,7 @@ export class Link extends Requests {
     this.problem = "";
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
-    this.clock = 0; // of the bench process in the last frame, in s: it refuses commands that are too old
+    this.clock = 0; // of the bench process in the last frame, in s; the process refuses commands with an old time
     this.waiting = new Map();
     this.number = 0;
     this.open();

@@ -10,7 +10,7 @@ from haselab.tracking import TrackOptions, Tracks
 __all__ = ["largest_stretch", "stretch_note"]
 
 _LEAST_POINTS = 6  # six numbers describe an affine motion in the plane; each point gives two
-_ERROR = 0.07  # rms error per stretch and side of the subset, measured with dots of the twin
+_ERROR = 0.07  # rms error over stretch and side of the subset, measured with the twin's dots
 _COMMON = 0.9  # share of the squared displacements that the affine motion explains
 
 
@@ -50,7 +50,7 @@ def largest_stretch(place_px: NDArray[np.float64], tracks: Tracks) -> float:
 
 
 def stretch_note(place_px: NDArray[np.float64], tracks: Tracks, options: TrackOptions) -> str:
-    """A warning about subsets that do not stretch with the sheet; empty if there is no need.
+    """Return a warning if the subsets do not stretch with the sheet; otherwise an empty text.
 
     Args:
         place_px: points at rest, `[x, y]`, in px. Shape `(N, 2)`.
@@ -64,7 +64,7 @@ def stretch_note(place_px: NDArray[np.float64], tracks: Tracks, options: TrackOp
     if wrong_px < np.median(tracks.std_x_px[tracks.valid]):
         return ""
     return (
-        f"The points move apart by up to {100 * stretch:.1f} %, which the subsets of the model "
-        f"translation do not follow. Positions may be wrong by {wrong_px:.1g} px rms, which the "
+        f"The points move apart by up to {100 * stretch:.1f} %, but the subsets of the model "
+        f"translation do not stretch. Positions may be wrong by {wrong_px:.1g} px rms, which the "
         "standard deviations do not include."
     )

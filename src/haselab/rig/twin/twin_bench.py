@@ -349,7 +349,7 @@ class TwinBench:
 
         For the camera model and for the noise-free truth of a study; never for an analysis.
         """
-        rate_hz, trace = self._frame_rate_hz, self._trace  # STOP of another thread may clear them
+        rate_hz, trace = self._frame_rate_hz, self._trace  # STOP in another thread may clear them
         if not trace or rate_hz <= 0.0:
             return None
         lengths = np.concatenate(trace)

@@ -163,7 +163,7 @@ class Swings:
         gain: of the amplifier.
         range_: width of the strain range.
         settings: limits.
-        alternates: whether the sign of the drive alternates on purpose: only its magnitude swings.
+        alternates: whether the sign of the drive alternates on purpose; only its magnitude counts.
     """
 
     def __init__(

@@ -164,7 +164,7 @@ class LoopWatchdog:
         )
 
     def _changes_sign(self, drive_v: float) -> bool:
-        """Whether an alternating voltage passes zero in this block, which gives no strain then."""
+        """Whether an alternating voltage passes zero in this block, so that it gives no strain."""
         before_v, self._before_v = self._before_v, drive_v
         return self._model.alternates and drive_v * before_v < 0.0
 

@@ -1,4 +1,4 @@
-"""A monitor that saturates: by the harmonics of the carrier, or by readings that pile up."""
+"""Detect a monitor that saturates, by harmonics of the carrier or by many equal readings."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _CLEAR = 4.5  # standard deviations of a harmonic's quadrature
-_RUN = 3  # equal readings in a row that count as piled up
+_RUN = 3  # equal readings in a row that count as clipped
 _FEWEST = 6  # readings of a block in such runs
-_PILED = 3.0  # such readings over those just inside them; a sine in coarse steps has at most 1.2
+_PILED = 3.0  # ratio to the readings just below; a sine in coarse steps has at most 1.2
 _JUST_INSIDE = (2.5, 0.02)  # steps, and share of the range
 _IN_PHASE = 0.06  # of a harmonic: tolerance for noise and skew of the phase of a saturation
 
@@ -39,7 +39,7 @@ def find_distortion(
         std: standard deviation of one quadrature.
         voltage: phasor of the carrier, `(blocks,)`.
         current: the same for the current.
-        apart: blocks that say nothing about the others, such as those at a rail, `(blocks,)`.
+        apart: blocks to leave out of the mean, such as those at a rail, `(blocks,)`.
     Returns:
         Two arrays of shape `(blocks,)`.
     """
@@ -99,10 +99,10 @@ def _saturates(harmonic: Complexes, excess: Complexes, std: Floats) -> NDArray[n
 
 
 def at_a_rail(cut: Floats, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Find blocks whose readings pile up at their largest or smallest value, as at a rail.
+    """Find blocks in which many readings equal the largest or smallest one, as at a rail.
 
-    Harmonics miss a rail that is crossed by a drive: it clips most of some periods and none of
-    others.
+    Harmonics do not show a rail that the drive reaches within a block, because it clips most of
+    some carrier periods and nothing of others.
 
     Args:
         cut: readings `(blocks, 2, segments, length)`.

@@ -229,7 +229,7 @@ def _better(found: _Found, other: _Found, segments: Segments, lines: int) -> NDA
         about = about / np.maximum(least * segments.quadrature, 1e-300) + 2.0 * (
             segments.count - count
         )
-        with np.errstate(over="ignore"):  # of noise-free readings, one fit may be exact
+        with np.errstate(over="ignore"):  # without noise, one of the fits may be exact
             misfits = about + freedom * (share - 1.0)
             return np.asarray(one.score * share.mean(axis=1) + misfits.sum(axis=1))
 

@@ -24,7 +24,7 @@ _EVEN = 0.3  # share of the phasors' scatter left after removing a constant freq
 _ALIKE = 2.0  # quartile ratio of the scatter; by chance 1.4 with 20 segments
 _COLOURED = 0.2  # logarithm of a ratio of noise densities that counts as coloured
 _SMALL = 1e-6  # of the carrier: less is rounding
-_NO_CARRIER = 1e-120  # stands for a phasor of exactly 0, as of a carrier below one converter step
+_NO_CARRIER = 1e-120  # replaces a phasor of 0, as of a carrier smaller than one converter step
 
 
 @dataclass(frozen=True)

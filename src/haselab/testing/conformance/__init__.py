@@ -1,7 +1,7 @@
-"""Conformance tests for instrument drivers, as pytest classes to derive from.
+"""Conformance tests for instrument drivers: base classes for your pytest classes.
 
-Derive a class from the one for your instrument, and give it a fixture `rig_file`: the path of a rig
-file with your section.
+Derive a class from the one for your kind of instrument. Give it a fixture `rig_file` that returns
+the path of a rig file with the section of your instrument.
 
 THE TESTS PUT OUT VOLTAGES. Run them on an emulator. On a real instrument, disconnect the actuator
 and the amplifier first, and keep clear.

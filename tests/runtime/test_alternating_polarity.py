@@ -85,5 +85,5 @@ def test_a_step_with_alternating_polarity_is_played_on_the_bench(tmp_path):
 
 
 def test_its_charging_needs_the_permission_of_the_rig_file(tmp_path):
-    with pytest.raises(SafetyError, match=r"charges the actuator too often: .* commanded to 0 V"):
+    with pytest.raises(SafetyError, match=r"too often: .* Raise charges_per_s .* commanded to 0 V"):
         played(tmp_path, WatchdogSettings().charges_per_s)

@@ -231,10 +231,14 @@ class Swings:
         if capacitance_f is not None:
             watt = 0.5 * capacitance_f * self._gain**2 * self._energy / WINDOW_S
             power = f" ({watt:.2g} W)"
+        advice = (
+            "Raise charges_per_s in [safety.loop] if the amplifier and the actuator withstand it."
+            if self._alternates
+            else "Lower the gains; check the sensor for noise."
+        )
         return (
             f"Output charges the actuator too often: {per_s:.3g} full charges per second{power} "
-            f"(limit {self._settings.charges_per_s:g}). Lower the gains; check the sensor for "
-            "noise."
+            f"(limit {self._settings.charges_per_s:g}). {advice}"
         )
 
 

@@ -293,7 +293,7 @@ def test_a_lease_that_has_ended_is_not_renewed(twin: TwinBench) -> None:
     arm(rig)
     rig.source.write(0.5)
     rig.safety.gate.interlock.lease(-3600.0)
-    with pytest.raises(SafetyError, match=r"of this program ended 3\.6e"):
+    with pytest.raises(SafetyError, match=r"of this program ended 3[56]\d\d"):
         rig.source.write(0.6)
     rig.acquisition.read()
     assert abs(twin.output_v) < 50.0

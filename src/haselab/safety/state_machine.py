@@ -302,7 +302,7 @@ class Safety:
         if late_s <= 0.0:
             return ""
         return (
-            f"The lease (lease_s) of this program ended {late_s:.2g} s before its next heartbeat. "
+            f"The lease (lease_s) of this program ended {late_s:.4g} s before its next heartbeat. "
             "Check whether the program hung or the computer slept."
         )
 

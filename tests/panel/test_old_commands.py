@@ -160,7 +160,7 @@ def test_a_confirmation_counts_for_its_own_step_alone(
     player._show("Hang 0.1 kg.")
     first = live.state.step
     player._show("Hang 0.2 kg.")
-    with pytest.raises(SafetyError, match="This step is over"):
+    with pytest.raises(SafetyError, match="no longer current"):
         live.do("confirm", "page", {"step": first}, clock.now_s)
     assert not player._confirmed.is_set()
     live.do("confirm", "page", {"step": live.state.step}, clock.now_s)

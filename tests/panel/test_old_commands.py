@@ -210,7 +210,7 @@ def test_an_output_that_rises_by_itself_trips_an_idle_bench(
     for _ in range(25):
         live.step()
     assert rig.safety.stage is Stage.TRIPPED
-    assert live.state.reason.startswith("Output of 1")
+    assert live.state.reason.startswith("The voltage monitor shows 1")
     assert "although the bench is not armed" in live.state.reason
     with pytest.raises(SafetyError, match="Remove the cause"):
         armed(live)

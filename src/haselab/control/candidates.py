@@ -33,6 +33,7 @@ _UNSTABLE = 1e3
 _MET = 1e-9
 _LARGEST_EXCESS = 1e12
 _UNASKED = 2.0  # larger than any miss of a share
+_SMALL_GAIN = 0.1  # a larger one may be that of a slow branch, whose resonance has a gain of 1
 _NOISE_GAIN = 15.0  # default for a plant from strain to strain
 _LONGEST_WINDOW = 250  # largest number of samples of half a period of ringing
 
@@ -79,8 +80,7 @@ class Task:
         if self.spec.noise_gain is not None:
             return self.spec.noise_gain
         gain = abs(PlantScale.of(self.plant).gain)
-        scaled = not 0.1 <= gain <= 10.0 and 0.0 < gain < math.inf
-        return _NOISE_GAIN / gain if scaled else _NOISE_GAIN
+        return _NOISE_GAIN / gain if 0.0 < gain < _SMALL_GAIN else _NOISE_GAIN
 
     def horizon_s(self) -> float:
         """Length of the simulated step, in s: several rise times, and the slow modes."""

@@ -31,7 +31,7 @@ class DesignSpec:
         peak_sensitivity: largest peak sensitivity.
         noise_gain: largest change of the controller's output when one measurement changes by 1, in
             the plant's input unit per output unit; None: 15, divided by the magnitude of the
-            plant's static gain if that is below 0.1 or above 10.
+            plant's static gain if that is below 0.1.
         frequency_spread: relative uncertainty of the natural frequency, up and down.
         keep_crossover: whether the highest crossover must be at least the plant's own.
         step: reference step of the simulated experiments, in the unit of the plant's output,

@@ -210,6 +210,7 @@ def test_a_study_of_another_page_does_not_disturb_the_one_that_has_armed(folder:
             number = (await second.ask("request"))["answer"]["number"]
             await first.arm(1.5)
             await first.ask("drive", value_v=1.0)
+            await first.until(lambda state: state["holder"] == first.holder)
             receiving = asyncio.create_task(first.until(lambda state: not state["holder"]))
             for _ in range(3):
                 values = {"number": number, "limit_v": 2.0, "study": LONG}

@@ -2,7 +2,6 @@
 
 import dataclasses
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from haselab.actuators import (
     rates,
     with_parameters,
 )
+from haselab.actuators.threads import in_threads
 from haselab.base import InputError, LimitError
 
 MASS_KG, LOAD_N = 0.25, 0.25 * 9.81
@@ -153,15 +153,11 @@ def test_a_part_of_the_columns_that_starts_late_is_waited_for(monkeypatch):
     sampled, start = SampledLaw(law, 15e3, BY["planar"]), start_of(law, 1.2)
     monkeypatch.setattr("haselab.actuators.response._CORES", 2)
 
-    class Late(ThreadPoolExecutor):
+    def late(job, items, most):
         """One thread, which pauses after each part."""
+        return in_threads(lambda item: (job(item), time.sleep(0.2))[0], items, 1)
 
-        def submit(self, *call):
-            submitted = super().submit(*call)
-            super().submit(time.sleep, 0.2)
-            return submitted
-
-    monkeypatch.setattr("haselab.actuators.response.ThreadPoolExecutor", lambda workers: Late(1))
+    monkeypatch.setattr("haselab.actuators.response.in_threads", late)
     again = sampled.respond(drive, times_s, start)
     monkeypatch.setattr("haselab.actuators.response._CORES", 1)
     found = sampled.respond(drive, times_s, start)

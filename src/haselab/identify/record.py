@@ -190,9 +190,8 @@ def record_notes(records: Sequence[Record], delay: Estimate | None) -> tuple[str
     # Not where the interval is wider than half a sample, or the delay was not estimated.
     if assumed and delay is not None and 0.0 < 4.0 * delay.std < sample_s:
         notes.append(
-            "The input is assumed to be held from sample to sample, like the output of a "
-            "converter. If it was measured, such as a monitor voltage, use --hold band-limited (in "
-            "Python: hold='band-limited'). Otherwise the estimated delay is too short by half a "
-            f"sample, {sample_s / 2:.3g} s."
+            "The input is assumed to be held from sample to sample. If it was measured, such as a "
+            "monitor voltage, use --hold band-limited (Python: hold='band-limited'); otherwise "
+            f"the delay is too short by half a sample, {sample_s / 2:.3g} s."
         )
     return tuple(dict.fromkeys(notes))

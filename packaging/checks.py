@@ -24,6 +24,15 @@ _MODULES = ("_camera", "_core", "_identify", "_loops", "_models", "_motion", "_s
             "_twin")  # fmt: skip
 _SOURCES = ("core", "firmware/app", "firmware/board", "firmware/protocol", "native/twin",
             "native/motion", "rigs")  # fmt: skip
+_COMMANDS = (
+    "doctor",
+    "init my-actuator --out actuator.toml",
+    "example bench --out bench",
+    "rig check bench/bench.toml",
+    "example chirp --out chirp",
+    "identify transfer chirp/chirp.csv --input Drive --output Displacement --out model.json",
+    "export bench/twin-hz.toml --to fmu --out twin.fmu",
+)
 _WITHOUT_COMPILER = ("cc", "gcc", "c++", "g++", "clang", "clang++")
 
 
@@ -110,17 +119,7 @@ def check_install(python: Path, wheel: Path, folder: Path) -> str:
     took_s = time.monotonic() - begin_s
     haselab, here = folder / "venv/bin/haselab", folder / "work"
     here.mkdir()
-    for line in (
-        "doctor",
-        "init my-actuator --out actuator.toml",
-        "example bench --out bench",
-        "rig check bench/bench.toml",
-        "example chirp --out chirp",
-        "identify transfer chirp/chirp.csv --input Drive --output Displacement --out model.json",
-        "export bench/twin-hz.toml --to fmu --out twin.fmu",
-        "reproduce --quick --out study",
-        "scoreboard --help",
-    ):
+    for line in (*_COMMANDS, "reproduce --quick --out study", "scoreboard --help"):
         printed = _run([haselab, *line.split()], environment, here)
         lacks = "needs the Python package" in " ".join(printed.split())
         if line.startswith("reproduce") and lacks:
@@ -162,31 +161,24 @@ def check_emulated(python: Path, wheel: Path, root: Path) -> str:
     Of the digests, only those are compared that depend on no mathematical function of numpy or of
     the C library: both may give other last bits there.
     """
-    site = root / "opt/haselab"
-    shutil.rmtree(site, ignore_errors=True)
-    inside = ["chroot", root, "env", "PYTHONPATH=/opt/haselab", "HOME=/root", "python3"]
+    site, here = root / "opt/haselab", root / "opt/work"
+    for folder in (site, here):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+    inside = ["chroot", root, "env", "--chdir=/opt/work", "PYTHONPATH=/opt/haselab", "python3"]
     version = _run([*inside, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]).strip()
     system = wheel.stem.rpartition("_2_17_")[2]
     platforms = [f"--platform=manylinux_2_{minor}_{system}" for minor in (17, 27, 28)]
     _run([python, "-m", "pip", "install", "--quiet", "--target", site, *platforms,
           f"--platform=manylinux2014_{system}", f"--python-version={version}",
           "--only-binary=:all:", wheel, *_same_numpy()])  # fmt: skip
-    shutil.copy(ROOT / "packaging/digest.py", root / "opt")
-    found = json.loads(_run([*inside, "/opt/digest.py"]))
+    shutil.copy(ROOT / "packaging/digest.py", here)
+    found = json.loads(_run([*inside, "digest.py"]))
     wanted = json.loads(_run([ROOT / ".venv/bin/python", ROOT / "packaging/digest.py"]))
     different = [name for name in ("tracking", "loops") if wanted[name] != found[name]]
     if different:
         raise CheckError(f"other results than on this computer: {', '.join(different)}")
-    shutil.rmtree(root / "root/work", ignore_errors=True)
-    for line in (
-        "doctor",
-        "example bench --out /root/work/bench",
-        "rig check /root/work/bench/bench.toml",
-        "example chirp --out /root/work/chirp",
-        "identify transfer /root/work/chirp/chirp.csv --input Drive --output Displacement "
-        "--out /root/work/model.json",
-        "export /root/work/bench/twin-hz.toml --to fmu --out /root/work/twin.fmu",
-    ):
+    for line in _COMMANDS:
         _run([*inside, "-m", "haselab", *line.split()])
     return f"Python {version}: 2 equal digests, doctor, examples, identification, FMU"
 

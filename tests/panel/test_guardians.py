@@ -50,6 +50,8 @@ def test_the_guardians_act_when_the_bench_process_does_not_answer_stop(tmp_path:
             end_s = time.monotonic() + WAIT_S
             while abs(served.hub.output_v) > 50.0 and time.monotonic() < end_s:
                 time.sleep(0.02)
+                # In lock-step only a request lets the amplifier fall; a commanded output stays.
+                served.hub.spend(round(0.02 * served.hub.rate_hz))
             assert abs(served.hub.output_v) < 50.0
         finally:
             interlock.close()

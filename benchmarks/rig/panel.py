@@ -99,9 +99,13 @@ class Page:
 
     async def until(self, ready: Callable[[dict[str, Any]], bool]) -> None:
         """Wait for a state of the bench."""
-        while not (self.state and ready(self.state)):
-            self._framed.clear()
-            await self._framed.wait()
+        try:
+            async with asyncio.timeout(60.0):
+                while not (self.state and ready(self.state)):
+                    self._framed.clear()
+                    await self._framed.wait()
+        except TimeoutError:
+            raise RuntimeError(f"The bench did not get there: {self.state['reason']}") from None
 
 
 @contextlib.asynccontextmanager

@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,10 @@ import pytest
 
 from haselab.base import InputError
 from haselab.panel.files import PanelFiles
+from haselab.panel.pages import study_job
 from haselab.panel.pages.recordings import analyse, compare, listed, note, report
-from haselab.panel.pages.study_job import available, check, chosen_study
+from haselab.panel.pages.study_job import StudyJob, available, check, chosen_study
+from haselab.rig.rig_file import load_rig
 from haselab.store.session.reader import SessionReader
 from tests.panel.running import WAIT_S, Page, RunningPanel, connected, ended, started
 
@@ -290,6 +293,23 @@ def test_some_experiments_of_a_study_keep_their_settings(files: PanelFiles) -> N
     for odd in (True, 0, "", "triangle", {}):  # which are not all experiments
         with pytest.raises(InputError, match="must be a list of names"):
             chosen_study(files, {"study": "reference study", "experiments": odd})
+
+
+def test_studies_that_begin_within_a_second_have_folders_of_their_own(
+    files: PanelFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stopped(datetime):
+        @classmethod
+        def now(cls, tz: Any = None) -> "Stopped":
+            return cls(2026, 11, 28, 18, 4, 50)
+
+    monkeypatch.setattr(study_job, "datetime", Stopped)
+    names = []
+    for _ in range(3):
+        job = StudyJob.of(files, load_rig(files.rig), {"study": "triangle.toml"})
+        job.options.folder.mkdir(parents=True)
+        names.append(job.options.folder.name)
+    assert names == [f"2026-11-28-180450-one-triangle{end}" for end in ("", "-2", "-3")]
 
 
 def test_a_study_beyond_the_bench_is_found_by_the_check(files: PanelFiles) -> None:

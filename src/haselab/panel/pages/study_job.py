@@ -79,10 +79,14 @@ class StudyJob:
         keep: KeepVideo = "none" if values.get("keep_video") == "none" else "sample"
         named = re.sub(r"[^\w.-]+", "-", study.name)[:60].strip("-.")
         name = f"{datetime.now():%Y-%m-%d-%H%M%S}-{named}"
+        folder, number = files.runs / name, 1
+        while folder.exists():  # another study began in the same second
+            number += 1
+            folder = files.runs / f"{name}-{number}"
         rig_config, seed = file.model_dump(mode="json"), 0
         if isinstance(file, TwinFile):  # the recording says so, and of which actuator
             rig_config, seed = file.configuration(files.rig).model_dump(mode="json"), file.seed
-        options = RunOptions(files.runs / name, seed, keep, rig_config, _tables(files))
+        options = RunOptions(folder, seed, keep, rig_config, _tables(files))
         return cls(study, options, files.actuator)
 
     def begin(self) -> None:

@@ -38,11 +38,14 @@ STUDY = {"study": "reference study", "experiments": ["triangle"], "keep_video": 
 
 
 @contextlib.contextmanager
-def panel() -> Iterator[tuple[subprocess.Popen[str], str, str]]:
-    """A panel on the twin: its process, host and token."""
+def panel(
+    *words: str, folder: Path | None = None
+) -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+    """A panel, on the twin unless its further words name a rig: its process, host and token."""
     with tempfile.TemporaryDirectory() as runs:
-        command = [sys.executable, "-m", "haselab.cli", "panel", "--no-browser", "--runs", runs]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", "haselab.cli", "panel", "--no-browser", *words]
+        command += ["--runs", str(folder or runs)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder)
         assert process.stdout is not None
         address = process.stdout.readline().strip()
         try:
@@ -81,6 +84,7 @@ class Page:
 
     async def ask(self, what: str, **values: object) -> dict[str, Any]:
         """Send a command and return its answer."""
+        await self.until(lambda state: True)  # a page shows no button before its first frame
         self._number += 1
         number = self._number
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
@@ -97,10 +101,10 @@ class Page:
         known = {"number": found["number"], "acknowledged": found["reason"]}
         await self.ask("arm", limit_v=2.0, **known, **values)
 
-    async def until(self, ready: Callable[[dict[str, Any]], bool]) -> None:
+    async def until(self, ready: Callable[[dict[str, Any]], bool], within_s: float = 60.0) -> None:
         """Wait for a state of the bench."""
         try:
-            async with asyncio.timeout(60.0):
+            async with asyncio.timeout(within_s):
                 while not (self.state and ready(self.state)):
                     self._framed.clear()
                     await self._framed.wait()

@@ -58,3 +58,56 @@ def test_the_guardians_act_when_the_bench_process_does_not_answer_stop(tmp_path:
             with contextlib.suppress(ProcessLookupError):  # a guardian kills one that is in a call
                 os.kill(bench, signal.SIGCONT)
             ended(panel)
+
+
+STUDY = """name = "one triangle"
+
+[triangle]
+low_v = 0.0
+high_v = 1.0
+frequency_hz = 0.5
+cycles = 3
+skipped_cycles = 1
+frame_rate_hz = 200.0
+"""
+PACE = 0.2  # of the wall clock, so that a busy machine queues its outputs in time
+
+
+def test_a_clock_that_goes_on_while_the_bench_is_armed_is_no_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a pace, as on a real bench, blocks pass while the instruments are set."""
+    monkeypatch.chdir(tmp_path)
+    Path("triangle.toml").write_text(STUDY)
+    with ServedTwin(twin_of_reading("hz"), 1, PACE) as served:
+        set_carrier = served.hub.carrier
+
+        def slowly(frequency_hz: float, amplitude_v: float, offset_v: float = 0.0) -> None:
+            time.sleep(0.1 / PACE if amplitude_v else 0.0)
+            set_carrier(frequency_hz, amplitude_v, offset_v)
+
+        monkeypatch.setattr(served.hub, "carrier", slowly)
+        limits = "\n[safety]\nmissed_limit = 1000\nlate_limit = 1000\n"  # their clock is the wall's
+        Path("served.toml").write_text(served.rig_file(ahead_blocks=5) + limits)
+        panel = started("--rig", "served.toml")
+
+        async def play() -> None:
+            async with connected(panel) as page:
+                assert "answer" in await page.arm(1.5)
+                await page.ask("drive", value_v=1.0)
+                await page.until(lambda state: state["drive_v"] == 1.0 or not state["holder"])
+                assert page.state["reason"] == ""
+                await page.ask("disarm")
+                asked = (await page.ask("request"))["answer"]
+                study = {"study": "triangle.toml", "keep_video": "none"}
+                arming = {"number": asked["number"], "acknowledged": asked["reason"]}
+                assert "answer" in await page.ask("arm", limit_v=1.5, study=study, **arming)
+                await page.until(lambda state: state["mode"] == "study")
+                await page.until(lambda state: state["task"] or not state["holder"])
+                assert page.state["reason"] == ""
+                await page.ask("disarm")
+
+        try:
+            asyncio.run(play())
+        finally:
+            ended(panel)

@@ -27,7 +27,7 @@ from haselab.panel.columns import LiveWriter
 from haselab.panel.page_leases import PageLeases
 from haselab.panel.pages.study_job import StudyJob
 from haselab.panel.pages.values import number
-from haselab.panel.study_player import StudyPlayer, save_last
+from haselab.panel.study_player import PictureFile, StudyPlayer
 from haselab.runtime.closed_loop import ClosedLoop
 from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
@@ -91,7 +91,8 @@ class LiveBench:
         lease_s: float = 1.5,
     ) -> None:
         self._leases = PageLeases(lease_s)
-        self._rig, self._writer, self._picture = rig, writer, picture
+        self._rig, self._writer = rig, writer
+        self._picture = None if picture is None else PictureFile(picture)
         self._read_loop, self._loop = read_loop, read_loop()
         about = rig.description
         self._lockin = lockin_of(about, CARRIER_HZ)
@@ -288,11 +289,11 @@ class LiveBench:
             return {"folder": str(job.options.folder)}
         try:
             self._rig.safety.run()
-            self._rig.begin()
             self._rig.check_idle()
             self._rig.generator.sine(CARRIER_HZ, CARRIER_V)
             if self._picture is not None:
                 self._rig.camera.start(_PICTURES_HZ)
+            self._rig.begin()  # last: from here on a slow instrument is a missed deadline
             if not self._rig.safety.live:  # STOP, while an instrument was slow
                 raise self._rig.safety.refusal()
         except BaseException:  # also a fault of a driver from another package
@@ -423,6 +424,8 @@ class LiveBench:
         with self._turn:  # a thread that releases a lock and takes it again keeps others waiting
             pass
         with self._mutex:
+            if self._job is not None:  # a page has armed the bench for it meanwhile
+                return
             try:
                 self._block()
                 if self._closed is not None:
@@ -511,6 +514,8 @@ class LiveBench:
         if self._holder:
             self._drive_v = self._next_v()
             rig.source.write(self._drive_v)
+        else:
+            rig.bench.unbroken = False  # blocks may be skipped: nothing is recorded or controlled
         codes = rig.acquisition.read()
         if self._closed is not None and self._reference is not None:
             self._closed.step(codes, self._reference)
@@ -537,11 +542,11 @@ class LiveBench:
                 rig.safety.guardians.make_safe(reason)
             self._end(reason)
 
-    def _look(self, path: Path) -> None:
+    def _look(self, picture: PictureFile) -> None:
         """Keep the last frame that has arrived, if there is a new one."""
         frames = self._rig.camera.take()
         if frames is not None and len(frames.time_s):
-            save_last(frames, path)
+            picture.save(frames)
 
     def _next_v(self) -> float:
         if self._closed is not None:

@@ -6,9 +6,12 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from haselab.base import HaselabError, Limits
@@ -19,7 +22,7 @@ from haselab.rig.protocols import Frames
 from haselab.safety.guarded import GuardedRig
 from haselab.study.run import run_study
 
-__all__ = ["FilmedCamera", "StudyEndedError", "StudyPlayer", "save_last"]
+__all__ = ["FilmedCamera", "PictureFile", "StudyEndedError", "StudyPlayer"]
 
 _POLL_S = 0.1
 _PICTURE_S = 0.2
@@ -29,19 +32,31 @@ class StudyEndedError(HaselabError):
     """Somebody ended a study: no fault, so the bench is not tripped."""
 
 
-def save_last(frames: Frames, path: Path) -> None:
-    """Save the last frame as a JPEG file, which a reader never sees half-written.
+class PictureFile:
+    """A JPEG file of the last frame, which a reader never sees half-written.
 
-    Without space for it, the page keeps the picture before: no run ends for a picture.
+    A thread writes it: an output must not be late because of a picture. While one is written, other
+    frames are left out. Without space for it, the page keeps the picture before.
 
     Args:
-        frames: at least one.
         path: of the file.
     """
-    new = path.with_suffix(".new")
-    with contextlib.suppress(OSError):
-        Image.fromarray(frames.image(len(frames.time_s) - 1)).save(new, "JPEG", quality=80)
-        new.replace(path)
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._writer = path, ThreadPoolExecutor(1, "picture")
+        self._last: Future[None] | None = None
+        Image.preinit()  # otherwise the first picture loads the formats
+
+    def save(self, frames: Frames) -> None:
+        """Save the last of some frames, at least one."""
+        if self._last is None or self._last.done():
+            self._last = self._writer.submit(self._save, frames.image(len(frames.time_s) - 1))
+
+    def _save(self, image: NDArray[np.uint8]) -> None:
+        new = self._path.with_suffix(".new")
+        with contextlib.suppress(OSError):
+            Image.fromarray(image).save(new, "JPEG", quality=80)
+            new.replace(self._path)
 
 
 class FilmedCamera:
@@ -49,11 +64,11 @@ class FilmedCamera:
 
     Args:
         camera: that takes the frames.
-        path: of the file.
+        picture: takes the last frame.
     """
 
-    def __init__(self, camera: Camera, path: Path) -> None:
-        self._camera, self._path, self._next_s = camera, path, 0.0
+    def __init__(self, camera: Camera, picture: PictureFile) -> None:
+        self._camera, self._picture, self._next_s = camera, picture, 0.0
 
     @property
     def uncertainty_s(self) -> float:
@@ -74,7 +89,7 @@ class FilmedCamera:
         frames = self._camera.take()
         if frames is not None and len(frames.time_s) and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _PICTURE_S
-            save_last(frames, self._path)
+            self._picture.save(frames)
         return frames
 
     def stop(self) -> None:
@@ -99,7 +114,7 @@ class StudyPlayer:
         return min(self._passed / self._total, 1.0) if self._total else 0.0
 
     def play(self, job: StudyJob, rig: GuardedRig, limit_v: float, why_not: Callable[[], str],
-             picture: Path | None) -> None:  # fmt: skip
+             picture: PictureFile | None) -> None:  # fmt: skip
         """Play a study on an armed bench; the bench ends at 0 V.
 
         Args:
@@ -108,7 +123,7 @@ class StudyPlayer:
             limit_v: highest drive that was typed when the bench was armed, in V.
             why_not: says why the study must end; empty while it may go on. It is asked for each
                 block.
-            picture: JPEG file for the last frame; None: none.
+            picture: takes the last frame; None: no pictures.
         Raises:
             HaselabError: see `run_study`; the recorded data are kept.
         """

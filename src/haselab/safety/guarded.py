@@ -116,6 +116,7 @@ class GuardedRig(Rig):
         """
         if not self.safety.settings.read_back:
             return
+        self.bench.passed()  # blocks before this one may have been skipped
         codes = self.acquisition.read()
         monitored = self.controller is None
         left_v = self.bench.watch.residual_v(codes) if monitored else self._metered_v()

@@ -1,0 +1,132 @@
+"""STOP in Chromium: from `pointerdown` on the page to the revocation of the permission.
+
+`python -m benchmarks.rig.panel_chromium [--presses 100]`
+
+The page's clock and this process's clock are the same one of the computer. The revocation is seen
+by a thread that reads the interlock's file every 0.2 ms. First, one page is open; then its scripts
+are slowed down 6 times and seven other pages receive all streams.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import math
+import random
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+from typing import Any
+
+import numpy as np
+
+from benchmarks.rig.panel import PAGES, child, page, panel
+from benchmarks.rows import Row
+from haselab.safety.interlock import Interlock
+
+READY = "document.getElementById('emergency-state').textContent === 'STOP: ready'"
+NOTE_PRESSES = """() => document.addEventListener('pointerdown',
+    event => { window.pressed_ms = performance.timeOrigin + event.timeStamp; }, true)"""
+LATEST_S = 10.0
+
+
+class Revocations:
+    """Notes when the permission is revoked. Use as a context."""
+
+    def __init__(self, process: int) -> None:
+        words = ["ps", "-ww", "-o", "args=", "-p", str(child(process, "stop_process"))]
+        listed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+        key = listed.partition("/haselab-panel-")[2].split(" http")[0].partition(" ")[2]
+        self.times_s: list[float] = []
+        self._interlock, self._over = Interlock(key), threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+
+    def __enter__(self) -> "Revocations":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+        self._interlock.close()
+
+    def _watch(self) -> None:
+        last = self._interlock.revision
+        while not self._over.wait(2e-4):
+            if (now := self._interlock.revision) != last:
+                self.times_s.append(time.time())
+                last = now
+
+
+@contextlib.asynccontextmanager
+async def chromium_page(address: str, slowdown: int) -> AsyncIterator[Any]:
+    """A page of the panel in Chromium, its mouse on STOP."""
+    from playwright.async_api import async_playwright
+
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
+        found = await browser.new_page()
+        await found.goto(address)
+        await found.wait_for_function(READY, timeout=6e4)
+        if slowdown > 1:
+            tools = await found.context.new_cdp_session(found)
+            await tools.send("Emulation.setCPUThrottlingRate", {"rate": slowdown})
+        await found.evaluate(NOTE_PRESSES)
+        box = await found.locator("#emergency").bounding_box()
+        await found.mouse.move(box["x"] + 20.0, box["y"] + 20.0)
+        yield found
+        await browser.close()
+
+
+async def pressed(
+    process: int, host: str, token: str, presses: int, others: int, slowdown: int
+) -> list[float]:
+    """Press STOP again and again; times in s until the revocation, NaN where there was none."""
+    times_s = []
+    async with contextlib.AsyncExitStack() as opened:
+        for _ in range(others):
+            await opened.enter_async_context(page(host, token, []))
+        address = f"http://{host}/?token={token}"
+        chromium = await opened.enter_async_context(chromium_page(address, slowdown))
+        revoked = opened.enter_context(Revocations(process))
+        for _ in range(presses):
+            await asyncio.sleep(0.1 + 0.05 * random.random())
+            before, begun_s = len(revoked.times_s), time.monotonic()
+            await chromium.mouse.down()
+            await chromium.mouse.up()
+            while len(revoked.times_s) == before and time.monotonic() < begun_s + LATEST_S:
+                await asyncio.sleep(1e-3)
+            if len(revoked.times_s) == before:
+                times_s.append(math.nan)
+                continue
+            pressed_s = 1e-3 * await chromium.evaluate("window.pressed_ms")
+            times_s.append(revoked.times_s[before] - pressed_s)
+    return times_s
+
+
+def rows(presses: int = 1000) -> Iterator[Row]:
+    """Measure one page, then a slow one beside seven others.
+
+    Args:
+        presses: of STOP, for each of both.
+    """
+    for others, slowdown, goal_ms in ((0, 1, 20.0), (PAGES - 1, 6, 50.0)):
+        with panel() as (process, host, token):
+            times_s = asyncio.run(pressed(process.pid, host, token, presses, others, slowdown))
+        seen_s = np.array(times_s)[np.isfinite(times_s)]
+        which = f"{1 + others} pages, slowed down {slowdown} times" if others else "1 page"
+        yield Row(f"pointerdown on STOP in Chromium to permission revoked, p99, {which}",
+                  1e3 * float(np.percentile(seen_s, 99)) if len(seen_s) else math.nan, "ms",
+                  goal_ms, False, f"median {1e3 * float(np.median(seen_s)):.2g} ms")  # fmt: skip
+        yield Row(f"presses of STOP in Chromium that revoked the permission, {which}",
+                  len(seen_s), f"of {presses}", presses)  # fmt: skip
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--presses", type=int, default=100)
+    for row in rows(parser.parse_args().presses):
+        print(row, flush=True)

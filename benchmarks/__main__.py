@@ -81,6 +81,8 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
             quick={"presses": 100, "seconds": 10.0, "armed_presses": 20},
             full={"seconds": 1800.0},
         ),
+        Measurement("rig.panel_chromium", quick={"presses": 100}),
+        Measurement("rig.panel_disturbance", quick={"seconds": 20.0, "rounds": 1}),
     ),
     "command": (Measurement("command"),),
 }

@@ -1,16 +1,18 @@
-"""Outputs that come too late in a study: without a panel, with one page, and with eight.
+"""Ticks that a study misses or is late for: without a panel, with one page, and with eight.
 
 `python -m benchmarks.rig.panel_disturbance [--seconds 60] [--rounds 1]`
 
 The twin is served by a process of its own and follows the wall clock, behind the drivers of the
 real instruments. `haselab run` plays a study of triangles on it, and the panel plays the same study
 with one page open and with eight, one of which is frozen: it neither reads nor answers. The ways
-take turns. A study has one output every 10 ms.
+take turns. A tick is an output, one every 10 ms; it is late if more than half of the available time
+had passed. A study that trips has missed all.
 """
 
 import argparse
 import asyncio
 import contextlib
+import math
 import re
 import subprocess
 import sys
@@ -18,6 +20,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import websockets
 
 from benchmarks.rig.panel import PAGES, page, panel
@@ -33,16 +36,17 @@ high_v = 1.0
 frequency_hz = 0.5
 cycles = {cycles}
 skipped_cycles = 1
-frame_rate_hz = 50.0
+frame_rate_hz = 200.0
 """
 
 
-def skipped(folder: Path) -> int:
-    """Outputs that were skipped in the only recording below a folder."""
+def counted(folder: Path) -> tuple[int, int]:
+    """Late and missed ticks in the only recording below a folder."""
     (session,) = folder.glob("**/session.h5")
     with SessionReader(session) as reader:
-        found = [re.match(r"(\d+) outputs came too late", text) for _, text in reader.events()]
-    return sum(int(one[1]) for one in found if one)
+        texts = " ".join(text for _, text in reader.events() if text.startswith("deadlines of"))
+    late, missed = (re.findall(rf"(\d+) {what}", texts) for what in ("late", "missed"))
+    return sum(map(int, late)), sum(map(int, missed))
 
 
 async def play(host: str, token: str, pages: int, seconds: float) -> None:
@@ -64,8 +68,8 @@ async def play(host: str, token: str, pages: int, seconds: float) -> None:
             raise RuntimeError(first.state["reason"])
 
 
-def outputs_skipped(pages: int, seconds: float) -> int:
-    """Outputs that were skipped with some pages; 0: without a panel."""
+def played(pages: int, seconds: float) -> tuple[float, float]:
+    """Late and missed ticks of a study with some pages; 0: without a panel."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         study = folder / "triangles.toml"
@@ -80,7 +84,10 @@ def outputs_skipped(pages: int, seconds: float) -> int:
             else:
                 with panel("--rig", str(served.path), folder=folder) as (_, host, token):
                     asyncio.run(play(host, token, pages, seconds))
-            return skipped(folder)
+            return counted(folder)
+        except (RuntimeError, subprocess.CalledProcessError) as error:
+            print(error, file=sys.stderr)
+            return math.inf, math.inf
         finally:
             served.close()
 
@@ -92,14 +99,14 @@ def rows(seconds: float = 60.0, rounds: int = 3) -> Iterator[Row]:
         seconds: of a study.
         rounds: studies of each.
     """
-    counts = [[outputs_skipped(pages, seconds) for pages in (0, 1, PAGES)] for _ in range(rounds)]
-    without, *others = (sum(column) for column in zip(*counts, strict=True))
+    ways = (0, 1, PAGES)
+    found = np.array([[played(pages, seconds) for pages in ways] for _ in range(rounds)]).sum(0)
     of = f"of {round(100 * seconds) * rounds}"
-    yield Row("outputs skipped in a study without a panel", without, of)
-    for pages, found in zip((1, PAGES), others, strict=True):
-        which = f"{pages} pages, one frozen" if pages > 1 else "1 page"
-        yield Row(f"outputs skipped in a study of the panel, {which}", found, of,
-                  without, False)  # fmt: skip
+    for pages, (late, missed) in zip(ways, found, strict=True):
+        which = {0: "without a panel", 1: "1 page"}.get(pages, f"{pages} pages, one frozen")
+        goal = found[0, 1] if pages else None
+        note = f"{late:g} late"
+        yield Row(f"ticks missed in a study, {which}", missed, of, goal, False, note)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,7 @@ CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # of the reference study
 _RAMP_V_PER_S = 1.0  # at the amplifier's input: 5 kV/s with a gain of 5000
 _HEARTBEAT_S = 0.5
 _PICTURES_HZ = 5.0
+_CHECK = "Check the instruments, then arm the bench again."
 _CATCH_UP_S, _WATCH_S = 0.2, 0.1
 _COMPUTES_S = 0.5  # without a block, after which a study does not look whether it must end
 _MOST_EVENTS = 40  # that a page shows
@@ -260,8 +261,12 @@ class LiveBench:
             try:
                 self._leases.require_in_time(at_s)
             except SafetyError:
-                self._end("Arming took too long, so the bench was taken to 0 V again.")
-                raise
+                reason = (
+                    "Arming took too long, so the bench was taken to 0 V again. Find the "
+                    "instrument that is slow, then arm the bench again."
+                )
+                self._end(reason)
+                raise SafetyError(reason) from None
         return answer
 
     def _arm(self, holder: str, values: JsonObject, job: StudyJob | None = None) -> JsonObject:
@@ -436,7 +441,7 @@ class LiveBench:
                 self._failed(error)
                 return
             except Exception as error:  # of a driver, for example if STOP interrupts its call
-                self._failed(DeviceError(f"A driver failed: {described(error)}."))
+                self._failed(DeviceError(f"A driver failed: {described(error)}. {_CHECK}"))
                 return
             if self._holder and self._rig.safety.stage is Stage.TRIPPED:
                 self._end(self._rig.safety.reason)
@@ -474,7 +479,7 @@ class LiveBench:
             )
             self._rig.safety.trip(reason)
         except Exception as error:  # of a driver, for example if STOP interrupts its call
-            reason = f"A driver or an experiment failed: {described(error)}."
+            reason = f"A driver or an experiment failed: {described(error)}. {_CHECK}"
             self._rig.safety.trip(reason)
         finally:
             over.set()

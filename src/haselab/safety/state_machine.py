@@ -302,8 +302,8 @@ class Safety:
         if late_s <= 0.0:
             return ""
         return (
-            f"The lease (lease_s) of this program ended {late_s:.4g} s before its next heartbeat. "
-            "Check whether the program hung or the computer slept."
+            f"The lease (lease_s; idle_s between experiments) of this program ended {late_s:.4g} s "
+            "before its next heartbeat. Check whether the program hung or the computer slept."
         )
 
     def run(self) -> None:

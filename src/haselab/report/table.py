@@ -33,8 +33,8 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
         columns: width of the terminal, at least 60.
 
     Returns:
-        Lines of at most `columns` characters. The column `noise-free` is left out if no row has
-        such a value, and those about a paper if no row is compared with one.
+        Lines of at most `columns` characters, if all numbers fit. The column `noise-free` is left
+        out if no row has such a value, and those about a paper if no row is compared with one.
 
     Raises:
         InputError: the document is not a results document.
@@ -63,7 +63,9 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
     lines.append(_GAP.join("-" * width for width in widths))
     for row in cells:
         lines.extend(_wrapped(row, widths))
-    return "\n".join([*lines, "", *_missing(found, columns), _count(found)])
+    return "\n".join(
+        [*lines, "", *_missing(found, columns), *textwrap.wrap(_count(found), columns)]
+    )
 
 
 def _cells(row: Quantity) -> tuple[str, ...]:
@@ -86,10 +88,18 @@ def _mark(row: Quantity) -> str:
 
 
 def _widths(rows: list[list[str]], columns: int) -> list[int]:
-    """Widths of the columns; the widest after the id are narrowed until all fit."""
-    widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
+    """Widths of the columns; the widest after the id are narrowed until all fit, but hold a word.
+
+    So no number is broken, even if the lines become too long.
+    """
+    of = range(len(rows[0]))
+    widths = [max(len(row[at]) for row in rows) for at in of]
+    words = [max((len(word) for row in rows for word in row[at].split()), default=0) for at in of]
     while sum(widths) + len(_GAP) * (len(widths) - 1) > columns:
-        widths[widths.index(max(widths[1:]), 1)] -= 1
+        wide = [at for at in of[1:] if widths[at] > words[at]]
+        if not wide:
+            break
+        widths[max(wide, key=lambda at: widths[at])] -= 1
     return widths
 
 

@@ -31,7 +31,7 @@ def test_a_first_order_step_rises_in_ln9_time_constants():
     # A parabola over a tenth of the rise leaves less than (0.1 ln 9)^3 / 60 of the step.
     assert found.rise_time_s.value == pytest.approx(0.7 * LN9, rel=1e-3)
     assert found.settling_time_s.value == pytest.approx(0.7 * math.log(50.0), abs=0.011)
-    assert found.ringing is None
+    assert found.ringing is None and found.trials[0].remark == ""
     assert found.overshoot.value < 1e-6
     assert abs(found.steady_state_error.value) < 1e-9
 
@@ -49,6 +49,7 @@ def test_the_raw_rise_of_a_ringing_step_is_that_of_its_first_swing():
     assert found.raw_rise_time_s.value == pytest.approx(first[1] - first[0], rel=0.03)
     assert found.raw_rise_time_s.value == pytest.approx(0.214, abs=0.005)
     assert found.rise_time_s.value < 0.1 * found.raw_rise_time_s.value
+    assert "so its rise time" in found.trials[0].remark
 
 
 @pytest.mark.parametrize("zeta", [0.03, 0.09, 0.15])

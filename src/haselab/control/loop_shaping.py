@@ -108,6 +108,8 @@ class Design:
         if self.plausible is not None:
             share = 100.0 * self.plausible.share.value
             lines.append(f"{share:.3g} % of the plausible plants keep the margins.")
+        if step.remark:
+            lines.append(f"Note: {step.remark}.")
         if self.shortfalls:
             lines.append(f"Demands not met: {'; '.join(self.shortfalls)}")
         return "\n".join(lines)

@@ -17,6 +17,7 @@ __all__ = ["StepMetrics", "StepNumbers", "over_trials", "step_metrics", "step_nu
 _BASELINE_S = 1.0  # the initial level is the mean of the last second before the step
 _FINAL_PART = 0.1  # the final value is the mean of the record's last tenth
 _SETTLED = 0.02
+_RINGS = 0.1  # of the step: such ringing crosses 90 % of it again
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,17 @@ class StepNumbers:
     ring_averaged_overshoot: float
     settling_time_s: float
     steady_state_error: float
+
+    @property
+    def remark(self) -> str:
+        """Why the rise time is not well defined; empty if it is."""
+        rings = self.overshoot - self.ring_averaged_overshoot
+        if rings <= _RINGS:
+            return ""
+        return (
+            f"the step rings by {100.0 * rings:.0f} % of its size, so its rise time, from which "
+            "the ringing is averaged out, is not well defined"
+        )
 
 
 @dataclass(frozen=True)

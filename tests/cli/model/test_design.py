@@ -66,6 +66,16 @@ def test_demands_of_a_file_are_met_or_the_command_exits_with_3(model, tmp_path, 
     )
 
 
+def test_a_step_that_rings_is_named_beside_its_rise_time(tmp_path, capsys):
+    model = tmp_path / "model.json"
+    model.write_text(json.dumps({"plant": Plant(1.0, 30.0, 0.03).to_dict()}))
+    spec = tmp_path / "spec.toml"
+    spec.write_text("rise_time_s = 0.05\novershoot = 1.0\nphase_margin_deg = 20.0\n")
+    words = ("design", model, "--structure", "pi", "--spec", spec, "--accept-shortfalls")
+    code, _, error = run(capsys, *words)
+    assert code == 0 and "the step rings by" in error and error.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

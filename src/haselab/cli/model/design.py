@@ -155,6 +155,8 @@ def command(
                 f"{_FEW:g} for more robust gains: {model}",
                 err=True,
             )
+    if remark := design.nominal.step.remark:
+        click.echo(f"haselab: warning: {remark}: {model}", err=True)
     emit(answer, as_json=as_json, out=None)
     slowest_s = 20.0 / max(design.nominal.margins.crossover_rad_s, 1e-3)
     step = design.spec.step

@@ -61,7 +61,8 @@ class StepMetrics:
     fields see `StepNumbers`.
 
     Args:
-        rise_time_s: in s.
+        rise_time_s: in s; NaN if it is shorter than the raw one, because averaging out the ringing
+            removed the rise as well.
         raw_rise_time_s: in s.
         overshoot: relative to the step.
         ring_averaged_overshoot: relative to the step.
@@ -124,8 +125,11 @@ def step_metrics(
     def over(name: str, unit: str) -> Estimate:
         return over_trials(np.array([getattr(item, name) for item in numbers]), unit)
 
+    rise_s = over("rise_time_s", "s")
+    if found is not None and rise_s.value < over("raw_rise_time_s", "s").value:
+        rise_s = Estimate(math.nan, math.nan, (math.nan, math.nan), "s")
     return StepMetrics(
-        rise_time_s=over("rise_time_s", "s"),
+        rise_time_s=rise_s,
         raw_rise_time_s=over("raw_rise_time_s", "s"),
         overshoot=over("overshoot", ""),
         ring_averaged_overshoot=over("ring_averaged_overshoot", ""),

@@ -51,6 +51,8 @@ class Lab:
 @pytest.fixture(scope="module")
 def lab(make_shell) -> Iterator[Lab]:
     shell = make_shell("instrument", PACKAGE)
+    # The commands work in a checkout too, whose settings pytest would otherwise take.
+    (shell.folder / "pyproject.toml").write_text((ROOT / "pyproject.toml").read_text())
     with ExitStack() as opened:
         emulator = opened.enter_context(emulator_of_package())
         twin = opened.enter_context(ServedTwin(twin_of_reading("hz"), 1, pace=0.0))

@@ -185,6 +185,30 @@ def test_a_lag_that_no_count_shows_is_found_by_the_loop() -> None:
         assert measure_start(board, file.daq, starts=3).late_blocks == 1
 
 
+def test_over_usb_counts_that_are_read_slowly_do_not_undo_a_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Reading a count takes 2.8 ms: it counts only if the next one agrees."""
+    with served_board() as (served, file), opened(file) as board:
+        acquired, write = board._acquired, board._ahead.write_many_sample
+        queued: list[int] = []
+
+        def slowly() -> int:
+            found = acquired()
+            if queued:
+                served.hub.spend(560)
+            return found
+
+        def noting(values: np.ndarray, timeout_s: float) -> None:
+            queued.append(len(values))
+            write(values, timeout_s)
+
+        monkeypatch.setattr(board, "_acquired", slowly)
+        monkeypatch.setattr(board._ahead, "write_many_sample", noting)
+        board._start_stream()
+        assert len(queued) == 1
+
+
 @pytest.mark.parametrize("samples", [500, 1000, 2000])
 def test_packets_of_up_to_a_block_do_not_keep_the_output_from_its_blocks(samples: int) -> None:
     with served_board(ahead_blocks=2, slow_transfer=samples) as (_, file), opened(file) as board:

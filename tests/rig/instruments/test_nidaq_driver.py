@@ -167,6 +167,18 @@ def test_orphaned_tasks_are_one_line_and_making_the_bench_safe_helps() -> None:
             board.read()
 
 
+@pytest.mark.parametrize("code", [-200292, -200293])
+def test_a_buffer_that_is_full_after_a_reset_says_to_start_again(code: int) -> None:
+    """The panel of a bench that `rig safe` has reset reported the bare status -200293."""
+    with served_board() as (_, file), opened(file) as board:
+        error = board._link._errors.DaqError("no more space in the buffer", code)
+        with (
+            pytest.raises(DeviceError, match=rf"full, .*status {code}.* start this program again"),
+            board._link.translated_errors(),
+        ):
+            raise error
+
+
 # ---- USB ----------------------------------------------------------------------------------------
 
 

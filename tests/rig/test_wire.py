@@ -170,7 +170,7 @@ def test_outputs_that_come_too_late_are_left_out_counted_and_no_block_is_lost(
     assert bench.rig.acquisition.time_s - start_s == pytest.approx(18 * d.block_s, abs=1e-9)
     # One value was queued ahead of the stall: so the outputs of all later blocks until the queue
     # runs again are left out, and then each comes in its own block. Over USB a stream starts with
-    # four values of the standing output, of which one is the queue.
+    # three values of the standing output, of which one is the queue.
     assert missed[-1] == missed[-3] and 0 < missed[-1] <= stalled + 2 + 3
     first = int(np.argmax(np.array(missed) == missed[-1])) + 1  # the first that was put out
     codes = np.concatenate(blocks)

@@ -15,6 +15,7 @@ from haselab.rig import (
     ReportsOutput,
     ReportsOutputState,
 )
+from haselab.safety import gate as gate_module
 from haselab.safety.gate import Gate
 
 
@@ -234,3 +235,52 @@ def test_a_permission_for_an_earlier_revision_is_none(gate: Gate) -> None:
     assert not gate.permitted and gate.revoked.startswith("Smoke (on ")
     gate.end()
     assert gate.revoked == ""
+
+
+class SlowDriver(Driver):
+    """One connection: two calls at the same time would mix up the replies."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = self.most = 0
+        self.entered, self.both, self.end = (threading.Event() for _ in range(3))
+
+    def off(self) -> None:
+        self.calls += 1
+        self.most = max(self.most, self.calls)
+        (self.both if self.entered.is_set() else self.entered).set()
+        self.end.wait()
+        self.calls -= 1
+        super().off()
+
+
+def test_a_driver_is_not_switched_off_by_two_threads_at_the_same_time(
+    gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A refused call of the source takes every driver to 0 V that another thread switches off."""
+    monkeypatch.setattr(gate_module, "_TURN_S", 600.0)
+    source, driver = gate.instrument(Driver()), SlowDriver()
+    supply = gate.instrument(driver)
+    first = threading.Thread(target=supply.off)
+    first.start()
+    driver.entered.wait()
+    second = threading.Thread(target=source.read_back)
+    second.start()
+    driver.both.wait(0.2)
+    driver.end.set()
+    first.join()
+    second.join()
+    assert driver.most == 1
+
+
+def test_a_driver_that_hangs_is_switched_off_all_the_same(gate: Gate) -> None:
+    driver = SlowDriver()
+    supply = gate.instrument(driver)
+    threads = [threading.Thread(target=supply.off) for _ in range(2)]
+    threads[0].start()
+    driver.entered.wait()
+    threads[1].start()
+    assert driver.both.wait(600.0)
+    driver.end.set()
+    for thread in threads:
+        thread.join()

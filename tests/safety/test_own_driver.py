@@ -561,3 +561,26 @@ def test_handlers_of_the_program_and_other_threads_are_left_alone() -> None:
     thread.start()
     thread.join()
     assert seen == [former]
+
+
+def test_after_a_wait_of_the_program_begin_says_that_blocks_may_be_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    own, missing = OwnBench(), [0, 100, 0, 100]
+    read = own.board.read
+
+    def read_after_wait() -> Any:
+        own.board._blocks += missing.pop(0) if missing else 0
+        return read()
+
+    monkeypatch.setattr(own.board, "read", read_after_wait)
+    with armed(own.rig) as guarded:
+        guarded.source.write(0.5)
+        guarded.acquisition.read()
+        guarded.begin()
+        for _ in range(2):
+            guarded.source.write(0.6)
+            guarded.acquisition.read()
+        with pytest.raises(DeviceError, match=r"instead of 2000\. .* call begin\(\)"):
+            guarded.acquisition.read()
+    assert own.amplifier.drive_v == 0.0

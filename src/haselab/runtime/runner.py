@@ -448,7 +448,8 @@ class Runner:
         if self._missed_row >= limit and self._safety.settings.real_time:
             raise self._safety.trip(
                 f"Lost deadline: outputs of {self._missed_row} blocks in a row came too late and "
-                f"were skipped (missed_limit = {limit}). Close other programs."
+                f"were skipped (missed_limit = {limit}). Close other programs, or raise "
+                "ahead_blocks or block_samples."
             )
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:

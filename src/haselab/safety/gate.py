@@ -14,8 +14,9 @@ import functools
 import inspect
 import os
 import sys
+import threading
 import weakref
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,10 +31,13 @@ __all__ = ["Gate"]
 
 _T = TypeVar("_T")
 
-# Calls that only lower the output or query an instrument: never delayed, never refused.
+# Calls that only lower the output or query an instrument: never refused.
 _SAFE = frozenset(
     {"zero", "off", "stop", "close", "is_off", "read_voltage", "check_power", "acquired"}
 )
+# Calls that wait for one another: two threads on one connection would mix up the replies.
+_ONE_BY_ONE = frozenset({"off", "is_off", "read_voltage", "check_power"})
+_TURN_S = 0.25  # longest such wait: then the call is made all the same
 _FORGETS = ("zero", "off")  # after these a driver has no earlier request left
 # Calls that request nothing themselves, but in which a driver may put out an earlier request:
 # reading a block starts a stream, pausing one writes its last value.
@@ -277,7 +281,8 @@ class Gate:
                 else:
                     self._to_zero()
         if name in _SAFE:
-            answer = method(*arguments, **named)
+            with instrument._gate_turn(name):
+                answer = method(*arguments, **named)
             instrument._gate_pending.discard(name)
             return answer
 
@@ -361,6 +366,17 @@ class _Instrument:
         self._gate_clearing = frozenset(name for name in _FORGETS if hasattr(driver, name))
         # Those still to be called before the driver is known to have no request.
         self._gate_pending = set(self._gate_clearing)
+        self._gate_calling = threading.RLock()
+
+    @contextlib.contextmanager
+    def _gate_turn(self, name: str) -> Iterator[None]:
+        """Wait until a call of another thread has ended, but never for long."""
+        taken = name in _ONE_BY_ONE and self._gate_calling.acquire(timeout=_TURN_S)
+        try:
+            yield
+        finally:
+            if taken:
+                self._gate_calling.release()
 
     def __getattr__(self, name: str) -> Any:
         """Forward attributes that the driver creates on access, as remote proxies do."""

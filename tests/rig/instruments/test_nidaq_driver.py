@@ -167,6 +167,18 @@ def test_orphaned_tasks_are_one_line_and_making_the_bench_safe_helps() -> None:
             board.read()
 
 
+@pytest.mark.parametrize("code", [-200292, -200293])
+def test_a_buffer_that_is_full_after_a_reset_says_to_start_again(code: int) -> None:
+    """The panel of a bench that `rig safe` has reset reported the bare status -200293."""
+    with served_board() as (_, file), opened(file) as board:
+        error = board._link._errors.DaqError("no more space in the buffer", code)
+        with (
+            pytest.raises(DeviceError, match=rf"full, .*status {code}.* start this program again"),
+            board._link.translated_errors(),
+        ):
+            raise error
+
+
 # ---- USB ----------------------------------------------------------------------------------------
 
 
@@ -183,6 +195,30 @@ def test_over_usb_outputs_come_in_their_blocks_however_late_its_counts(lag: int)
 def test_a_lag_that_no_count_shows_is_found_by_the_loop() -> None:
     with served_board(ahead_blocks=3, usb_lag_samples=1800) as (_, file), opened(file) as board:
         assert measure_start(board, file.daq, starts=3).late_blocks == 1
+
+
+def test_over_usb_counts_that_are_read_slowly_do_not_undo_a_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Reading a count takes 2.8 ms: it counts only if the next one agrees."""
+    with served_board() as (served, file), opened(file) as board:
+        acquired, write = board._acquired, board._ahead.write_many_sample
+        queued: list[int] = []
+
+        def slowly() -> int:
+            found = acquired()
+            if queued:
+                served.hub.spend(560)
+            return found
+
+        def noting(values: np.ndarray, timeout_s: float) -> None:
+            queued.append(len(values))
+            write(values, timeout_s)
+
+        monkeypatch.setattr(board, "_acquired", slowly)
+        monkeypatch.setattr(board._ahead, "write_many_sample", noting)
+        board._start_stream()
+        assert len(queued) == 1
 
 
 @pytest.mark.parametrize("samples", [500, 1000, 2000])

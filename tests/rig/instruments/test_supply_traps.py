@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from haselab.base import DeviceError, InputError
+from haselab.rig.drivers import quietly
 from haselab.rig.instruments.petapicovoltron import line as supply_line
 from haselab.rig.instruments.petapicovoltron.section import PetaPicoVoltronConfig
 from haselab.rig.instruments.petapicovoltron.supply import (
@@ -201,6 +202,42 @@ def test_off_never_raises_whatever_answers() -> None:
         with pytest.raises(DeviceError, match="does not reply correctly"):
             supply.is_off()
         supply.close()
+
+
+class LatePort:
+    """A port at which nothing arrives at first, and then every reply, in order."""
+
+    def __init__(self, firmware: SupplyFirmware, silent_writes: int) -> None:
+        self._firmware, self._silent = firmware, silent_writes
+        self._coming: list[bytes] = []
+
+    def reset_input_buffer(self) -> None:
+        """Nothing has arrived yet that could be discarded."""
+
+    def write(self, data: bytes) -> None:
+        replies = [self._firmware.answer(each, 0.0) for each in self._firmware.take(data)]
+        self._coming += [f"{reply}\r\n".encode() for reply in replies]
+        self._silent -= 1
+
+    def read_until(self, end: bytes, most: int) -> bytes:
+        return self._coming.pop(0) if self._coming and self._silent < 0 else b""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+@pytest.mark.parametrize("silent_writes", [1, 2, 3])
+def test_late_replies_to_an_earlier_request_are_not_those_of_the_next_one(
+    silent_writes: int,
+) -> None:
+    with bench() as b, contextlib.closing(supply_line.SupplyLine(b.config)) as line:
+        line._port.close()
+        line._port = LatePort(SupplyFirmware("x", SupplyFaults()), silent_writes)
+        while quietly(line.switch_off) is not None:
+            pass
+        assert line.not_off() == ""
+        assert line.number("QVset") == 0.0
+        assert line.query_all(["QName", "QVmax"]) == ["x", "5000"]
 
 
 # ---- at power-on --------------------------------------------------------------------------------

@@ -35,6 +35,7 @@ _STARTS = 12  # attempts to start the output synchronously
 _LOOKS = 100  # readings of the device's counts, until both belong to one block
 _LEAD, _AT_ONCE = 50, 10  # known values queued in the device, and most that one call queues
 _FEWEST = 2  # number of values with which a stream is started
+_FEWEST_USB = 3  # over USB, so that two readings of the counts fit before the last value
 _USB_LOOKS = 8  # packets after a start over USB after which the device's counts are read
 
 
@@ -327,7 +328,7 @@ class NidaqBoard:
         block, switch = self._config.block_samples, self._config.switch_in_block
         ahead, usb = self._config.ahead_blocks, self._link.usb
         for trial in range(_STARTS):
-            queued = max(ahead, min(_FEWEST << trial, 32))
+            queued = max(ahead, min((_FEWEST_USB if usb else _FEWEST) << trial, 32))
             now = self._acquired()
             edge: int = now // block * block + switch
             margin = switch // 2

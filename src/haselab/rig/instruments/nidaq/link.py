@@ -22,6 +22,11 @@ _FULL_V = 10.0  # range of the analogue outputs
 _END = re.compile(r"(Source|Destination) Terminal:")  # of a route, in DAQmx's text
 _ROUTE = "the device cannot route a required signal"
 _ROUTE_ADVICE = "Change the terminals and counters of the rig file, or use another device."
+_NO_CLOCK = "the output's buffer is full, because its clock has stopped"
+_NO_CLOCK_ADVICE = (
+    "If another program has reset the board, such as 'haselab rig safe', start this program again; "
+    "otherwise check daq.counter."
+)
 _SILENT_S = 2e-3  # timeout after a server has not replied once, so that the guardian acts soon
 # DAQmx status: meaning, what to do.
 _EXPLANATIONS = {
@@ -49,10 +54,8 @@ _EXPLANATIONS = {
         "a setting is outside the device's limits",
         "Change channels, wiring, range and rate of section daq.",
     ),
-    -200292: (
-        "the output's buffer is full, because its clock has stopped",
-        "Check daq.counter, and that no other program uses it.",
-    ),
+    -200292: (_NO_CLOCK, _NO_CLOCK_ADVICE),
+    -200293: (_NO_CLOCK, _NO_CLOCK_ADVICE),
     -200462: (
         "an output was started without values",
         "This is a bug in haselab. Please report it.",

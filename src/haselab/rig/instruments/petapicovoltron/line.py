@@ -18,6 +18,7 @@ button would otherwise start the cycles again.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import re
@@ -63,6 +64,7 @@ class SupplyLine:
         self._config = config
         self.version = ""
         self._received = b""  # since the last request
+        self._unanswered = 0  # requests whose replies may still arrive
         serial = load_driver("serial", "The high-voltage supply")
         try:
             self._port: Any = serial.Serial(
@@ -87,31 +89,61 @@ class SupplyLine:
         Raises:
             DeviceError: There is no reply, or the reply is `Err`.
         """
-        try:
-            self._send(command.encode("ascii") + b"\r")
-            answer = self._sound(command, self._line(command))
-            if not _DEBUG.fullmatch(answer):
-                return answer
-        except DeviceError:
-            pass
+        if not self._unanswered:
+            with contextlib.suppress(DeviceError):
+                self._send(command.encode("ascii") + b"\r")
+                answer = self._sound(command, self._line(command))
+                if not _DEBUG.fullmatch(answer):
+                    return answer
         return self._sound(command, self.query_all([command])[0])
 
     def query_all(self, commands: Sequence[str]) -> list[str]:
         """Send several commands at once and return their replies; ignore earlier data.
 
+        Replies to a request that timed out may arrive after the next one was sent. So, after a
+        timeout, the commands are sent at once, and again if a reply is missing; the last replies
+        are returned.
+
         Raises:
             DeviceError: There is no reply.
         """
         whole = "".join(f"{command}\r" for command in (*commands, "QVer"))
-        self._send(_FILLER + whole.encode("ascii"))
+        request = _FILLER + whole.encode("ascii")
+        for _ in range(2 if self._unanswered else 1):
+            self._unanswered += 1
+            self._send(request)
+            found, fault = self._all_replies(commands)
+            if fault is None:
+                break
+        if fault is not None and not found:
+            raise fault
+        lines = found[-1]
+        self._unanswered = 0
+        if len(lines) < len(commands):
+            raise self.no_reply(f"{len(lines)} replies to {len(commands)} commands; {_IGNORE}")
+        return lines[len(lines) - len(commands) :]
+
+    def _all_replies(self, commands: Sequence[str]) -> tuple[list[list[str]], Exception | None]:
+        """Read the replies to all requests; also return why some are missing."""
+        found: list[list[str]] = []
+        for _ in range(self._unanswered):
+            fault = quietly(lambda: found.append(self._replies(commands)))
+            if fault is not None:
+                return found, fault
+        return found, None
+
+    def _replies(self, commands: Sequence[str]) -> list[str]:
+        """Read all lines before the next reply to `QVer`.
+
+        Raises:
+            DeviceError: There is no such reply.
+        """
         lines: list[str] = []
         for _ in range(_MOST_LINES):
             line = self._line(commands[0] if commands else "QVer")
             if _VERSION.fullmatch(line):
                 self.version = line
-                if len(lines) >= len(commands):
-                    return lines[len(lines) - len(commands) :]
-                raise self.no_reply(f"{len(lines)} replies to {len(commands)} commands; {_IGNORE}")
+                return lines
             if not _DEBUG.fullmatch(line):
                 lines.append(line)
         raise self.no_reply(f"{_MOST_LINES} lines and no reply to QVer; {_IGNORE}")

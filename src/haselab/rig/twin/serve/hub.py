@@ -28,7 +28,8 @@ UNDERFLOW = -200290  # DAQmx status of an output that ran dry
 TICKS = 20  # samples in one mechanical step
 _BUFFER_S = 10.0
 _RAMP_S, _RAMP_PIECES = 1.0, 50
-_SHORTEST_S = 1e-4  # sleep of a reader
+_SHORTEST_S = 1e-4  # sleep of a reader, and of the pace keeper
+_DELAY_S = 1e-3  # of the pace keeper; a shorter one is not noted. Time to take a request
 _IDLE_S = 0.02  # longest sleep of the pace keeper
 _RIGHT = Wiring()
 _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
@@ -83,6 +84,8 @@ class TwinHub(Closing):
         self._closed = threading.Event()
         self._started = time.monotonic()
         self.stalled_s = 0.0  # of the wall clock, in which this process was not run
+        # delays of this process that were passed on: when, and how long, both in samples
+        self._delays: deque[tuple[int, int]] = deque()
         self._before = 0  # samples before the inputs were started
         self._total = 0  # samples of the bench's whole life here
         self._keeper: threading.Thread | None = None
@@ -102,24 +105,67 @@ class TwinHub(Closing):
 
         An instrument does not stop when the computer is busy, but this one does when its process
         does not run. A delay above one block is therefore subtracted from its clock, and counted,
-        so that it does not cause errors in the program under test.
+        so that it does not cause errors in the program under test. A shorter one is subtracted
+        only if an output would be late because of it: see `_wait_for_output`.
         """
         elapsed_s = (time.monotonic() - self._started) * self._pace
         behind = int(elapsed_s * self.rate_hz) // TICKS * TICKS - self._total
         excess = behind - self.description.block_samples
         if excess <= 0:
             return behind
-        lost_s = excess / (self.rate_hz * self._pace)
+        self._pause(excess)
+        if self._delays:  # not passed on
+            total, samples = self._delays.pop()
+            self._delays.append((total, max(samples - excess, 0)))
+        return behind - excess // TICKS * TICKS
+
+    def _pause(self, samples: int) -> None:
+        lost_s = samples / (self.rate_hz * self._pace)
         self._started += lost_s
         self.stalled_s += lost_s
-        return behind - excess // TICKS * TICKS
 
     def _keep_pace(self) -> None:
         while not self._closed.is_set():
-            with self._lock:
-                self._advance(self._behind())
-                wait_s = (self._next_event() - self._behind()) / (self.rate_hz * self._pace)
-            self._closed.wait(min(max(wait_s, 1e-4), _IDLE_S))
+            wait_s = self._follow_clock()
+            due_s = time.monotonic() + wait_s
+            self._closed.wait(wait_s)
+            self._note_delay(time.monotonic() - due_s)
+
+    def _follow_clock(self) -> float:
+        """Advance to the present; return the time until the next event, in s."""
+        with self._lock:
+            self._advance(self._behind())
+            behind = self._behind()
+            until = self._next_event() if behind >= 0 else 0
+            wait_s = (until - behind) / (self.rate_hz * self._pace)
+        return min(max(wait_s, _SHORTEST_S), _IDLE_S)
+
+    def _note_delay(self, late_s: float) -> None:
+        """Note that this process ran late, and its clients got their blocks late."""
+        if late_s < _DELAY_S:
+            return
+        with self._lock:
+            self._delays.append((self._total, int(late_s * self.rate_hz * self._pace)))
+
+    def _wait_for_output(self, passed: int) -> bool:
+        """Pause the clock before an edge if the output is missing because this process ran late.
+
+        Its client had that much less time, and its request may be waiting. Delays of the last two
+        blocks count, once each.
+
+        Args:
+            passed: samples since the edge.
+        """
+        block = self.description.block_samples
+        while self._delays and self._delays[0][0] < self._total - 2 * block:
+            self._delays.popleft()
+        there = self._queue and self._queue[0][0] <= self._total
+        if there or self._repeated or not self._streaming or not self._delays:
+            return False
+        delayed = min(sum(samples for _, samples in self._delays), block)
+        self._delays.clear()
+        self._pause(max(delayed, passed + round(_DELAY_S * self.rate_hz * self._pace)))
+        return True
 
     def _next_event(self) -> int:
         """Samples until the next event: an output, or the end of a block."""
@@ -142,6 +188,8 @@ class TwinHub(Closing):
             if self._period:
                 to_edge = self._to_edge()
                 if to_edge == 0:
+                    if self._wait_for_output(samples):
+                        break
                     self._clock_output()
                     to_edge = self._period
                 piece = min(piece, to_edge)

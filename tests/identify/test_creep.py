@@ -178,3 +178,12 @@ def test_swapped_columns_have_no_result():
         moved = y + noise * np.random.default_rng(43).normal(size=y.size)
         assert fit_creep(Record.sampled(u, moved, 50.0)).succeeded
         assert "swapped" in fit_creep(Record.sampled(moved, u, 50.0)).status
+
+
+def test_an_input_that_is_not_held_is_noted():
+    u = np.r_[np.zeros(100), np.ones(400)]
+    y = PronyCreep(1.0, (0.2,), (1.0,)).simulate(u, 100.0)
+    y = y + 0.002 * np.random.default_rng(1).normal(size=u.size)
+    for hold in ("zero", "first"):
+        fit = fit_creep(Record.sampled(u, y, 100.0, hold=hold), model="prony")
+        assert any("treated as held" in note for note in fit.notes) == (hold == "first")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -277,7 +277,15 @@ def fit_creep(
         scores.setdefault(_kind(entry), entry.bic - best.bic)
     verdict = _kind(best) if is_decisive(scores) else _UNSURE
     verdict = _NONE_VISIBLE if verdict == _NONE else verdict
-    return _describe(setting, scored, scores, verdict, stepped)
+    fit = _describe(setting, scored, scores, verdict, stepped)
+    if record.hold == "zero":
+        return fit
+    half_s = 0.5 / record.input_rate_hz
+    moved = (
+        f"The input is {record.hold}, but is treated as held from sample to sample: the creep may "
+        f"begin {half_s:.3g} s earlier or later. Leave out more with --leave-out-s if this matters."
+    )
+    return replace(fit, notes=(*fit.notes, moved))
 
 
 def _rest(record: Record) -> float:

@@ -187,3 +187,16 @@ def test_an_input_that_is_not_held_is_noted():
     for hold in ("zero", "first"):
         fit = fit_creep(Record.sampled(u, y, 100.0, hold=hold), model="prony")
         assert any("treated as held" in note for note in fit.notes) == (hold == "first")
+
+
+def test_a_noisy_measured_input_gives_no_result():
+    rng = np.random.default_rng(1)
+    u = np.r_[np.zeros(100), np.ones(400)]
+    y = PronyCreep(1.0, (0.2,), (1.0,)).simulate(u, 100.0) + 0.002 * rng.normal(size=u.size)
+    # With 2 % of noise, the interval of `instant` contained the truth in 0 of 6 records.
+    fit = fit_creep(Record.sampled(u + 0.02 * rng.normal(size=u.size), y, 100.0), model="prony")
+    assert fit.status.startswith("no result: the input is noisy")
+    smooth = np.sin(np.linspace(0.0, 6.0, 500))
+    answer = PronyCreep(1.0, (0.2,), (1.0,)).simulate(smooth, 100.0)
+    assert fit_creep(Record.sampled(smooth, answer + 0.002 * rng.normal(size=500), 100.0),
+                     model="prony").succeeded  # fmt: skip

@@ -77,14 +77,75 @@ def test_the_triangle_gives_the_same_choice_as_the_whole_record():
     assert min(candidates, key=bic) == chosen.orders
 
 
-def test_noise_of_the_sensor_is_told_as_bias():
+def test_noise_of_the_sensor_that_biases_the_poles_gives_no_result():
     u = np.random.default_rng(5).normal(size=4000)
     clean = lfilter([0.0, 1e-3, 1e-3], [1.0, -1.996, 0.998], u)
     y = clean + 0.1 * clean.std() * np.random.default_rng(6).normal(size=4000)
     fit = fit_arx(Record.sampled(u, y, 400.0), ArxOrders(2, 2, 1))
-    assert any("Use `haselab identify transfer`" in note for note in fit.notes)
-    assert fit.residual_whiteness_p < 0.05
-    assert any("biased" in note for note in fit.notes)
+    assert fit.status.startswith("no result: noise biases the coefficients")
+    assert fit.status.endswith("Use `haselab identify transfer`")
+    assert fit.residual_whiteness_p < 0.001 and fit.answer()["a"] is None
+
+
+def test_a_little_noise_of_the_sensor_widens_the_intervals():
+    bottom, top = [1.0, -1.5, 0.7], [0.0, 1.0, 0.5]
+    runs, inside = 40, np.zeros(3)
+    for run in range(runs):
+        u, e = np.random.default_rng([7, run]).normal(size=(2, 2000))
+        fit = fit_arx(
+            Record.sampled(u, lfilter(top, bottom, u) + 0.15 * e, 100.0), ArxOrders(2, 2, 1)
+        )
+        assert fit.status == "ok" and any("noise biases" in note for note in fit.notes)
+        estimates = [*fit.a, fit.static_gain]
+        truth = [*bottom[1:], 7.5]
+        inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, truth, strict=True)]
+    # Without the bias, no interval contains a_1. Binomial: 3.5 spreads below 95 %.
+    assert inside.min() / runs >= 0.95 - 3.5 * np.sqrt(0.95 * 0.05 / runs)
+
+
+def test_noise_that_passes_the_poles_is_not_called_bias():
+    for run in range(20):
+        u, e = np.random.default_rng([8, run]).normal(size=(2, 500))
+        y = lfilter([0, 0, 0, 1.0, 0.5], [1, -1.5, 0.7], u) + lfilter([2.0], [1, -1.5, 0.7], e)
+        fit = fit_arx(Record.sampled(u, y, 100.0), ArxOrders(2, 2, 3))
+        # The simulation explains far less than the prediction, as it must.
+        assert fit.status == "ok" and fit.prediction_fit_percent - fit.fit_percent > 10.0
+        assert bool(fit.notes) == (fit.residual_whiteness_p < 0.05)
+
+
+def test_a_record_that_begins_far_from_its_mean_is_not_biased():
+    runs, inside = 60, np.zeros(5)
+    for run in range(runs):
+        u, e = np.random.default_rng([9, run]).normal(size=(2, 60))
+        y = lfilter([0, 0, 0, 1.0, 0.5], [1, -1.5, 0.7], u + 5.0)
+        y = y + lfilter([0.5], [1, -1.5, 0.7], e)
+        fit = fit_arx(Record.sampled(u + 5.0, y, 100.0), ArxOrders(2, 2, 3))
+        truth = [-1.5, 0.7, 1.0, 0.5, 7.5]
+        estimates = [*fit.a, *fit.b, fit.static_gain]
+        inside += [e.ci95[0] <= t <= e.ci95[1] for e, t in zip(estimates, truth, strict=True)]
+    # Binomial: 3.5 spreads below 95 %.
+    assert inside.min() / runs >= 0.95 - 3.5 * np.sqrt(0.95 * 0.05 / runs)
+
+
+def test_the_gain_and_time_constant_of_a_possible_integrator_are_not_identifiable():
+    rng = np.random.default_rng(3)
+    u, e = np.repeat(rng.choice([-1.0, 1.0], 30), 10), rng.normal(size=300)
+    y = lfilter([0.0, 0.01], [1.0, -1.0], u) + lfilter([0.05], [1.0, -1.0], e)
+    fit = fit_arx(Record.sampled(u, y, 100.0), ArxOrders(1, 1, 1))
+    assert abs(fit.a[0].value + 1.0) < 1.96 * fit.a[0].std
+    assert np.isnan(fit.static_gain.value) and np.isnan(fit.modes[0]["time_constant_s"].value)
+    assert any("may be an integrator" in note for note in fit.notes)
+
+
+def test_an_input_that_is_not_held_gives_no_continuous_model():
+    rng = np.random.default_rng(4)
+    u = np.cumsum(rng.normal(size=400)) * 0.1
+    y = lfilter([0.2, 0.3, 0.1], [1, -1.5, 0.7], u) + lfilter([0.01], [1, -1.5, 0.7],
+                                                              rng.normal(size=400))  # fmt: skip
+    fit = fit_arx(Record.sampled(u, y, 50.0, hold="first"))
+    assert fit.orders == ArxOrders(2, 3, 0)
+    assert fit.answer()["continuous"] is None
+    assert any("The input is first, not held" in note for note in fit.notes)
 
 
 def test_a_simulated_record_that_starts_in_motion_is_explained():

@@ -178,3 +178,25 @@ def test_swapped_columns_have_no_result():
         moved = y + noise * np.random.default_rng(43).normal(size=y.size)
         assert fit_creep(Record.sampled(u, moved, 50.0)).succeeded
         assert "swapped" in fit_creep(Record.sampled(moved, u, 50.0)).status
+
+
+def test_an_input_that_is_not_held_is_noted():
+    u = np.r_[np.zeros(100), np.ones(400)]
+    y = PronyCreep(1.0, (0.2,), (1.0,)).simulate(u, 100.0)
+    y = y + 0.002 * np.random.default_rng(1).normal(size=u.size)
+    for hold in ("zero", "first"):
+        fit = fit_creep(Record.sampled(u, y, 100.0, hold=hold), model="prony")
+        assert any("treated as held" in note for note in fit.notes) == (hold == "first")
+
+
+def test_a_noisy_measured_input_gives_no_result():
+    rng = np.random.default_rng(1)
+    u = np.r_[np.zeros(100), np.ones(400)]
+    y = PronyCreep(1.0, (0.2,), (1.0,)).simulate(u, 100.0) + 0.002 * rng.normal(size=u.size)
+    # With 2 % of noise, the interval of `instant` contained the truth in 0 of 6 records.
+    fit = fit_creep(Record.sampled(u + 0.02 * rng.normal(size=u.size), y, 100.0), model="prony")
+    assert fit.status.startswith("no result: the input is noisy")
+    smooth = np.sin(np.linspace(0.0, 6.0, 500))
+    answer = PronyCreep(1.0, (0.2,), (1.0,)).simulate(smooth, 100.0)
+    assert fit_creep(Record.sampled(smooth, answer + 0.002 * rng.normal(size=500), 100.0),
+                     model="prony").succeeded  # fmt: skip

@@ -94,3 +94,11 @@ def test_without_a_fault_all_pass(tmp_path: Path) -> None:
     code, output = conformance(tmp_path / "package")
     assert code == 0, output
     assert "20 passed" in output
+
+
+def test_the_suite_without_pytest_names_what_to_install():
+    code = "import sys; sys.modules['pytest'] = None; import haselab.testing.conformance"
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert "pytest, which is not installed" in found.stderr.splitlines()[-1]

@@ -55,9 +55,10 @@ def open_folder(plan: Plan, folder: Path) -> None:
         plan: of the campaign.
         folder: new, empty, or of the same campaign.
     Raises:
-        InputError: it holds something else.
+        InputError: it holds something else, or pyarrow is not installed.
         DeviceError: the disk refuses.
     """
+    library("pyarrow", "campaign")  # before anything is written
     described = plan.campaign.described()
     if not (folder / CAMPAIGN).exists():
         others = is_occupied(folder) and any(

@@ -13,7 +13,7 @@ from haselab.base import InputError
 from haselab.identify.record import Record
 from haselab.store.columns.table import Table
 
-__all__ = ["TimeAxis", "check_rising", "records_of", "time_axis"]
+__all__ = ["TimeAxis", "check_complete", "check_rising", "records_of", "time_axis"]
 
 Floats = NDArray[np.float64]
 _FEW_MISSING = 3  # rows whose input is interpolated
@@ -63,6 +63,28 @@ def check_rising(time_s: NDArray[np.float64], file: Path, name: str) -> None:
             f"Column {name} does not increase after row {at + 1} (step of {steps[at]:g} s). Sort "
             f"the rows, or remove repeated ones: {file}"
         )
+
+
+def check_complete(axis: TimeAxis, file: Path, name: str) -> None:
+    """Refuse times between which rows are missing.
+
+    Args:
+        axis: of the times.
+        file: where they are from, for the message.
+        name: of their column.
+    Raises:
+        InputError: a missing row; the rows after it are later than a constant rate says.
+    """
+    if not axis.missing:
+        return
+    at = int(np.flatnonzero(np.diff(axis.number) > 1)[0])
+    step_s = float(axis.time_s[at + 1] - axis.time_s[at])
+    raise InputError(
+        f"Column {name} has a step of {step_s:g} s after row {at + 1} instead of "
+        f"{1.0 / axis.rate_hz:g} s: {axis.missing} rows are missing in the file, so no rate "
+        "describes it. Use the part before or after the step, or resample the record: "
+        f"{file}"
+    )
 
 
 def time_axis(time_s: Floats, file: Path, name: str = "time_s") -> TimeAxis:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -116,3 +117,12 @@ def test_bad_use_is_one_line(
     printed = capsys.readouterr()
     assert said in printed.err and printed.err.count("\n") == 1 and printed.out == ""
     assert [path.name for path in Path("full").iterdir()] == ["notes.txt"]
+
+
+def test_a_campaign_without_pyarrow_writes_nothing(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert code_of("campaign", file, "--out", "out") == 2
+    assert "pip install 'haselab[campaign]'" in capsys.readouterr().err
+    assert not Path("out").exists()

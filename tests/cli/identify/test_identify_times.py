@@ -49,6 +49,15 @@ def test_a_rate_that_contradicts_the_times_is_refused(tmp_path, method):
         ask(method, file, "--rate-hz", "100")
 
 
+@pytest.mark.parametrize("method", ["arx", "subspace", "creep", "hysteresis", "frequency-response"])
+def test_a_stated_rate_does_not_close_a_gap(tmp_path, method):
+    t, u, y = recorded()
+    kept = np.r_[0:1000, 1400:3000]
+    file = write(tmp_path / "a.csv", time_s=t[kept], u=u[kept], y=y[kept])
+    with pytest.raises(InputError, match=r"of 2\.005 s after row 1000 .* 400 rows are missing"):
+        ask(method, file, "--rate-hz", "200")
+
+
 def test_a_rate_that_agrees_with_rounded_times_is_taken(tmp_path):
     t, u, y = recorded()
     file = write(tmp_path / "a.csv", time_s=np.round(t, 3), u=u, y=y)

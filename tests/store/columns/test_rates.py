@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
+from haselab.base import InputError
 from haselab.store.columns.table import read_table
 
 T, U, Y = np.arange(40) / 100.0, np.sin(np.arange(40.0)), np.cos(np.arange(40.0))
@@ -49,3 +50,48 @@ def test_a_column_of_temperatures_does_not_hide_the_one_of_times(tmp_path):
     file.write_text("\n".join(["t,u,y,T [°C]", *rows]), encoding="utf-8")
     table = read_table(file, ["u", "y"])
     assert (table.time_name, table.rate_hz) == ("t", pytest.approx(100.0, rel=1e-9))
+
+
+def test_stored_integers_are_scaled_as_their_attributes_say(tmp_path):
+    path, y = tmp_path / "packed.h5", np.linspace(-1.0, 2.0, 100)
+    with h5py.File(path, "w") as file:
+        file["u"] = np.round(y / 1e-3).astype("i2")
+        file["u"].attrs["scale_factor"] = 1e-3
+        packed = np.round((y - 5.0) / 1e-3).astype("i2")
+        file.create_dataset("y", data=packed, chunks=(10,), compression="gzip")
+        file["y"].attrs.update({"scale_factor": np.array([1e-3]), "add_offset": 5.0})
+    table = read_table(path, ["u", "y"])
+    # Half a step of the stored numbers.
+    assert np.abs(table["u"] - y).max() <= 0.501e-3
+    assert np.abs(table["y"] - y).max() <= 0.501e-3
+
+
+def test_the_fill_value_of_a_dataset_is_no_measurement(tmp_path):
+    path, y = tmp_path / "filled.h5", np.linspace(0.0, 1.0, 100)
+    y[40:50] = -9999.0
+    with h5py.File(path, "w") as file:
+        file["y"] = y
+        file["y"].attrs["_FillValue"] = -9999.0
+    with pytest.raises(InputError, match=r"nan in row 41 \(10 such rows\)"):
+        read_table(path, ["y"])
+
+
+@pytest.mark.parametrize("late", [0, 3])
+def test_waveforms_that_begin_at_different_times_are_refused(tmp_path, late):
+    tdms = pytest.importorskip("nptdms")
+    path, begin = tmp_path / "late.tdms", np.datetime64("2026-01-01T00:00:00", "us")
+    waveform = {"wf_increment": 0.01, "wf_start_offset": 0.0}
+    channels = [
+        tdms.ChannelObject(
+            "g", name, np.arange(50.0),
+            properties={**waveform, "wf_start_time": begin + np.timedelta64(seconds, "s")},
+        )
+        for name, seconds in (("u", 0), ("y", late))
+    ]  # fmt: skip
+    with tdms.TdmsWriter(str(path)) as writer:
+        writer.write_segment(channels)
+    if late:
+        with pytest.raises(InputError, match="g/y begins 3 s after channel g/u"):
+            read_table(path, ["u", "y"])
+    else:
+        assert read_table(path, ["u", "y"]).rate_hz == pytest.approx(100.0)

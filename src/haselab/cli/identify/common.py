@@ -20,7 +20,7 @@ from haselab.cli.options import shared_option
 from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
 from haselab.models.actuator import ActuatorTables
-from haselab.pipelines.time_axis import check_rising, records_of, time_axis
+from haselab.pipelines.time_axis import check_complete, check_rising, records_of, time_axis
 from haselab.store.columns.reader import check_rate
 from haselab.store.columns.selection import ColumnOptions, check_assumed_seconds
 from haselab.store.columns.table import Table, read_table
@@ -311,7 +311,11 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
     if given is not None and 0.0 < given < float("inf"):
         rows = next(iter(table.columns.values())).size
         if table.time_s is not None and table.time_name is not None:
-            found_hz = table.rate_hz or time_axis(table.time_s, file, table.time_name).rate_hz
+            found_hz = table.rate_hz
+            if found_hz is None:
+                axis = time_axis(table.time_s, file, table.time_name)
+                check_complete(axis, file, table.time_name)
+                found_hz = axis.rate_hz
             _check_rate(table, given, found_hz, file)
         elif table.rate_hz is not None:
             check_rate(given, table.rate_hz, rows, "the file's own rate", file)
@@ -319,8 +323,8 @@ def rate_hz_of(table: Table, given: float | None, file: Path) -> float:
     if rate_hz is None and table.time_s is not None:
         check_rising(table.time_s, file, table.time_name or "time_s")
         raise InputError(
-            f"The times in {where} are uneven. Resample the record, or state the rate with "
-            f"--rate-hz: {file}"
+            f"The times in {where} are uneven. Resample the record. If no row is missing, you can "
+            f"state the rate with --rate-hz instead: {file}"
         )
     if rate_hz is None:
         why = f" {table.why_no_times}" if table.why_no_times else ""

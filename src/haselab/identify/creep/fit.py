@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,6 +51,8 @@ _BEYOND = 3.0  # record lengths: longer time constants are not identifiable
 _STRAIGHT = 0.999  # order at which a power of time counts as a straight line
 _WEAK = 2.0  # standard deviations of a gain below which its time constant is not identifiable
 _HELD_OUT = 0.25
+_NOISE = 0.1  # of the input's range: median step of an input that is noisy, ...
+_TURNED = 0.58  # ... and share of the steps that reverse
 _HELD = 0.02  # of the rows are updates of an input, at most, ...
 _MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
 _UNKNOWN = (-math.inf, math.inf)
@@ -267,6 +269,12 @@ def fit_creep(
             "the output is held between few updates, and the input changes at every row; the "
             "columns are swapped",
         )
+    if _noisy(record.u):
+        return _no_result(
+            setting,
+            "the input is noisy, as a measured one is, and its noise biases every parameter; give "
+            "the command that was held, or the mean of each level",
+        )
     found = [entry for entry in _tried(_KINDS[model], setting) if _one_sided(entry, setting)]
     if not found:
         return _no_result(setting, "no law converged; record longer")
@@ -277,7 +285,15 @@ def fit_creep(
         scores.setdefault(_kind(entry), entry.bic - best.bic)
     verdict = _kind(best) if is_decisive(scores) else _UNSURE
     verdict = _NONE_VISIBLE if verdict == _NONE else verdict
-    return _describe(setting, scored, scores, verdict, stepped)
+    fit = _describe(setting, scored, scores, verdict, stepped)
+    if record.hold == "zero":
+        return fit
+    half_s = 0.5 / record.input_rate_hz
+    moved = (
+        f"The input is {record.hold}, but is treated as held from sample to sample: the creep may "
+        f"begin {half_s:.3g} s earlier or later. Leave out more with --leave-out-s if this matters."
+    )
+    return replace(fit, notes=(*fit.notes, moved))
 
 
 def _rest(record: Record) -> float:
@@ -318,6 +334,16 @@ def _swapped(u: Floats, y: Floats) -> bool:
     """Whether the output is held like an input while the input varies like an output."""
     updates, moves = (np.count_nonzero(np.diff(column)) for column in (y, u))
     return bool(updates <= _HELD * u.size and moves >= _MOVING * u.size)
+
+
+def _noisy(u: Floats) -> bool:
+    """Whether most rows only differ by noise, whose differences reverse two times out of three."""
+    steps = np.diff(u)
+    if np.count_nonzero(steps) < _MOVING * steps.size:
+        return False
+    small = float(np.median(np.abs(steps))) < _NOISE * float(np.ptp(u))
+    turned = np.count_nonzero(steps[1:] * steps[:-1] < 0.0)
+    return bool(small and turned > _TURNED * steps.size)
 
 
 def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:

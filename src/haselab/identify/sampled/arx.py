@@ -5,17 +5,26 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, InputError, JsonObject, ResultError, check_fields, checked
+from haselab.base import (
+    Estimate,
+    InputError,
+    JsonObject,
+    ResultError,
+    check_fields,
+    checked,
+)
 from haselab.base.chart import Chart
+from haselab.base.estimate import Z95
 from haselab.identify.fit import RecordFit
-from haselab.identify.noise import fit_percent, whiteness_p
+from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.record import Record, finite_vector
+from haselab.identify.sampled.arx_bias import instrumental_numbers, regressors
 from haselab.identify.sampled.record import (
     check_same_rate,
     sampled_chart,
@@ -33,7 +42,10 @@ _MOST = {"na": 12, "nb": 64, "nk": 1000}
 _SEARCH_ORDER = 4
 _SEARCH_DELAY = 12
 _WHITE = 0.05
-_BIASED = 10.0  # per cent by which prediction may fit better than simulation without a note
+_COLOURED = 1e-3  # whiteness below which a difference from unbiased coefficients counts
+_BIASED = 1.5  # times the error of a simulation with unbiased coefficients: no result
+_LEVEL = 2.5  # standard deviations of a constant that is part of the equation
+_UNKNOWN = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,11 @@ class ArxOrders:
     def memory(self) -> int:
         """Number of samples before the first predicted one."""
         return max(self.na, self.nb + self.nk - 1)
+
+    @property
+    def numbers(self) -> tuple[int, int, int]:
+        """na, nb and nk."""
+        return self.na, self.nb, self.nk
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,12 +133,25 @@ class ArxFit(RecordFit[Record]):
 
     @property
     def static_gain(self) -> Estimate:
-        """Static gain: output per input in steady state."""
+        """Static gain: output per input in steady state, with Fieller's interval.
+
+        Not identifiable if the poles may as well be those of an integrator.
+        """
         model = self._fitted()
-        below = float(model.denominator.sum())
-        by_a = np.full(self.orders.na, -model.static_gain / below)
-        slope = np.concatenate([by_a, np.full(self.orders.nb, 1.0 / below)])
-        return Estimate.normal(model.static_gain, math.sqrt(slope @ self.covariance @ slope), "")
+        above, below = float(model.b.sum()), float(model.denominator.sum())
+        sums = np.zeros((2, self.orders.na + self.orders.nb))
+        sums[0, self.orders.na :], sums[1, : self.orders.na] = 1.0, 1.0
+        (by_b, both), (_, by_a) = sums @ self.covariance @ sums.T
+        # All gains g for which above - g below is within 1.96 of its standard deviations of 0.
+        square = below**2 - Z95**2 * by_a
+        middle = above * below - Z95**2 * both
+        root = middle**2 - square * (above**2 - Z95**2 * by_b)
+        if not square > 0.0 or not root >= 0.0:
+            return Estimate(math.nan, math.inf, _UNKNOWN, "")
+        gain = above / below
+        spread = max(float(by_b - 2.0 * gain * both + gain**2 * by_a), 0.0)
+        ends = (middle - math.sqrt(root)) / square, (middle + math.sqrt(root)) / square
+        return Estimate(gain, math.sqrt(spread) / abs(below), (float(ends[0]), float(ends[1])), "")
 
     @property
     def modes(self) -> tuple[JsonObject, ...]:
@@ -141,9 +171,7 @@ class ArxFit(RecordFit[Record]):
                 "pole_rad_s": [float(s.real), float(s.imag)],
             }
             if real:
-                mode["time_constant_s"] = self._mode_estimate(
-                    -1.0 / s.real, (slope / s**2).real, "s"
-                )
+                mode["time_constant_s"] = self._time_constant(float(z.real), self._pole_slope(z))
             else:
                 size, turned = abs(s), slope * np.conj(s)
                 mode["natural_frequency_rad_s"] = self._mode_estimate(
@@ -160,6 +188,17 @@ class ArxFit(RecordFit[Record]):
         na = self.orders.na
         by_z = np.polyval(np.polyder(self._fitted().denominator), z)
         return np.asarray([-(z ** (na - j)) / by_z for j in range(1, na + 1)])
+
+    def _time_constant(self, z: float, slope: NDArray[np.complex128]) -> Estimate:
+        """Time constant of a real pole: the ends of the pole's interval, converted."""
+        pole = self._mode_estimate(z, slope.real, "")
+        if pole.ci95[1] >= 1.0:
+            return Estimate(math.nan, math.inf, _UNKNOWN, "s")
+        step_s = 1.0 / self.record.input_rate_hz
+        low, high = (-step_s / math.log(end) if end > 0.0 else 0.0 for end in pole.ci95)
+        return Estimate(
+            -step_s / math.log(z), pole.std * step_s / (z * math.log(z) ** 2), (low, high), "s"
+        )
 
     def _mode_estimate(self, value: float, slope: Floats, unit: str) -> Estimate:
         part = self.covariance[: self.orders.na, : self.orders.na]
@@ -209,6 +248,8 @@ class ArxFit(RecordFit[Record]):
         }
 
     def _continuous(self) -> dict[str, Any] | None:
+        if self.record.hold != "zero":
+            return None
         try:
             top, bottom, delay_s = self._fitted().continuous()
         except ResultError:
@@ -259,27 +300,41 @@ def fit_arx(
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
     if orders is None:
-        orders = _chosen(inputs, outputs, criterion)
+        least_delay = 1 if record.hold == "zero" else 0
+        orders = _chosen(inputs, outputs, criterion, level=remove_means, least_delay=least_delay)
     least = orders.memory + 2 * (orders.na + orders.nb)
     if inputs.size <= least:
         raise InputError(
             f"The record has {inputs.size} samples; it must have more than {least} for na = "
             f"{orders.na}, nb = {orders.nb}, nk = {orders.nk}. Record longer, or lower the orders."
         )
-    return _fit(record, inputs, outputs, orders, point)
+    level = remove_means and _has_level(inputs, outputs, orders)
+    return _fit(record, inputs, outputs, orders, point, level)
 
 
-def _regressors(u: Floats, y: Floats, orders: ArxOrders, first: int) -> Floats:
-    """Earlier outputs with their sign turned, then inputs, from sample `first` on."""
-    k = np.arange(first, y.size)
-    past = [-y[k - i] for i in range(1, orders.na + 1)]
-    drive = [u[k - orders.nk - j] for j in range(orders.nb)]
-    return np.column_stack([*past, *drive])
+@dataclass(frozen=True)
+class _Solved:
+    """Least-squares solution.
+
+    Args:
+        numbers: `a`, then `b`.
+        covariance: of them.
+        errors: prediction errors.
+        columns: regressors. Shape `(M, P)`, with a column of ones if there is a level.
+        level: the constant of the equation and its standard deviation; 0 if it has none.
+    """
+
+    numbers: Floats
+    covariance: Floats
+    errors: Floats
+    columns: Floats
+    level: tuple[float, float] = (0.0, math.inf)
 
 
-def _solved(u: Floats, y: Floats, orders: ArxOrders) -> tuple[Floats, Floats, Floats]:
-    """Coefficients, their covariance and the prediction errors."""
-    columns = _regressors(u, y, orders, orders.memory)
+def _solved(u: Floats, y: Floats, orders: ArxOrders, *, level: bool) -> _Solved:
+    """Solve the equations, with a constant if asked to."""
+    columns = regressors(u, y, orders.numbers, orders.memory)
+    columns = np.hstack([columns, np.ones((columns.shape[0], int(level)))])
     target = y[orders.memory :]
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0.0] = 1.0
@@ -292,28 +347,41 @@ def _solved(u: Floats, y: Floats, orders: ArxOrders) -> tuple[Floats, Floats, Fl
     covariance = (right.T / sizes**2) @ right * float(errors @ errors) / freedom
     blind = (np.abs(right[~regular]) > 1e-6).any(axis=0)
     covariance[blind, blind] = np.inf
-    return numbers, covariance / np.outer(scale, scale), errors
+    covariance = covariance / np.outer(scale, scale)
+    if not level:
+        return _Solved(numbers, covariance, errors, columns)
+    constant = float(numbers[-1]), math.sqrt(max(float(covariance[-1, -1]), 0.0))
+    return _Solved(numbers[:-1], covariance[:-1, :-1], errors, columns, constant)
 
 
-def _chosen(u: Floats, y: Floats, criterion: str) -> ArxOrders:
+def _has_level(u: Floats, y: Floats, orders: ArxOrders) -> bool:
+    """Whether the means are no operating point, as of a record that begins far from them."""
+    constant, std = _solved(u, y, orders, level=True).level
+    return abs(constant) > _LEVEL * std
+
+
+def _chosen(u: Floats, y: Floats, criterion: str, *, level: bool, least_delay: int) -> ArxOrders:
     """The orders of the lowest criterion; all are compared on the samples left by the largest."""
     most_delay = min(_SEARCH_DELAY, max(1, y.size // 8))
-    largest = ArxOrders(_SEARCH_ORDER, most_delay + _SEARCH_ORDER - 1, 1)
-    all_columns = np.column_stack([_regressors(u, y, largest, largest.memory), y[largest.memory :]])
+    drives = most_delay + _SEARCH_ORDER - least_delay
+    largest = ArxOrders(_SEARCH_ORDER, drives, least_delay)
+    columns = regressors(u, y, largest.numbers, largest.memory)
+    ones = np.ones((columns.shape[0], int(level)))
+    all_columns = np.column_stack([ones, columns, y[largest.memory :]])
     # Least squares on the triangular factor equals that on the record for any choice of columns.
     triangle: Floats = np.asarray(np.linalg.qr(all_columns, mode="r"))
     count = all_columns.shape[0]
     floor = count * (1e-12 * float(np.ptp(y))) ** 2
     best, lowest = ArxOrders(1, 1, 1), math.inf
     counts = range(1, _SEARCH_ORDER + 1)
-    for na, nb, nk in itertools.product(counts, counts, range(1, most_delay + 1)):
-        if nb > na:
+    delays = range(least_delay, most_delay + 1)
+    for na, nb, nk in itertools.product(counts, range(1, _SEARCH_ORDER + 2), delays):
+        if nb > na + (nk == 0) or nb + nk - least_delay > drives:
             continue
-        outputs = np.arange(na)
-        drives = _SEARCH_ORDER + nk - 1 + np.arange(nb)
-        columns = triangle[:, np.concatenate([outputs, drives])]
-        numbers = np.linalg.lstsq(columns, triangle[:, -1], rcond=None)[0]
-        cost = float(((triangle[:, -1] - columns @ numbers) ** 2).sum())
+        kept = np.concatenate([np.arange(na), _SEARCH_ORDER + nk - least_delay + np.arange(nb)])
+        kept = np.concatenate([np.arange(int(level)), level + kept])
+        numbers = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
+        cost = float(((triangle[:, -1] - triangle[:, kept] @ numbers) ** 2).sum())
         score = _criteria(cost + floor, count, na + nb)[criterion]
         if score < lowest:
             best, lowest = ArxOrders(na, nb, nk), score
@@ -329,51 +397,90 @@ def _criteria(cost: float, count: int, numbers: int) -> dict[str, float]:
 
 
 def _fit(
-    record: Record, u: Floats, y: Floats, orders: ArxOrders, point: tuple[float, float]
+    record: Record, u: Floats, y: Floats, orders: ArxOrders, point: tuple[float, float], level: bool
 ) -> ArxFit:
     rate_hz = record.input_rate_hz
-    numbers, covariance, errors = _solved(u, y, orders)
+    solved = _solved(u, y, orders, level=level)
+    numbers, errors = solved.numbers, solved.errors
     model = ArxModel(numbers[: orders.na], numbers[orders.na :], orders.nk, rate_hz)
     criteria = _criteria(float(errors @ errors), errors.size, numbers.size)
-    simulated = _simulation_percent(model, u, y)
-    predicted = fit_percent([y[orders.memory :]], [y[orders.memory :] - errors])
     whiteness = whiteness_p([errors])
-    status = "ok"
+    status, covariance = "ok", solved.covariance
     if not np.isfinite(np.diag(covariance)).all():
         status = (
             "no result: the data do not support these orders; lower na or nb, or excite "
             "the plant with more frequencies"
         )
+    elif whiteness < _WHITE:
+        status, covariance = _with_bias(solved, u, y, orders, rate_hz, whiteness)
     names = [f"a_{i + 1}" for i in range(orders.na)] + [f"b_{i + 1}" for i in range(orders.nb)]
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     estimates = {
         name: Estimate.normal(value, spread, "")
         for name, value, spread in zip(names, numbers, std, strict=True)
     }
-    return ArxFit(
+    below = float(model.denominator.sum())
+    if level and below > Z95 * math.sqrt(max(float(covariance[: orders.na, : orders.na].sum()), 0)):
+        point = point[0], point[1] + solved.level[0] / below
+    fit = ArxFit(
         status=status,
         parameters=estimates if status == "ok" else {},
         covariance=covariance,
         residuals=(errors,),
-        notes=_notes(model, simulated, predicted, whiteness),
         orders=orders,
         model=model if status == "ok" else None,
         record=record,
         operating_point=point,
-        fit_percent=simulated,
-        prediction_fit_percent=predicted,
-        validation_fit_percent=_validation_percent(u, y, rate_hz, orders),
+        fit_percent=_simulation_percent(model, u, y, level=level),
+        prediction_fit_percent=fit_percent([y[orders.memory :]], [y[orders.memory :] - errors]),
+        validation_fit_percent=_validation_percent(u, y, rate_hz, orders, level=level),
         residual_whiteness_p=whiteness,
         aic=criteria["aic"],
         bic=criteria["bic"],
     )
+    return replace(fit, notes=_notes(fit, model))
 
 
-def _simulation_percent(model: ArxModel, u: Floats, y: Floats) -> float:
+def _with_bias(
+    solved: _Solved, u: Floats, y: Floats, orders: ArxOrders, rate_hz: float, whiteness: float
+) -> tuple[str, Floats]:
+    """Status, and a covariance that includes the bias, where the prediction errors are coloured."""
+    size, level = solved.numbers.size, solved.columns.shape[1] > solved.numbers.size
+    wide = coloured_covariance([solved.columns], [solved.errors], solved.columns.shape[1])
+    covariance = wide[:size, :size]
+    free = instrumental_numbers(u, y, orders.numbers, orders.memory, level=level)
+    if free is None or not np.isfinite(covariance).all():
+        return "ok", solved.covariance if free is None else covariance
+    fits = [
+        _simulation_percent(
+            ArxModel(each[: orders.na], each[orders.na : size], orders.nk, rate_hz), u, y,
+            level=level,
+        )
+        for each in (solved.numbers, free)
+    ]  # fmt: skip
+    off = solved.numbers - free[:size]
+    covariance = covariance + np.outer(off, off)
+    errors = [100.0 - fit for fit in fits]
+    if not math.isfinite(errors[0]) and math.isfinite(errors[1]):
+        errors[0] = math.inf
+    if whiteness < _COLOURED and errors[0] > _BIASED * errors[1]:
+        shown = f"fits to {fits[0]:.0f} %" if math.isfinite(fits[0]) else "is not possible"
+        return (
+            f"no result: noise biases the coefficients: their simulation {shown}, that of "
+            f"instrumental variables of the same orders to {fits[1]:.0f} %, and the prediction "
+            f"errors are not white (p = {whiteness:.2g}). Use `haselab identify transfer`"
+        ), covariance
+    return "ok", covariance
+
+
+def _simulation_percent(model: ArxModel, u: Floats, y: Floats, *, level: bool) -> float:
     """Fit of the output simulated from the input alone, with the best initial state."""
     if not model.is_stable:
         return math.nan
     free = _free(model, y.size)
+    if level:
+        constant = lfilter([1.0], model.denominator, np.ones(y.size))
+        free = np.column_stack([free, constant])
     forced = model.simulate(u)
     state = np.linalg.lstsq(free, y - forced, rcond=None)[0]
     return fit_percent([y], [forced + free @ state])
@@ -387,33 +494,39 @@ def _free(model: ArxModel, count: int) -> Floats:
     return np.asarray(lfilter([1.0], model.denominator, starts, axis=0))
 
 
-def _validation_percent(u: Floats, y: Floats, rate_hz: float, orders: ArxOrders) -> float:
+def _validation_percent(
+    u: Floats, y: Floats, rate_hz: float, orders: ArxOrders, *, level: bool
+) -> float:
     """Fit to three quarters of the record, validated on the last quarter."""
     cut = (3 * y.size) // 4
     if min(cut, y.size - cut) <= orders.memory + 2 * (orders.na + orders.nb):
         return math.nan
-    numbers = _solved(u[:cut], y[:cut], orders)[0]
+    numbers = _solved(u[:cut], y[:cut], orders, level=level).numbers
     model = ArxModel(numbers[: orders.na], numbers[orders.na :], orders.nk, rate_hz)
-    return _simulation_percent(model, u[cut:], y[cut:])
+    return _simulation_percent(model, u[cut:], y[cut:], level=level)
 
 
-def _notes(
-    model: ArxModel, simulated: float, predicted: float, whiteness: float
-) -> tuple[str, ...]:
+def _notes(fit: ArxFit, model: ArxModel) -> tuple[str, ...]:
     notes = []
     if not model.is_stable:
         notes.append("The equation is unstable, so it cannot be simulated; lower the orders.")
-    elif predicted - simulated > _BIASED and simulated < 90.0:
+    if fit.residual_whiteness_p < _WHITE:
         notes.append(
-            f"The output is predicted to {predicted:.0f} % but simulated to {simulated:.0f} % "
-            "only, so the dynamics are biased by noise. Use `haselab identify transfer`."
+            f"The prediction errors are not white (p = {fit.residual_whiteness_p:.2g}), so noise "
+            "biases the coefficients. The intervals include the difference from an estimate with "
+            "instrumental variables. Raise the orders, or use `haselab identify transfer`."
         )
-    if whiteness < _WHITE:
+    if fit.model is not None and math.isnan(fit.static_gain.value):
         notes.append(
-            f"The prediction errors are not white (p = {whiteness:.2g}): the coefficients are "
-            "biased and the intervals too narrow. Raise the orders, or use `haselab identify "
-            "transfer`."
+            "The static gain is not identifiable: within the intervals the plant may be an "
+            "integrator. Record longer."
         )
     if not model.has_continuous:
         notes.append("A pole at z <= 0 has no continuous counterpart; lower na.")
+    if fit.record.hold != "zero":
+        notes.append(
+            f"The input is {fit.record.hold}, not held, so the continuous transfer function is not "
+            "computed and the equation is valid for such inputs only. `fit_transfer` takes any "
+            "hold."
+        )
     return tuple(notes)

@@ -22,6 +22,7 @@ from haselab.identify.record import Record, finite_vector, record_notes
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.checks.ambiguity import OtherMinimum, ambiguity, find_other_minima
 from haselab.identify.transfer.checks.diagnosis import diagnose
+from haselab.identify.transfer.feedback import feedback_p
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer.parameters import (
     covariance_table,
@@ -50,6 +51,13 @@ _RELATED = 1e-3
 _UNEXPLAINED = (
     "no result: the model explains {:.1f} % of the output, and the residuals still follow the "
     "input; check --input and --output, or fit more poles"
+)
+_FEEDBACK = 1e-6  # probability below which the input follows the residuals
+_NO_DISTURBANCE = 99.0  # per cent of fit above which no disturbance matters
+_FED_BACK = (
+    "The residuals predict the input. If a loop was closed during the record, disturbances that "
+    "are not white bias the gain and the delay, by more than their intervals if the residuals are "
+    "large. Record with the loop open, or move the reference more."
 )
 _RESTING = (
     "A step at t = 0 is indistinguishable from an initial state; rest before it is assumed. "
@@ -327,6 +335,8 @@ def _fitted(
         fit = fit if why is None else replace(fit, status=why, ambiguous=False)
     if fit.succeeded and fit.fit_percent < _LITTLE and fit.input_correlation_p < _RELATED:
         fit = replace(fit, status=_UNEXPLAINED.format(fit.fit_percent))
+    if fit.succeeded and _is_fed_back(fit):
+        fit = replace(fit, notes=(*fit.notes, _FED_BACK))
     alone = all(np.ptp(record.u) == 0.0 for record in records)
     if fit.succeeded or not (structure.initial_state and alone):
         return fit
@@ -374,6 +384,13 @@ def _fit(
     if found.fault is not None:
         fit = replace(fit, status=found.fault, ambiguous=False)
     return replace(fit, notes=(*fit.notes, *found.notes))
+
+
+def _is_fed_back(fit: TransferFit) -> bool:
+    """Whether disturbances came back through the input; white ones do not bias the fit."""
+    if fit.residual_whiteness_p >= _RELATED or fit.fit_percent > _NO_DISTURBANCE:
+        return False
+    return feedback_p(fit.records, fit.residuals) < _FEEDBACK
 
 
 def _doubtful(fit: TransferFit) -> bool:

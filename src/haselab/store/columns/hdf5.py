@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import zlib
 from collections.abc import Callable, Sequence
@@ -211,7 +212,10 @@ class Hdf5Archive(MemberArchive):
                 return _one_value(dataset)
             return chunked_reader(dataset, int(np.argmax(dataset.shape)), self._open)
 
-        return Member(dataset.shape, dataset.dtype, start)
+        packing = _packing(dataset)
+        if packing is None:
+            return Member(dataset.shape, dataset.dtype, start)
+        return Member(dataset.shape, np.dtype(np.float64), lambda: _unpacked(start(), *packing))
 
     def rate_hz(self, names: Sequence[str]) -> float | None:
         """A dataset of one number, or what the attributes of the file and the columns agree on."""
@@ -232,6 +236,32 @@ class Hdf5Archive(MemberArchive):
             if isinstance(value, str) and value.strip():
                 return value
         return super().unit_text(full)
+
+
+def _packing(dataset: h5py.Dataset) -> tuple[float, float, float] | None:
+    """Factor, offset and fill value that the attributes state; None where they change nothing.
+
+    Source: CF Conventions 1.11, sections 2.5.1 and 8.1.
+    """
+    if dataset.dtype.kind not in "iuf":
+        return None
+    stated = []
+    for key, default in (("scale_factor", 1.0), ("add_offset", 0.0), ("_FillValue", math.nan)):
+        value = dataset.attrs.get(key)
+        number = np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf"
+        stated.append(float(np.reshape(value, -1)[0]) if number else default)
+    factor, offset, fill = stated
+    return None if (factor, offset) == (1.0, 0.0) and math.isnan(fill) else (factor, offset, fill)
+
+
+def _unpacked(read: Read, factor: float, offset: float, fill: float) -> Read:
+    """Numbers that are stored scaled; a missing one is NaN."""
+
+    def unpacked(count: int) -> NDArray[Any]:
+        stored = np.asarray(read(count), dtype=np.float64)
+        return np.where(stored == fill, math.nan, stored * factor + offset)
+
+    return unpacked
 
 
 def _one_value(dataset: h5py.Dataset) -> Read:

@@ -74,6 +74,7 @@ class TdmsArchive(MemberArchive):
         """A channel of one number, or the increment that the waveforms of all columns share."""
         stated = super().rate_hz(names)
         waveforms = [self._channels[name].properties for name in names]
+        self._check_starts(names)
         if stated is not None or len({each.get("wf_start_offset", 0.0) for each in waveforms}) > 1:
             return stated
         return one_rate(
@@ -81,6 +82,24 @@ class TdmsArchive(MemberArchive):
             for each in waveforms
             if (step := positive(each.get("wf_increment"))) and (unit_s := _seconds(each))
         )
+
+    def _check_starts(self, names: Sequence[str]) -> None:
+        """Refuse channels that began at different times: their rows do not belong together."""
+        found = {name: self._channels[name].properties for name in names}
+        starts = {n: each["wf_start_time"] for n, each in found.items() if "wf_start_time" in each}
+        if len(starts) < 2 or any(positive(e.get("wf_increment")) is None for e in found.values()):
+            return
+        began = {name: np.datetime64(start, "us") for name, start in starts.items()}
+        first, last = min(began, key=began.__getitem__), max(began, key=began.__getitem__)
+        late_s = float((began[last] - began[first]) / np.timedelta64(1, "s"))
+        step_s = min(
+            float(each["wf_increment"]) * (_seconds(each) or 1.0) for each in found.values()
+        )
+        if late_s > 0.5 * step_s:
+            raise InputError(
+                f"Channel {last} begins {late_s:.6g} s after channel {first} (wf_start_time), so "
+                f"their rows do not belong together. Export them on one time axis: {self.file}"
+            )
 
     def unit_text(self, full: str) -> str:
         """The channel's property `unit_string`, else what its name states."""

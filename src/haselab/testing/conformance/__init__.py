@@ -16,8 +16,12 @@ Example:
     ...         return path
 """
 
-from haselab.testing.conformance.bench import BenchConformance
-from haselab.testing.conformance.instruments import (
+from haselab.store.optional import library
+
+library("pytest", "test")  # in one clear line, before the modules that import it
+
+from haselab.testing.conformance.bench import BenchConformance  # noqa: E402
+from haselab.testing.conformance.instruments import (  # noqa: E402
     BlockTimer,
     CameraConformance,
     GeneratorConformance,

@@ -227,6 +227,9 @@ class LiveBench:
             f"Manual drive changes by {_RAMP_V_PER_S:g} V/s ({1e-3 * output_v_per_s:g} kV/s at the "
             "output)."
         )
+        if self._loop is not None:
+            highest_v = self._loop.voltage_map.voltage_v(self._loop.saturation.high)
+            manual += f" A closed loop may use up to {float(highest_v):.3g} V."
         return {"number": self._request.number, "limits": f"{self._request.limits} {manual}",
                 "reason": self._request.reason}  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from fractions import Fraction
 
@@ -11,6 +12,7 @@ import pytest
 import tifffile
 
 from haselab.cli.main import main
+from haselab.pipelines.tracking.points import Points, name_gauge
 from haselab.store.manifest import seal
 
 COLUMNS = ["frame", "time_s", "point", "x_px", "y_px", "std_x_px", "std_y_px", "quality", "valid"]
@@ -391,6 +393,20 @@ def test_a_sheet_without_clamp_dots_gets_three_points_near_either_end(tmp_path, 
     assert all(places[f"upper{k}"] < 82 for k in (1, 2, 3))
     last = read(tmp_path / "t-strain.csv")[-1]
     assert float(last["strain"]) == pytest.approx(0.02, abs=5 * float(last["strain_std"]))
+
+
+def test_a_tilted_gauge_and_a_missing_one_are_named():
+    x, y = np.meshgrid(np.linspace(0, 200, 9), np.linspace(0, 200, 9))
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+
+    def named(place_px):
+        return name_gauge(Points([f"p{k}" for k in range(len(place_px))], place_px, 21))
+
+    assert "tilted" not in named(grid).gauge
+    sheared = named(grid @ [[1.0, 0.0], [0.35, 1.0]])  # no particle is below another
+    assert re.search(r"tilted by \d+\.\d deg, and the strain is along it", sheared.gauge)
+    bare = named(grid[(y.ravel() > 30) | (x.ravel() < 40)])
+    assert bare.gauge == "" and "no strain: there are fewer than three" in bare.chosen[-1]
 
 
 def test_an_overlay_video_shows_every_frame(clip, tmp_path):

@@ -197,3 +197,10 @@ def test_a_plant_of_negative_gain_is_refused_with_the_way_out(tmp_path, capsys):
     path.write_text(json.dumps({"plant": Plant(-1.0, 32.1, 0.12).to_dict()}))
     code, _, error = run(capsys, "design", path)
     assert code == 2 and "Negate the input column" in error and "--limits" in error
+
+
+def test_margins_of_a_derivative_without_its_filter_say_so(model, capsys):
+    words = ("margins", model, "--kp", 0.5, "--ki", 2.0, "--kd", 0.01)
+    code, _, error = run(capsys, *words)
+    assert code == 0 and "the derivative is not filtered" in error and error.count("\n") == 1
+    assert run(capsys, *words, "--derivative-filter-s", 0.02)[::2] == (0, "")

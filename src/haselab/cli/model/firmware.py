@@ -304,12 +304,12 @@ def _step_of(design: ChipDesign) -> float:
 def _twin(
     run: Path, reading: Literal["rad", "hz"] | None, twin: Path | None, draw: int | None
 ) -> TwinConfig:
-    """The twin of the options, else that of the run in the folder, else the default one."""
+    """The twin of the options, else that of the run in this folder, else the default one."""
     if twin is not None or draw is not None:
         config = twin_of_options(reading, twin, 1, draw).configuration(Path())
         name_origin(config)
         return config
-    results = run / "results.json"
+    results = (run if run.is_dir() else run.parent) / "results.json"
     if reading is None and results.is_file():
         known = twin_of(table_at(read_json(results), "provenance", "rig_config"))
         if known is not None:

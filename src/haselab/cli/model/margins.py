@@ -75,6 +75,12 @@ def command(
                 "(and --kd and --derivative-filter-s if needed), or none of them."
             )
         gains = PidGains(*(value or 0.0 for value in given))
+        if gains.kd and derivative_filter_s is None:
+            click.echo(
+                "haselab: warning: the derivative is not filtered; give the filter with "
+                "--derivative-filter-s",
+                err=True,
+            )
     elif held is not None:
         gains = feedback_of(held, setting.rate_hz)
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,6 +56,11 @@ _WIDENED = 1.1  # ratio of the deviations when points do not fit their neighbour
 _STRAIGHT_ROW = 0.05  # scatter of a row of fiducials across it, relative to the rows' distance
 _FEWEST_FOR_GAUGE = 30
 _GAUGE_BAND = 0.12  # of the height of all particles, from either end
+_TILTED_DEG = 1.0  # of the gauge, above which it is stated
+_NO_GAUGE = (
+    f"no strain: there are fewer than three particles within {100 * _GAUGE_BAND:g} % of the height "
+    "of either end"
+)
 _SUBSET_PX = (15, 41)  # least, most
 _CLAMP_SUBSET_PX = 21
 _SUBSET_SIGMAS = 7.0
@@ -278,25 +284,33 @@ def name_gauge(points: Points) -> Points:
     x, y = points.place_px.T
     top, bottom = float(y.min()), float(y.max())
     band = _GAUGE_BAND * (bottom - top)
-    names = list(points.names)
+    names, middles = list(points.names), []
+    across = x.min() + np.array([0.25, 0.5, 0.75]) * np.ptp(x)
     for name, near, level in (
         ("upper", y < top + band, top),
         ("lower", y > bottom - band, bottom),
     ):
         chosen: list[int] = []
-        for share in (0.25, 0.5, 0.75):
-            place = np.array([x.min() + share * np.ptp(x), level])
-            away = np.where(near, np.hypot(x - place[0], y - place[1]), np.inf)
+        for place in across:
+            along = (y - level) if name == "upper" else 0.0
+            away = np.where(near, np.hypot(x - place, along), np.inf)
             away[chosen] = np.inf
             chosen.append(int(np.argmin(away)))
         if not near[chosen].all() or len(set(chosen)) < 3:
-            return points
+            return replace(points, chosen=(*points.chosen, _NO_GAUGE))
+        across = x[chosen]  # the lower ones are those below them, so that the line is hardly tilted
+        middles.append(points.place_px[chosen].mean(axis=0))
         for k, index in enumerate(sorted(chosen, key=lambda index: x[index]), 1):
             names[index] = f"{name}{k}"
     reason = (
         "no clamp dots: upper1-3, lower1-3 are the particles nearest to a quarter, the middle and "
         f"three quarters of the width, within {100 * _GAUGE_BAND:g} % of the height of either end"
     )
+    tilt_deg = math.degrees(math.atan2(*np.abs(middles[1] - middles[0])))
+    if tilt_deg > _TILTED_DEG:
+        reason += (
+            f"; the line between them is tilted by {tilt_deg:.1f} deg, and the strain is along it"
+        )
     return replace(points, names=names, gauge=reason)
 
 

@@ -358,12 +358,13 @@ class _Server:
         gap_s = reader.gap_s if reader is not None else math.nan
         times = {
             "clock_s": self._bench.clock_s,
-            "end_s": None if math.isnan(end_s) else end_s,
-            "gap_s": None if math.isnan(gap_s) else gap_s,
+            "end_s": end_s,
+            "gap_s": gap_s,
             "age_s": min(self._bench.age_s(), 1e9),
-            "written_s": None if reader is None or math.isnan(end_s) else reader.written_s,
+            "written_s": reader.written_s if reader is not None else math.nan,
         }
-        text = f'{{"state": {self._bench.state_text}, {json.dumps(times)[1:]}'.encode()
+        known = {name: None if math.isnan(at_s) else at_s for name, at_s in times.items()}
+        text = f'{{"state": {self._bench.state_text}, {json.dumps(known)[1:]}'.encode()
         text += b" " * (-len(text) % 8)
         head = _HEAD.pack(
             SCHEMA, 0, tick, monitors.start_s, monitors.step_s, signals.start_s,

@@ -1,12 +1,12 @@
-"""Ticks that a study misses or is late for: without a panel, with one page, and with eight.
+"""Outputs that a study misses or gives late: without a panel, with one page, and with eight.
 
 `python -m benchmarks.rig.panel_disturbance [--seconds 60] [--rounds 1]`
 
 The twin is served by a process of its own and follows the wall clock, behind the drivers of the
 real instruments. `haselab run` plays a study of triangles on it, and the panel plays the same study
 with one page open and with eight, one of which is frozen: it neither reads nor answers. The ways
-take turns. A tick is an output, one every 10 ms; it is late if more than half of the available time
-had passed. A study that trips has missed all.
+take turns. There is one output every 10 ms; it is late if more than half of the available time had
+passed. A study that trips has missed all.
 """
 
 import argparse
@@ -41,7 +41,7 @@ frame_rate_hz = 200.0
 
 
 def counted(folder: Path) -> tuple[int, int]:
-    """Late and missed ticks in the only recording below a folder."""
+    """Late and missed outputs in the only recording below a folder."""
     (session,) = folder.glob("**/session.h5")
     with SessionReader(session) as reader:
         texts = " ".join(text for _, text in reader.events() if text.startswith("deadlines of"))
@@ -69,7 +69,7 @@ async def play(host: str, token: str, pages: int, seconds: float) -> None:
 
 
 def played(pages: int, seconds: float) -> tuple[float, float]:
-    """Late and missed ticks of a study with some pages; 0: without a panel."""
+    """Late and missed outputs of a study with some pages; 0: without a panel."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         study = folder / "triangles.toml"
@@ -106,7 +106,7 @@ def rows(seconds: float = 60.0, rounds: int = 3) -> Iterator[Row]:
         which = {0: "without a panel", 1: "1 page"}.get(pages, f"{pages} pages, one frozen")
         goal = found[0, 1] if pages else None
         note = f"{late:g} late"
-        yield Row(f"ticks missed in a study, {which}", missed, of, goal, False, note)
+        yield Row(f"outputs missed in a study, {which}", missed, of, goal, False, note)
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ frame_rate_hz = 200.0
 PACE = 0.2  # of the wall clock, so that a busy machine queues its outputs in time
 
 
-def test_a_clock_that_goes_on_while_the_bench_is_armed_is_no_gap(
+def test_blocks_that_pass_while_a_bench_is_armed_are_not_a_gap(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a pace, as on a real bench, blocks pass while the instruments are set."""

@@ -48,8 +48,8 @@ class StepNumbers:
         if rings <= _RINGS:
             return ""
         return (
-            f"the step rings by {100.0 * rings:.0f} % of its size, so its rise time, from which "
-            "the ringing is averaged out, is not well defined"
+            f"the step response rings by {100.0 * rings:.0f} % of the step, so its rise time with "
+            "the ringing averaged out is not well defined"
         )
 
 

@@ -228,8 +228,7 @@ class LiveBench:
             "output)."
         )
         if self._loop is not None:
-            highest_v = self._loop.voltage_map.voltage_v(self._loop.saturation.high)
-            manual += f" A closed loop may use up to {float(highest_v):.3g} V."
+            manual += f" In closed loop: up to {self._loop_v():.3g} V at the amplifier's input."
         return {"number": self._request.number, "limits": f"{self._request.limits} {manual}",
                 "reason": self._request.reason}  # fmt: skip
 
@@ -265,8 +264,8 @@ class LiveBench:
                 self._leases.require_in_time(at_s)
             except SafetyError:
                 reason = (
-                    "Arming took too long, so the bench was taken to 0 V again. Find the "
-                    "instrument that is slow, then arm the bench again."
+                    "Arming took too long, so the bench was taken to 0 V. Check the instruments "
+                    "and the CPU load, then arm the bench again."
                 )
                 self._end(reason)
                 raise SafetyError(reason) from None
@@ -320,6 +319,13 @@ class LiveBench:
         if self._holder and holder != self._holder and what not in ("disarm", "leave", "cancel"):
             raise SafetyError("Another page has armed the bench. It must disarm the bench first.")
 
+    def _loop_v(self) -> float:
+        """Highest drive of the closed loop, in V; of a contraction it is at the lower limit."""
+        assert self._loop is not None
+        limits = self._loop.saturation
+        ends = self._loop.voltage_map.voltage_v(np.array([limits.low, limits.high]))
+        return float(np.max(ends))
+
     def _find_request(self, values: JsonObject) -> ArmingRequest:
         if self._request is None or self._request.number != values.get("number"):
             raise SafetyError("This request is no longer valid. Press 'Arm the bench' again.")
@@ -370,7 +376,7 @@ class LiveBench:
                 f"{limits.low:g} to {limits.high:g}. Choose another one."
             )
         if self._closed is None:
-            highest_v = float(self._loop.voltage_map.voltage_v(limits.high))
+            highest_v = self._loop_v()
             if highest_v > self._limit_v:
                 raise LimitError(
                     f"The controller may use up to {highest_v:.3g} V, but the bench was armed for "

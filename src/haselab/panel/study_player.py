@@ -35,8 +35,8 @@ class StudyEndedError(HaselabError):
 class PictureFile:
     """A JPEG file of the last frame, which a reader never sees half-written.
 
-    A thread writes it: an output must not be late because of a picture. While one is written, other
-    frames are left out. Without space for it, the page keeps the picture before.
+    A thread writes it, so that a picture never delays an output. Frames that arrive meanwhile are
+    dropped. If the disk is full, the page keeps the previous picture.
 
     Args:
         path: of the file.

@@ -66,7 +66,7 @@ def check_rising(time_s: NDArray[np.float64], file: Path, name: str) -> None:
 
 
 def check_complete(axis: TimeAxis, file: Path, name: str) -> None:
-    """Refuse times between which rows are missing.
+    """Refuse times with missing rows.
 
     Args:
         axis: of the times.
@@ -81,9 +81,8 @@ def check_complete(axis: TimeAxis, file: Path, name: str) -> None:
     step_s = float(axis.time_s[at + 1] - axis.time_s[at])
     raise InputError(
         f"Column {name} has a step of {step_s:g} s after row {at + 1} instead of "
-        f"{1.0 / axis.rate_hz:g} s: {axis.missing} rows are missing in the file, so no rate "
-        "describes it. Use the part before or after the step, or resample the record: "
-        f"{file}"
+        f"{1.0 / axis.rate_hz:g} s; in the whole file {axis.missing} rows are missing. Split it at "
+        f"each gap, or resample the record: {file}"
     )
 
 

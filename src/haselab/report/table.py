@@ -88,7 +88,7 @@ def _mark(row: Quantity) -> str:
 
 
 def _widths(rows: list[list[str]], columns: int) -> list[int]:
-    """Widths of the columns; the widest after the id are narrowed until all fit, but hold a word.
+    """Widths of the columns; the widest after the id are narrowed, but never below a word.
 
     So no number is broken, even if the lines become too long.
     """

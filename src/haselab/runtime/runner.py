@@ -449,7 +449,7 @@ class Runner:
             raise self._safety.trip(
                 f"Lost deadline: outputs of {self._missed_row} blocks in a row came too late and "
                 f"were skipped (missed_limit = {limit}). Close other programs, or raise "
-                "ahead_blocks or block_samples."
+                "daq.ahead_blocks or daq.block_samples."
             )
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:

@@ -37,7 +37,7 @@ _SAFE = frozenset(
 )
 # Calls that wait for one another: two threads on one connection would mix up the replies.
 _ONE_BY_ONE = frozenset({"off", "is_off", "read_voltage", "check_power"})
-_TURN_S = 0.25  # longest such wait: then the call is made all the same
+_TURN_S = 0.25  # longest such wait; after it the call is made anyway
 _FORGETS = ("zero", "off")  # after these a driver has no earlier request left
 # Calls that request nothing themselves, but in which a driver may put out an earlier request:
 # reading a block starts a stream, pausing one writes its last value.
@@ -370,7 +370,7 @@ class _Instrument:
 
     @contextlib.contextmanager
     def _gate_turn(self, name: str) -> Iterator[None]:
-        """Wait until a call of another thread has ended, but never for long."""
+        """Wait at most `_TURN_S` until such a call of another thread has ended."""
         taken = name in _ONE_BY_ONE and self._gate_calling.acquire(timeout=_TURN_S)
         try:
             yield

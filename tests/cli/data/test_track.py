@@ -385,9 +385,7 @@ def test_a_sheet_without_clamp_dots_gets_three_points_near_either_end(tmp_path, 
     clip, out = write_clip(tmp_path / "c.mkv", images), tmp_path / "t.csv"
     assert call(clip, "--auto", "--rest-frames", 3, "--out", out, "--json") == 0
     summary = summary_of(capsys)
-    assert any(
-        "no clamp dots: upper1-3, lower1-3 are the particles" in w for w in summary["chosen"]
-    )
+    assert any("no clamp dots: upper1-3 are the particles nearest" in w for w in summary["chosen"])
     places = {row["point"]: float(row["y_px"]) for row in read(out) if row["frame"] == "0"}
     assert all(places[f"lower{k}"] > 318 for k in (1, 2, 3))
     assert all(places[f"upper{k}"] < 82 for k in (1, 2, 3))
@@ -406,7 +404,7 @@ def test_a_tilted_gauge_and_a_missing_one_are_named():
     sheared = named(grid @ [[1.0, 0.0], [0.35, 1.0]])  # no particle is below another
     assert re.search(r"tilted by \d+\.\d deg, and the strain is along it", sheared.gauge)
     bare = named(grid[(y.ravel() > 30) | (x.ravel() < 40)])
-    assert bare.gauge == "" and "no strain: there are fewer than three" in bare.chosen[-1]
+    assert bare.gauge == "" and "no strain: fewer than three" in bare.chosen[-1]
 
 
 def test_an_overlay_video_shows_every_frame(clip, tmp_path):

@@ -73,7 +73,7 @@ def test_a_step_that_rings_is_named_beside_its_rise_time(tmp_path, capsys):
     spec.write_text("rise_time_s = 0.05\novershoot = 1.0\nphase_margin_deg = 20.0\n")
     words = ("design", model, "--structure", "pi", "--spec", spec, "--accept-shortfalls")
     code, _, error = run(capsys, *words)
-    assert code == 0 and "the step rings by" in error and error.count("\n") == 1
+    assert code == 0 and "the step response rings by" in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def command(
         gains = PidGains(*(value or 0.0 for value in given))
         if gains.kd and derivative_filter_s is None:
             click.echo(
-                "haselab: warning: the derivative is not filtered; give the filter with "
+                "haselab: warning: the derivative is not filtered. Set its filter with "
                 "--derivative-filter-s",
                 err=True,
             )

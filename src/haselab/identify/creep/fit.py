@@ -272,8 +272,8 @@ def fit_creep(
     if _noisy(record.u):
         return _no_result(
             setting,
-            "the input is noisy, as a measured one is, and its noise biases every parameter; give "
-            "the command that was held, or the mean of each level",
+            "the input is noisy, which biases every parameter; use the commanded input, or the "
+            "mean of each level",
         )
     found = [entry for entry in _tried(_KINDS[model], setting) if _one_sided(entry, setting)]
     if not found:
@@ -290,8 +290,8 @@ def fit_creep(
         return fit
     half_s = 0.5 / record.input_rate_hz
     moved = (
-        f"The input is {record.hold}, but is treated as held from sample to sample: the creep may "
-        f"begin {half_s:.3g} s earlier or later. Leave out more with --leave-out-s if this matters."
+        f"The record has hold = {record.hold}, but its input is treated as held: the creep may "
+        f"begin {half_s:.3g} s earlier or later. If this matters, raise --leave-out-s."
     )
     return replace(fit, notes=(*fit.notes, moved))
 

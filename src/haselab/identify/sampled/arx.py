@@ -355,7 +355,7 @@ def _solved(u: Floats, y: Floats, orders: ArxOrders, *, level: bool) -> _Solved:
 
 
 def _has_level(u: Floats, y: Floats, orders: ArxOrders) -> bool:
-    """Whether the means are no operating point, as of a record that begins far from them."""
+    """Whether the equation needs a constant, as for a record that begins far from its means."""
     constant, std = _solved(u, y, orders, level=True).level
     return abs(constant) > _LEVEL * std
 
@@ -464,11 +464,11 @@ def _with_bias(
     if not math.isfinite(errors[0]) and math.isfinite(errors[1]):
         errors[0] = math.inf
     if whiteness < _COLOURED and errors[0] > _BIASED * errors[1]:
-        shown = f"fits to {fits[0]:.0f} %" if math.isfinite(fits[0]) else "is not possible"
+        shown = f"{fits[0]:.0f} %" if math.isfinite(fits[0]) else "not possible"
         return (
-            f"no result: noise biases the coefficients: their simulation {shown}, that of "
-            f"instrumental variables of the same orders to {fits[1]:.0f} %, and the prediction "
-            f"errors are not white (p = {whiteness:.2g}). Use `haselab identify transfer`"
+            f"no result: noise biases the coefficients (simulated fit: {shown}; with instrumental "
+            f"variables of the same orders: {fits[1]:.0f} %; prediction errors not white, "
+            f"p = {whiteness:.2g}). Use `haselab identify transfer`"
         ), covariance
     return "ok", covariance
 
@@ -513,8 +513,8 @@ def _notes(fit: ArxFit, model: ArxModel) -> tuple[str, ...]:
     if fit.residual_whiteness_p < _WHITE:
         notes.append(
             f"The prediction errors are not white (p = {fit.residual_whiteness_p:.2g}), so noise "
-            "biases the coefficients. The intervals include the difference from an estimate with "
-            "instrumental variables. Raise the orders, or use `haselab identify transfer`."
+            "may bias the coefficients. Where possible, the intervals include an estimate of this "
+            "bias. Raise the orders, or use `haselab identify transfer`."
         )
     if fit.model is not None and math.isnan(fit.static_gain.value):
         notes.append(
@@ -525,8 +525,8 @@ def _notes(fit: ArxFit, model: ArxModel) -> tuple[str, ...]:
         notes.append("A pole at z <= 0 has no continuous counterpart; lower na.")
     if fit.record.hold != "zero":
         notes.append(
-            f"The input is {fit.record.hold}, not held, so the continuous transfer function is not "
-            "computed and the equation is valid for such inputs only. `fit_transfer` takes any "
-            "hold."
+            f"The record has hold = {fit.record.hold}, so there is no continuous transfer "
+            "function, and the equation is valid for such inputs only. Use `haselab identify "
+            "transfer`, which takes any hold."
         )
     return tuple(notes)

@@ -55,9 +55,9 @@ _UNEXPLAINED = (
 _FEEDBACK = 1e-6  # probability below which the input follows the residuals
 _NO_DISTURBANCE = 99.0  # per cent of fit above which no disturbance matters
 _FED_BACK = (
-    "The residuals predict the input. If a loop was closed during the record, disturbances that "
-    "are not white bias the gain and the delay, by more than their intervals if the residuals are "
-    "large. Record with the loop open, or move the reference more."
+    "The residuals predict the input. If a loop was closed during the record, a disturbance that "
+    "is not white biases the gain and the delay, and the intervals do not include this bias. "
+    "Record in open loop, or use a larger reference signal."
 )
 _RESTING = (
     "A step at t = 0 is indistinguishable from an initial state; rest before it is assumed. "

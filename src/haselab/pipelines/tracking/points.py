@@ -58,8 +58,8 @@ _FEWEST_FOR_GAUGE = 30
 _GAUGE_BAND = 0.12  # of the height of all particles, from either end
 _TILTED_DEG = 1.0  # of the gauge, above which it is stated
 _NO_GAUGE = (
-    f"no strain: there are fewer than three particles within {100 * _GAUGE_BAND:g} % of the height "
-    "of either end"
+    f"no strain: fewer than three particles are within {100 * _GAUGE_BAND:g} % of the height of "
+    "one end; name the points with --points"
 )
 _SUBSET_PX = (15, 41)  # least, most
 _CLAMP_SUBSET_PX = 21
@@ -268,8 +268,8 @@ def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
 def name_gauge(points: Points) -> Points:
     """Name three particles near each end `upper1-3` and `lower1-3`, as the reference study does.
 
-    If the clamps have no dots, these are the particles within 12 % of the height from either end
-    that are nearest to a quarter, half and three quarters of the width.
+    If the clamps have no dots, these are particles within 12 % of the height from an end. The upper
+    ones are nearest to a quarter, half and three quarters of the width, the lower ones below them.
 
     Args:
         points: of a sheet that holds together.
@@ -303,8 +303,9 @@ def name_gauge(points: Points) -> Points:
         for k, index in enumerate(sorted(chosen, key=lambda index: x[index]), 1):
             names[index] = f"{name}{k}"
     reason = (
-        "no clamp dots: upper1-3, lower1-3 are the particles nearest to a quarter, the middle and "
-        f"three quarters of the width, within {100 * _GAUGE_BAND:g} % of the height of either end"
+        "no clamp dots: upper1-3 are the particles nearest to a quarter, half and three quarters "
+        f"of the width, lower1-3 those below them, within {100 * _GAUGE_BAND:g} % of the height of "
+        "an end"
     )
     tilt_deg = math.degrees(math.atan2(*np.abs(middles[1] - middles[0])))
     if tilt_deg > _TILTED_DEG:

@@ -81,7 +81,7 @@ class BlockWatch:
                 f"Gap in the recording: the clock advanced by {samples:.6g} samples in one block "
                 f"instead of {self._rig.block_samples}. Check the link, the buffer and the CPU "
                 "load. If your own program waited between two blocks, call begin() of the armed "
-                "rig before it reads on."
+                "rig after the wait."
             )
 
     def fault(self, codes: NDArray[np.int16], requested_v: float, *, follows: bool = True) -> str:

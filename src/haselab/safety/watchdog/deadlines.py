@@ -105,8 +105,8 @@ class Deadlines:
     def _fault(self, what: str) -> str:
         return (
             f"Lost deadline: {what} (worst {1e3 * self._worst_s:.1f} ms, limit "
-            f"{1e3 * self._deadline_s:g} ms). Close other programs, or raise ahead_blocks or "
-            "block_samples."
+            f"{1e3 * self._deadline_s:g} ms). Close other programs, or raise daq.ahead_blocks or "
+            "daq.block_samples."
         )
 
     @property

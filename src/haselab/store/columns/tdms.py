@@ -84,7 +84,7 @@ class TdmsArchive(MemberArchive):
         )
 
     def _check_starts(self, names: Sequence[str]) -> None:
-        """Refuse channels that began at different times: their rows do not belong together."""
+        """Refuse channels with different start times: equal rows have different times."""
         found = {name: self._channels[name].properties for name in names}
         starts = {n: each["wf_start_time"] for n, each in found.items() if "wf_start_time" in each}
         if len(starts) < 2 or any(positive(e.get("wf_increment")) is None for e in found.values()):
@@ -98,7 +98,7 @@ class TdmsArchive(MemberArchive):
         if late_s > 0.5 * step_s:
             raise InputError(
                 f"Channel {last} begins {late_s:.6g} s after channel {first} (wf_start_time), so "
-                f"their rows do not belong together. Export them on one time axis: {self.file}"
+                f"equal rows have different times. Export them with one time axis: {self.file}"
             )
 
     def unit_text(self, full: str) -> str:

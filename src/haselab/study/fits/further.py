@@ -91,7 +91,7 @@ def further_trials(
             "desired": np.interp(seen.frame_time_s, seen.block_start_s, seen.reference),
             "strain": seen.length_m / maps.length_m - 1.0,
             "drive_v": np.interp(seen.frame_time_s, seen.block_start_s, seen.drive_v),
-            "limit_v": float(maps.voltage_map.voltage_v(loops.setting.saturation.high)),
+            "limit_v": _limit_v(maps, loops, study),
         }
     return quantities, notes, {"further": drawn} if drawn else {}
 
@@ -116,9 +116,16 @@ def _like(trials: Sequence[StepNumbers], pi: Sequence[StepNumbers], name: str) -
     return over_trials(values, "s" if name.endswith("_s") else "", known)
 
 
+def _limit_v(maps: Maps, loops: Loops, study: Study) -> float:
+    """Drive at the limit towards which the saturating step goes, in V."""
+    limits = loops.setting.saturation
+    strain = limits.high if study.steps.saturating_step > 0.0 else limits.low
+    return float(maps.voltage_map.voltage_v(strain))
+
+
 def _saturation(seen: Observation, maps: Maps, loops: Loops, study: Study) -> dict[str, Estimate]:
     """Time of the output at its limit, and time to leave it after the reference returned."""
-    limit_v = float(maps.voltage_map.voltage_v(loops.setting.saturation.high))
+    limit_v = _limit_v(maps, loops, study)
     at_limit = seen.drive_v >= limit_v - _AT_LIMIT_V
     reference = saturating_reference(study.steps)
     much = np.flatnonzero(reference == study.steps.saturating_step)

@@ -24,8 +24,8 @@ _ROUTE = "the device cannot route a required signal"
 _ROUTE_ADVICE = "Change the terminals and counters of the rig file, or use another device."
 _NO_CLOCK = "the output's buffer is full, because its clock has stopped"
 _NO_CLOCK_ADVICE = (
-    "If another program has reset the board, such as 'haselab rig safe', start this program again; "
-    "otherwise check daq.counter."
+    "If another program, such as 'haselab rig safe', has reset the board, start this program "
+    "again; otherwise check daq.counter."
 )
 _SILENT_S = 2e-3  # timeout after a server has not replied once, so that the guardian acts soon
 # DAQmx status: meaning, what to do.

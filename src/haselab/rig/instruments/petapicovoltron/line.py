@@ -100,9 +100,9 @@ class SupplyLine:
     def query_all(self, commands: Sequence[str]) -> list[str]:
         """Send several commands at once and return their replies; ignore earlier data.
 
-        Replies to a request that timed out may arrive after the next one was sent. So, after a
-        timeout, the commands are sent at once, and again if a reply is missing; the last replies
-        are returned.
+        Replies to a request that timed out may arrive late. After a timeout, all outstanding
+        replies are read, the request is repeated once if one is missing, and the last replies are
+        returned.
 
         Raises:
             DeviceError: There is no reply.

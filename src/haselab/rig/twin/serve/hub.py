@@ -29,7 +29,7 @@ TICKS = 20  # samples in one mechanical step
 _BUFFER_S = 10.0
 _RAMP_S, _RAMP_PIECES = 1.0, 50
 _SHORTEST_S = 1e-4  # sleep of a reader, and of the pace keeper
-_DELAY_S = 1e-3  # of the pace keeper; a shorter one is not noted. Time to take a request
+_DELAY_S = 1e-3  # shortest noted delay of the pace keeper; also time to take a pending request
 _IDLE_S = 0.02  # longest sleep of the pace keeper
 _RIGHT = Wiring()
 _RAIL_V = 1.0  # smallest voltage of the supply that counts as on
@@ -83,7 +83,7 @@ class TwinHub(Closing):
         self.protected = ""  # why, once the bench has protected itself
         self._closed = threading.Event()
         self._started = time.monotonic()
-        self.stalled_s = 0.0  # of the wall clock, in which this process was not run
+        self.stalled_s = 0.0  # wall-clock time subtracted because this process ran late
         # delays of this process that were passed on: when, and how long, both in samples
         self._delays: deque[tuple[int, int]] = deque()
         self._before = 0  # samples before the inputs were started

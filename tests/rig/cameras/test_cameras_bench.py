@@ -90,8 +90,8 @@ def test_a_folder_films_on_the_clock_of_the_board(served, pictures):
         images = np.concatenate([found.images for found in taken])
     # One frame a block of 10 ms, from the start on; a rounding of the clock may move one frame.
     assert abs(len(images) - 21) <= 1
-    # The first pictures may belong to blocks that the start of the output took: over USB those of its
-    # three queued values, and the one in which it began.
+    # The first pictures may belong to blocks that the start of the output took: over USB those of
+    # its three queued values, and the one in which it began.
     first = next(k for k, frame in enumerate(frames) if np.array_equal(frame, images[0]))
     assert first <= 4  # blocks
     np.testing.assert_array_equal(images, frames[first : first + len(images)])

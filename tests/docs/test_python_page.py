@@ -30,7 +30,7 @@ def test_the_examples_of_the_page_run(
             PAGE.execute(code, names)
     printed = capsys.readouterr().out
     assert "TransferFit: ok" in printed and "natural_frequency_rad_s" in printed
-    assert "\nok ArxOrders" in printed
+    assert "\nSubspaceFit: ok" in printed
     assert (tmp_path / "fit.svg").stat().st_size > 0
     unit, capacitance_f = printed.splitlines()[-1].split()
     assert unit == "F" and 1e-10 < float(capacitance_f) < 1e-8

@@ -64,7 +64,12 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
     for row in cells:
         lines.extend(_wrapped(row, widths))
     return "\n".join(
-        [*lines, "", *_missing(found, columns), *textwrap.wrap(_count(found), columns)]
+        [
+            *lines,
+            "",
+            *_missing(found, columns),
+            *textwrap.wrap(_count(found), columns, break_on_hyphens=False),
+        ]
     )
 
 

@@ -125,12 +125,12 @@ def step_metrics(
     def over(name: str, unit: str) -> Estimate:
         return over_trials(np.array([getattr(item, name) for item in numbers]), unit)
 
-    rise_s = over("rise_time_s", "s")
-    if found is not None and rise_s.value < over("raw_rise_time_s", "s").value:
+    rise_s, raw_s = over("rise_time_s", "s"), over("raw_rise_time_s", "s")
+    if found is not None and rise_s.value < raw_s.value:
         rise_s = Estimate(math.nan, math.nan, (math.nan, math.nan), "s")
     return StepMetrics(
         rise_time_s=rise_s,
-        raw_rise_time_s=over("raw_rise_time_s", "s"),
+        raw_rise_time_s=raw_s,
         overshoot=over("overshoot", ""),
         ring_averaged_overshoot=over("ring_averaged_overshoot", ""),
         settling_time_s=over("settling_time_s", "s"),

@@ -41,7 +41,6 @@ def _stated(page: Page, before: str, after: str) -> float:
 
 def test_the_first_study_has_the_results_that_the_page_states(make_shell: Callable) -> None:
     page, shell = Page("start/twin-in-five-minutes.md"), make_shell("first")
-    (shell.folder / "study.toml").write_text(page.toml[0], encoding="utf-8")
     _answers(shell, page.commands)
     rows = {row["id"]: row["measured"] for row in shell.json("first/results.json")["quantities"]}
     for name, shown in (
@@ -74,7 +73,6 @@ def test_a_csv_becomes_a_bode_plot_a_model_and_a_prediction(make_shell: Callable
 @pytest.mark.slow
 def test_a_film_becomes_tracks_and_a_strain(make_shell: Callable) -> None:
     page, shell = Page("start/your-own-video.md"), make_shell("video")
-    (shell.folder / "study.toml").write_text(page.toml[0], encoding="utf-8")
     answers = _answers(shell, page.commands)
     tracks = answers["tracks.csv"]
     valid = _stated(page, "twelve frames with the points on them |", " %")

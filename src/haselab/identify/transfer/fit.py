@@ -20,6 +20,7 @@ from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.prediction import fitted_output, predict
 from haselab.identify.record import Record, finite_vector, record_notes
 from haselab.identify.residual_tests import input_correlation_p
+from haselab.identify.transfer.bode import bode_panels
 from haselab.identify.transfer.checks.ambiguity import OtherMinimum, ambiguity, find_other_minima
 from haselab.identify.transfer.checks.diagnosis import diagnose
 from haselab.identify.transfer.feedback import feedback_p
@@ -200,6 +201,11 @@ class TransferFit(RecordFit[Record]):
         self._require()
         return PlantPosterior.from_dict(covariance_table(self.parameters, self.covariance))
 
+    @property
+    def _spread(self) -> PlantPosterior | None:
+        """The posterior; None if a parameter is not identifiable."""
+        return None if np.isinf(self.covariance).any() else self.posterior
+
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
@@ -213,7 +219,7 @@ class TransferFit(RecordFit[Record]):
         return predict(
             self.rational,
             several(records),
-            posterior=None if np.isinf(self.covariance).any() else self.posterior,
+            posterior=self._spread,
             noise_std=float(np.std(np.concatenate(self.residuals))),
             training_output=self.training_output,
             rng=np.random.default_rng(1),
@@ -232,7 +238,14 @@ class TransferFit(RecordFit[Record]):
         """See `Fit`."""
         self._present(self.records or None)
         title = f"Transfer function, fit {self.fit_percent:.1f} %"
-        return records_chart(title, self.records, self.residuals, (names or ("", "Output"))[1])
+        output = (names or ("", "Output"))[1]
+        chart = records_chart(title, self.records, self.residuals, output)
+        try:
+            model = self.rational
+        except ResultError:  # a parameter is not identifiable
+            return chart
+        bode = bode_panels(model, self._spread, self.records)
+        return Chart(title, (*chart.panels, *bode), shared_x=False)
 
     def answer(self) -> JsonObject:
         """The result under its public JSON keys."""

@@ -30,6 +30,7 @@ class DataSet:
         text: what was recorded and how.
         tables: function that returns the text of each file by its name.
         commands: that use the files, in order, without the word haselab.
+        video: function that writes the video; None: the data set has none.
     """
 
     name: str
@@ -37,6 +38,7 @@ class DataSet:
     text: str
     tables: Callable[[], dict[str, str]]
     commands: Sequence[str]
+    video: Callable[[Path], list[Path]] | None = None
 
 
 def _german(header: str, columns: Sequence[Floats], form: str = "%.7g") -> str:
@@ -95,6 +97,12 @@ def _actuator() -> dict[str, str]:
     columns = [time_ms, 1e3 * v, 1e3 * i]
     monitors = _german("Zeit [ms];U Monitor [mV];I Monitor [mV]", columns, "%.6g")
     return {"monitors.csv": monitors, **tables}
+
+
+def _video(folder: Path) -> list[Path]:
+    path = folder / "triangle.avi"
+    recordings.film(_SEED, path)
+    return [path, path.with_suffix(".csv")]
 
 
 def _campaigns() -> dict[str, str]:
@@ -170,6 +178,19 @@ DATA_SETS: tuple[DataSet, ...] = (
         "which is clamped at 3 times its natural width.",
         _tensile,
         ("identify regions tensile.csv --stretch Streckung --load Kraft --plot regions.svg",),
+    ),
+    DataSet(
+        "video",
+        "Video of an actuator while the drive is a triangle",
+        "triangle.avi: 0.4 s at rest, then one triangle of 0 to 2 V in 2 s, with a hung mass of "
+        "0.25 kg; 512 x 512 pixels of 0.35 mm, 50 frames a second, compressed without loss. "
+        "triangle.csv has the time of each frame.",
+        dict,
+        (
+            "track triangle.avi --auto --count 60 --rest-frames 10 --scale-mm-per-px 0.35 "
+            "--out tracks.csv --report tracks.html --overlay tracks.png",
+        ),
+        _video,
     ),
     DataSet(
         "actuator",
@@ -252,6 +273,8 @@ def write_data_set(data_set: DataSet, folder: Path) -> list[Path]:
     for name, text in data_set.tables().items():
         write_text(folder / name, text)
         written.append(folder / name)
+    if data_set.video is not None:
+        written += data_set.video(folder)
     commands = "\n".join(f"    haselab {command}" for command in data_set.commands)
     readme = (
         f"# {data_set.title}\n\nSIMULATED by the twin, with its noise. {data_set.text}\n\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -13,10 +14,11 @@ from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.lockin import lockin_of
 from haselab.signals import constant, linear_chirp, triangle
+from haselab.store.video.writer import VideoWriter
 
 __all__ = [
     "CARRIER_HZ", "ZERO_LENGTH_M", "ActuatorRecords", "Cycles", "actuator_records", "chirp",
-    "cycles", "monitors", "release", "tensile",
+    "cycles", "film", "monitors", "release", "tensile",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
@@ -24,7 +26,7 @@ CARRIER_HZ = 2000.0
 _CARRIER_V, _MASS_KG, _BLOCK_S = 0.02, 0.25, 0.01
 _CAMERA_M = 3e-6  # standard deviation of a measured length
 _SETTLE_S = 30.0
-_HIGHEST_V = 2.0
+_HIGHEST_V, _FRAMES_HZ = 2.0, 50.0
 ZERO_LENGTH_M = 0.051  # of the records of one actuator
 
 
@@ -182,6 +184,29 @@ def actuator_records(seed: int) -> ActuatorRecords:
     every = 4
     volts = np.asarray(np.concatenate(codes)[::every] * rig.volt_per_code, np.float64)
     return ActuatorRecords(volts, rig.rate_hz / every, played)
+
+
+def film(seed: int, path: Path) -> None:
+    """Film one triangle of the drive with 50 pictures a second, the first 20 of them at rest.
+
+    Args:
+        seed: of all noise.
+        path: of the new video, `.mkv` or `.avi`; the times of the frames go to a CSV file beside
+            it.
+    """
+    bench = _bench(seed, carrier=False)
+    writer = VideoWriter(path, _FRAMES_HZ)
+    drive_v = np.concatenate([constant(0.0, 0.4, 1.0 / _BLOCK_S),
+                              triangle(0.0, _HIGHEST_V, 0.5, 1, 1.0 / _BLOCK_S)])  # fmt: skip
+    bench.start(_FRAMES_HZ)
+    start_s = bench.time_s
+    for value in drive_v:
+        bench.write(float(value))
+        bench.read()
+        frames = bench.take()
+        if frames is not None:
+            writer.append(frames.images, frames.time_s - start_s)
+    writer.close()
 
 
 def release(seed: int) -> tuple[Floats, Floats]:

@@ -1,0 +1,81 @@
+"""Bode diagram of a fitted transfer function, over the frequency response of its records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haselab.base import InputError
+from haselab.base.chart import Curve, Panel
+from haselab.identify.frequency.response import estimate_frequency_response
+from haselab.identify.record import Record
+from haselab.models.posterior import PlantPosterior
+from haselab.models.rational import RationalModel
+
+__all__ = ["bode_panels"]
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+_POINTS, _DRAWS, _SEED = 300, 200, 1
+_MOST_POINTS = 20000  # of the records, for which the lines are estimated within about a second
+
+
+def bode_panels(
+    model: RationalModel, posterior: PlantPosterior | None, records: Sequence[Record]
+) -> tuple[Panel, Panel]:
+    """Magnitude and phase of a model, with its band of 95 % and the records' frequency response.
+
+    Args:
+        model: the fitted model.
+        posterior: with the covariance of its parameters; None: no band is drawn.
+        records: that were fitted. Their frequency response is drawn if input and output have the
+            same times and the input varies enough.
+    Returns:
+        The panel of the magnitude and that of the phase.
+    """
+    duration_s = max(record.u.size / record.input_rate_hz for record in records)
+    highest_hz = 0.5 * max(record.input_rate_hz for record in records)
+    frequency_hz = np.geomspace(1.0 / duration_s, highest_hz, _POINTS)
+    response = model.frequency_response(2.0 * np.pi * frequency_hz)
+    size_std, turn_std = _deviations(posterior, frequency_hz, response)
+    phase = np.unwrap(np.angle(response))
+    sizes, phases, measured = [], [], _measured(records)
+    if measured is not None:
+        hz, lines = measured
+        near = np.interp(hz, frequency_hz, phase)
+        turns = np.degrees(near + np.angle(lines * np.exp(-1j * near)))
+        sizes.append(Curve(hz, np.abs(lines), "measured", "points"))
+        phases.append(Curve(hz, turns, "", "points"))
+    sizes.append(Curve(frequency_hz, np.abs(response), "model, 95 %", std=size_std))
+    phases.append(Curve(frequency_hz, np.degrees(phase), std=turn_std))
+    return (
+        Panel("Frequency (Hz)", "Magnitude", sizes, log_x=True, log_y=True),
+        Panel("Frequency (Hz)", "Phase (°)", phases, log_x=True),
+    )
+
+
+def _deviations(
+    posterior: PlantPosterior | None, frequency_hz: Floats, response: Complexes
+) -> tuple[Floats | None, Floats | None]:
+    """Standard deviation of the magnitude and of the phase in degrees."""
+    if posterior is None:
+        return None, None
+    plants = posterior.draw(_DRAWS, np.random.default_rng(_SEED))
+    drawn = np.array([plant.frequency_response(2.0 * np.pi * frequency_hz) for plant in plants])
+    return np.abs(drawn).std(axis=0), np.degrees(np.angle(drawn / response).std(axis=0))
+
+
+def _measured(records: Sequence[Record]) -> tuple[Floats, Complexes] | None:
+    """Frequencies in Hz and response of the records; None where it cannot be estimated."""
+    if sum(record.y.size for record in records) > _MOST_POINTS:
+        return None
+    try:
+        found = estimate_frequency_response(records, method="polynomial")
+    except InputError:
+        return None
+    used = (found.frequency_hz > 0.0) & np.isfinite(found.response)
+    if not found.succeeded or not used.any():
+        return None
+    return found.frequency_hz[used], found.response[used]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import hmac
 import json
 import secrets
@@ -24,7 +25,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from haselab.base import DeviceError, HaselabError, JsonObject, to_plain
+from haselab.base import DeviceError, HaselabError, InputError, JsonObject, to_plain
 
 __all__ = [
     "NO_TOKEN",
@@ -33,9 +34,11 @@ __all__ = [
     "OnlyOwnPages",
     "Requests",
     "WebServer",
+    "hosts_of",
     "listening",
     "routes_of",
     "serve",
+    "served_ips",
 ]
 
 STATIC = Path(__file__).parent / "static"
@@ -52,22 +55,25 @@ class Access:
     """Who may use a web server.
 
     Args:
-        port: of the server on the loopback address.
+        port: of the server.
+        lan: IPv4 address of this computer in its network, for pages on other computers; empty:
+            only pages on this computer.
         token: that a page must send.
     """
 
     port: int
+    lan: str = ""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
 
     @property
-    def address(self) -> str:
-        """Address for the browser, with the token."""
-        return f"http://127.0.0.1:{self.port}/?token={self.token}"
+    def addresses(self) -> tuple[str, ...]:
+        """Addresses for a browser, with the token: on this computer, then on others."""
+        return tuple(f"http://{ip}:{self.port}/?token={self.token}" for ip in served_ips(self.lan))
 
     @property
     def hosts(self) -> tuple[str, ...]:
         """Values of Host that are accepted."""
-        return f"127.0.0.1:{self.port}", f"localhost:{self.port}"
+        return hosts_of(self.lan, self.port)
 
     @property
     def origins(self) -> tuple[str, ...]:
@@ -82,6 +88,27 @@ class Access:
     def is_known(self, request: Request) -> bool:
         """Whether a request has the token."""
         return self.is_token(request.headers.get("x-panel-token", ""))
+
+
+def served_ips(lan: str) -> tuple[str, ...]:
+    """IP addresses to serve on.
+
+    Args:
+        lan: IPv4 address of this computer in its network, or empty.
+    Returns:
+        The loopback address, then the other one.
+    """
+    return ("127.0.0.1", lan) if lan else ("127.0.0.1",)
+
+
+def hosts_of(lan: str, port: int) -> tuple[str, ...]:
+    """Host and port, as pages name a server of this computer.
+
+    Args:
+        lan: IPv4 address of this computer in its network, or empty.
+        port: of the server.
+    """
+    return tuple(f"{name}:{port}" for name in ("localhost", *served_ips(lan)))
 
 
 class OnlyOwnPages:
@@ -210,34 +237,46 @@ class WebServer(uvicorn.Server):
 
 
 @contextlib.contextmanager
-def listening(port: int) -> Iterator[socket.socket]:
-    """Listen on the loopback address.
+def listening(port: int, lan: str = "") -> Iterator[list[socket.socket]]:
+    """Listen on the loopback address and, if there is one, on the address in the network.
 
     Args:
         port: TCP port; 0: a free one.
+        lan: IPv4 address of this computer in its network, or empty.
     Yields:
-        The socket of a web server.
+        The sockets of a web server, all with one port.
     Raises:
         DeviceError: the port is in use.
+        InputError: this computer does not have the address.
     """
-    with socket.socket() as listener:
-        try:
-            listener.bind(("127.0.0.1", port))
-            listener.listen(128)  # a browser that is early waits
-        except OSError as error:
-            raise DeviceError(
-                f"Port {port} cannot be used ({error.strerror}). Choose another one with "
-                "--page-port, or leave it out for a free one."
-            ) from None
-        yield listener
+    listeners: list[socket.socket] = []
+    with contextlib.ExitStack() as opened:
+        for ip in served_ips(lan):
+            listener = opened.enter_context(socket.socket())
+            try:
+                listener.bind((ip, port))
+                listener.listen(128)  # a browser that is early waits
+            except OSError as error:
+                if error.errno == errno.EADDRNOTAVAIL:
+                    raise InputError(
+                        f"--lan is {ip}, but this computer does not have this address. Use one "
+                        "that its network settings show."
+                    ) from None
+                raise DeviceError(
+                    f"Port {port} cannot be used ({error.strerror}). Choose another one with "
+                    "--page-port, or leave it out for a free one."
+                ) from None
+            port = listener.getsockname()[1]
+            listeners.append(listener)
+        yield listeners
 
 
-def serve(server: uvicorn.Server, listener: socket.socket) -> int:
+def serve(server: uvicorn.Server, listeners: list[socket.socket]) -> int:
     """Serve until the server should exit, or until Ctrl-C, SIGTERM or a closed terminal.
 
     Args:
         server: to run.
-        listener: its socket.
+        listeners: its sockets.
     Returns:
         Number of the signal; 0: there was none.
     """
@@ -252,5 +291,5 @@ def serve(server: uvicorn.Server, listener: socket.socket) -> int:
             if hasattr(signal, name):
                 number = getattr(signal, name)
                 restored.callback(signal.signal, number, signal.signal(number, end))
-        server.run([listener])
+        server.run(listeners)
     return received[0] if received else 0

@@ -60,8 +60,8 @@ def pick_points(
     def end_once_saved(name: str) -> None:
         server.should_exit = server.should_exit or bool(saved)
 
-    with listening(0) as listener:
-        access = Access(listener.getsockname()[1])
+    with listening(0) as listeners:
+        access = Access(listeners[0].getsockname()[1])
         requests = {name: partial(do, videos) for name, do in PICK_REQUESTS.items()}
         application = Starlette(
             routes=[
@@ -73,8 +73,8 @@ def pick_points(
         server = WebServer(
             uvicorn.Config(application, log_level="warning", ws="none", timeout_graceful_shutdown=2)
         )
-        announce(access.address)
+        announce(access.addresses[0])
         if browser:
-            webbrowser.open(access.address)
-        number = serve(server, listener)
+            webbrowser.open(access.addresses[0])
+        number = serve(server, listeners)
     return saved[-1] if saved else number

@@ -18,7 +18,7 @@ import uvicorn
 
 from haselab.base import DeviceError
 from haselab.panel.files import PanelFiles
-from haselab.panel.page_server import Access, WebServer, listening
+from haselab.panel.page_server import Access, WebServer, listening, served_ips
 from haselab.panel.web import WebSettings, application
 from haselab.rig.bench_config import BenchConfig
 from haselab.rig.rig_file import load_rig
@@ -34,20 +34,20 @@ class Panel(NamedTuple):
     """A panel that runs.
 
     Args:
-        address: to open in a browser; it holds the token.
+        addresses: to open in a browser on this computer, then on others; they hold the token.
         bench: its bench process.
         stop: its stop process.
         stop_port: TCP port of the stop process.
         server: its web server, to be run by the caller.
-        listener: socket of the web server.
+        listeners: sockets of the web server.
     """
 
-    address: str
+    addresses: tuple[str, ...]
     bench: subprocess.Popen[str]
     stop: subprocess.Popen[str]
     stop_port: int
     server: uvicorn.Server
-    listener: socket.socket
+    listeners: list[socket.socket]
 
 
 def stop_answers(port: int, within_s: float) -> bool:
@@ -104,17 +104,22 @@ def _end(process: subprocess.Popen[str], within_s: float = _END_S) -> None:
 
 
 @contextlib.contextmanager
-def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Iterator[Panel]:
+def running_panel(
+    files: PanelFiles, port: int = 0, lease_s: float = 1.5, lan: str = ""
+) -> Iterator[Panel]:
     """Start the bench process and the stop process; on exit, go to 0 V and end them.
 
     Args:
         files: rig, actuator and recordings.
-        port: of the web server on the loopback address; 0: a free one.
+        port: of the web server; 0: a free one.
         lease_s: longest time without a message from the page that armed the bench, in s.
+        lan: IPv4 address of this computer in its network, to serve on as well; empty: this
+            computer only.
     Yields:
         The panel; the caller runs its server.
     Raises:
         DeviceError: A process does not start, or the port is in use.
+        InputError: This computer does not have the address.
     """
     in_memory = Path("/dev/shm")
     place = in_memory if in_memory.is_dir() and os.access(in_memory, os.W_OK) else None
@@ -122,15 +127,15 @@ def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Ite
         folder = Path(
             opened.enter_context(tempfile.TemporaryDirectory(prefix="haselab-panel-", dir=place))
         )
-        listener = opened.enter_context(listening(port))
-        access = Access(listener.getsockname()[1])
+        listeners = opened.enter_context(listening(port, lan))
+        access = Access(listeners[0].getsockname()[1], lan)
         words = [str(files.rig), str(folder), str(files.runs), str(lease_s)]
         words += [] if files.actuator is None else [str(files.actuator)]
         bench, key = _started(["haselab.panel.bench_process", *words], "bench process")
         opened.callback(_end, bench)
         settings = WebSettings(folder, access, 0, files)
         real = [str(files.rig)] if isinstance(load_rig(files.rig), BenchConfig) else []
-        words = ["0", str(folder), key, ",".join(access.origins), *real]
+        words = [",".join(served_ips(lan)), str(folder), key, ",".join(access.origins), *real]
         stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
         opened.callback(_end, stop, _END_STOP_S)
         opened.callback(_end, bench)  # ends before STOP, which works until the bench is at 0 V
@@ -141,4 +146,4 @@ def running_panel(files: PanelFiles, port: int = 0, lease_s: float = 1.5) -> Ite
                 ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             )
         )  # fmt: skip
-        yield Panel(access.address, bench, stop, settings.stop_port, server, listener)
+        yield Panel(access.addresses, bench, stop, settings.stop_port, server, listeners)

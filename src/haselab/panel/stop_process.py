@@ -1,4 +1,4 @@
-"""`python -m haselab.panel.stop_process PORT FOLDER KEY ORIGIN [RIG.toml]`: STOP, and nothing else.
+"""`python -m haselab.panel.stop_process IPS FOLDER KEY ORIGINS [RIG.toml]`: STOP, and nothing else.
 
 A small process with a port of its own, so that STOP waits for nothing: not for the web server, a
 plot, a command or a blocking call. `POST /stop` revokes the permission in the interlock KEY, so
@@ -41,21 +41,27 @@ class StopServer(ThreadingHTTPServer):
     """Serves STOP.
 
     Args:
-        port: on the loopback address; 0: a free one.
+        port: TCP port; 0: a free one.
         stop: called for each STOP; returns what to answer.
         origins: of the pages that may call it.
+        ip: address of this computer on which it serves.
     """
 
     daemon_threads = True
     request_queue_size = 128
 
     def __init__(
-        self, port: int, stop: Callable[[], dict[str, object]], origins: tuple[str, ...]
+        self,
+        port: int,
+        stop: Callable[[], dict[str, object]],
+        origins: tuple[str, ...],
+        ip: str = "127.0.0.1",
     ) -> None:
         self.stop, self.origins = stop, origins
+        self.names = (ip, "localhost") if ip == "127.0.0.1" else (ip,)
         self._open: dict[int, socket.socket] = {}  # connections, the oldest first
         self._turn = threading.Lock()
-        super().__init__(("127.0.0.1", port), _Handler)
+        super().__init__((ip, port), _Handler)
 
     @property
     def port(self) -> int:
@@ -111,9 +117,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _allowed(self) -> bool:
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         name = host.rpartition(":")[0]
-        mine = name in ("127.0.0.1", "localhost") and (
-            origin is None or origin in self.server.origins
-        )
+        mine = name in self.server.names and (origin is None or origin in self.server.origins)
         if not mine:
             self.close_connection = True  # ignore the rest of what it sent
             self._reply(403, {"error": "Only the panel's own page may use this port."})
@@ -181,16 +185,19 @@ def main(words: list[str]) -> None:
     """Serve STOP until stdin ends.
 
     Args:
-        words: port, folder, key of the interlock, origins of the page separated by commas, and
-            optionally the rig file of a real bench.
+        words: IP addresses to serve on, separated by commas; folder; key of the interlock; origins
+            of the page, separated by commas; and optionally the rig file of a real bench.
     """
-    port, folder, key, origins = int(words[0]), Path(words[1]), words[2], words[3].split(",")
+    folder, key, origins = Path(words[1]), words[2], tuple(words[3].split(","))
     with contextlib.suppress(AttributeError, OSError):  # it needs little processor time
         os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     stop = _Stop(folder, key, words[4] if len(words) > 4 else "")
-    server = StopServer(port, stop, tuple(origins))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    print(f"ready {server.port}", flush=True)
+    port = 0  # the first server finds a free one, and the others use it too
+    for ip in words[0].split(","):
+        server = StopServer(port, stop, origins, ip)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        port = server.port
+    print(f"ready {port}", flush=True)
     sys.stdin.read()
 
 

@@ -33,7 +33,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from haselab.base import HaselabError
 from haselab.panel.columns import SIGNALS, Columns, LiveReader
 from haselab.panel.files import PanelFiles
-from haselab.panel.page_server import NO_TOKEN, STATIC, Access, OnlyOwnPages, routes_of
+from haselab.panel.page_server import (
+    NO_TOKEN,
+    STATIC,
+    Access,
+    OnlyOwnPages,
+    hosts_of,
+    routes_of,
+)
 from haselab.panel.pages.camera import CameraPicture
 from haselab.panel.pages.recordings import analyse_recorded
 from haselab.panel.pages.requests import REQUESTS
@@ -72,7 +79,7 @@ class WebSettings:
 
     def stop_sources(self) -> str:
         """Addresses of the stop process, which pages may request."""
-        return f"http://127.0.0.1:{self.stop_port} http://localhost:{self.stop_port}"
+        return " ".join(f"http://{host}" for host in hosts_of(self.access.lan, self.stop_port))
 
 
 class _Bench:

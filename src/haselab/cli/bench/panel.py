@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import tempfile
 import threading
 import time
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from haselab.base import DeviceError
+from haselab.base import DeviceError, InputError, shown
 from haselab.cli.common import Real
 from haselab.cli.options import shared_option
 from haselab.panel.files import PanelFiles
@@ -22,6 +23,22 @@ from haselab.store.folder import write_new
 __all__ = ["command"]
 
 _STOP_S, _STOP_TRIALS = 4.0, 3  # if STOP answers none of these trials, the panel ends at 0 V
+
+
+def _check_lan(context: click.Context, option: click.Parameter, value: str) -> str:
+    """An address of the network that a page can name; the loopback address is always served."""
+    if not value:
+        return value
+    try:
+        ip = ipaddress.IPv4Address(value)
+    except ValueError:
+        ip = None
+    if ip is None or ip.is_unspecified or ip.is_multicast or value == "127.0.0.1":
+        raise InputError(
+            f"--lan is {shown(value)}. Use one IPv4 address of this computer in its network, for "
+            "example 192.168.1.20."
+        )
+    return value
 
 
 @click.command("panel")
@@ -46,6 +63,11 @@ _STOP_S, _STOP_TRIALS = 4.0, 3  # if STOP answers none of these trials, the pane
     help="Set how long the page that armed the bench may be silent, in s, before the output goes "
     "to 0 V. A larger value suits a slow tablet, but a lost page keeps its voltage longer.",
 )  # fmt: skip
+@click.option(
+    "--lan", default="", metavar="IP", callback=_check_lan,
+    help="Serve the page also on this IPv4 address of this computer, for a tablet in the same "
+    "network. The connection is not encrypted. Default: this computer only.",
+)  # fmt: skip
 @shared_option("--no-browser", is_flag=True)
 def command(
     rig: Path | None,
@@ -53,14 +75,15 @@ def command(
     runs: Path,
     page_port: int,
     lease_s: float,
+    lan: str,
     no_browser: bool,
 ) -> None:
     """Show and drive a bench in a browser.
 
     HIGH VOLTAGE WILL BE APPLIED on a real bench when a page arms and drives it. Keep clear. The
     page Live has signals, STOP, arming, a manual drive and, with --actuator, a closed loop. Other
-    pages play studies, pick points in videos, change the gains and check the computer. The panel is
-    served on this computer only. Ctrl-C takes the output to 0 V and ends the panel.
+    pages play studies, pick points in videos, change the gains and check the computer. Ctrl-C takes
+    the output to 0 V and ends the panel.
     """
     with contextlib.ExitStack() as opened:
         if rig is None:
@@ -68,11 +91,11 @@ def command(
             rig = folder / "twin.toml"
             write_new(rig, 'kind = "twin"\n')
         panel = opened.enter_context(
-            running_panel(PanelFiles(rig, actuator, runs), page_port, lease_s)
+            running_panel(PanelFiles(rig, actuator, runs), page_port, lease_s, lan)
         )
-        click.echo(panel.address)
+        click.echo("\n".join(panel.addresses))
         if not no_browser:
-            webbrowser.open(panel.address)
+            webbrowser.open(panel.addresses[0])
         _serve(panel)
 
 
@@ -105,7 +128,7 @@ def _serve(panel: Panel) -> None:
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     threading.Thread(target=watch_stop, daemon=True).start()
-    serve(panel.server, panel.listener)
+    serve(panel.server, panel.listeners)
     panel.server.should_exit = True
     watcher.join()
     if lost:

@@ -49,7 +49,7 @@ def test_a_panel_whose_stop_hangs_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 
         monkeypatch.setattr(command, "serve", until_exit)
         panel: Any = SimpleNamespace(
-            bench=Process(), stop=Process(), stop_port=port, server=server, listener=None
+            bench=Process(), stop=Process(), stop_port=port, server=server, listeners=[]
         )
         with pytest.raises(DeviceError, match="The stop process does not answer, so the panel"):
             command._serve(panel)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from haselab.base import InputError, ResultError
+from haselab.base.chart import Chart
 from haselab.control.candidates import Task, plant_crossover, score
+from haselab.control.charts import step_chart
 from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.control.plants.general_loops import trace_general
@@ -23,6 +26,9 @@ from haselab.control.stability.margins import Margins, margins
 from haselab.control.stability.plausible import PlausibleMargins
 from haselab.control.step_metrics import StepNumbers, step_metrics
 from haselab.models.plant import Plant
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     "Design",
@@ -69,6 +75,7 @@ class Design:
         nominal: prediction for the given plant.
         spread: predictions over the spread of natural frequency, the nominal one first.
         shortfalls: unmet demands, as text; empty if all are met.
+        plant: that it was designed for.
         plausible: margins on plants drawn from the posterior; None without one.
     """
 
@@ -78,7 +85,26 @@ class Design:
     nominal: Prediction
     spread: tuple[Prediction, ...]
     shortfalls: tuple[str, ...]
+    plant: AnyPlant = field(repr=False)
     plausible: PlausibleMargins | None = None
+
+    def chart(self) -> Chart:
+        """Predicted step and open loop of the given plant, as data of a figure.
+
+        Returns:
+            The chart.
+        """
+        assert self.spec.step is not None  # of a design that was made
+        crossover_rad_s = self.nominal.margins.crossover_rad_s
+        return step_chart(self.plant, self.gains, self.setting, self.spec.step, crossover_rad_s)
+
+    def plot(self) -> Figure:
+        """Draw the predicted step, and the open loop with its delay.
+
+        Returns:
+            A matplotlib figure: a notebook shows it, and `savefig` writes it.
+        """
+        return self.chart().plot()
 
     def summary(self) -> str:
         """Gains, margins and the predicted step, as a table of plain text.
@@ -317,7 +343,8 @@ def evaluate_gains(task: Task, gains: PidGains) -> Design:
         for plant in task.plants()
     )
     spec = dataclasses.replace(task.spec, step=task.step, noise_gain=task.noise_gain)
-    return Design(gains, spec, task.setting, spread[0], spread, _shortfalls(task, gains, spread))
+    shortfalls = _shortfalls(task, gains, spread)
+    return Design(gains, spec, task.setting, spread[0], spread, shortfalls, task.plant)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ import numpy as np
 from haselab.base import InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section, warn_misspelled_in
 from haselab.cli.common import REAL, SEED, Real, answer_options, emit
-from haselab.cli.model.charts import design_chart, loop_chart
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -24,6 +23,7 @@ from haselab.control import (
     design_controller,
     margins,
 )
+from haselab.control.charts import loop_chart
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
 from haselab.controllers import (
@@ -158,10 +158,7 @@ def command(
     if remark := design.nominal.step.remark:
         click.echo(f"haselab: warning: {remark}: {model}", err=True)
     emit(answer, as_json=as_json, out=None)
-    slowest_s = 20.0 / max(design.nominal.margins.crossover_rad_s, 1e-3)
-    step = design.spec.step
-    assert step is not None  # of a design that was made
-    save_plot(plot, lambda: design_chart(plant, design.gains, setting, step, slowest_s))
+    save_plot(plot, design.chart)
 
 
 def _own_design(

@@ -8,11 +8,11 @@ import click
 
 from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.common import REAL, answer_options, emit
-from haselab.cli.model.charts import loop_chart
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import LinearController, LoopSetting, PidGains, margins
+from haselab.control.charts import loop_chart
 from haselab.pipelines.design.answer import margins_answer
 from haselab.pipelines.design.feedback import feedback_of, read_controller
 from haselab.pipelines.design.model_file import loop_of, read_any_plant

@@ -25,13 +25,14 @@ from haselab.control import (
 )
 from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.control.plausible_design import evaluate_controller
+from haselab.control.predicted_step import predicted_step
 from haselab.control.reach import default_step
 from haselab.control.stability.margins import Margins, frequency_grid
 from haselab.firmware.settings import RATE_HZ, UPDATE_DELAY_S
 from haselab.models.actuator import ControllerSection
 from haselab.panel.files import PanelFiles
 from haselab.panel.pages.values import number
-from haselab.pipelines.design.answer import margins_answer, plausible_sentence, predicted_step
+from haselab.pipelines.design.answer import margins_answer, plausible_sentence
 from haselab.pipelines.design.feedback import feedback_of
 from haselab.pipelines.design.model_file import (
     loop_of,

@@ -10,7 +10,7 @@ import math
 import random
 import signal
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
@@ -360,7 +360,9 @@ class _Mapped(Protocol):
 def _mapper(workers: int, bar: Progress) -> Iterator[_Mapped]:
     """A map that keeps the order, over processes or in this one."""
 
-    def here(what: str, job: Callable[[Item], Result], items: Sequence[Item]) -> list[Result | Lost]:
+    def here(
+        what: str, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> list[Result | Lost]:
         kept: list[Result | Lost] = []
         for item in items:
             kept.append(job(item))

@@ -105,8 +105,8 @@ def _score_weights(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
         first, last = np.searchsorted(trace.update_s, [at_s - 0.02, at_s - 1e-9])
         return float(trace.estimated_kg[first:last].mean()) if last > first else math.nan
 
-    before_kg, (at_s, _, after) = estimate(0.0), scenario.events[0]
-    step = step_response(trace, at_s, _LAST_S, after)
+    before_kg, (at_s, before, after) = estimate(0.0), scenario.events[0]
+    step = step_response(trace, at_s, _LAST_S, before, after)
     return {
         "change_error_0p2s_kg": abs(estimate(0.2) - before_kg - _GRAMS_KG),
         "change_error_1s_kg": abs(estimate(1.0) - before_kg - _GRAMS_KG),

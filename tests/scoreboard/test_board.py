@@ -200,8 +200,11 @@ def test_the_force_loop_designs_itself_and_is_better_than_an_open_loop(truth):
     assert force[0].reason == "" and set(force[0].values) == {
         "kp", "ki", "kd", "filter_s", "reference_s"
     }  # fmt: skip
-    for task, metric in (("T1", "settling_s"), ("T1", "iae"), ("T4", "peak")):
+    for task, metric in (("T1", "iae"), ("T4", "peak")):
         assert rows["force", task, metric].median < rows["open-loop", task, metric].median
+    # the open loop ends 0.28 of the step before the desired strain
+    assert rows["force", "T1", "settling_s"].median < 0.5
+    assert rows["open-loop", "T1", "settling_s"].median is None
     assert rows["force", "T4", "recovery_s"].median < 0.5  # the open loop does not come back
     assert rows["open-loop", "T4", "recovery_s"].median is None
 

@@ -110,9 +110,9 @@ def test_the_limit_by_noise_is_the_median_error_of_a_mean():
     """5,000 draws: the median is known to 1.25/sqrt(5000) of a standard deviation, here 2 %."""
     rng = np.random.default_rng(8)
     means = np.abs(rng.standard_normal((5000, 6, 25)).mean(axis=2))
-    assert mean_error(1.0, 25.0) == pytest.approx(float(np.median(means[:, 0])), rel=0.06)
+    assert mean_error([1.0], 25.0) == pytest.approx(float(np.median(means[:, 0])), rel=0.06)
     largest = float(np.median(means.max(axis=1)))
-    assert mean_error(1.0, 25.0, 6) == pytest.approx(largest, rel=0.03)
+    assert mean_error(6 * [1.0], 25.0) == pytest.approx(largest, rel=0.03)
 
 
 def test_the_limit_of_a_weight_is_that_of_a_double_integrator():

@@ -132,11 +132,10 @@ def _score_tracking(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
 def _bounds_staircase(
     known: KnownActuator, scenario: Scenario, loop: LoopClass
 ) -> Mapping[str, float]:
-    noise = max(sensed_noise(known, scenario, loop, strain) for strain in (_LOW, _HIGH))
-    if noise == 0.0:
+    noises = [sensed_noise(known, scenario, loop, strain) for _, _, strain in scenario.events]
+    if min(noises) == 0.0:
         return {}
-    count = _STAIR_S / loop.period_s
-    return {"error_at_rest": mean_error(noise, count, len(scenario.events))}
+    return {"error_at_rest": mean_error(noises, _STAIR_S / loop.period_s)}
 
 
 def _bounds_tracking(

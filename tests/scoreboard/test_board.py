@@ -244,6 +244,11 @@ def test_the_identified_stack_is_that_of_the_bench_within_its_standard_deviation
         assert known.static_drive_v(strain) == pytest.approx(true.static_drive_v(strain), rel=5e-3)
 
 
+def test_tasks_that_no_class_plays_are_refused():
+    with pytest.raises(InputError, match=r"T6 is not played in the class chip-1khz\. Add --class"):
+        play_board(Plan(("open-loop",), ("T6",), ("chip-1khz",)))
+
+
 def test_a_device_that_is_not_identified_leaves_its_tasks_not_done(monkeypatch):
     monkeypatch.setattr(board, "_identify", lambda name: (None, "the records contradict the model"))
     game = play_board(Plan(("open-loop", "force"), ("T4",), ("host-100hz",), seeds=1))

@@ -307,7 +307,7 @@ def play_board(plan: Plan, progress: Progress | None = None) -> Game:
     Returns:
         All results, in the order of the plan.
     Raises:
-        InputError: No controller is made for the loop of any class.
+        InputError: No controller is made for the loop of any class, or no class plays any task.
     """
     bar = progress or SilentProgress()
     tasks = [TASKS[name] for name in plan.tasks]
@@ -326,6 +326,11 @@ def play_board(plan: Plan, progress: Progress | None = None) -> Game:
         for controller, loop in pairs for task in tasks if loop in task.classes
         for index in range(plan.seeds)
     ]  # fmt: skip
+    if not plays:
+        raise InputError(
+            f"{', '.join(plan.tasks)} is not played in the class {', '.join(plan.classes)}. Add "
+            f"--class {tasks[0].classes[0]}."
+        )
     bar.start(len(devices) + len(pairs) * len(devices) + len(plays))
     try:
         with _mapper(plan.workers, bar) as mapped:

@@ -7,6 +7,7 @@ import tomllib
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -31,6 +32,9 @@ SETTING = ControllerSetting(0.01, -0.05, 0.1, 0.02)
 SEEN = Measurement(0.01, 6e-10, 1.5, 3.0)
 FOREIGN = ControllerKind("foreign", OpenLoop, (Parameter("rate", "1/s", None, 0.0, 10.0),))
 NAMELESS = 3
+FAR_AHEAD = ControllerKind("foreign", OpenLoop, preview_s=1e9)
+WORDS_AHEAD = ControllerKind("foreign", OpenLoop, preview_s=cast(float, "0.1"))
+NAMES_ONLY = ControllerKind("foreign", OpenLoop, cast(tuple[Parameter, ...], ("gain",)))
 
 
 class TheirPoint(EntryPoint):
@@ -145,6 +149,20 @@ def test_an_entry_point_that_is_no_kind_is_refused(installed):
         CONTROLLERS.find("nameless")
     with pytest.raises(InputError, match=r"controller 'other' .*its name is 'foreign'"):
         CONTROLLERS.find("other")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("FAR_AHEAD", r"its preview_s is 1000000000\.0, but must be 0 to 60"),
+        ("WORDS_AHEAD", "its preview_s is '0.1', but must be 0 to 60"),
+        ("NAMES_ONLY", "its parameters are not a tuple of Parameter"),
+    ],
+)
+def test_attributes_of_a_kind_with_wrong_values_are_refused(installed, name, said):
+    installed(foreign=f"{__name__}:{name}")
+    with pytest.raises(InputError, match=said):
+        CONTROLLERS.find("foreign")
 
 
 def test_a_built_in_name_cannot_be_taken(installed):

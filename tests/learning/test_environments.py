@@ -190,6 +190,8 @@ def test_a_step_outside_of_an_episode_is_refused() -> None:
     for begun in (env, StrainVectorEnv(1, "track", devices=1)):
         with pytest.raises(InputError, match="has not begun"):
             begun.step(action)
+    with pytest.raises(InputError, match="has not begun"):
+        StrainEnv("track", devices=1, render_mode="rgb_array").render()
     env.reset(seed=1)
     while not env.step(action)[3]:
         pass
@@ -208,3 +210,15 @@ def test_seeds_of_numpy_are_seeds_and_none_is_random() -> None:
     for wrong in (-1, 1.5, True, [1, "a"]):
         with pytest.raises(InputError, match="The seed is"):
             first(wrong)
+
+
+def test_the_mask_of_a_reset_says_which_episodes_begin() -> None:
+    envs, action = StrainVectorEnv(3, "hold", devices=1), np.ones((3, 1), np.float32)
+    envs.reset(seed=1)
+    moved = envs.step(action)[0]
+    found, _ = envs.reset(options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(found[[0, 2]], moved[[0, 2]])
+    assert found[1, 4] < 1.0  # the drive of strain 0 again
+    for wrong in ([True, False], [1], np.ones((3, 1), dtype=bool)):
+        with pytest.raises(InputError, match="State 3 values of True or False"):
+            envs.reset(options={"reset_mask": wrong})

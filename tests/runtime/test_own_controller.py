@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import sys
 
@@ -250,6 +251,18 @@ def test_a_controller_that_does_not_start_is_refused_before_anything_moves(scene
 def test_a_controller_that_exits_at_its_start_is_refused(scene):
     with pytest.raises(InputError, match=r"'spy' does not start: .*it called sys\.exit\(3\)"):
         scene.play(lambda: sys.exit(3), [0.0] * 5)
+
+
+def test_an_exception_that_is_no_exception_stops_the_run_at_zero(scene):
+    """Such as that of a task of asyncio that was cancelled, or a panic in Rust."""
+
+    class Cancelled(Spy):
+        def step(self, reference: float, measurement: Measurement) -> float:
+            raise asyncio.CancelledError
+
+    with pytest.raises(SafetyError, match=r"'spy' failed: .*it raised CancelledError"):
+        scene.play(lambda: Cancelled(0.0), [0.0] * 5)
+    assert scene.twin.output_v == 0.0
 
 
 def test_a_wild_controller_is_stopped_by_the_watchdog_as_a_pid_is(scene):

@@ -110,9 +110,9 @@ def test_the_limit_by_noise_is_the_median_error_of_a_mean():
     """5,000 draws: the median is known to 1.25/sqrt(5000) of a standard deviation, here 2 %."""
     rng = np.random.default_rng(8)
     means = np.abs(rng.standard_normal((5000, 6, 25)).mean(axis=2))
-    assert mean_error(1.0, 25.0) == pytest.approx(float(np.median(means[:, 0])), rel=0.06)
+    assert mean_error([1.0], 25.0) == pytest.approx(float(np.median(means[:, 0])), rel=0.06)
     largest = float(np.median(means.max(axis=1)))
-    assert mean_error(1.0, 25.0, 6) == pytest.approx(largest, rel=0.03)
+    assert mean_error(6 * [1.0], 25.0) == pytest.approx(largest, rel=0.03)
 
 
 def test_the_limit_of_a_weight_is_that_of_a_double_integrator():
@@ -162,7 +162,11 @@ def trace(strain, reference=None) -> Trace:
 def test_a_first_order_step_has_its_rise_and_settling_time():
     tau_s, after = 0.1, 0.04
     found = step_response(
-        trace(lambda t: after * np.where(t > 0, 1.0 - np.exp(-t / tau_s), 0.0)), 0.0, 2.0, after
+        trace(lambda t: after * np.where(t > 0, 1.0 - np.exp(-t / tau_s), 0.0)),
+        0.0,
+        2.0,
+        0.0,
+        after,
     )
     assert found.rise_s == pytest.approx(tau_s * math.log(9.0), abs=2e-4)
     assert found.settling_s == pytest.approx(tau_s * math.log(50.0), abs=2e-3)  # two samples
@@ -179,19 +183,38 @@ def test_a_resonant_step_has_the_overshoot_of_its_damping():
         wave = np.cos(damped * t) + zeta / math.sqrt(1 - zeta**2) * np.sin(damped * t)
         return -0.02 * (1.0 - np.exp(-zeta * omega * t) * wave)
 
-    found = step_response(trace(strain), 0.0, 2.0, -0.02)
+    found = step_response(trace(strain), 0.0, 2.0, 0.0, -0.02)
     expected = math.exp(-math.pi * zeta / math.sqrt(1.0 - zeta**2))
     assert found.overshoot == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_step_that_did_not_happen_or_swings_has_no_numbers():
-    stuck = step_response(trace(lambda t: 0.0 * t), 0.0, 2.0, 0.04)
+    stuck = step_response(trace(lambda t: 0.0 * t), 0.0, 2.0, 0.0, 0.04)
     swings = step_response(
-        trace(lambda t: np.where(t > 0, 0.04 + 0.05 * np.sin(30.0 * t), 0.0)), 0.0, 2.0, 0.04
+        trace(lambda t: np.where(t > 0, 0.04 + 0.05 * np.sin(30.0 * t), 0.0)), 0.0, 2.0, 0.0, 0.04
     )
-    short = step_response(trace(lambda t: 0.0 * t), 3.0, 2.0, 0.04)
+    short = step_response(trace(lambda t: 0.0 * t), 3.0, 2.0, 0.0, 0.04)
     for score in (stuck, swings, short):
         assert math.isnan(score.rise_s) and math.isnan(score.overshoot)
+
+
+def test_a_step_is_scored_by_the_desired_strain_and_not_by_the_one_that_was_reached():
+    """A first-order response to 0.7 of the step never crosses 90 % of it, and never settles."""
+    tau_s, after = 0.1, 0.04
+
+    def reaches(share):
+        return trace(lambda t: after * share * np.where(t > 0, 1.0 - np.exp(-t / tau_s), 0.0))
+
+    short = step_response(reaches(0.7), 0.0, 2.0, 0.0, after)
+    assert math.isnan(short.rise_s) and math.isnan(short.settling_s)
+    assert (short.overshoot, short.error) == (0.0, pytest.approx(-0.3 * after, rel=1e-4))
+    long = step_response(reaches(1.25), 0.0, 2.0, 0.0, after)
+    # 1 - exp(-t / tau) = 0.72 and 0.08
+    assert long.rise_s == pytest.approx(tau_s * math.log(0.92 / 0.28), abs=2e-4)
+    assert long.overshoot == pytest.approx(0.25, abs=1e-4) and math.isnan(long.settling_s)
+    # a second step of the same size that begins where the first one has ended, far from its start
+    missed = step_response(reaches(0.7), 1.0, 2.0, -after, 0.75 * after)
+    assert math.isnan(missed.rise_s) and missed.overshoot == 0.0
 
 
 def test_a_load_response_has_its_peak_and_its_time_back():

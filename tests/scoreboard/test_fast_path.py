@@ -19,7 +19,7 @@ from haselab.rig.twin.config import twin_of_reading
 from haselab.rig.twin.twin_bench import TwinBench, describe
 from haselab.runtime.lockin import counted_s, lockin_of
 from haselab.runtime.loop import RunningController
-from haselab.scoreboard.devices import find_device
+from haselab.scoreboard.devices import ZERO_LENGTH_M, find_device
 from haselab.scoreboard.knowledge import true_actuator
 from haselab.scoreboard.loop_class import (
     CARRIER_HZ,
@@ -31,6 +31,7 @@ from haselab.scoreboard.loop_class import (
 )
 from haselab.scoreboard.plant import FastPlant
 from haselab.scoreboard.play import Scenario, play, setting_for
+from haselab.scoreboard.tasks.task import sensed_noise
 
 HOST = CLASSES["host-100hz"]
 HZ = find_device("hz")
@@ -242,3 +243,16 @@ def test_a_closed_loop_on_the_full_twin_has_the_trace_of_the_fast_path():
         drive_v = round(drive_v / HOST.drive_step_v) * HOST.drive_step_v
     np.testing.assert_allclose(fast.strain[9::10], strains, rtol=0.0, atol=5.0 * 1.2 * 2.83e-4)
     assert strains[-1] == pytest.approx(0.04, abs=2e-3)
+
+
+@pytest.mark.parametrize("strain", [-0.03, 0.21])
+def test_the_limits_by_noise_assume_the_noise_that_is_played(strain):
+    """The length creeps by far less than the noise; 2,000 differences know it to 2 %."""
+    known, scenario = true_actuator(HZ), Scenario(HZ, ZERO_LENGTH_M, 1.0, np.zeros_like)
+    plant = FastPlant(HZ, HOST, np.random.default_rng(1), 2000)
+    plant.train()
+    drive_v = known.static_drive_v(strain)
+    plant.hold(drive_v, 60.0)
+    sensed = [known.strain(known.sensed_length_m(plant.update(drive_v))) for _ in range(2000)]
+    played = float(np.diff(sensed).std()) / math.sqrt(2.0)
+    assert played == pytest.approx(sensed_noise(known, scenario, HOST, strain), rel=0.06)

@@ -1,4 +1,4 @@
-"""`sys.exit()` in code of other packages, which must not end a run or a check of this program."""
+"""`sys.exit()` and the like in code of other packages, which must not end a run of this program."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ class SignalExit(SystemExit):
 def no_exit() -> Iterator[None]:
     """Turn `sys.exit()` in code of another package into an error, like any other one there.
 
+    The same for exceptions that are no `Exception`, such as `asyncio.CancelledError`, or a panic in
+    an extension written in Rust. Ctrl-C still ends the program.
+
     Raises:
-        RuntimeError: The code called `sys.exit()`.
+        RuntimeError: The code called `sys.exit()`, or raised such an exception.
     Example:
         >>> import sys
         >>> with no_exit():
@@ -32,6 +35,10 @@ def no_exit() -> Iterator[None]:
         raise
     except SystemExit as stop:
         raise RuntimeError(f"it called sys.exit({exit_code_text(stop)})") from stop
+    except (Exception, KeyboardInterrupt, GeneratorExit):
+        raise
+    except BaseException as error:
+        raise RuntimeError(f"it raised {type(error).__name__}") from error
 
 
 def exit_code_text(stop: SystemExit) -> str:

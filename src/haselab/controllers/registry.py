@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
-from haselab.base import InputError
+from haselab.base import InputError, is_real, shown
 from haselab.base.registry import Registry
-from haselab.controllers.kind import ChosenController, ControllerKind
+from haselab.controllers.kind import ChosenController, ControllerKind, Parameter
 
 __all__ = ["CONTROLLERS", "chosen_controller", "parameters_of"]
+
+_LONGEST_PREVIEW_S = 60.0
 
 
 def _fault(kind: object, name: str) -> str:
@@ -18,8 +19,11 @@ def _fault(kind: object, name: str) -> str:
         return f"it is of the type {type(kind).__name__!r}, not a ControllerKind"
     if kind.output not in ("strain", "voltage"):
         return f"its output is {kind.output!r}, neither 'strain' nor 'voltage'"
-    if not 0.0 <= kind.preview_s < math.inf:
-        return f"its preview_s is {kind.preview_s!r}, but must be 0 or more"
+    if not is_real(kind.preview_s) or not 0.0 <= kind.preview_s <= _LONGEST_PREVIEW_S:
+        return f"its preview_s is {shown(kind.preview_s)}, but must be 0 to {_LONGEST_PREVIEW_S:g}"
+    good = isinstance(kind.parameters, tuple)
+    if not good or not all(isinstance(one, Parameter) for one in kind.parameters):
+        return "its parameters are not a tuple of Parameter"
     return "" if kind.name == name else f"its name is {kind.name!r}"
 
 

@@ -107,9 +107,15 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         )  # fmt: skip
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Frame of the camera, shape `(H, W, 3)`; None without a render mode."""
+        """Frame of the camera, shape `(H, W, 3)`; None without a render mode.
+
+        Raises:
+            InputError: No episode has begun.
+        """
         if self.render_mode is None:
             return None
+        if not self._simulation.length_m.all():
+            raise InputError("The episode has not begun. Call reset() before render().")
         if self._camera is None:
             config = find_device("hz").config
             law = config.law

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from haselab.base import JsonObject
+from haselab.base import InputError, JsonObject, shown
 from haselab.learning.environment import action_space, actions_of, observation_space
 from haselab.learning.simulation import StrainSimulation, whole_number
 
@@ -58,7 +58,8 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
             seed: of all loops together; several are combined, without those that are None.
             options: `reset_mask`, shape `(num_envs,)`: which episodes begin; default: all.
         Raises:
-            InputError: A seed is not a whole number of 0 or more.
+            InputError: A seed is not a whole number of 0 or more, or `reset_mask` has another type
+                or shape.
         """
         if seed is not None:
             several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
@@ -68,11 +69,21 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
             # without any number, the operating system gives one
             self._np_random = np.random.default_rng((parts or None) if several else parts[0])
             self._np_random_seed = None if several else int(parts[0])
-        mask = (options or {}).get("reset_mask")
-        which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        which = self._chosen((options or {}).get("reset_mask"))
         self._simulation.reset(which.astype(np.int64), self.np_random)
         self._ended[which] = False
         return self._simulation.observe(), {}
+
+    def _chosen(self, mask: object) -> NDArray[np.intp]:
+        """Places of the episodes that begin."""
+        if mask is None:
+            return np.arange(self.num_envs)
+        flags = np.asarray(mask)
+        if flags.dtype != np.bool_ or flags.shape != (self.num_envs,):
+            raise InputError(
+                f"reset_mask is {shown(mask)}. State {self.num_envs} values of True or False."
+            )
+        return np.flatnonzero(flags)
 
     def step(
         self, actions: Observed

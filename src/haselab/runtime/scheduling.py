@@ -1,4 +1,4 @@
-"""Raise the priority of a real-time loop, in the system if allowed and in Python."""
+"""Priorities of processes, and their threads for linear algebra."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import os
 import sys
 from collections.abc import Iterator
 
-__all__ = ["lower_priority", "with_priority"]
+__all__ = ["lower_priority", "one_thread", "with_priority"]
 
 _NICENESS = -10
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _SWITCH_S = 0.5e-3  # Python's default of 5 ms is half a block
 
 
@@ -40,6 +41,24 @@ def lower_priority() -> None:
     process that lowers its own must not be started in a session of its own.
     """
     _set_niceness(max(_niceness(), -_NICENESS))
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Give the processes that are started here one thread for linear algebra.
+
+    The number is fixed when numpy is imported, so it has to be in their environment.
+    """
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _niceness() -> int:

@@ -7,25 +7,32 @@ they finish. Each task and seed has random numbers of its own, the same for all 
 from __future__ import annotations
 
 import math
-import multiprocessing
+import random
 import signal
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import HaselabError, InputError, Progress, ResultError, SilentProgress
+from haselab.base import (
+    DeviceError,
+    HaselabError,
+    InputError,
+    Progress,
+    ResultError,
+    SilentProgress,
+)
 from haselab.controllers import CONTROLLERS, ChosenController, KnownActuator
 from haselab.scoreboard.devices import Device, find_device
 from haselab.scoreboard.entrants import Designed, designed
 from haselab.scoreboard.knowledge import identified, known_by, true_actuator
 from haselab.scoreboard.loop_class import CLASSES, LoopClass, noise_of
 from haselab.scoreboard.play import Scenario, play
+from haselab.scoreboard.processes import Lost, Workers, announce_limit
 from haselab.scoreboard.tasks import TASKS, Task
 
 __all__ = ["Entry", "Game", "Plan", "Played", "known_in_class", "play_board"]
@@ -37,6 +44,7 @@ _SHOWN_S = 4e-3  # between two points of a trace that is kept
 _SLOWEST = 10.0  # times the duration of a task: a controller that takes longer does not return
 _LEAST_S = 20.0
 _BUSY = 4.0  # wall time over processor time that other programs explain
+_GRACE = 1.5  # a process that has not ended by itself then is ended
 _EXCESS = 1.02  # of the permitted field: what a sensed length may miss
 
 
@@ -50,7 +58,8 @@ class Plan:
         classes: names.
         seed: of all random numbers.
         seeds: how often each task is played.
-        workers: number of processes; 1: none but this one.
+        workers: number of processes, in which a controller cannot affect other tasks; 0: none but
+            this one.
     """
 
     controllers: tuple[str, ...]
@@ -58,7 +67,7 @@ class Plan:
     classes: tuple[str, ...] = ("host-100hz", "chip-1khz")
     seed: int = 0
     seeds: int = 5
-    workers: int = 1
+    workers: int = 0
 
 
 @dataclass(frozen=True)
@@ -166,7 +175,8 @@ def _design(job: _DesignJob) -> Entry:
         return Entry(job.controller, job.loop, job.device, reason=job.status)
     known = known_in_class(job.known, device, loop)
     try:
-        with _deadline(600.0, "the design takes longer than 10 minutes"):
+        about = zlib.crc32(f"{job.controller} {job.loop} {job.device}".encode())
+        with _seeded([about]), _deadline(600.0, "the design takes longer than 10 minutes"):
             found = designed(CONTROLLERS.find(job.controller), loop, known)
     except TimeoutError as error:
         found = Designed(None, str(error))
@@ -181,6 +191,7 @@ class _PlayJob:
     index: int
     seed: int
     known: KnownActuator | None
+    lost: str = ""  # why its process has ended; empty: it has not been played
 
 
 def _play(job: _PlayJob) -> Played:
@@ -193,8 +204,9 @@ def _play(job: _PlayJob) -> Played:
         return Played(*about, nothing, {}, entry.reason, violates=False)
     scenario = task.scenario(job.known, rng)
     bounds = _bounds(task, scenario, loop)
-    if entry.reason:
-        return Played(*about, nothing, bounds, entry.reason, violates=False)
+    if entry.reason or job.lost:
+        reason = entry.reason or f"Controller {entry.controller!r}: {job.lost}"
+        return Played(*about, nothing, bounds, reason, violates=bool(job.lost))
     kind = CONTROLLERS.find(entry.controller)
     chosen = ChosenController(kind, tuple(entry.values.items()))
     known = known_in_class(job.known, device, loop)
@@ -203,7 +215,10 @@ def _play(job: _PlayJob) -> Played:
         known = replace(known, zero_length_m=scenario.zero_m)
     longest_s = max(_SLOWEST * (scenario.duration_s + scenario.lead_s), _LEAST_S)
     try:
-        with _deadline(longest_s, f"the controller takes longer than {_SLOWEST:g} times the task"):
+        with (
+            _seeded(_seed(job.seed, job.task, job.index)),
+            _deadline(longest_s, f"the controller takes longer than {_SLOWEST:g} times the task"),
+        ):
             trace = play(scenario, chosen, loop, known, rng)
     except TimeoutError as error:
         return Played(*about, nothing, bounds, str(error), violates=True)
@@ -227,7 +242,25 @@ def _bounds(task: Task, scenario: Scenario, loop: LoopClass) -> Mapping[str, flo
 
 def _random(seed: int, task: str, index: int) -> np.random.Generator:
     """Random numbers of a task and seed, the same for all controllers and classes."""
-    return np.random.default_rng([seed, zlib.crc32(task.encode()), index])
+    return np.random.default_rng(_seed(seed, task, index))
+
+
+def _seed(seed: int, task: str, index: int) -> list[int]:
+    return [seed, zlib.crc32(task.encode()), index]
+
+
+@contextmanager
+def _seeded(seed: Sequence[int]) -> Iterator[None]:
+    """Seed the global generators that a controller may draw from, and restore them afterwards."""
+    before = random.getstate(), np.random.get_state(legacy=False)  # noqa: NPY002
+    number = int(np.random.SeedSequence(seed).generate_state(1)[0])
+    random.seed(number)
+    np.random.seed(number)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        random.setstate(before[0])
+        np.random.set_state(before[1])  # noqa: NPY002
 
 
 @contextmanager
@@ -242,6 +275,7 @@ def _deadline(duration_s: float, reason: str) -> Iterator[None]:
     def stop(*_: object) -> None:
         raise TimeoutError(reason)
 
+    announce_limit(_GRACE * _BUSY * duration_s, reason)
     try:
         timers = (
             (signal.ITIMER_PROF, signal.SIGPROF, duration_s),
@@ -273,7 +307,7 @@ def play_board(plan: Plan, progress: Progress | None = None) -> Game:
     Returns:
         All results, in the order of the plan.
     Raises:
-        InputError: No controller is made for the loop of any class.
+        InputError: No controller is made for the loop of any class, or no class plays any task.
     """
     bar = progress or SilentProgress()
     tasks = [TASKS[name] for name in plan.tasks]
@@ -292,44 +326,97 @@ def play_board(plan: Plan, progress: Progress | None = None) -> Game:
         for controller, loop in pairs for task in tasks if loop in task.classes
         for index in range(plan.seeds)
     ]  # fmt: skip
+    if not plays:
+        raise InputError(
+            f"{', '.join(plan.tasks)} is not played in the class {', '.join(plan.classes)}. Add "
+            f"--class {tasks[0].classes[0]}."
+        )
     bar.start(len(devices) + len(pairs) * len(devices) + len(plays))
     try:
         with _mapper(plan.workers, bar) as mapped:
-            found = dict(zip(devices, mapped("identify", _identify, devices), strict=True))
+            fits = _all_done(mapped("identify", _identify, devices))
+            found = dict(zip(devices, fits, strict=True))
             jobs = [
                 _DesignJob(controller, loop, device, *found[device])
                 for controller, loop in pairs for device in devices
             ]  # fmt: skip
-            entries = tuple(mapped("design", _design, jobs))
+            entries = _entries(mapped, jobs)
             by_name = {(e.controller, e.loop, e.device): e for e in entries}
-            played = tuple(mapped("play", _play, [
+            played = _all_played(mapped, [
                 _PlayJob(by_name[controller, loop, task.device], task.name, index, plan.seed,
                          found[task.device][0])
                 for controller, loop, task, index in plays
-            ]))  # fmt: skip
+            ])  # fmt: skip
     finally:
         bar.stop()
     statuses = {name: status for name, (_, status) in found.items()}
     return Game(plan, entries, played, statuses)
 
 
-_Mapped = Callable[[str, Callable[[Item], Result], Sequence[Item]], list[Result]]
+class _Mapped(Protocol):
+    """A map that keeps the order."""
+
+    def __call__(
+        self, what: str, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> list[Result | Lost]: ...
 
 
 @contextmanager
-def _mapper(workers: int, bar: Progress) -> Iterator[_Mapped]:  # type: ignore[type-arg]
+def _mapper(workers: int, bar: Progress) -> Iterator[_Mapped]:
     """A map that keeps the order, over processes or in this one."""
 
-    def collect(what: str, results: Iterable[Result]) -> list[Result]:
-        kept = []
-        for result in results:
-            kept.append(result)
+    def here(
+        what: str, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> list[Result | Lost]:
+        kept: list[Result | Lost] = []
+        for item in items:
+            kept.append(job(item))
             bar.advance(1.0, what)
         return kept
 
-    if workers <= 1:
-        yield lambda what, job, items: collect(what, map(job, items))
+    if workers < 1:
+        yield here
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield lambda what, job, items: collect(what, pool.map(job, items))
+    pool = Workers(workers)
+
+    def there(
+        what: str, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> list[Result | Lost]:
+        found: dict[int, Result | Lost] = {}
+        for place, result in pool.each(job, items):
+            found[place] = result
+            bar.advance(1.0, what)
+        return [found[place] for place in range(len(items))]
+
+    try:
+        yield there
+    finally:
+        pool.close()
+
+
+def _all_done(found: list[Result | Lost]) -> list[Result]:
+    """The results of jobs without code of other packages."""
+    lost = [one.reason for one in found if isinstance(one, Lost)]
+    if lost:
+        raise DeviceError(
+            f"A job did not end: {lost[0]}. Check the memory of the computer, or use fewer workers."
+        )
+    return [one for one in found if not isinstance(one, Lost)]
+
+
+def _entries(mapped: _Mapped, jobs: Sequence[_DesignJob]) -> tuple[Entry, ...]:
+    return tuple(
+        Entry(job.controller, job.loop, job.device, reason=f"no design: {one.reason}")
+        if isinstance(one, Lost) else one
+        for job, one in zip(jobs, mapped("design", _design, jobs), strict=True)
+    )  # fmt: skip
+
+
+def _all_played(mapped: _Mapped, jobs: Sequence[_PlayJob]) -> tuple[Played, ...]:
+    """Play; a task whose process ended is not done."""
+    found = mapped("play", _play, jobs)
+    lost = {k: one.reason for k, one in enumerate(found) if isinstance(one, Lost)}
+    again = mapped("play", _play, [replace(jobs[k], lost=reason) for k, reason in lost.items()])
+    for k, one in zip(lost, _all_done(again), strict=True):
+        found[k] = one
+    return tuple(_all_done(found))

@@ -8,6 +8,7 @@ exactly. Limits of the knowledge come from the noise of the sensed length alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +26,7 @@ _STEP_S = 1e-4
 _ROUNDS = 40
 _SHORTEST_S, _LONGEST_S = 0.05, 30.0
 _MEDIAN = 0.6745  # of the absolute value of a normal error, over its standard deviation
+_FARTHEST = 10.0  # standard deviations, above the largest of any number of errors
 _SMALL_KG = 1e-3
 _HEAVY = 1e3  # weight of the equations that close a period
 
@@ -167,22 +169,28 @@ def least_peak(known: KnownActuator, strain: float, added_kg: float, dead_s: flo
 # ---- limits by noise -----------------------------------------------------------------------------
 
 
-def mean_error(noise: float, count: float, largest_of: int = 1) -> float:
+def mean_error(noises: Sequence[float], count: float) -> float:
     r"""Median error of the best estimate of a constant from measurements with white noise.
 
-    With several errors the median of the largest: $\Phi(q)$ is the probability of each below it.
+    Of several constants the largest error counts: the median $q$ of the largest is where
+    $\prod_k (2\Phi(q/\sigma_k) - 1) = 1/2$.
 
     Args:
-        noise: standard deviation of one measurement.
-        count: of the measurements.
-        largest_of: number of independent errors of which the largest counts.
+        noises: standard deviation of one measurement, of each constant.
+        count: of the measurements of one constant.
     Example:
-        >>> round(mean_error(1.0, 100.0), 4)
-        0.0674
+        >>> round(mean_error([1.0], 100.0), 4), round(mean_error([1.0, 1e-3], 100.0), 4)
+        (0.0674, 0.0674)
     """
-    from scipy.stats import halfnorm  # slow to import
+    from scipy.optimize import brentq  # slow to import
+    from scipy.special import erf
 
-    return noise / math.sqrt(count) * float(halfnorm.ppf(0.5 ** (1.0 / largest_of)))
+    stds = np.asarray(noises, dtype=float) / math.sqrt(count)
+
+    def beyond(error: float) -> float:
+        return float(np.prod(erf(error / (math.sqrt(2.0) * stds)))) - 0.5
+
+    return float(brentq(beyond, 0.0, _FARTHEST * stds.max(), rtol=1e-12))
 
 
 def weight_error_kg(

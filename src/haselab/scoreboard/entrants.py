@@ -9,6 +9,7 @@ import numpy as np
 
 from haselab.actuators import GRAVITY_M_S2, linearise
 from haselab.base import InputError, ResultError
+from haselab.base.exits import no_exit
 from haselab.control import DesignSpec, LoopSetting, Saturation, design_pid
 from haselab.control.plants.general import AnyPlant
 from haselab.controllers import CONTROLLERS, ChosenController, ControllerKind, KnownActuator
@@ -85,7 +86,8 @@ def designed(kind: ControllerKind, loop: LoopClass, known: KnownActuator) -> Des
         if kind.design is None:
             return Designed(kind.choose())
         blank = ChosenController(kind, ())
-        return Designed(kind.choose(kind.design(setting_for(blank, loop, known, 0.0))))
+        with no_exit():
+            return Designed(kind.choose(kind.design(setting_for(blank, loop, known, 0.0))))
     except Exception as error:  # a design of another package may raise anything
         return Designed(None, f"no design: {type(error).__name__}: {error}")
 

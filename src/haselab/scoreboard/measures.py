@@ -31,12 +31,13 @@ _BACK = 1e-3  # strain
 
 @dataclass(frozen=True)
 class StepScore:
-    """One step response; NaN where it ended far from the step, or still swings.
+    """One step response; NaN where it ended far from the desired strain, or still swings.
 
     Args:
-        rise_s: 10 to 90 % of the way to the final value.
-        overshoot: largest excess over the final value, relative to the step.
-        settling_s: after which the mean of 20 ms stays within 2 % of the step.
+        rise_s: 10 to 90 % of the way to the desired strain; NaN where it does not come so far.
+        overshoot: largest excess over the desired strain, relative to the step.
+        settling_s: after which the mean of 20 ms stays within 2 % of the step around the desired
+            strain; NaN where it does not.
         error: final value less the desired one, in strain.
     """
 
@@ -62,43 +63,50 @@ def smoothed(values: Floats, window_s: float = _SMOOTH_S) -> Floats:
     return np.asarray((sums[last] - sums[first]) / (last - first))
 
 
-def step_response(trace: Trace, at_s: float, last_s: float, after: float) -> StepScore:
+def step_response(
+    trace: Trace, at_s: float, last_s: float, before: float, after: float
+) -> StepScore:
     """Score a step of the reference.
+
+    All numbers are relative to the desired strain, not to the one that was reached: a controller
+    that stops half-way is not faster than one that goes the whole way.
 
     Args:
         trace: with the step.
         at_s: when the reference changes.
         last_s: duration of the record from then on.
-        after: desired strain after the step.
+        before: desired strain before the step.
+        after: the one after it.
     Returns:
         The numbers.
     """
     nothing = StepScore(math.nan, math.nan, math.nan, math.nan)
-    _, before = trace.between(at_s - _BEFORE_S, at_s)
+    _, earlier = trace.between(at_s - _BEFORE_S, at_s)
     time_s, strain = trace.between(at_s, at_s + last_s)
-    if before.size == 0 or time_s.size < round(0.9 * last_s / TRACE_S):
+    if earlier.size == 0 or time_s.size < round(0.9 * last_s / TRACE_S):
         return nothing
-    start = float(before.mean())
-    moved = (strain - start) / (after - start)
-    final = float(moved[-round(_FINAL * moved.size) :].mean())
-    last = moved[-round(_FINAL * moved.size) :]
-    if abs(final - 1.0) > _FAR or float(last.std()) > _RESTLESS:
+    size = after - before
+    left = (after - strain) / size  # of the step; below 0: beyond the desired strain
+    last = left[-round(_FINAL * left.size) :]
+    if abs(float(last.mean())) > _FAR or float(last.std()) > _RESTLESS:
         return nothing
-    outside = np.flatnonzero(np.abs(smoothed(moved) - final) > _SETTLED)
+    outside = np.flatnonzero(np.abs(smoothed(left)) > _SETTLED)
     settled = int(outside[-1]) + 1 if outside.size else 0
+    start = (after - float(earlier.mean())) / size
     return StepScore(
-        rise_s=(_crossing(moved, 0.9 * final) - _crossing(moved, 0.1 * final)) * TRACE_S,
-        overshoot=max(float(moved.max()) - final, 0.0),
-        settling_s=settled * TRACE_S if settled < 0.9 * moved.size else math.nan,
-        error=(final - 1.0) * (after - start),
-    )
+        rise_s=(_crossing(1.0 - left / start, 0.9) - _crossing(1.0 - left / start, 0.1)) * TRACE_S
+        if start > _FAR else math.nan,
+        overshoot=max(-float(left.min()), 0.0),
+        settling_s=settled * TRACE_S if settled < 0.9 * left.size else math.nan,
+        error=-float(last.mean()) * size,
+    )  # fmt: skip
 
 
 def _crossing(moved: Floats, level: float) -> float:
-    """Index of the first crossing, by linear interpolation."""
+    """Index of the first crossing, by linear interpolation; NaN without one."""
     above = int(np.argmax(moved >= level))
     if above == 0:
-        return 0.0
+        return 0.0 if moved[0] >= level else math.nan
     low, high = moved[above - 1], moved[above]
     return float(above - 1 + (level - low) / (high - low))
 

@@ -13,10 +13,21 @@ from haselab.scoreboard.devices import Device
 from haselab.scoreboard.knowledge import TRAINED
 from haselab.scoreboard.loop_class import CARRIER_HZ, CARRIER_V, STEP_S, LoopClass, noise_of
 
-__all__ = ["FastPlant"]
+__all__ = ["FastPlant", "relative_noise_of"]
 
 Floats = NDArray[np.float64]
 _TRAIN_S, _REST_S = 20.0, 60.0
+
+
+def relative_noise_of(loop: LoopClass, device: Device) -> float:
+    """Standard deviation of a capacitance over its value, the same at every length.
+
+    Args:
+        loop: class.
+        device: true.
+    """
+    middle_f = float(device.law.capacitance_f(device.law.free_length_m))
+    return noise_of(loop, device.config, middle_f) / middle_f
 
 
 class FastPlant:
@@ -44,8 +55,7 @@ class FastPlant:
         self._timing = loop.steps, switch_at, loop.first, loop.last
         self._outputs = [0.0] * (2 + waiting)  # the oldest acts first
         self._at = self._lead
-        middle_f = float(device.law.capacitance_f(device.law.free_length_m))
-        self._relative_noise = noise_of(loop, device.config, middle_f) / middle_f
+        self._relative_noise = relative_noise_of(loop, device)
         self._mass_kg = math.nan
         self.hang(device.mass_kg)
 

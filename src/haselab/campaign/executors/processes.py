@@ -13,16 +13,15 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Iterator
 from multiprocessing.connection import Connection, wait
 
 from haselab.base import DeviceError, HaselabError
 from haselab.campaign.executors.executor import Chunk, Outcome
 from haselab.campaign.plan import Problem
+from haselab.runtime.scheduling import one_thread
 
 __all__ = ["ProcessExecutor"]
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _MOST_STARTS = 5  # in a row without one that became ready
 _END_S = 2.0
 
@@ -34,29 +33,11 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
         self.process = context.Process(target=_serve, args=(other, problem), daemon=True)
-        with _one_thread():
+        with one_thread():
             self.process.start()
         other.close()
         self.is_ready = False
         self.given: dict[int, Chunk] = {}
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for linear algebra in the processes that are started here.
-
-    The number is fixed when numpy is imported, so it has to be in their environment.
-    """
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 class ProcessExecutor:

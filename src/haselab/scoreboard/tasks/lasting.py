@@ -106,7 +106,7 @@ def _score_periodic(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
 
 def _bounds_hold(known: KnownActuator, scenario: Scenario, loop: LoopClass) -> Mapping[str, float]:
     noise = sensed_noise(known, scenario, loop, _SIZE)
-    return {"error": mean_error(noise, _AFTER_S / loop.period_s)} if noise > 0.0 else {}
+    return {"error": mean_error([noise], _AFTER_S / loop.period_s)} if noise > 0.0 else {}
 
 
 def _bounds_periodic(

@@ -31,9 +31,11 @@ _SLOW_S = 6.0
 _FASTEST = (
     "time-optimal from rest to rest on the true law: full voltage, then 0 V. No dead time, no noise"
 )
-RISE = Metric("rise_s", "s", "rise 10 to 90 %, step of 0.04 at strain 0", _FASTEST)
-OVERSHOOT = Metric("overshoot", "", "overshoot of that step")
-SETTLING = Metric("settling_s", "s", "settling to 2 % of that step", _FASTEST)
+RISE = Metric("rise_s", "s", "rise 10 to 90 % of the step, step of 0.04 at strain 0", _FASTEST)
+OVERSHOOT = Metric("overshoot", "", "overshoot beyond the desired strain, of that step")
+SETTLING = Metric(
+    "settling_s", "s", "time until within 2 % of that step of the desired strain", _FASTEST
+)
 _ALL = (
     RISE,
     OVERSHOOT,
@@ -84,7 +86,7 @@ def _scenario(known: KnownActuator, rng: np.random.Generator) -> Scenario:
 
 def _score(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
     found = [
-        (before, after, step_response(trace, at_s, _HOLD_S, after))
+        (before, after, step_response(trace, at_s, _HOLD_S, before, after))
         for at_s, before, after in scenario.events
     ]
     chosen = next(
@@ -101,7 +103,7 @@ def _score(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
         "overshoot": chosen.overshoot,
         "settling_s": chosen.settling_s,
         "rise_from_zero_s": found[0][2].rise_s,
-        "worst_overshoot": max(score.overshoot for _, _, score in found),
+        "worst_overshoot": float(np.max([score.overshoot for _, _, score in found])),
         "iae": float(np.mean(iae)),
         "drive_variation_v_per_s": variation_v_per_s(trace),
         "peak_field_v_per_m": trace.peak_field_v_per_m,
@@ -143,8 +145,8 @@ def _other(name: str, hold_s: float) -> Callable[[KnownActuator, np.random.Gener
 
 
 def _score_other(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
-    (at_s, _, after), (back_s, _, _) = scenario.events
-    score = step_response(trace, at_s, back_s - at_s, after)
+    (at_s, before, after), (back_s, _, _) = scenario.events
+    score = step_response(trace, at_s, back_s - at_s, before, after)
     return {
         "rise_s": score.rise_s,
         "overshoot": score.overshoot,

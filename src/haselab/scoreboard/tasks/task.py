@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from haselab.controllers import KnownActuator
 from haselab.scoreboard.bounds import least_tracking_error
-from haselab.scoreboard.loop_class import STEP_S, LoopClass, noise_of
+from haselab.scoreboard.loop_class import STEP_S, LoopClass
+from haselab.scoreboard.plant import relative_noise_of
 from haselab.scoreboard.play import TRACE_S, Scenario, Trace
 
 __all__ = ["Metric", "Task", "no_bounds", "sensed_noise", "staircase", "tracking_limit"]
@@ -72,7 +73,7 @@ def no_bounds(known: KnownActuator, scenario: Scenario, loop: LoopClass) -> Mapp
 
 
 def sensed_noise(known: KnownActuator, scenario: Scenario, loop: LoopClass, strain: float) -> float:
-    """Standard deviation of one measured strain.
+    """Standard deviation of one measured strain, by the noise that `FastPlant` adds.
 
     Args:
         known: true device.
@@ -80,8 +81,8 @@ def sensed_noise(known: KnownActuator, scenario: Scenario, loop: LoopClass, stra
         loop: class.
         strain: at which it is measured.
     """
-    farad = float(known.law.capacitance_f(known.zero_length_m))
-    noise_f = noise_of(loop, scenario.device.config, farad)
+    farad = float(known.law.capacitance_f(known.length_m(strain)))
+    noise_f = relative_noise_of(loop, scenario.device) * farad
     return replace(known, capacitance_noise_f=noise_f).length_noise_m(strain) / known.zero_length_m
 
 

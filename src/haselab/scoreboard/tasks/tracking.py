@@ -59,12 +59,12 @@ def _staircase(known: KnownActuator, rng: np.random.Generator) -> Scenario:
 
 def _score_staircase(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
     errors, noises, overshoots = [], [], []
-    for at_s, _, after in scenario.events:
+    for at_s, before, after in scenario.events:
         _, rest = trace.between(at_s + _STAIR_S - _REST_S, at_s + _STAIR_S)
         whole = rest.size >= round(0.9 * _REST_S / 1e-3)
         errors.append(abs(float(rest.mean()) - after) if whole else math.nan)
         noises.append(float(rest.std()) if whole else math.nan)
-        overshoots.append(step_response(trace, at_s, _STAIR_S, after).overshoot)
+        overshoots.append(step_response(trace, at_s, _STAIR_S, before, after).overshoot)
     return {
         "error_at_rest": float(np.max(errors)),
         "noise_at_rest": float(np.median(noises)),
@@ -132,11 +132,10 @@ def _score_tracking(trace: Trace, scenario: Scenario) -> Mapping[str, float]:
 def _bounds_staircase(
     known: KnownActuator, scenario: Scenario, loop: LoopClass
 ) -> Mapping[str, float]:
-    noise = max(sensed_noise(known, scenario, loop, strain) for strain in (_LOW, _HIGH))
-    if noise == 0.0:
+    noises = [sensed_noise(known, scenario, loop, strain) for _, _, strain in scenario.events]
+    if min(noises) == 0.0:
         return {}
-    count = _STAIR_S / loop.period_s
-    return {"error_at_rest": mean_error(noise, count, len(scenario.events))}
+    return {"error_at_rest": mean_error(noises, _STAIR_S / loop.period_s)}
 
 
 def _bounds_tracking(

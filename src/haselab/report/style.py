@@ -93,7 +93,7 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
     canvas = FigureCanvasSVG(figure)  # whose texts have the sizes of the document
     _arrange(figure)
     figure.dpi = matplotlib.rcParams["savefig.dpi"]  # of what is drawn as an image
-    canvas.print_svg(buffer, metadata=_NO_METADATA)
+    canvas.print_svg(buffer, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)

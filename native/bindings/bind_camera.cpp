@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>    // module, class
 #include <nanobind/ndarray.h>     // numpy arrays without a copy
 #include <nanobind/stl/pair.h>
+#include <nanobind/stl/vector.h>
 
 #include <cstdint>
 #include <memory>
@@ -19,6 +20,7 @@ namespace nb = nanobind;
 using Floats = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Table = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Levels = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using Span = std::pair<int, int>;
 using Frames = nb::ndarray<std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 
 namespace {
@@ -26,6 +28,12 @@ namespace {
 std::vector<float> copied(const Floats &values, std::size_t size, const char *what) {
     if (values.shape(0) != size) throw std::invalid_argument(what);
     return {values.data(), values.data() + size};
+}
+
+camera_span inside(const Span &span, int size) {
+    if (span.first < 0 || span.first > span.second || span.second > size)
+        throw std::invalid_argument("rows and columns: first to stop, inside the frame");
+    return {span.first, span.second};
 }
 
 class Scene {
@@ -61,25 +69,26 @@ public:
         check(lengths_px, out.shape(0), out.shape(1), out.shape(2));
         const nb::gil_scoped_release release;
         std::vector<float> scratch(camera_scratch_size(&scene_, lengths_px.shape(1)));
+        const camera_span columns = {0, scene_.width};
+        const camera_part whole = {{0, scene_.height}, &columns, 1};
         for (std::size_t f = 0; f < lengths_px.shape(0); f++)
             camera_expect(&scene_, lengths_px.data() + f * lengths_px.shape(1), lengths_px.shape(1),
-                          {0, scene_.height}, scratch.data(), out.data() + f * pixels());
+                          &whole, scratch.data(), out.data() + f * pixels());
     }
 
     void render(Table lengths_px, std::uint64_t first_index, Frames out,
-                std::pair<int, int> rows) const {
+                Span rows, const std::vector<Span> &columns) const {
         check(lengths_px, out.shape(0), out.shape(1), out.shape(2));
-        if (rows.first < 0 || rows.first > rows.second || rows.second > scene_.height)
-            throw std::invalid_argument("rows: first to stop, inside the frame");
-        const int even = rows.first - rows.first % 2;  // a pixel of an odd number would be first
-        const std::size_t width = light_x_.size();
+        std::vector<camera_span> spans;
+        for (const Span &span : columns) spans.push_back(inside(span, scene_.width));
+        const camera_part part = {inside(rows, scene_.height), spans.data(), spans.size()};
         const nb::gil_scoped_release release;
         std::vector<float> scratch(camera_scratch_size(&scene_, lengths_px.shape(1)));
         const std::unique_ptr<float[]> level(new float[pixels()]);  // most of it may stay untouched
         for (std::size_t f = 0; f < lengths_px.shape(0); f++) {
             camera_expect(&scene_, lengths_px.data() + f * lengths_px.shape(1), lengths_px.shape(1),
-                          {even, rows.second}, scratch.data(), level.get());
-            camera_expose(level.get(), width * even, width * rows.second, &noise_, first_index + f,
+                          &part, scratch.data(), level.get());
+            camera_expose(&scene_, level.get(), &part, &noise_, first_index + f,
                           out.data() + f * pixels());
         }
     }
@@ -130,7 +139,7 @@ NB_MODULE(_camera, m) {
         .def("expect", &Scene::expect, nb::arg("lengths_px"), nb::arg("out").noconvert(),
              "Expected levels of each row of lengths, into out (frames, height, width) float32.")
         .def("render", &Scene::render, nb::arg("lengths_px"), nb::arg("first_index"),
-             nb::arg("out").noconvert(), nb::arg("rows"),
-             "Some rows of noisy 8-bit frames, one for each row of lengths, into out (frames, height, "
-             "width) uint8. The row before an odd first one is drawn, too; the others stay.");
+             nb::arg("out").noconvert(), nb::arg("rows"), nb::arg("columns"),
+             "Some rows and columns of noisy 8-bit frames, one for each row of lengths, into out "
+             "(frames, height, width) uint8. The other pixels stay.");
 }

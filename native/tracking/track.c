@@ -197,12 +197,13 @@ static void load_patch(const struct track_kernels *kernels, const struct track_f
     patch->values = out;
 }
 
-/* Distance from a row of the frame to the farthest one that the patch was filtered from, px. */
-static float reach_of(const struct track_patch *patch, double y)
+/* Distance along x or y to the farthest pixel that the patch was filtered from, px. */
+static float reach_of(const struct track_patch *patch, double x, double y)
 {
-    const double above = y - (patch->top - TRACK_REACH);
+    const double left = x - (patch->left - TRACK_REACH), above = y - (patch->top - TRACK_REACH);
+    const double right = patch->left + patch->columns - 1 + TRACK_REACH - x;
     const double below = patch->top + patch->rows - 1 + TRACK_REACH - y;
-    return (float)(above > below ? above : below);
+    return (float)fmax(fmax(left, right), fmax(above, below));
 }
 
 /* Does the patch hold all that the pose needs? */
@@ -340,8 +341,8 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
     struct track_patch local = {0};
     struct track_sums sums;
     enum track_status status = TRACK_SLOW;
-    const double start_y = pose->y;
-    float reach = whole ? (float)frame->height : 0.0f;
+    const double start_x = pose->x, start_y = pose->y;
+    float reach = whole ? track_larger_side(frame) : 0.0f;
     int iteration = 0;
     *result = (struct track_result){0};
     while (status == TRACK_SLOW && iteration < settings->max_iterations) {
@@ -352,7 +353,7 @@ void track_refine(const struct track_kernels *kernels, const struct track_frame 
         }
         if (!whole && (iteration == 0 || !patch_covers(&local, t->side, pose))) {
             load_patch(kernels, frame, t->side, pose, &local, buffers);
-            const float farthest = reach_of(&local, start_y);
+            const float farthest = reach_of(&local, start_x, start_y);
             reach = farthest > reach ? farthest : reach;
         }
         const struct track_grid grid = lay_grid(whole ? whole : &local, t, frame, pose);

@@ -45,6 +45,11 @@ struct track_frame {
     int bytes, bits;
 };
 
+static inline float track_larger_side(const struct track_frame *frame)
+{
+    return (float)(frame->width > frame->height ? frame->width : frame->height);
+}
+
 struct track_template {
     const float *shape, *gradient, *inverse;
     const float *place; /* distance of each sample from the centre along x, then y, px */
@@ -63,7 +68,7 @@ struct track_result {
     float residual;  /* mean square of r, weighted with the gradient's energy, grey^2 */
     float iterations;
     float status;
-    float reach; /* farthest row of pixels that was read, from the subset's centre at the start, px */
+    float reach; /* farthest pixel that was read, along x or y from the subset's centre at the start */
 };
 
 struct track_settings {

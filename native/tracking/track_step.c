@@ -317,7 +317,7 @@ struct track_summary track_step(const struct track_kernels *kernels,
     *after->gain = gain_after(*before->gain, gain, agreed);
     remember(&w, before, after);
     struct track_summary summary = summarise(&w, before);
-    summary.reach_px = searched ? (float)frame->height : reach;
+    summary.reach_px = searched ? track_larger_side(frame) : reach;
     summary.due = report(&w, found);
     summary.audit = track_audit_frame(points, found, w.expected); /* no longer needed */
     return summary;

@@ -39,7 +39,7 @@ size_t camera_scratch_size(const camera_scene *scene, size_t samples)
 
 /* Profiles along y: sheet[k][y] between the clamps, clamps[y] averaged over the samples. */
 static void fill_windows(const camera_scene *s, const double *lengths_px, size_t samples,
-                         camera_rows rows, float *sheet, float *clamps)
+                         camera_span rows, float *sheet, float *clamps)
 {
     const double edge = s->edge_px;
     const double upper_in = s->top_px + s->clamp_inside_px;
@@ -79,9 +79,11 @@ static span span_of(double left_px, double right_px, double edge_px, float weigh
 }
 
 /* Adds spans to a row that is 0, each in its turn. Where all are full, their sum is the same. */
-static inline void add_spans(float *cover, int width, const span *spans, size_t count, const float *falloff)
+static inline void add_spans(float *cover, camera_span columns, const span *spans, size_t count,
+                             const float *falloff)
 {
-    int first = 0, last = width - 1;
+    const int left = columns.first, stop = columns.stop;
+    int first = left, last = stop - 1;
     float all = 0.0f;
     for (size_t k = 0; k < count; k++) {
         first = spans[k].full > first ? spans[k].full : first;
@@ -89,23 +91,23 @@ static inline void add_spans(float *cover, int width, const span *spans, size_t 
         all += spans[k].weight;
     }
     if (first > last) {
-        first = width, last = width - 1;
+        first = stop, last = stop - 1;
     }
     for (size_t k = 0; k < count; k++) {
         const span s = spans[k];
-        const int full_stop = s.full < width ? s.full : width;
-        for (int x = s.from > 0 ? s.from : 0; x < full_stop; x++) {
+        const int full_stop = s.full < stop ? s.full : stop;
+        for (int x = s.from > left ? s.from : left; x < full_stop; x++) {
             cover[x] += s.weight / (1.0f + s.rise * falloff[x - s.from]);
         }
         const int end_stop = s.end < first ? s.end : first - 1;
-        for (int x = s.full > 0 ? s.full : 0; x <= end_stop; x++) {
+        for (int x = s.full > left ? s.full : left; x <= end_stop; x++) {
             cover[x] += s.weight;
         }
-        for (int x = last + 1; x <= s.end && x < width; x++) {
+        for (int x = last + 1; x <= s.end && x < stop; x++) {
             cover[x] += s.weight;
         }
-        const int to_stop = s.to < width ? s.to : width - 1;
-        for (int x = s.end + 1 > 0 ? s.end + 1 : 0; x <= to_stop; x++) {
+        const int to_stop = s.to < stop ? s.to : stop - 1;
+        for (int x = s.end + 1 > left ? s.end + 1 : left; x <= to_stop; x++) {
             cover[x] += s.weight / (1.0f + s.fall * falloff[s.to - x]);
         }
     }
@@ -115,8 +117,8 @@ static inline void add_spans(float *cover, int width, const span *spans, size_t 
 }
 
 HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths_px, size_t samples,
-                                    camera_rows rows, const float *sheet, const float *clamps,
-                                    float *cover, float *level)
+                                    const camera_part *part, const float *sheet,
+                                    const float *clamps, float *cover, float *level)
 {
     float falloff[FALLOFF_SIZE];
     span spans[CAMERA_SAMPLES_MAX];
@@ -124,10 +126,8 @@ HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths
         falloff[i] = (float)exp(-i / s->edge_px);
     }
     const float weight = (s->sheet_grey - s->background_grey) / (float)samples;
-    const size_t row_bytes = (size_t)s->width * sizeof(float);
-    for (int y = rows.first; y < rows.stop; y++) {
+    for (int y = part->rows.first; y < part->rows.stop; y++) {
         size_t spanned = 0;
-        memset(cover, 0, row_bytes);
         for (size_t k = 0; k < samples; k++) {
             const float window = sheet[k * (size_t)s->height + (size_t)y];
             if (window <= 0.0f) {
@@ -139,13 +139,17 @@ HS_CLONES static void fill_surfaces(const camera_scene *s, const double *lengths
             spans[spanned++] =
                 span_of(s->mid_px - half, s->mid_px + half, s->edge_px, weight * window);
         }
-        add_spans(cover, s->width, spans, spanned, falloff);
         const float clamp = (s->clamp_grey - s->background_grey) * clamps[y];
         const float light = s->illumination_y[y];
         float *row = level + (size_t)y * (size_t)s->width;
-        for (int x = 0; x < s->width; x++) {
-            row[x] = (light + s->illumination_x[x]) *
-                     (s->background_grey + clamp * s->clamp_x[x] + cover[x]);
+        for (size_t i = 0; i < part->count; i++) {
+            const camera_span columns = part->columns[i];
+            memset(cover + columns.first, 0, (size_t)(columns.stop - columns.first) * sizeof *cover);
+            add_spans(cover, columns, spans, spanned, falloff);
+            for (int x = columns.first; x < columns.stop; x++) {
+                row[x] = (light + s->illumination_x[x]) *
+                         (s->background_grey + clamp * s->clamp_x[x] + cover[x]);
+            }
         }
     }
 }
@@ -194,7 +198,7 @@ typedef struct {
 } images;
 
 /* Subtracts the images from the level, each in its turn. */
-HS_CLONES static void subtract_images(const camera_scene *s, camera_rows rows, const images *b,
+HS_CLONES static void subtract_images(const camera_scene *s, camera_span rows, const images *b,
                                       float *level)
 {
     const int y_from = b->upper > rows.first ? b->upper : rows.first;
@@ -224,10 +228,35 @@ HS_CLONES static void subtract_images(const camera_scene *s, camera_rows rows, c
     }
 }
 
+/* Whether some of these columns belong to a part. */
+static int has_columns(const camera_part *part, double first, double last)
+{
+    for (size_t i = 0; i < part->count; i++) {
+        if (last >= part->columns[i].first && first < part->columns[i].stop) {
+            return 1;
+        }
+    }
+    return 0;
+}
+
+/* Whether a blob may be seen in these rows at some sample; most are not near a small part. */
+static int may_show(const camera_scene *s, const camera_blob *blob, const double *lengths_px,
+                    size_t samples, camera_span rows)
+{
+    const double reach = BLOB_REACH * blob->sigma_px + 2.0; /* and two roundings */
+    int seen = 0;
+    for (size_t k = 0; k < samples; k++) {
+        const double y = s->top_px + blob->along * lengths_px[k];
+        seen |= y + reach > rows.first && y - reach < rows.stop;
+    }
+    return seen;
+}
+
 /* Subtracts a blob at all samples of the exposure. */
 static void subtract_blob(const camera_scene *s, const camera_blob *blob, const double *lengths_px,
-                          size_t samples, camera_rows rows, const float *sheet, float *level)
+                          size_t samples, const camera_part *part, const float *sheet, float *level)
 {
+    const camera_span rows = part->rows;
     const float depth = (float)(blob->depth_grey / (double)samples);
     const int on_sheet = blob->along > 0.0 && blob->along < 1.0;
     const shape form = shape_of(blob);
@@ -243,7 +272,8 @@ static void subtract_blob(const camera_scene *s, const camera_blob *blob, const 
         if (!(x > -reach && x < s->width - 1 + reach && y > -reach && y < s->height - 1 + reach)) {
             continue;
         }
-        if (line + reach < rows.first || line - reach >= rows.stop) {
+        if (line + reach < rows.first || line - reach >= rows.stop ||
+            !has_columns(part, column - reach, column + reach)) {
             continue;
         }
         if (batch.count && (batch.left != (int)column - reach || batch.upper != (int)line - reach)) {
@@ -269,17 +299,21 @@ static void subtract_blob(const camera_scene *s, const camera_blob *blob, const 
     }
 }
 
-void camera_expect(const camera_scene *s, const double *lengths_px, size_t samples, camera_rows rows,
-                   float *scratch, float *level)
+void camera_expect(const camera_scene *s, const double *lengths_px, size_t samples,
+                   const camera_part *part, float *scratch, float *level)
 {
     float *sheet = scratch, *clamps = sheet + samples * (size_t)s->height;
     float *cover = clamps + s->height;
-    fill_windows(s, lengths_px, samples, rows, sheet, clamps);
-    fill_surfaces(s, lengths_px, samples, rows, sheet, clamps, cover, level);
+    fill_windows(s, lengths_px, samples, part->rows, sheet, clamps);
+    fill_surfaces(s, lengths_px, samples, part, sheet, clamps, cover, level);
     for (size_t i = 0; i < s->blob_count; i++) {
-        subtract_blob(s, s->blobs + i, lengths_px, samples, rows, sheet, level);
+        if (may_show(s, s->blobs + i, lengths_px, samples, part->rows)) {
+            subtract_blob(s, s->blobs + i, lengths_px, samples, part, sheet, level);
+        }
     }
 }
+
+#define GOLDEN 0x9e3779b97f4a7c15u
 
 /* The finaliser of a 64-bit counter generator: each input bit reaches each output bit. */
 static uint64_t scramble(uint64_t z)
@@ -289,31 +323,44 @@ static uint64_t scramble(uint64_t z)
     return z ^ (z >> 31);
 }
 
+/* Exposes the pixels from `first` to before `stop`; `counter`: that of the frame's first pixel. */
 HS_CLONES
-void camera_expose(const float *level, size_t first, size_t stop, const camera_noise *noise,
-                   uint64_t frame, uint8_t *out)
+static void expose_pixels(const float *level, size_t first, size_t stop, const camera_noise *noise,
+                          uint64_t counter, uint8_t *out)
 {
-    const uint64_t golden = 0x9e3779b97f4a7c15u;
     const float *table = noise->table;
     const float read_variance = noise->read_noise_grey * noise->read_noise_grey;
-    uint64_t counter = scramble(scramble(noise->seed + golden) + golden * (frame + 1u));
-    counter += golden * (first / 2u); /* one for two pixels */
+    counter += GOLDEN * (first / 2u); /* one for two pixels */
     float normal[NOISE_BLOCK];
-    for (size_t start = first; start < stop; start += NOISE_BLOCK) {
+    for (size_t start = first - first % 2; start < stop; start += NOISE_BLOCK) {
         const size_t n = stop - start < NOISE_BLOCK ? stop - start : NOISE_BLOCK;
-        for (size_t i = 0; i < NOISE_BLOCK; i += 2) {
-            counter += golden;
+        for (size_t i = 0; i < n; i += 2) {
+            counter += GOLDEN;
             const uint64_t bits = scramble(counter);
             normal[i] = table[bits & 4095u] + table[(bits >> 12) & 4095u];
             normal[i + 1] = table[(bits >> 24) & 4095u] + table[(bits >> 36) & 4095u];
         }
-        for (size_t i = 0; i < n; i++) {
+        for (size_t i = start < first ? 1 : 0; i < n; i++) {
             const float mean = level[start + i] > 0.0f ? level[start + i] : 0.0f;
             const float sd = sqrtf(noise->shot_gain_grey * mean + read_variance);
             float grey = mean + sd * normal[i] + 0.5f;
             grey = grey > 0.0f ? grey : 0.0f;
             grey = grey < 255.0f ? grey : 255.0f;
             out[start + i] = (uint8_t)(int)grey;
+        }
+    }
+}
+
+void camera_expose(const camera_scene *scene, const float *level, const camera_part *part,
+                   const camera_noise *noise, uint64_t frame, uint8_t *out)
+{
+    const uint64_t counter = scramble(scramble(noise->seed + GOLDEN) + GOLDEN * (frame + 1u));
+    for (int y = part->rows.first; y < part->rows.stop; y++) {
+        const size_t row = (size_t)y * (size_t)scene->width;
+        for (size_t i = 0; i < part->count; i++) {
+            const camera_span columns = part->columns[i];
+            expose_pixels(level, row + (size_t)columns.first, row + (size_t)columns.stop, noise,
+                          counter, out);
         }
     }
 }

@@ -52,8 +52,15 @@ typedef struct {
 } camera_scene;
 
 typedef struct {
-    int first, stop; /* 0 to the height */
-} camera_rows;
+    int first, stop; /* from the first one to before the end */
+} camera_span;
+
+/* What is drawn: rows within the height, in spans of columns within the width. */
+typedef struct {
+    camera_span rows;
+    const camera_span *columns;
+    size_t count; /* of the spans of columns */
+} camera_part;
 
 typedef struct {
     float shot_gain_grey;  /* variance = shot_gain * level + read_noise^2, in grey^2 */
@@ -65,15 +72,16 @@ typedef struct {
 /* Floats of scratch memory that camera_expect needs. */
 size_t camera_scratch_size(const camera_scene *scene, size_t samples);
 
-/* Some rows of the mean of the images at `samples` lengths, at most CAMERA_SAMPLES_MAX, in grey levels;
- * `level` holds width * height floats, of which those of other rows stay as they are. */
-void camera_expect(const camera_scene *scene, const double *lengths_px, size_t samples, camera_rows rows,
-                   float *scratch, float *level);
+/* A part of the mean of the images at `samples` lengths, at most CAMERA_SAMPLES_MAX, in grey levels;
+ * `level` holds width * height floats. Those of other rows stay as they are, those of other columns
+ * may become anything. */
+void camera_expect(const camera_scene *scene, const double *lengths_px, size_t samples,
+                   const camera_part *part, float *scratch, float *level);
 
-/* Pixels from `first`, an even number, to `stop` of one noisy 8-bit exposure of the levels, rounded to
- * nearest, saturated at 0 and 255. The noise depends on (seed, frame, pixel) alone, so frames and
- * their parts may be made in any order. */
-void camera_expose(const float *level, size_t first, size_t stop, const camera_noise *noise,
-                   uint64_t frame, uint8_t *out);
+/* A part of one noisy 8-bit exposure of the levels, rounded to nearest, saturated at 0 and 255; the
+ * other pixels stay as they are. The noise depends on (seed, frame, pixel) alone, so frames and their
+ * parts may be made in any order. */
+void camera_expose(const camera_scene *scene, const float *level, const camera_part *part,
+                   const camera_noise *noise, uint64_t frame, uint8_t *out);
 
 #endif

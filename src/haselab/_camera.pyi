@@ -1,3 +1,5 @@
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,4 +43,5 @@ class Scene:
         first_index: int,
         out: NDArray[np.uint8],
         rows: tuple[int, int],
+        columns: Sequence[tuple[int, int]],
     ) -> None: ...

@@ -261,6 +261,11 @@ class KnownActuator:
         return np.asarray(self.table.low_m + self.table.step_m * knots)
 
     @cached_property
+    def elastic_knots_n(self) -> list[float]:
+        """`elastic_n` at the lengths of the table."""
+        return [self.elastic_n(length_m) for length_m in self._lengths_m.tolist()]
+
+    @cached_property
     def elongates(self) -> bool:
         """Whether a voltage makes the actuator longer."""
         return bool(np.median(self.table.pull_n_v2[0]) > 0.0)

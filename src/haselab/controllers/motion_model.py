@@ -40,8 +40,7 @@ class MotionModel:
     def __init__(self, known: KnownActuator) -> None:
         table, losses = known.table, known.law.losses
         self._low_m, self._step_m = table.low_m, table.step_m
-        lengths_m = table.low_m + table.step_m * np.arange(table.elastic_n.size)
-        self._elastic = [known.elastic_n(float(length)) for length in lengths_m]
+        self._elastic = known.elastic_knots_n
         self._last = len(self._elastic) - 2
         self._per_v2: list[list[float]] = table.pull_n_v2.tolist()
         self._step_v, self._gain = table.step_v, known.gain_v_per_v

@@ -200,11 +200,10 @@ def _blocks(
     # other models than the plain one use other samples
     plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz
     used = sensed.valid & plain & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_std_f > 0)
-    changes = np.flatnonzero(np.diff(np.pad(lockin.counted, 1).astype(np.int8)))
     volt_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]
     carrier_v = 0.5 * volt_per_code * float(np.median(sensed.v_pp[used])) if used.any() else np.nan
     return _Blocks(
-        record.block_start_s, record.drive_v, changes.reshape(-1, 2) / config.rate_hz,
+        record.block_start_s, record.drive_v, _spans(lockin) / config.rate_hz,
         sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v, rise, _lag_s(sensed, used),
         *_weights(record.codes[:, :, 0], lockin),
     )  # fmt: skip
@@ -305,6 +304,12 @@ def _carrier_gain(conditions: NDArray[np.void], blocks: Collection[_Blocks], gai
     return float(np.median(found)) if found else gain
 
 
+def _spans(lockin: Lockin) -> NDArray[np.int64]:
+    """First of the samples that count, and the one after, of each uninterrupted part."""
+    changes = np.flatnonzero(np.diff(np.pad(lockin.counted, 1).astype(np.int8)))
+    return changes.reshape(-1, 2)
+
+
 def _weights(codes: NDArray[np.int16], lockin: Lockin) -> tuple[Floats, Floats]:
     r"""How the capacitance of a block follows from that of each moment in it.
 
@@ -327,7 +332,10 @@ def _weights(codes: NDArray[np.int16], lockin: Lockin) -> tuple[Floats, Floats]:
     side = at >= config.blank[1]
     basis = np.stack([turn.real, turn.imag, side, ~side, ramp_s / np.ptp(ramp_s)], axis=1)
     fit = np.linalg.pinv(basis)[:2]  # to the coefficients of cosine and sine
-    voltage = codes[:, at].astype(np.float32) @ fit.T.astype(np.float32)
+    # part by part: an index for each sample would take four times as long
+    counted = [codes[:, first:end] for first, end in _spans(lockin).tolist()]
+    samples = np.concatenate(counted, axis=1, dtype=np.float32)
+    voltage = samples @ fit.T.astype(np.float32)
     current = 1j * (voltage[:, 0] - 1j * voltage[:, 1])  # ahead by a quarter of a period
     size = np.maximum(np.abs(current), np.finfo(np.float32).tiny)
     c, s = current.real / size, -current.imag / size  # c cos + s sin is the current

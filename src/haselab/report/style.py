@@ -90,8 +90,10 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
         The document; text stays text.
     """
     buffer = io.StringIO()
+    canvas = FigureCanvasSVG(figure)  # whose texts have the sizes of the document
     _arrange(figure)
-    figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
+    figure.dpi = matplotlib.rcParams["savefig.dpi"]  # of what is drawn as an image
+    canvas.print_svg(buffer, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -103,8 +105,7 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
 
 
 def _arrange(figure: Figure) -> None:
-    """Place axes and texts, once. With a layout engine, `savefig` draws everything twice."""
-    FigureCanvasSVG(figure)  # whose texts have the sizes of the document
+    """Place axes and texts, once. `savefig` would draw everything twice."""
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)

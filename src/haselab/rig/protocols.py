@@ -21,6 +21,7 @@ __all__ = [
     "GaplessAcquisition",
     "Gate",
     "HighVoltageSupply",
+    "ImagePart",
     "LoadStand",
     "MonitorCalibration",
     "PartialImage",
@@ -35,6 +36,8 @@ __all__ = [
 
 PLANAR_HASEL = "planar-hasel"  # the kind of the reference study
 
+# Rows, and spans of their columns; each from the first one to before the last.
+ImagePart = tuple[tuple[int, int], Sequence[tuple[int, int]]]
 _T = TypeVar("_T")
 
 
@@ -153,13 +156,13 @@ class Frames:
 
 
 class PartialImage(Protocol):
-    """An image of a simulated camera, of which only the rows that are needed are drawn."""
+    """An image of a simulated camera, of which only the parts that are needed are drawn."""
 
     def whole(self) -> NDArray[np.uint8]:
         """Draw all of it."""
 
-    def rows(self, spans: Sequence[tuple[int, int]]) -> NDArray[np.uint8]:
-        """Draw rows, each span from its first one to before its end; others may hold anything."""
+    def with_parts(self, parts: Sequence[ImagePart]) -> NDArray[np.uint8]:
+        """Draw parts; the other pixels may hold anything."""
 
 
 class VoltageSource(Protocol):

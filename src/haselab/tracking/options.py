@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 
-__all__ = ["Floats", "Frame", "Model", "PartialFrame", "Poses", "TrackOptions"]
+__all__ = [
+    "Floats",
+    "Frame",
+    "FramePart",
+    "Model",
+    "PartialFrame",
+    "Poses",
+    "Span",
+    "TrackOptions",
+]
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
@@ -19,14 +28,18 @@ Poses = NDArray[np.void]  # centre_px and deformation of each subset; native/tra
 Model = Literal["translation", "neighbours", "affine"]
 
 
+Span = tuple[int, int]  # from the first row or column to before the last
+FramePart = tuple[Span, Sequence[Span]]  # rows, and which of their columns
+
+
 class PartialFrame(Protocol):
-    """A frame of which only the rows that are needed are made."""
+    """A frame of which only the parts that are needed are made."""
 
     def whole(self) -> NDArray[np.uint8]:
         """Make all of it."""
 
-    def rows(self, spans: Sequence[tuple[int, int]]) -> NDArray[np.uint8]:
-        """Make rows, each span from its first one to before its end; others may hold anything."""
+    def with_parts(self, parts: Sequence[FramePart]) -> NDArray[np.uint8]:
+        """Make parts; the other pixels may hold anything."""
 
 
 _LARGEST_SUBSET_PX = 101

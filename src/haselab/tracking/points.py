@@ -15,7 +15,16 @@ from haselab.tracking.attempt import FEWER, Attempt, better, distance_px, joint_
 from haselab.tracking.audit import may_be_uncertain, uncertain_points
 from haselab.tracking.camera.fixed_pattern import FixedPattern, find_pattern, stays_with_pixels
 from haselab.tracking.neighbours import Neighbourhood, build_neighbourhood
-from haselab.tracking.options import Floats, Frame, Model, PartialFrame, Poses, TrackOptions
+from haselab.tracking.options import (
+    Floats,
+    Frame,
+    FramePart,
+    Model,
+    PartialFrame,
+    Poses,
+    Span,
+    TrackOptions,
+)
 from haselab.tracking.reference import (
     JUMP_PX,
     Reference,
@@ -40,8 +49,19 @@ _SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed
 _LEAST_LEFT = 0.05  # of a template's power; below, the pattern may be the texture
 _DOTS_IN_SUBSET = 6.0  # distance, in sides of a subset, at which a dot's gradients differ
 _MOVED_PX = 1.5  # along x or y, after which an offset is outside its pixel
-_NEAR_PX = 28.0  # of the rows of a frame around the expected points that are made first
+_NEAR_PX = 22.0  # around expected points, of the parts made first; subsets of 21 px reach 18.5
 _DUE = 0.1  # share of strongly deformed points at which the reference is renewed
+
+
+def _around(positions_px: Sequence[float], size: int) -> list[Span]:
+    """Rows or columns of a frame around positions in it, merged where they overlap."""
+    spans: list[Span] = []
+    for at_px in sorted(positions_px):
+        first, stop = max(floor(at_px - _NEAR_PX), 0), min(ceil(at_px + _NEAR_PX) + 1, size)
+        if spans and first <= spans[-1][1]:
+            first = spans.pop()[0]
+        spans.append((first, stop))
+    return spans
 
 
 class PointTracker:
@@ -178,12 +198,12 @@ class PointTracker:
             InputError: the frame does not fit the reference.
         """
         if not isinstance(frame, np.ndarray):
-            rows = self._rows(state)
-            if rows:
-                part = frame.rows(rows)
+            parts = self._parts(state)
+            if parts:
+                part = frame.with_parts(parts)
                 _check_frame(part, state.reference.shape)
                 attempt = self._attempt(state, part)
-                if attempt.summary.reach_px <= _NEAR_PX:  # it has read nothing but these rows
+                if attempt.summary.reach_px <= _NEAR_PX:  # it has read nothing but these parts
                     return self._judged(state, part, attempt)
             frame = frame.whole()
         _check_frame(frame, state.reference.shape)
@@ -191,21 +211,18 @@ class PointTracker:
         after, found = self._judged(state, clean, self._attempt(state, clean))
         return (after if after.textured is None else self._decided(after, frame)), found
 
-    def _rows(self, state: TrackState) -> list[tuple[int, int]]:
-        """Rows around the expected points, merged; none if more than these may be looked at."""
+    def _parts(self, state: TrackState) -> list[FramePart]:
+        """Pixels around the expected points; none if more than these may be looked at."""
         if self._together or state.pattern is not None or state.textured is not None:
             return []
-        expected_px = state.poses["centre_px"][:, 1] + state.velocity_px[:, 1]
-        spans: list[tuple[int, int]] = []
-        for y_px in sorted(expected_px.tolist()):
-            if not 0.0 <= y_px < state.reference.shape[0]:
-                return []
-            first = max(floor(y_px - _NEAR_PX), 0)
-            stop = min(ceil(y_px + _NEAR_PX) + 1, state.reference.shape[0])
-            if spans and first <= spans[-1][1]:
-                first = spans.pop()[0]
-            spans.append((first, stop))
-        return spans
+        height, width = state.reference.shape
+        expected_px = (state.poses["centre_px"] + state.velocity_px).tolist()
+        if not all(0.0 <= x_px < width and 0.0 <= y_px < height for x_px, y_px in expected_px):
+            return []
+        return [
+            (rows, _around([x for x, y in expected_px if rows[0] <= y < rows[1]], width))
+            for rows in _around([y for _, y in expected_px], height)
+        ]
 
     def _judged(
         self, state: TrackState, frame: Frame, attempt: Attempt

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from haselab.rig.protocols import ImagePart
 from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import TwinBench
@@ -18,19 +19,21 @@ REST = 10
 
 
 @pytest.mark.parametrize(("width_px", "height_px"), [(256, 200), (255, 201)])
-def test_a_part_of_a_frame_has_the_bits_of_the_whole_and_leaves_other_rows(width_px, height_px):
+def test_a_part_of_a_frame_has_the_bits_of_the_whole_and_leaves_other_pixels(width_px, height_px):
     config = TwinCameraConfig(width_px=width_px, height_px=height_px, fiducial_spacing_px=40.0)
     camera = TwinCamera(config, 0.02, 0.02, seed=3)
     lengths_m = np.linspace(0.030, 0.031, config.exposure_samples)[np.newaxis]
     whole = camera.render(lengths_m, 7)[0]
     rng = np.random.default_rng(1)
-    for first, stop in np.sort(rng.integers(0, height_px + 1, (40, 2))).tolist():
-        part = np.full((1, height_px, width_px), 99, dtype=np.uint8)
-        camera.render(lengths_m, 7, part, (first, stop))
-        first -= first % 2  # as `render` states
-        assert (part[0, first:stop] == whole[first:stop]).all()
-        if first < stop:
-            assert (part[0, :first] == 99).all() and (part[0, stop:] == 99).all()
+    for rows in np.sort(rng.integers(0, height_px + 1, (40, 2))).tolist():
+        edges = np.sort(rng.integers(0, width_px + 1, 4)).tolist()
+        expected = np.full((1, height_px, width_px), 99, dtype=np.uint8)
+        part = expected.copy()
+        spans = [(edges[0], edges[1]), (edges[2], edges[3])]
+        camera.render(lengths_m, 7, part, (tuple(rows), spans))
+        for first, stop in spans:
+            expected[0, slice(*rows), first:stop] = whole[slice(*rows), first:stop]
+        np.testing.assert_array_equal(part, expected)
 
 
 def test_frames_drawn_one_by_one_are_those_that_are_drawn_together():
@@ -46,13 +49,14 @@ def test_frames_drawn_one_by_one_are_those_that_are_drawn_together():
     images = together.images
     for k in reversed(range(len(images))):
         view = apart.view(k)
-        assert (view.rows([(40, 80), (200, 230)])[200:230] == images[k, 200:230]).all()
+        parts = [((40, 80), [(0, 512)]), ((200, 230), [(3, 40), (101, 200)])]
+        assert (view.with_parts(parts)[200:230, 101:200] == images[k, 200:230, 101:200]).all()
         assert (view.whole() == images[k]).all()
         assert (apart.image(k) == images[k]).all()
 
 
 class Part:
-    """A frame whose rows are noise until they are asked for."""
+    """A frame whose pixels are noise until they are asked for."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
         self._image = image
@@ -62,18 +66,19 @@ class Part:
         self.complete = True
         return self._image
 
-    def rows(self, spans: Sequence[tuple[int, int]]) -> NDArray[np.uint8]:
+    def with_parts(self, parts: Sequence[ImagePart]) -> NDArray[np.uint8]:
         shown = np.random.default_rng(0).integers(0, 256, self._image.shape).astype(np.uint8)
-        for first, stop in spans:
-            shown[first:stop] = self._image[first:stop]
+        for rows, columns in parts:
+            for first, stop in columns:
+                shown[slice(*rows), first:stop] = self._image[slice(*rows), first:stop]
         return shown
 
 
 def test_a_tracker_finds_the_same_in_parts_of_frames_also_after_a_jump():
-    """The clamp moves by 5 px a frame, jumps by 14 and by 35, and leaves the picture."""
+    """The clamp moves by 3 px a frame, jumps by 14 and by 35, and leaves the picture."""
     camera = TwinCamera(TwinCameraConfig(), 0.07, 0.032, seed=2)
     scale_m = camera.config.scale_m_per_px
-    moves_px = [0.0] * REST + [5.0] * 8 + [14.0] + [0.0] * 4 + [35.0] + [-2.0] * 4
+    moves_px = [0.0] * REST + [3.0] * 8 + [14.0] + [0.0] * 4 + [35.0] + [-2.0] * 4
     lengths_m = 0.05 + scale_m * np.cumsum(moves_px)
     samples = camera.config.exposure_samples
     images = camera.render(np.repeat(lengths_m[:, np.newaxis], samples, axis=1), 0)

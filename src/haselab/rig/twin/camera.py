@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from haselab import _camera
 from haselab.base import InputError, LimitError, Limits
+from haselab.rig.protocols import ImagePart
 from haselab.store.toml import Section
 
 __all__ = ["TwinCamera", "TwinCameraConfig"]
@@ -184,7 +185,7 @@ class TwinCamera:
         lengths_m: ArrayLike,
         first_index: int,
         out: NDArray[np.uint8] | None = None,
-        rows: tuple[int, int] | None = None,
+        part: ImagePart | None = None,
     ) -> NDArray[np.uint8]:
         """Render consecutive frames of a recording.
 
@@ -193,8 +194,7 @@ class TwinCamera:
                 Shape `(F, samples)`.
             first_index: number of the first of these frames in the recording; chooses the noise.
             out: where the frames go, of the shape and type that is returned; None: a new array.
-            rows: first row that is drawn, and the one after the last; None: all. The row before an
-                odd one is drawn, too; the others of `out` stay.
+            part: that is drawn; the other pixels of `out` stay. None: all is drawn.
 
         Returns:
             Grey levels of mean `expected_levels` and variance `shot_gain_grey` times the mean plus
@@ -209,7 +209,8 @@ class TwinCamera:
             raise InputError(f"first_index is {first_index}, but it must be at least 0.")
         lengths_px = self._lengths_px(lengths_m)
         frames = np.empty(self._shape(lengths_px), dtype=np.uint8) if out is None else out
-        self._scene.render(lengths_px, first_index, frames, rows or (0, self.config.height_px))
+        whole = (0, self.config.height_px), [(0, self.config.width_px)]
+        self._scene.render(lengths_px, first_index, frames, *(part or whole))
         return frames
 
     def expected_levels(self, lengths_m: ArrayLike) -> NDArray[np.float32]:

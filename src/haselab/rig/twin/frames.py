@@ -1,7 +1,7 @@
 """Frames of the twin's camera, which are drawn when somebody looks at them.
 
-Most frames of a study are tracked and not kept, and a tracker looks at a few rows of each. A row
-has the same bits in whichever part of a frame it is drawn.
+Most frames of a study are tracked and not kept, and a tracker looks at a small part of each. A
+pixel has the same bits in whichever part of a frame it is drawn.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.rig import Frames
-from haselab.rig.protocols import PartialImage
+from haselab.rig.protocols import ImagePart, PartialImage
 from haselab.rig.twin.camera import TwinCamera
 
 __all__ = ["DrawnFrames"]
@@ -61,11 +61,11 @@ class DrawnFrames(Frames):
         """See `haselab.rig.Frames`."""
         return self.images[index] if self._drawn is not None else _PartialImage(self, index)
 
-    def drawn(self, index: int, rows: tuple[int, int] | None, on: Images | None = None) -> Images:
-        """Draw one image, or some of its rows on another one."""
+    def drawn(self, index: int, part: ImagePart | None, on: Images | None = None) -> Images:
+        """Draw one image, or a part of it on another one."""
         lengths_m = self._lengths_m[index : index + 1]
         out = None if on is None else on[np.newaxis]
-        return np.asarray(self._camera.render(lengths_m, self._first + index, out, rows)[0])
+        return np.asarray(self._camera.render(lengths_m, self._first + index, out, part)[0])
 
 
 class _PartialImage:
@@ -78,9 +78,9 @@ class _PartialImage:
         """See `PartialImage`."""
         return self._frames.image(self._index)
 
-    def rows(self, spans: Sequence[tuple[int, int]]) -> Images:
+    def with_parts(self, parts: Sequence[ImagePart]) -> Images:
         """See `PartialImage`."""
         image = np.empty(self._frames.shape_px, dtype=np.uint8)
-        for span in spans:
-            self._frames.drawn(self._index, span, image)
+        for part in parts:
+            self._frames.drawn(self._index, part, image)
         return image

@@ -277,14 +277,19 @@ class Delay:
         """Blocks by which the monitor lags more than expected; 0 if no other lag fits better."""
         level, drive = np.array(self._level), np.array(self._drive)
         level -= level.mean()
+        if _residuals(level, drive[np.newaxis, _LAGS : _LAGS + _FOLLOWED])[0] < _LEAST_CODES:
+            return 0  # as nearly always: no lag fits decisively better
         # Row j: the drive j blocks before the one that should be in force.
         shifted = np.lib.stride_tricks.sliding_window_view(drive, _FOLLOWED)
-        shifted = shifted[: _LAGS + 1][::-1]
-        shifted = shifted - shifted.mean(axis=1, keepdims=True)
-        power = np.einsum("ij,ij->i", shifted, shifted)
-        slope = shifted @ level / (power + 1e-12)
-        left = np.sqrt(np.maximum(level @ level - slope * slope * power, 0.0) / _FOLLOWED)
+        left = _residuals(level, shifted[: _LAGS + 1][::-1])
         best = int(left.argmin())
-        if left[0] < _LEAST_CODES or left[0] < _LAG_RATIO * left[best]:
-            return 0
-        return best
+        return 0 if left[0] < _LAG_RATIO * left[best] else best
+
+
+def _residuals(level: NDArray[np.float64], drives: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What each row of drives leaves of the level, in codes RMS, at the best gain and offset."""
+    moved = drives - drives.mean(axis=1, keepdims=True)
+    power = np.einsum("ij,ij->i", moved, moved)
+    slope = moved @ level / (power + 1e-12)
+    left = np.maximum(level @ level - slope * slope * power, 0.0)
+    return np.asarray(np.sqrt(left / _FOLLOWED))

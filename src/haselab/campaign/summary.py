@@ -152,7 +152,8 @@ def draws_are_independent(described: Mapping[str, Any], *, grouped: bool) -> boo
         described: the campaign, as in its campaign.json.
         grouped: each group has the cases of one point of the axes; otherwise one has all cases.
     Returns:
-        False if intervals that take the cases as independent would be too narrow.
+        False if intervals that take the cases as independent would be too narrow, and if nothing
+        is drawn.
     """
     design, parameters = described["design"], described["parameters"].values()
     is_drawn = any(isinstance(each, Mapping) for each in parameters)
@@ -214,12 +215,15 @@ def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | Non
     """How often the interval of an estimate contains the true value; None: no case has both."""
     true = group.values(f"{name}.true")
     low, high = group.values(f"{name}.low"), group.values(f"{name}.high")
+    # an interval without ends, of a parameter that is not identifiable, contains any value
     known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
+    known &= np.isfinite(low) | np.isfinite(high)
     inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
     if count == 0:
         return None
     return {
         "result": name, "group": group.label, "count": count, "inside": inside,
+        "without_interval": len(group.rows) - count,
         "share": {
             "value": inside / count,
             "ci95": _share_interval(inside, count) if independent else None,
@@ -271,6 +275,7 @@ def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonOb
     return [
         {
             "parameter": path, "method": "Sobol indices", "blocks": whole.shape[0],
+            "blocks_left_out": blocks.shape[0] - whole.shape[0],
             "first": _around(found["S1"][k], found["S1_conf"][k]),
             "total": _around(found["ST"][k], found["ST_conf"][k]),
         }
@@ -293,9 +298,9 @@ def _rank_correlations(
     from scipy.stats import spearmanr  # slow to import
 
     values = group.values(name)
-    good = np.isfinite(values)
+    good = ~np.isnan(values)  # what was not reached ranks above any number
     count = int(good.sum())
-    if count < LEAST_CASES or np.ptp(values[good]) == 0.0:
+    if count < LEAST_CASES or np.unique(values[good]).size < 2:
         return []
     found: list[JsonObject] = []
     for path in paths:
@@ -306,6 +311,7 @@ def _rank_correlations(
         ends = np.tanh([middle - half, middle + half])
         found.append({
             "parameter": path, "method": "rank correlation", "count": count,
+            "without_value": values.size - count,
             "correlation": {
                 "value": rho, "ci95": [float(end) for end in ends] if independent else None,
             },

@@ -26,6 +26,7 @@ from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.projection import Basis, Solution, minimise, project
 from haselab.identify.record import Record
 from haselab.identify.sampled.record import single_record
+from haselab.identify.training_output import grid_step
 from haselab.models.creep import Creep
 
 __all__ = ["CreepFit", "fit_creep"]
@@ -55,6 +56,8 @@ _NOISE = 0.1  # of the input's range: median step of an input that is noisy, ...
 _TURNED = 0.58  # ... and share of the steps that reverse
 _HELD = 0.02  # of the rows are updates of an input, at most, ...
 _MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
+_REPEATED = 0.5  # share of the samples that repeat the one before, where steps hide the noise
+_LEAST_EFFECTIVE = 8.0  # samples, as for coloured residuals
 _UNKNOWN = (-math.inf, math.inf)
 
 
@@ -74,6 +77,17 @@ class _Setting:
     y: Floats
     kept: NDArray[np.bool_]
     offset: bool
+
+    @property
+    def step(self) -> float:
+        """Step of a converter that hides the noise: most samples repeat; 0: there is none."""
+        held = self.y[self.kept]
+        return grid_step(held) if np.mean(np.diff(held) == 0.0) > _REPEATED else 0.0
+
+    @property
+    def runs(self) -> NDArray[np.int64]:
+        """Number of the run of equal outputs to which each fitted sample belongs."""
+        return np.cumsum(np.diff(self.y[self.kept], prepend=self.y[self.kept][0]) != 0.0)
 
     def thinned(self) -> _Setting:
         """At most 800 of the fitted samples."""
@@ -121,8 +135,23 @@ class _Fitted:
     def parameters(self) -> int:
         return self.solution.search.size + self.solution.shared.size
 
-    def covariance(self) -> Floats:
-        return coloured_covariance(self.solution.columns, self.solution.residuals, self.parameters)
+    def covariance(self, setting: _Setting) -> Floats:
+        """Covariance of search and shared, with the rounding errors of a converter.
+
+        These are a function of the output, so all samples of a run of equal outputs may have the
+        same one, of a variance of `step**2 / 12`.
+        """
+        solution = self.solution
+        covariance = coloured_covariance(solution.columns, solution.residuals, self.parameters)
+        step = setting.step
+        if step == 0.0 or not np.isfinite(covariance).all():
+            return covariance
+        columns = np.vstack(list(solution.columns))
+        inverse = np.linalg.pinv(columns)
+        runs = setting.runs
+        by_run = np.zeros((inverse.shape[0], int(runs[-1]) + 1))
+        np.add.at(by_run.T, runs, inverse.T)
+        return np.asarray(covariance + step**2 / 12.0 * by_run @ by_run.T)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -416,7 +445,9 @@ def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
     richest = min(found, key=lambda entry: entry.solution.cost)
     count = int(setting.kept.sum())
     effective = effective_count(richest.solution.residuals)
-    floor = (_ROUNDING * float(np.ptp(setting.y))) ** 2
+    floor = max(_ROUNDING * float(np.ptp(setting.y)), setting.step / math.sqrt(12.0)) ** 2
+    if setting.step > 0.0:  # the rounding error of a run is one error
+        effective = min(effective, max(float(setting.runs[-1]) + 1.0, _LEAST_EFFECTIVE))
     scored = [
         _Fitted(
             entry.law,
@@ -436,7 +467,12 @@ def _describe(
     stepped: bool,
 ) -> CreepFit:
     best = scored[0]
+    candidates = tuple(entry for entry in scored if entry.bic - best.bic < APART)
     estimates, covariance = _estimates(best, setting)
+    if _kind(best) == _NONE:  # a creep that is not excluded is part of this response
+        ends = [_instant(entry, setting).ci95 for entry in candidates]
+        joint = (min(low for low, _ in ends), max(high for _, high in ends))
+        estimates["instant"] = replace(estimates["instant"], ci95=joint)
     residuals = best.solution.residuals[0]
     measured = setting.y[setting.kept]
     instant = float(best.solution.shared[0])
@@ -453,9 +489,15 @@ def _describe(
         validation_fit_percent=_validation(setting, best),
         residual_whiteness_p=whiteness_p([residuals]),
         fitted=best.law.model(best.solution.search, instant, best.gains(setting)),
-        candidates=tuple(entry for entry in scored if entry.bic - best.bic < APART),
+        candidates=candidates,
         setting=setting,
     )
+
+
+def _instant(entry: _Fitted, setting: _Setting) -> Estimate:
+    at = entry.solution.search.size
+    variance = float(entry.covariance(setting)[at, at])
+    return Estimate.normal(float(entry.solution.shared[0]), math.sqrt(max(variance, 0.0)), "")
 
 
 def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], Floats]:
@@ -465,7 +507,7 @@ def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], 
     """
     solution = entry.solution
     count = solution.search.size
-    inner = entry.covariance()
+    inner = entry.covariance(setting)
     std = np.sqrt(np.maximum(np.diag(inner), 0.0))
     names = [*entry.law.names[:count], "instant", *["offset"] * setting.offset]
     names += entry.law.names[count:]
@@ -506,7 +548,7 @@ def _forecast(setting: _Setting, entry: _Fitted, after_s: float) -> Estimate:
     basis = ahead.bases(entry.law, entry.solution.search)[0]
     value = float(basis.shared[0] @ entry.solution.shared)
     row = np.concatenate([basis.by_search[:, 0] @ entry.solution.shared, basis.shared[0]])
-    covariance = entry.covariance()
+    covariance = entry.covariance(setting)
     if not np.isfinite(covariance).all():
         return Estimate(value, math.inf, _UNKNOWN, "")
     return Estimate.normal(value, math.sqrt(max(float(row @ covariance @ row), 0.0)), "")
@@ -542,8 +584,14 @@ def _notes(
             "clipping, drift). Intervals and forecasts assume that the law is right. Leave "
             "ringing out with --leave-out-s."
         )
+    if setting.step > 0.0:
+        notes.append(
+            f"The output has steps of {setting.step:.3g} that hide its noise. The intervals allow "
+            "for the same rounding error in all samples of a run of equal values. Record more "
+            "digits, or a larger step of the input."
+        )
     spikes = np.abs(residuals) > _SPIKE * 1.4826 * float(np.median(np.abs(residuals)))
-    if spikes.any():
+    if spikes.any() and setting.step == 0.0:
         notes.append(
             f"{np.count_nonzero(spikes)} of {residuals.size} outputs are more than {_SPIKE:g} "
             "standard deviations away from the law and are not excluded. Remove spikes first."

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
+from haselab.identify.creep.columns import are_swapped, is_noisy
 from haselab.identify.creep.laws import (
     CreepLaw,
     FractionalLaw,
@@ -52,10 +53,6 @@ _BEYOND = 3.0  # record lengths: longer time constants are not identifiable
 _STRAIGHT = 0.999  # order at which a power of time counts as a straight line
 _WEAK = 2.0  # standard deviations of a gain below which its time constant is not identifiable
 _HELD_OUT = 0.25
-_NOISE = 0.1  # of the input's range: median step of an input that is noisy, ...
-_TURNED = 0.58  # ... and share of the steps that reverse
-_HELD = 0.02  # of the rows are updates of an input, at most, ...
-_MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
 _REPEATED = 0.5  # share of the samples that repeat the one before, where steps hide the noise
 _LEAST_EFFECTIVE = 8.0  # samples, as for coloured residuals
 _UNKNOWN = (-math.inf, math.inf)
@@ -292,13 +289,13 @@ def fit_creep(
     drift = _drift_before(setting, rest_known=not stepped)
     if drift is not None:
         return _no_result(setting, drift)
-    if _swapped(record.u, setting.y):
+    if are_swapped(record.u, setting.y):
         return _no_result(
             setting,
             "the output is held between few updates, and the input changes at every row; the "
             "columns are swapped",
         )
-    if _noisy(record.u):
+    if is_noisy(record.u):
         return _no_result(
             setting,
             "the input is noisy, which biases every parameter; use the commanded input, or the "
@@ -357,22 +354,6 @@ def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
     # A step at the first sample: the output before it and the instantaneous response are
     # indistinguishable.
     return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
-
-
-def _swapped(u: Floats, y: Floats) -> bool:
-    """Whether the output is held like an input while the input varies like an output."""
-    updates, moves = (np.count_nonzero(np.diff(column)) for column in (y, u))
-    return bool(updates <= _HELD * u.size and moves >= _MOVING * u.size)
-
-
-def _noisy(u: Floats) -> bool:
-    """Whether most rows only differ by noise, whose differences reverse two times out of three."""
-    steps = np.diff(u)
-    if np.count_nonzero(steps) < _MOVING * steps.size:
-        return False
-    small = float(np.median(np.abs(steps))) < _NOISE * float(np.ptp(u))
-    turned = np.count_nonzero(steps[1:] * steps[:-1] < 0.0)
-    return bool(small and turned > _TURNED * steps.size)
 
 
 def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:

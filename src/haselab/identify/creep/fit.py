@@ -140,12 +140,10 @@ class _Fitted:
         """
         solution = self.solution
         covariance = coloured_covariance(solution.columns, solution.residuals, self.parameters)
-        step = setting.step
+        step, runs = setting.step, setting.runs
         if step == 0.0 or not np.isfinite(covariance).all():
             return covariance
-        columns = np.vstack(list(solution.columns))
-        inverse = np.linalg.pinv(columns)
-        runs = setting.runs
+        inverse = np.linalg.pinv(np.vstack(list(solution.columns)))
         by_run = np.zeros((inverse.shape[0], int(runs[-1]) + 1))
         np.add.at(by_run.T, runs, inverse.T)
         return np.asarray(covariance + step**2 / 12.0 * by_run @ by_run.T)
@@ -428,7 +426,7 @@ def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
     effective = effective_count(richest.solution.residuals)
     floor = max(_ROUNDING * float(np.ptp(setting.y)), setting.step / math.sqrt(12.0)) ** 2
     if setting.step > 0.0:  # the rounding error of a run is one error
-        effective = min(effective, max(float(setting.runs[-1]) + 1.0, _LEAST_EFFECTIVE))
+        effective = min(effective, max(setting.runs[-1] + 1.0, _LEAST_EFFECTIVE))
     scored = [
         _Fitted(
             entry.law,
@@ -451,9 +449,8 @@ def _describe(
     candidates = tuple(entry for entry in scored if entry.bic - best.bic < APART)
     estimates, covariance = _estimates(best, setting)
     if _kind(best) == _NONE:  # a creep that is not excluded is part of this response
-        ends = [_instant(entry, setting).ci95 for entry in candidates]
-        joint = (min(low for low, _ in ends), max(high for _, high in ends))
-        estimates["instant"] = replace(estimates["instant"], ci95=joint)
+        lows, highs = zip(*(_instant(entry, setting).ci95 for entry in candidates), strict=True)
+        estimates["instant"] = replace(estimates["instant"], ci95=(min(lows), max(highs)))
     residuals = best.solution.residuals[0]
     measured = setting.y[setting.kept]
     instant = float(best.solution.shared[0])

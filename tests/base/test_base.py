@@ -32,6 +32,10 @@ def test_lognormal_interval_is_that_of_the_logarithm_and_stays_positive(value, r
     assert 0 < estimate.ci95[0] < value < estimate.ci95[1]
 
 
+def test_the_lognormal_interval_of_an_unknown_number_is_from_0_to_infinity():
+    assert Estimate.lognormal(4.2, math.inf, "s").ci95 == (0.0, math.inf)
+
+
 @given(value=FINITE, std=SPREAD, factor=st.floats(-1e3, 1e3))
 def test_scaling_keeps_the_interval_in_order_and_the_value_inside(value, std, factor):
     scaled = Estimate.normal(value, std, "rad/s").scaled(factor, "Hz")

@@ -75,6 +75,7 @@ def test_a_failed_case_takes_its_block_out_of_the_indices(campaigns: Any) -> Non
     rows[5] = replace(rows[5], results={}, error="it failed")
     summary = summarised(plan, rows)
     assert {one["blocks"] for one in summary["sensitivities"]} == {15}
+    assert {one["blocks_left_out"] for one in summary["sensitivities"]} == {1}
     assert summary["distributions"][0]["without_value"] == 1
     assert summary["distributions"][0]["median"]["ci95"] is None  # the points share coordinates
     assert summary["failures"][0]["count"] == 1 and summary["failures"][0]["index"] == 5
@@ -104,6 +105,30 @@ def test_coverage_counts_intervals_that_contain_the_truth(campaigns: Any) -> Non
     assert found["share"]["ci95"] == pytest.approx([0.6211, 0.9679], abs=1e-4)
 
 
+def test_an_interval_without_ends_does_not_count_as_one_that_contains_the_truth(
+    campaigns: Any,
+) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 20))
+    endless = {"y": 0.0, "y.low": -math.inf, "y.high": math.inf, "y.true": 2.0}
+    wrong = endless | {"y.low": -1.0, "y.high": 1.0}
+    rows = [CaseRow(f"{k}", k, plan.values(k), endless if k < 15 else wrong) for k in range(19)]
+    rows.append(CaseRow("19", 19, plan.values(19), error="it failed"))
+    summary = summarised(plan, rows)
+    (found,) = summary["coverage"]
+    assert (found["inside"], found["count"], found["without_interval"]) == (0, 4, 16)
+    page = campaign_page(summary, {})
+    assert "Without an interval" in page and "<td>16</td>" in page
+
+
+def test_what_was_not_reached_ranks_above_all_in_a_correlation(campaigns: Any) -> None:
+    """The result falls with the gain until it is not reached: the numbers alone say -1."""
+    plan = campaigns.plan(DESIGN.format("random", 64))
+    rows = rows_of(plan, lambda gain, omega: -gain if gain < 0.3 else math.inf)
+    found = {one["parameter"]: one for one in summarised(plan, rows)["sensitivities"]}
+    assert found["case.gain"]["correlation"]["value"] > 0.5
+    assert (found["case.gain"]["count"], found["case.gain"]["without_value"]) == (64, 0)
+
+
 def test_what_was_not_reached_is_larger_than_any_number(campaigns: Any) -> None:
     plan = campaigns.plan(DESIGN.format("random", 21))
     rows = rows_of(plan, lambda gain, omega: gain)
@@ -130,6 +155,8 @@ def test_two_campaigns_are_compared_by_their_medians(campaigns: Any) -> None:
     # the standard deviation of a median of 400 is 1.253 / 20
     assert low < 1.0 < high and high - low == pytest.approx(3.92 * 1.253 / 20 * 2**0.5, rel=0.35)
     assert compared(rows, {"y": np.full(400, math.nan)}) == []
+    (found,) = compared(rows, {"y": np.r_[np.zeros(400), np.full(7, math.nan)]})
+    assert (found["here"]["without_value"], found["there"]["without_value"]) == (0, 7)
 
 
 def test_the_page_is_self_contained_and_the_same_for_the_same_rows(campaigns: Any) -> None:

@@ -18,9 +18,10 @@ import click
 import numpy as np
 import pytest
 
-from haselab.base import InputError
+from haselab.base import Estimate, InputError
 from haselab.cli.main import cli, main
 from haselab.cli.output import OutputRule, reserved
+from haselab.cli.readable import readable
 
 sys.path.insert(0, str(Path(__file__).parent / "study"))
 from test_study_run import UNDER_WAY, started, tiny_study
@@ -329,3 +330,9 @@ def test_missing_folders_of_out_and_plot_are_created_and_removed_if_nothing_is_w
     assert code == (0 if works else 2)
     assert (out.is_file(), plot.is_file()) == (works, works)
     assert (out.parent.exists(), plot.parents[1].exists()) == (works, works)
+
+
+@pytest.mark.parametrize("form", [Estimate.normal, Estimate.lognormal])
+def test_an_estimate_with_an_infinite_interval_is_shown_as_not_identifiable(form) -> None:
+    (line,) = readable({"stiffness": form(4.2, float("inf"), "N/m")})
+    assert "not identifiable" in line and "4.2 N/m is arbitrary" in line and "[" not in line

@@ -200,3 +200,48 @@ def test_a_noisy_measured_input_gives_no_result():
     answer = PronyCreep(1.0, (0.2,), (1.0,)).simulate(smooth, 100.0)
     assert fit_creep(Record.sampled(smooth, answer + 0.002 * rng.normal(size=500), 100.0),
                      model="prony").succeeded  # fmt: skip
+
+
+def quantised(seed, step):
+    """A creep of 0.02 after a step of 0.1, read by a converter that hides the noise."""
+    rng = np.random.default_rng(seed)
+    u = np.r_[np.zeros(60), np.ones(1200)]
+    creep = PronyCreep(0.1 * rng.uniform(0.98, 1.02), (0.02 * rng.uniform(0.98, 1.02),), (5.0,))
+    y = creep.simulate(u, 20.0) + rng.uniform(-0.5, 0.5) * step + 1e-5 * rng.normal(size=u.size)
+    return Record.sampled(u, np.round(y / step) * step, 20.0), creep
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("step", [5e-4, 2e-3])
+def test_intervals_allow_for_the_steps_of_a_converter(step):
+    runs, inside = 8, Counter()
+    for seed in range(runs):
+        record, creep = quantised(seed, step)
+        fit = fit_creep(record, "prony")
+        assert any("steps of" in note for note in fit.notes)
+        truth = {"instant": creep.instant, "gain_1": creep.gains[0], "time_constant_1_s": 5.0}
+        for name, value in truth.items():
+            estimate = fit.parameters[name]
+            low, high = estimate.ci95
+            inside[name] += low <= value <= high
+    # Fewer than this in 8 has a probability below 1e-3 when 95 % are inside.
+    assert min(inside[name] for name in truth) >= binom.ppf(1e-3, runs, 0.95)
+
+
+def test_a_creep_that_steps_hide_leaves_its_share_of_the_response_open():
+    record, creep = quantised(1, 0.01)  # three levels after the step
+    fit = fit_creep(record, "prony")
+    assert fit.verdict == "cannot tell"
+    low, high = fit.parameters["instant"].ci95
+    assert low < creep.instant < high
+
+
+def test_steps_that_the_noise_hides_change_nothing():
+    y = answer(TWO)
+    fine, coarse = (
+        fit_creep(Record.sampled(HELD, each, RATE_HZ), "prony")
+        for each in (y, np.round(y / NOISE) * NOISE)
+    )
+    assert not any("steps of" in note for note in coarse.notes)
+    # Rounding adds 1/12 of the noise's variance, which is 4 % of the standard deviations.
+    assert coarse.parameters["instant"].std < 1.2 * fine.parameters["instant"].std

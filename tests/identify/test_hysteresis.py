@@ -282,3 +282,16 @@ def test_the_last_digit_of_an_output_decides_no_structure(digits):
     assert not any("coloured" in note for note in fit.notes)
     # An error of a digit at each end of a play moves its threshold by no more than this.
     assert fit.parameters["threshold_1"].value == pytest.approx(0.15, abs=10.0**-digits)
+
+
+def test_an_approximation_of_loops_of_another_form_is_said_to_be_one():
+    """Sixty operators: the fitted ones are no property of what made the loops."""
+    u = np.concatenate([high * triangle(0.0, 1.0, 0.25, 1, 50.0) for high in (2.0, 2.0, 1.0)])
+    thresholds = np.linspace(0.02, 1.0, 60)
+    many = PrandtlIshlinskii(0.3, tuple(thresholds), tuple(0.02 * np.exp(-thresholds)))
+    few = PrandtlIshlinskii(0.6, (0.2, 0.5), (0.5, 0.3))
+    noise = 1e-3 * np.random.default_rng(1).normal(size=u.size)
+    for made_by, is_other in ((many, True), (few, False)):
+        y = made_by.simulate(u) + (0.0 if is_other else noise)
+        notes = fit_hysteresis([LoopRecord(u, y, 50.0)], "prandtl-ishlinskii").notes
+        assert any("only approximate" in note for note in notes) == is_other

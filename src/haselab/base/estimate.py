@@ -41,8 +41,13 @@ class Estimate:
 
     @classmethod
     def lognormal(cls, value: float, relative_std: float, unit: str) -> Estimate:
-        """Estimate of a positive quantity whose logarithm has standard deviation `relative_std`."""
+        """Estimate of a positive quantity whose logarithm has standard deviation `relative_std`.
+
+        If this is infinite, the interval is from 0 to infinity.
+        """
         value, relative_std = float(value), float(relative_std)
+        if math.isinf(relative_std) and value > 0.0:
+            return cls(value, math.inf, (0.0, math.inf), unit)
         factor = math.exp(Z95 * min(relative_std, 300.0))
         low, high = sorted((value / factor, value * factor))
         return cls(value, abs(value) * relative_std, (low, high), unit)

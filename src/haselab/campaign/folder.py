@@ -19,8 +19,8 @@ from haselab.store.folder import drafted, json_text, read_json, write_new, write
 from haselab.store.optional import library
 
 __all__ = [
-    "CAMPAIGN", "FAILED", "TABLE", "described_in", "finished_rows", "open_folder", "plan_of",
-    "read_results", "write_table",
+    "CAMPAIGN", "FAILED", "TABLE", "changes_of", "described_in", "finished_rows", "open_folder",
+    "plan_of", "read_results", "write_table",
 ]  # fmt: skip
 
 CAMPAIGN, DESIGN = "campaign.json", "design.npy"
@@ -73,7 +73,7 @@ def open_folder(plan: Plan, folder: Path) -> None:
             write_new(folder / CAMPAIGN, json_text(described))
         _save_design(plan, folder / DESIGN)
     found = read_json(folder / CAMPAIGN)
-    changes = list(_changes("", found, described))
+    changes = changes_of(found, described)
     if changes:
         shown = "; ".join(changes[:_MOST_SHOWN])
         more = f"; and {len(changes) - _MOST_SHOWN} more" if len(changes) > _MOST_SHOWN else ""
@@ -94,13 +94,22 @@ def _save_design(plan: Plan, path: Path) -> None:
         ) from None
 
 
-def _changes(path: str, old: Json, new: Json) -> list[str]:
+def changes_of(old: Json, new: Json, path: str = "") -> list[str]:
+    """Say in which values two tables differ.
+
+    Args:
+        old: the table "there".
+        new: the table "here".
+        path: of both, in the texts.
+    Returns:
+        One text for each value that differs.
+    """
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         names = dict.fromkeys([*new, *old])
         inner = [(f"{path}.{name}" if path else name, name) for name in names]
         return [
             change for where, name in inner
-            for change in _changes(where, old.get(name), new.get(name))
+            for change in changes_of(old.get(name), new.get(name), where)
         ]  # fmt: skip
     return [] if old == new else [f"{path} is {_short(old)} there and {_short(new)} here"]
 

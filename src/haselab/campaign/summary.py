@@ -22,8 +22,8 @@ from haselab.store.campaign.shards import CaseRow
 from haselab.store.optional import library
 
 __all__ = [
-    "LEAST_CASES", "Group", "compared", "draws_are_independent", "groups_of", "median_interval",
-    "result_names", "summarised",
+    "LEAST_CASES", "Group", "compared", "draws_are_independent", "groups_of", "is_random",
+    "median_interval", "result_names", "summarised", "without_effect",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
@@ -115,8 +115,9 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         Distributions, coverage, sensitivities and failures, as JSON types.
     """
     campaign, groups = plan.campaign, groups_of(plan.campaign, rows)
-    independent = draws_are_independent(campaign.described(), grouped=len(groups) > 1)
-    is_random = bool(campaign.distributions) or campaign.design.repeats > 1
+    described = campaign.described()
+    independent = draws_are_independent(described, grouped=len(groups) > 1)
+    drawn = is_random(described)
     names = result_names(rows)
     return {
         "name": campaign.name,
@@ -125,9 +126,9 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         "design": campaign.design.model_dump(mode="json"),
         "cases": len(rows),
         "failed": sum(bool(row.error) for row in rows),
-        "is_random": is_random,
+        "is_random": drawn,
         "distributions": [
-            _distribution(group, name, independent=independent and is_random)
+            _distribution(group, name, independent=independent and drawn)
             for name in names
             for group in groups
         ],
@@ -139,6 +140,7 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         ],
         "sensitivities": list(_sensitivities(campaign, groups, names, independent=independent)),
         "failures": _failures(rows),
+        "without_effect": [*without_effect(campaign, rows)],
     }
 
 
@@ -160,6 +162,16 @@ def draws_are_independent(described: Mapping[str, Any], *, grouped: bool) -> boo
     if design["kind"] == "saltelli" or (is_drawn and design["repeats"] > 1):
         return False
     return grouped or axes == 1 or not (is_drawn or design["same_noise"])
+
+
+def is_random(described: Mapping[str, Any]) -> bool:
+    """Whether the cases are draws; a grid that is computed once draws nothing.
+
+    Args:
+        described: the campaign, as in its campaign.json.
+    """
+    drawn = any(isinstance(each, Mapping) for each in described["parameters"].values())
+    return drawn or described["design"]["repeats"] > 1
 
 
 def _distribution(group: Group, name: str, *, independent: bool) -> JsonObject:
@@ -214,12 +226,15 @@ def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | Non
     """How often the interval of an estimate contains the true value; None: no case has both."""
     true = group.values(f"{name}.true")
     low, high = group.values(f"{name}.low"), group.values(f"{name}.high")
+    # an interval without ends, of a parameter that is not identifiable, contains any value
     known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
+    known &= np.isfinite(low) | np.isfinite(high)
     inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
     if count == 0:
         return None
     return {
         "result": name, "group": group.label, "count": count, "inside": inside,
+        "without_interval": len(group.rows) - count,
         "share": {
             "value": inside / count,
             "ci95": _share_interval(inside, count) if independent else None,
@@ -271,6 +286,7 @@ def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonOb
     return [
         {
             "parameter": path, "method": "Sobol indices", "blocks": whole.shape[0],
+            "blocks_left_out": blocks.shape[0] - whole.shape[0],
             "first": _around(found["S1"][k], found["S1_conf"][k]),
             "total": _around(found["ST"][k], found["ST_conf"][k]),
         }
@@ -293,9 +309,9 @@ def _rank_correlations(
     from scipy.stats import spearmanr  # slow to import
 
     values = group.values(name)
-    good = np.isfinite(values)
+    good = ~np.isnan(values)  # what was not reached ranks above any number
     count = int(good.sum())
-    if count < LEAST_CASES or np.ptp(values[good]) == 0.0:
+    if count < LEAST_CASES or np.unique(values[good]).size < 2:
         return []
     found: list[JsonObject] = []
     for path in paths:
@@ -306,6 +322,7 @@ def _rank_correlations(
         ends = np.tanh([middle - half, middle + half])
         found.append({
             "parameter": path, "method": "rank correlation", "count": count,
+            "without_value": values.size - count,
             "correlation": {
                 "value": rho, "ci95": [float(end) for end in ends] if independent else None,
             },
@@ -327,6 +344,33 @@ def _failures(rows: Sequence[CaseRow]) -> list[Json]:
     ]  # fmt: skip
 
 
+def without_effect(campaign: Campaign, rows: Sequence[CaseRow]) -> list[str]:
+    """Axes along which no result of any case changes: the kind may not use the parameter.
+
+    Args:
+        campaign: of the rows.
+        rows: of all its cases.
+    Returns:
+        Their paths; none if all cases failed.
+    """
+    if all(row.error for row in rows):
+        return []
+    of_level = campaign.points * campaign.design.repeats
+    found = list[str]()
+    for axis in campaign.axes:
+        seen: dict[str, str] = {}
+        others = [one.path for one in campaign.axes if one is not axis]
+        alike = len(axis.values) > 1 and all(
+            seen.setdefault(
+                repr([row.index % of_level, *(row.values[path] for path in others)]), told
+            ) == told
+            for row in rows
+            for told in [repr((sorted(row.results.items()), row.error))]
+        )  # fmt: skip
+        found += [axis.path] if alike else []
+    return found
+
+
 def compared(
     here: Sequence[CaseRow], there: Mapping[str, Floats], *, independent: bool = True
 ) -> list[Json]:
@@ -335,16 +379,18 @@ def compared(
     Args:
         here: rows of this one.
         there: results of the other one, by name.
-        independent: the draws of both are, see `draws_are_independent`.
+        independent: the cases of both are independent draws, see `draws_are_independent` and
+            `is_random`.
     Returns:
-        For each result of both: the medians, and their difference with its bootstrap interval.
+        For each result of both: the medians, the number of cases without a value, which they leave
+        out, and the difference of the medians with its bootstrap interval.
     """
     rng = np.random.default_rng(_SEED)
     group, found = Group("", tuple(here)), list[Json]()
     for name in result_names(here):
         first = group.present(name)
-        second = there.get(name, np.zeros(0))
-        second = second[~np.isnan(second)]
+        others = there.get(name, np.zeros(0))
+        second = others[~np.isnan(others)]
         if min(first.size, second.size) < LEAST_CASES:
             continue
         if not (np.isfinite(first).all() and np.isfinite(second).all()):
@@ -358,8 +404,10 @@ def compared(
             intervals = [None, None, None]
         found.append({
             "result": name,
-            "here": {"value": medians[0], "ci95": intervals[0]},
-            "there": {"value": medians[1], "ci95": intervals[1]},
+            "here": {"value": medians[0], "ci95": intervals[0],
+                     "without_value": len(here) - first.size},
+            "there": {"value": medians[1], "ci95": intervals[1],
+                      "without_value": others.size - second.size},
             "difference": {"value": medians[0] - medians[1], "ci95": intervals[2]},
         })  # fmt: skip
     return found

@@ -22,6 +22,7 @@ __all__ = ["campaign_page"]
 Floats = NDArray[np.float64]
 _MOST_FIGURES = 12
 _MOST_CURVES = 6
+_MOST_CHANGES = 12
 _MOST_CHARACTERS = 160
 
 #: Results of the cases, by name and by group.
@@ -66,6 +67,12 @@ def _packaged(name: str) -> str:
 
 
 def _about(summary: Mapping[str, Any]) -> str:
+    unused = summary.get("without_effect", ())
+    more = f" No result depends on {', '.join(unused)}." if unused else ""
+    return _meaning(summary) + more
+
+
+def _meaning(summary: Mapping[str, Any]) -> str:
     if not summary["is_random"]:
         return (
             "All points of a grid, computed once each. The curves show which values the results "
@@ -114,10 +121,12 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     yield _Table(
         "Coverage of the intervals",
         "How often the stated interval of 95 % contains the true value, which the simulation knows "
-        "and the analysis does not. Good intervals contain it in 95 % of the cases.",
-        ("Estimate", "Axes", "Cases", "Inside", "Share"),
+        "and the analysis does not. Good intervals contain it in 95 % of the cases. Failed cases "
+        "and those in which the estimate was not identifiable have no interval and do not count.",
+        ("Estimate", "Axes", "Cases", "Without an interval", "Inside", "Share"),
         [
-            (one["result"], one["group"], str(one["count"]), str(one["inside"]),
+            (one["result"], one["group"], str(one["count"]), str(one["without_interval"]),
+             str(one["inside"]),
              _with_interval(one["share"]))
             for one in summary["coverage"]
         ],
@@ -137,34 +146,50 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     yield _Table(
         "Comparison",
         f"This campaign against that in {summary.get('compared_with', '')}. The interval of the "
-        "difference is from resampling both.",
-        ("Result", "Median here", "Median there", "Difference"),
+        "difference is from resampling both. Cases without a value are left out. "
+        f"{_differences(summary.get('differs_in', ()))}",
+        ("Result", "Median here", "Median there", "Difference", "Without a value, here and there"),
         [
-            (one["result"], *(_with_interval(one[key]) for key in ("here", "there", "difference")))
+            (
+                one["result"],
+                *(_with_interval(one[key]) for key in ("here", "there", "difference")),
+                f"{one['here']['without_value']} and {one['there']['without_value']}",
+            )
             for one in summary.get("comparison", ())
         ],
     )
+
+
+def _differences(changes: Sequence[str]) -> str:
+    if not changes:
+        return "The two campaigns have the same file."
+    more = len(changes) - _MOST_CHANGES
+    listed = "; ".join(changes[:_MOST_CHANGES]) + (f"; and {more} more" if more > 0 else "")
+    return f"The campaigns differ: {listed}."
 
 
 def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
     yield _Table(
         "Sensitivity: Sobol indices",
         "First-order index: share of the variance that a parameter causes alone. Total index: "
-        "together with all others. Intervals of 95 % from resampling.",
-        ("Result", "Axes", "Parameter", "First-order index", "Total index"),
+        "together with all others. Intervals of 95 % from resampling. A block of samples in which "
+        "a case has no finite value is left out; if many are, the indices are those of a part of "
+        "the distributions only.",
+        ("Result", "Axes", "Parameter", "First-order index", "Total index", "Blocks", "Left out"),
         [
             (one["result"], one["group"], one["parameter"], _with_interval(one["first"]),
-             _with_interval(one["total"]))
+             _with_interval(one["total"]), str(one["blocks"]), str(one["blocks_left_out"]))
             for one in found if "first" in one
         ],
     )  # fmt: skip
     yield _Table(
         "Sensitivity: rank correlation",
         "Spearman's correlation of a parameter and a result: 1 and −1 for a monotone relation, 0 "
-        "also for one that rises and falls.",
-        ("Result", "Axes", "Parameter", "Correlation"),
+        "also for one that rises and falls. A result that was not reached ranks above all others.",
+        ("Result", "Axes", "Parameter", "Correlation", "Cases", "Without a value"),
         [
-            (one["result"], one["group"], one["parameter"], _with_interval(one["correlation"]))
+            (one["result"], one["group"], one["parameter"], _with_interval(one["correlation"]),
+             str(one["count"]), str(one["without_value"]))
             for one in found if "correlation" in one
         ],
     )  # fmt: skip

@@ -82,6 +82,33 @@ def test_a_comparison_with_itself_finds_no_difference(
     assert all(one["ci95"][0] <= 0.0 <= one["ci95"][1] for one in differences)
 
 
+def test_two_grids_are_compared_without_intervals_and_an_axis_without_effect_is_named(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A grid that is computed once draws nothing."""
+    grid = """
+name = "a"
+kind = "geometry"
+[base]
+twin = "hz"
+[parameters]
+twin.load.mass_kg = [0.2, {}]
+twin.camera.exposure_s = [1e-3, 1.2e-3, 1.4e-3, 1.6e-3]
+"""
+    for name, mass_kg, more in (("one", 0.25, ()), ("two", 0.3, ("--compare", "one"))):
+        file.write_text(grid.format(mass_kg))
+        assert code_of("campaign", file, "--out", name, "--workers", 1, *more) == 0
+        said = capsys.readouterr().err
+        assert said.count("no result depends on") == 1 and "twin.camera.exposure_s" in said
+    summary = json.loads(Path("two/summary.json").read_text())
+    assert summary["without_effect"] == ["twin.camera.exposure_s"]
+    assert summary["comparison"]
+    for one in summary["comparison"]:
+        assert all(one[key]["ci95"] is None for key in ("here", "there", "difference"))
+    page = Path("two/report.html").read_text()
+    assert "[0.2, 0.25] there and [0.2, 0.3] here" in page
+
+
 def test_if_all_cases_fail_there_is_no_result(
     file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

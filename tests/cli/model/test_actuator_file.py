@@ -196,6 +196,7 @@ def test_compare_predicts_a_record_that_was_not_used(known, capsys):
     # An exact model leaves the noise: its rms, up to the few numbers that are fitted.
     assert answer["rms_error"] == pytest.approx(NOISE, rel=0.1)
     assert answer["inside_band"] == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / 1200))
+    assert answer["notes"] == []
     rows = np.loadtxt(second, delimiter=",", skiprows=1)
     spread = np.sqrt(np.mean((rows[:, 2] - rows[:, 2].mean()) ** 2))
     fit = 100 * (1 - answer["rms_error"] / spread)
@@ -364,6 +365,8 @@ def test_another_actuator_is_seen_by_the_band(known, tmp_path, capsys):
     other = record(tmp_path / "other.csv", 3, Plant(0.8, 20.0, 0.15, 0.004))
     answer = json.loads(run(capsys, "compare", actuator, other, "--json")[1])
     assert answer["inside_band"] < 0.5 and answer["fit_percent"] < 70
+    (note,) = answer["notes"]
+    assert "does not describe this record within its uncertainty" in note
 
 
 def test_a_file_without_a_model_says_which_command_writes_one(files, capsys):

@@ -71,6 +71,12 @@ def timed(record, factor):
     )  # fmt: skip
 
 
+def clipped(record):
+    """A converter that ends below the highest capacitance, with noise below its end."""
+    noisy = record.capacitance_f + STD_F * np.random.default_rng(1).normal(size=200)
+    return replace(record, capacitance_f=np.minimum(noisy, np.quantile(noisy, 0.6)))
+
+
 def mirrored(record):
     return replace(record, length_m=2.0 * record.length_m[0] - record.length_m)
 
@@ -110,6 +116,17 @@ def test_swapped_units_and_volts_are_named_without_numbers(seen, bad, words):
     law, record = seen
     fit = fit_actuator(law, [record, bad(record)], mass_kg=float(record.drive.mass_kg[0]))
     assert words in fit.status and not fit.parameters
+
+
+def test_clipped_capacitances_are_named_and_values_that_rest_are_not(seen):
+    """The record has no noise, so before the step all its values are at one end, exactly."""
+    law, record = seen
+    ramp = np.linspace(0.0, record.drive.voltage_v.max(), 200)
+    moving = replace(record, drive=replace(record.drive, voltage_v=ramp))
+    assert "capacitances are exactly" in find_implausible(law, [clipped(moving)])
+    assert "exactly" not in find_implausible(law, [record])
+    coarse = replace(moving, capacitance_f=np.round(record.capacitance_f, 11))
+    assert "exactly" not in find_implausible(law, [coarse])
 
 
 def test_a_record_without_motion_may_have_a_small_drive(seen):

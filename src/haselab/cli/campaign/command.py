@@ -15,6 +15,7 @@ from haselab.campaign.definition import load_campaign
 from haselab.campaign.executors.executor import Executor
 from haselab.campaign.executors.processes import ProcessExecutor
 from haselab.campaign.folder import (
+    changes_of,
     described_in,
     finished_rows,
     open_folder,
@@ -29,8 +30,10 @@ from haselab.campaign.summary import (
     compared,
     draws_are_independent,
     groups_of,
+    is_random,
     result_names,
     summarised,
+    without_effect,
 )
 from haselab.cli.common import WORKERS, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
@@ -107,16 +110,26 @@ def command(
         rows = finished_rows(plan, out)
         write_table(plan, rows, out)
         summary = summarised(plan, rows)
+        for path in without_effect(plan.campaign, rows):
+            click.echo(
+                f"haselab: warning: no result depends on {path}; the kind "
+                f"{plan.campaign.kind!r} may not use it", err=True,
+            )  # fmt: skip
         if there is not None:
             both = (plan.campaign.described(), there[1])
-            independent = all(draws_are_independent(each, grouped=False) for each in both)
+            independent = all(
+                is_random(each) and draws_are_independent(each, grouped=False) for each in both
+            )
             comparison = compared(rows, there[0], independent=independent)
             if not comparison:
                 click.echo(
                     f"haselab: No comparison: no result has at least {LEAST_CASES} values in both "
                     f"campaigns, all of them finite. {other}", err=True,
                 )  # fmt: skip
-            summary |= {"comparison": comparison, "compared_with": str(other)}
+            summary |= {
+                "comparison": comparison, "compared_with": str(other),
+                "differs_in": changes_of(there[1], plan.campaign.described()),
+            }  # fmt: skip
         write_text(out / "report.html", campaign_page(summary, _values(plan, rows)))
         answer["summary"] = summary
         write_json(out / "summary.json", summary)

@@ -36,6 +36,7 @@ from haselab.cli.model.physical_model import has_physical_model
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
+from haselab.identify.model_choice import effective_count
 from haselab.identify.prediction import predict
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.training_output import TrainingOutput, is_comparable
@@ -45,6 +46,7 @@ from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["command"]
 
+_BAND, _BY_CHANCE = 0.95, 1e-4  # share of the samples inside; probability of fewer by noise alone
 _NO_BAND = "no uncertainty: the model has no covariance"
 _NO_NOISE = (
     "none: the model file does not state residual_std, without which the band would be too narrow. "
@@ -256,5 +258,20 @@ def _answer(found: Prediction, no_band: str) -> dict[str, object]:
         "band": no_band or "95 %, from the covariance of the model and its residuals",
         "samples": found.measured.size,
         "used_for_fit": None if math.isnan(found.used_for_fit) else found.used_for_fit,
+        "notes": [] if no_band else _notes(found),
         "status": found.status,
     }
+
+
+def _notes(found: Prediction) -> list[str]:
+    """Say so if the error is larger than the band explains, whatever the colour of the noise."""
+    from scipy.stats import binom  # slow to import
+
+    worth = round(effective_count([found.measured - found.predicted]))
+    if found.inside_band * worth >= binom.ppf(_BY_CHANCE, worth, _BAND):
+        return []
+    return [
+        f"Only {100.0 * found.inside_band:.0f} % of the samples are inside the band of 95 %: the "
+        "model does not describe this record within its uncertainty, or the noise is larger than "
+        "in the record of the fit."
+    ]

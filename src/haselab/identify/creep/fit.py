@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
+from haselab.identify.creep.columns import are_swapped, is_noisy
 from haselab.identify.creep.laws import (
     CreepLaw,
     FractionalLaw,
@@ -26,6 +27,7 @@ from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.projection import Basis, Solution, minimise, project
 from haselab.identify.record import Record
 from haselab.identify.sampled.record import single_record
+from haselab.identify.training_output import grid_step
 from haselab.models.creep import Creep
 
 __all__ = ["CreepFit", "fit_creep"]
@@ -51,10 +53,8 @@ _BEYOND = 3.0  # record lengths: longer time constants are not identifiable
 _STRAIGHT = 0.999  # order at which a power of time counts as a straight line
 _WEAK = 2.0  # standard deviations of a gain below which its time constant is not identifiable
 _HELD_OUT = 0.25
-_NOISE = 0.1  # of the input's range: median step of an input that is noisy, ...
-_TURNED = 0.58  # ... and share of the steps that reverse
-_HELD = 0.02  # of the rows are updates of an input, at most, ...
-_MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
+_REPEATED = 0.5  # share of the samples that repeat the one before, where steps hide the noise
+_LEAST_EFFECTIVE = 8.0  # samples, as for coloured residuals
 _UNKNOWN = (-math.inf, math.inf)
 
 
@@ -74,6 +74,17 @@ class _Setting:
     y: Floats
     kept: NDArray[np.bool_]
     offset: bool
+
+    @property
+    def step(self) -> float:
+        """Step of a converter that hides the noise: most samples repeat; 0: there is none."""
+        held = self.y[self.kept]
+        return grid_step(held) if np.mean(np.diff(held) == 0.0) > _REPEATED else 0.0
+
+    @property
+    def runs(self) -> NDArray[np.int64]:
+        """Number of the run of equal outputs to which each fitted sample belongs."""
+        return np.cumsum(np.diff(self.y[self.kept], prepend=self.y[self.kept][0]) != 0.0)
 
     def thinned(self) -> _Setting:
         """At most 800 of the fitted samples."""
@@ -121,8 +132,21 @@ class _Fitted:
     def parameters(self) -> int:
         return self.solution.search.size + self.solution.shared.size
 
-    def covariance(self) -> Floats:
-        return coloured_covariance(self.solution.columns, self.solution.residuals, self.parameters)
+    def covariance(self, setting: _Setting) -> Floats:
+        """Covariance of search and shared, with the rounding errors of a converter.
+
+        These are a function of the output, so all samples of a run of equal outputs may have the
+        same one, of a variance of `step**2 / 12`.
+        """
+        solution = self.solution
+        covariance = coloured_covariance(solution.columns, solution.residuals, self.parameters)
+        step, runs = setting.step, setting.runs
+        if step == 0.0 or not np.isfinite(covariance).all():
+            return covariance
+        inverse = np.linalg.pinv(np.vstack(list(solution.columns)))
+        by_run = np.zeros((inverse.shape[0], int(runs[-1]) + 1))
+        np.add.at(by_run.T, runs, inverse.T)
+        return np.asarray(covariance + step**2 / 12.0 * by_run @ by_run.T)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,13 +287,13 @@ def fit_creep(
     drift = _drift_before(setting, rest_known=not stepped)
     if drift is not None:
         return _no_result(setting, drift)
-    if _swapped(record.u, setting.y):
+    if are_swapped(record.u, setting.y):
         return _no_result(
             setting,
             "the output is held between few updates, and the input changes at every row; the "
             "columns are swapped",
         )
-    if _noisy(record.u):
+    if is_noisy(record.u):
         return _no_result(
             setting,
             "the input is noisy, which biases every parameter; use the commanded input, or the "
@@ -328,22 +352,6 @@ def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
     # A step at the first sample: the output before it and the instantaneous response are
     # indistinguishable.
     return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
-
-
-def _swapped(u: Floats, y: Floats) -> bool:
-    """Whether the output is held like an input while the input varies like an output."""
-    updates, moves = (np.count_nonzero(np.diff(column)) for column in (y, u))
-    return bool(updates <= _HELD * u.size and moves >= _MOVING * u.size)
-
-
-def _noisy(u: Floats) -> bool:
-    """Whether most rows only differ by noise, whose differences reverse two times out of three."""
-    steps = np.diff(u)
-    if np.count_nonzero(steps) < _MOVING * steps.size:
-        return False
-    small = float(np.median(np.abs(steps))) < _NOISE * float(np.ptp(u))
-    turned = np.count_nonzero(steps[1:] * steps[:-1] < 0.0)
-    return bool(small and turned > _TURNED * steps.size)
 
 
 def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:
@@ -416,7 +424,9 @@ def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
     richest = min(found, key=lambda entry: entry.solution.cost)
     count = int(setting.kept.sum())
     effective = effective_count(richest.solution.residuals)
-    floor = (_ROUNDING * float(np.ptp(setting.y))) ** 2
+    floor = max(_ROUNDING * float(np.ptp(setting.y)), setting.step / math.sqrt(12.0)) ** 2
+    if setting.step > 0.0:  # the rounding error of a run is one error
+        effective = min(effective, max(setting.runs[-1] + 1.0, _LEAST_EFFECTIVE))
     scored = [
         _Fitted(
             entry.law,
@@ -436,7 +446,11 @@ def _describe(
     stepped: bool,
 ) -> CreepFit:
     best = scored[0]
+    candidates = tuple(entry for entry in scored if entry.bic - best.bic < APART)
     estimates, covariance = _estimates(best, setting)
+    if _kind(best) == _NONE:  # a creep that is not excluded is part of this response
+        lows, highs = zip(*(_instant(entry, setting).ci95 for entry in candidates), strict=True)
+        estimates["instant"] = replace(estimates["instant"], ci95=(min(lows), max(highs)))
     residuals = best.solution.residuals[0]
     measured = setting.y[setting.kept]
     instant = float(best.solution.shared[0])
@@ -453,9 +467,15 @@ def _describe(
         validation_fit_percent=_validation(setting, best),
         residual_whiteness_p=whiteness_p([residuals]),
         fitted=best.law.model(best.solution.search, instant, best.gains(setting)),
-        candidates=tuple(entry for entry in scored if entry.bic - best.bic < APART),
+        candidates=candidates,
         setting=setting,
     )
+
+
+def _instant(entry: _Fitted, setting: _Setting) -> Estimate:
+    at = entry.solution.search.size
+    variance = float(entry.covariance(setting)[at, at])
+    return Estimate.normal(float(entry.solution.shared[0]), math.sqrt(max(variance, 0.0)), "")
 
 
 def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], Floats]:
@@ -465,7 +485,7 @@ def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], 
     """
     solution = entry.solution
     count = solution.search.size
-    inner = entry.covariance()
+    inner = entry.covariance(setting)
     std = np.sqrt(np.maximum(np.diag(inner), 0.0))
     names = [*entry.law.names[:count], "instant", *["offset"] * setting.offset]
     names += entry.law.names[count:]
@@ -506,7 +526,7 @@ def _forecast(setting: _Setting, entry: _Fitted, after_s: float) -> Estimate:
     basis = ahead.bases(entry.law, entry.solution.search)[0]
     value = float(basis.shared[0] @ entry.solution.shared)
     row = np.concatenate([basis.by_search[:, 0] @ entry.solution.shared, basis.shared[0]])
-    covariance = entry.covariance()
+    covariance = entry.covariance(setting)
     if not np.isfinite(covariance).all():
         return Estimate(value, math.inf, _UNKNOWN, "")
     return Estimate.normal(value, math.sqrt(max(float(row @ covariance @ row), 0.0)), "")
@@ -542,8 +562,14 @@ def _notes(
             "clipping, drift). Intervals and forecasts assume that the law is right. Leave "
             "ringing out with --leave-out-s."
         )
+    if setting.step > 0.0:
+        notes.append(
+            f"The output has steps of {setting.step:.3g} that hide its noise. The intervals allow "
+            "for the same rounding error in all samples of a run of equal values. Record more "
+            "digits, or a larger step of the input."
+        )
     spikes = np.abs(residuals) > _SPIKE * 1.4826 * float(np.median(np.abs(residuals)))
-    if spikes.any():
+    if spikes.any() and setting.step == 0.0:
         notes.append(
             f"{np.count_nonzero(spikes)} of {residuals.size} outputs are more than {_SPIKE:g} "
             "standard deviations away from the law and are not excluded. Remove spikes first."

@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 _LENGTH, _CAPACITANCE = 10.0, 100.0  # factor from the start values that no start explains
 _BREAKDOWN = 3.0  # fields over that of breakdown, likewise
 _MONITOR = 0.05  # largest error of the voltage's monitor and of the amplifier's gain together
+_FEWEST_CLIPPED, _CLIPPED = 10, 0.02  # number and share of values at an end of their range
 _UNSEEN = 0.01  # motion over the noise of a length
 _STILL = 20.0  # spread of the lengths over their noise, of an actuator that moves
 _FOLLOWS = 0.7  # correlation with the simulated motion, of lengths that follow the drive
@@ -52,6 +53,7 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
     for record in records:
         for fault in (
             _length(law, record), _capacitance(law, record), _field(law, record), _monitor(record),
+            _clipped(record),
         ):  # fmt: skip
             if fault:
                 return f"{record.name}: {fault}"
@@ -112,6 +114,37 @@ def _monitor(record: MotionRecord) -> str:
         "the gain of the amplifier, the scale of its voltage monitor, and that the monitor follows "
         "the drive"
     )
+
+
+def _clipped(record: MotionRecord) -> str:
+    """Whether many values are exactly at an end of their range while the voltage changes."""
+    drive = record.drive
+    first = np.unique(record.window_of, return_index=True)[1]
+    capacitance_s = drive.edge_s[record.window[first]]
+    for what, values, time_s, unit in (
+        ("lengths", record.length_m, record.length_time_s, "m"),
+        ("capacitances", record.capacitance_f, capacitance_s, "F"),
+    ):
+        at = np.searchsorted(drive.edge_s, time_s, side="right") - 1
+        square_v2 = drive.voltage_v[np.clip(at, 0, drive.voltage_v.size - 1)] ** 2
+        for end in {float(values.min()), float(values.max())} if values.size else ():
+            count = _stuck(values == end, square_v2)
+            others = values[values != end]
+            repeats = float(np.mean(np.diff(others) == 0.0)) if others.size > 1 else 1.0
+            if count >= max(_FEWEST_CLIPPED, _CLIPPED * values.size) and repeats < _CLIPPED:
+                return (
+                    f"{count} of the {what} are exactly {end:.6g} {unit} while the voltage "
+                    f"changes: they are clipped. Leave these {what} out (valid = 0), or record "
+                    "with a larger range"
+                )
+    return ""
+
+
+def _stuck(at_end: NDArray[np.bool_], square_v2: Floats) -> int:
+    """Number of values in runs at the end of a range during which the voltage changes."""
+    edges = np.flatnonzero(np.diff(at_end, prepend=False, append=False))
+    runs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+    return sum(end - start for start, end in runs if np.ptp(square_v2[start:end]) > 0.0)
 
 
 def _drive(law: ActuatorLaw, record: MotionRecord, simulated_m: Floats | None) -> str:

@@ -131,14 +131,16 @@ def status_of(
     if ratio > _GROSS:
         return (
             f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
-            "noise. Check the mass, the units and that all records are of one actuator, or start "
-            "nearer, by [actuator.parameters]"
+            "noise. Check the mass, the units, that each table begins at rest under its first "
+            "voltage and that all records are of one actuator, or start nearer, by "
+            "[actuator.parameters]"
         ), False
     if seen.misses_a_signal:
         return (
             f"the records contradict the model: it explains only {100.0 * max(seen.share, 0.0):.0f}"
-            " % of the variance of a signal. Check the mass, the amplifier's gain, the units and "
-            "that all records are of one actuator, or start nearer, by [actuator.parameters]"
+            " % of the variance of a signal. Check the mass, the amplifier's gain, the units, that "
+            "each table begins at rest under its first voltage and that all records are of one "
+            "actuator, or start nearer, by [actuator.parameters]"
         ), False
     if not converged:
         return "the search did not converge; start nearer, by [actuator.parameters]", False

@@ -23,6 +23,9 @@ __all__ = ["Envelope", "Free", "PrintedFit", "fit_free", "fit_printed"]
 
 _FEWEST = 16  # frames of a motion
 _WITH_CREEP = 3  # parameters that are searched: decay, frequency, and time constant of the creep
+_ONE_TRIAL = (
+    "one trial: the interval only includes the change without the last peak, not the scatter"
+)
 _LEAST_PEAKS = 2  # of one sign, through which an envelope is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks are below the residuals of eq. 6
 
@@ -206,6 +209,7 @@ def fit_free(trials: Sequence[Observation], near: Free | None = None) -> Free:
             "S19.omega_0": f"{_model(fit)}; the rms residual is "
             f"{1e3 * float(np.sqrt(np.mean(left_m**2))):.2g} mm",
             "S19.eq6_omega_0": "decaying oscillation without a creep term" + _missing(printed),
+            **(dict.fromkeys(_envelope_decays(printed), _ONE_TRIAL) if len(printed) == 1 else {}),
         },
         figures={"free_response": _figure(trials, records, fit, printed)},
     )

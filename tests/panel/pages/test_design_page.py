@@ -9,8 +9,8 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, Request, expect
 
-from tests.panel.running import WAIT_S, RunningPanel, ended, started
 from tests.panel.pages.test_design import CONTROLLER, GAINS, MODEL, ask
+from tests.panel.running import WAIT_S, RunningPanel, ended, started
 
 WAIT_MS = 1e3 * WAIT_S
 

@@ -41,6 +41,7 @@ def _stated(page: Page, before: str, after: str) -> float:
 
 def test_the_first_study_has_the_results_that_the_page_states(make_shell: Callable) -> None:
     page, shell = Page("start/twin-in-five-minutes.md"), make_shell("first")
+    (shell.folder / "study.toml").write_text(page.toml[0], encoding="utf-8")
     _answers(shell, page.commands)
     rows = {row["id"]: row["measured"] for row in shell.json("first/results.json")["quantities"]}
     for name, shown in (

@@ -175,8 +175,8 @@ def _design(job: _DesignJob) -> Entry:
         return Entry(job.controller, job.loop, job.device, reason=job.status)
     known = known_in_class(job.known, device, loop)
     try:
-        about = zlib.crc32(f"{job.controller} {job.loop} {job.device}".encode())
-        with _seeded([about]), _deadline(600.0, "the design takes longer than 10 minutes"):
+        seed = zlib.crc32(f"{job.controller} {job.loop} {job.device}".encode())
+        with _seeded([seed]), _deadline(600.0, "the design takes longer than 10 minutes"):
             found = designed(CONTROLLERS.find(job.controller), loop, known)
     except TimeoutError as error:
         found = Designed(None, str(error))
@@ -399,7 +399,8 @@ def _all_done(found: list[Result | Lost]) -> list[Result]:
     lost = [one.reason for one in found if isinstance(one, Lost)]
     if lost:
         raise DeviceError(
-            f"A job has no result: {lost[0]}. Check the memory of the computer, or use fewer workers."
+            f"A job has no result: {lost[0]}. Check the memory of the computer, or use fewer "
+            "workers."
         )
     return [one for one in found if not isinstance(one, Lost)]
 

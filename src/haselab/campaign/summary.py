@@ -226,9 +226,11 @@ def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | Non
     """How often the interval of an estimate contains the true value; None: no case has both."""
     true = group.values(f"{name}.true")
     low, high = group.values(f"{name}.low"), group.values(f"{name}.high")
-    # an interval without ends, of a parameter that is not identifiable, contains any value
+    # the interval of a parameter that is not identifiable contains any value, also one from 0 to
+    # infinity, of a positive parameter
     known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
     known &= np.isfinite(low) | np.isfinite(high)
+    known &= ~np.isinf(group.values(f"{name}.std"))
     inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
     if count == 0:
         return None

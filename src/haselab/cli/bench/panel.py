@@ -65,7 +65,7 @@ def _check_lan(context: click.Context, option: click.Parameter, value: str) -> s
 )  # fmt: skip
 @click.option(
     "--lan", default="", metavar="IP", callback=_check_lan,
-    help="Also serve the page on this IPv4 address of this computer, for a tablet in the same "
+    help="Serve the page also on this IPv4 address of this computer, for a tablet in the same "
     "network. Whoever has the printed address can arm the bench, and the connection is not "
     "encrypted. Default: this computer only.",
 )  # fmt: skip

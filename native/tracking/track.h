@@ -68,7 +68,7 @@ struct track_result {
     float residual;  /* mean square of r, weighted with the gradient's energy, grey^2 */
     float iterations;
     float status;
-    float reach; /* farthest pixel that was read, along x or y from the subset's centre at the start */
+    float reach; /* along x or y from the subset's centre at the start to the farthest pixel read, px */
 };
 
 struct track_settings {

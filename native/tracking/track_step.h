@@ -115,8 +115,8 @@ struct track_summary {
     float unevenness; /* of the light: how far a point's grey level over the reference's is from the
                          median of all, at most, for nine tenths of them */
     float largest_std_px; /* of the believed points */
-    float reach_px;       /* farthest pixel that was read, along x or y from where a point was
-                             expected; the frame's larger side if points were searched for */
+    float reach_px;       /* along x or y from where a point was expected to the farthest pixel that
+                             was read; the frame's larger side if points were searched for */
     struct track_audit audit;
 };
 

@@ -239,7 +239,7 @@ static int has_columns(const camera_part *part, double first, double last)
     return 0;
 }
 
-/* Whether a blob may be seen in these rows at some sample; most are not near a small part. */
+/* Whether a blob may reach these rows at some sample; most blobs are far from a small part. */
 static int may_show(const camera_scene *s, const camera_blob *blob, const double *lengths_px,
                     size_t samples, camera_span rows)
 {
@@ -323,7 +323,7 @@ static uint64_t scramble(uint64_t z)
     return z ^ (z >> 31);
 }
 
-/* Exposes the pixels from `first` to before `stop`; `counter`: that of the frame's first pixel. */
+/* Exposes the pixels from `first` to `stop` - 1; `counter`: of the noise of the frame's first pixel. */
 HS_CLONES
 static void expose_pixels(const float *level, size_t first, size_t stop, const camera_noise *noise,
                           uint64_t counter, uint8_t *out)

@@ -52,7 +52,7 @@ typedef struct {
 } camera_scene;
 
 typedef struct {
-    int first, stop; /* from the first one to before the end */
+    int first, stop; /* the first one, and the one after the last */
 } camera_span;
 
 /* What is drawn: rows within the height, in spans of columns within the width. */
@@ -72,9 +72,9 @@ typedef struct {
 /* Floats of scratch memory that camera_expect needs. */
 size_t camera_scratch_size(const camera_scene *scene, size_t samples);
 
-/* A part of the mean of the images at `samples` lengths, at most CAMERA_SAMPLES_MAX, in grey levels;
- * `level` holds width * height floats. Those of other rows stay as they are, those of other columns
- * may become anything. */
+/* A part of the mean of the images at `samples` lengths, at most CAMERA_SAMPLES_MAX, in grey levels.
+ * `level` holds width * height floats. Those of other rows stay as they are; those of other columns
+ * in the same rows are undefined. */
 void camera_expect(const camera_scene *scene, const double *lengths_px, size_t samples,
                    const camera_part *part, float *scratch, float *level);
 

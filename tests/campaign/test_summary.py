@@ -110,8 +110,10 @@ def test_an_interval_without_ends_does_not_count_as_one_that_contains_the_truth(
 ) -> None:
     plan = campaigns.plan(DESIGN.format("random", 20))
     endless = {"y": 0.0, "y.low": -math.inf, "y.high": math.inf, "y.true": 2.0}
+    positive = endless | {"y.low": 0.0, "y.std": math.inf}
     wrong = endless | {"y.low": -1.0, "y.high": 1.0}
-    rows = [CaseRow(f"{k}", k, plan.values(k), endless if k < 15 else wrong) for k in range(19)]
+    results = [endless] * 10 + [positive] * 5 + [wrong] * 4
+    rows = [CaseRow(f"{k}", k, plan.values(k), results[k]) for k in range(19)]
     rows.append(CaseRow("19", 19, plan.values(19), error="it failed"))
     summary = summarised(plan, rows)
     (found,) = summary["coverage"]

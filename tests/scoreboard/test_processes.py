@@ -1,4 +1,4 @@
-"""Jobs that end their process, hang, print, or leave something behind: the others do not notice."""
+"""Jobs that end their process, hang, print, or leave something behind do not affect the others."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _found(items: list[str]) -> dict[str, object]:
         workers.close()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="no copies of a process")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks a process for each job")
 def test_what_a_job_does_to_its_process_does_not_affect_the_others(capfd):
     good = ["first", "starts a thread", "copies itself", "prints", "last"]
     bad = {

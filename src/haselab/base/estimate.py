@@ -43,7 +43,7 @@ class Estimate:
     def lognormal(cls, value: float, relative_std: float, unit: str) -> Estimate:
         """Estimate of a positive quantity whose logarithm has standard deviation `relative_std`.
 
-        If this is infinite, the interval is from 0 to infinity.
+        If `relative_std` is infinite, the interval is from 0 to infinity.
         """
         value, relative_std = float(value), float(relative_std)
         if math.isinf(relative_std) and value > 0.0:

@@ -1,4 +1,4 @@
-"""`sys.exit()` and the like in code of other packages, which must not end a run of this program."""
+"""Keep code of other packages from ending this program, by `sys.exit()` for example."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ class SignalExit(SystemExit):
 def no_exit() -> Iterator[None]:
     """Turn `sys.exit()` in code of another package into an error, like any other one there.
 
-    The same for exceptions that are no `Exception`, such as `asyncio.CancelledError`, or a panic in
-    an extension written in Rust. Ctrl-C still ends the program.
+    Exceptions that do not derive from `Exception` become an error, too, such as
+    `asyncio.CancelledError` or a panic in an extension written in Rust. Ctrl-C still ends the
+    program.
 
     Raises:
-        RuntimeError: The code called `sys.exit()`, or raised such an exception.
+        RuntimeError: The code called `sys.exit()` or raised such an exception.
     Example:
         >>> import sys
         >>> with no_exit():

@@ -98,9 +98,9 @@ def changes_of(old: Json, new: Json, path: str = "") -> list[str]:
     """Say in which values two tables differ.
 
     Args:
-        old: the table "there".
-        new: the table "here".
-        path: of both, in the texts.
+        old: table that the texts call "there".
+        new: table that the texts call "here".
+        path: prefix of the names in the texts.
     Returns:
         One text for each value that differs.
     """

@@ -165,7 +165,7 @@ def draws_are_independent(described: Mapping[str, Any], *, grouped: bool) -> boo
 
 
 def is_random(described: Mapping[str, Any]) -> bool:
-    """Whether the cases are draws; a grid that is computed once draws nothing.
+    """Whether the cases are random draws; a grid whose points are computed once has none.
 
     Args:
         described: the campaign, as in its campaign.json.
@@ -226,9 +226,11 @@ def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | Non
     """How often the interval of an estimate contains the true value; None: no case has both."""
     true = group.values(f"{name}.true")
     low, high = group.values(f"{name}.low"), group.values(f"{name}.high")
-    # an interval without ends, of a parameter that is not identifiable, contains any value
+    # the interval of a parameter that is not identifiable contains any value, also one from 0 to
+    # infinity, of a positive parameter
     known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
     known &= np.isfinite(low) | np.isfinite(high)
+    known &= ~np.isinf(group.values(f"{name}.std"))
     inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
     if count == 0:
         return None
@@ -309,7 +311,7 @@ def _rank_correlations(
     from scipy.stats import spearmanr  # slow to import
 
     values = group.values(name)
-    good = ~np.isnan(values)  # what was not reached ranks above any number
+    good = ~np.isnan(values)  # infinite: not reached, which ranks above any number
     count = int(good.sum())
     if count < LEAST_CASES or np.unique(values[good]).size < 2:
         return []
@@ -347,6 +349,9 @@ def _failures(rows: Sequence[CaseRow]) -> list[Json]:
 def without_effect(campaign: Campaign, rows: Sequence[CaseRow]) -> list[str]:
     """Axes along which no result of any case changes: the kind may not use the parameter.
 
+    Noise that differs between the points of an axis changes the results, too, so such an axis is
+    found only in results without noise, or with `same_noise`.
+
     Args:
         campaign: of the rows.
         rows: of all its cases.
@@ -362,10 +367,10 @@ def without_effect(campaign: Campaign, rows: Sequence[CaseRow]) -> list[str]:
         others = [one.path for one in campaign.axes if one is not axis]
         alike = len(axis.values) > 1 and all(
             seen.setdefault(
-                repr([row.index % of_level, *(row.values[path] for path in others)]), told
-            ) == told
+                repr([row.index % of_level, *(row.values[path] for path in others)]), outcome
+            ) == outcome
             for row in rows
-            for told in [repr((sorted(row.results.items()), row.error))]
+            for outcome in [repr((sorted(row.results.items()), row.error))]
         )  # fmt: skip
         found += [axis.path] if alike else []
     return found

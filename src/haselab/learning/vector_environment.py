@@ -75,7 +75,7 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         return self._simulation.observe(), {}
 
     def _chosen(self, mask: object) -> NDArray[np.intp]:
-        """Places of the episodes that begin."""
+        """Return the indices of the episodes that begin."""
         if mask is None:
             return np.arange(self.num_envs)
         flags = np.asarray(mask)

@@ -192,7 +192,7 @@ def main(words: list[str]) -> None:
     with contextlib.suppress(AttributeError, OSError):  # it needs little processor time
         os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     stop = _Stop(folder, key, words[4] if len(words) > 4 else "")
-    port = 0  # the first server finds a free one, and the others use it too
+    port = 0  # the first server takes a free one; the next uses the same
     for ip in words[0].split(","):
         server = StopServer(port, stop, origins, ip)
         threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -162,7 +162,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
 
 def _differences(changes: Sequence[str]) -> str:
     if not changes:
-        return "The two campaigns have the same file."
+        return "The two campaign files are equal."
     more = len(changes) - _MOST_CHANGES
     listed = "; ".join(changes[:_MOST_CHANGES]) + (f"; and {more} more" if more > 0 else "")
     return f"The campaigns differ: {listed}."

@@ -92,7 +92,7 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
     buffer = io.StringIO()
     canvas = FigureCanvasSVG(figure)  # whose texts have the sizes of the document
     _arrange(figure)
-    figure.dpi = matplotlib.rcParams["savefig.dpi"]  # of what is drawn as an image
+    figure.dpi = matplotlib.rcParams["savefig.dpi"]  # for parts that are drawn as images
     canvas.print_svg(buffer, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
     text = buffer.getvalue()
     text = text[text.index("<svg") :]

@@ -36,7 +36,7 @@ __all__ = [
 
 PLANAR_HASEL = "planar-hasel"  # the kind of the reference study
 
-# Rows, and spans of their columns; each from the first one to before the last.
+# Rows, and spans of their columns; each is the first one and the one after the last.
 ImagePart = tuple[tuple[int, int], Sequence[tuple[int, int]]]
 _T = TypeVar("_T")
 
@@ -162,7 +162,7 @@ class PartialImage(Protocol):
         """Draw all of it."""
 
     def with_parts(self, parts: Sequence[ImagePart]) -> NDArray[np.uint8]:
-        """Draw parts; the other pixels may hold anything."""
+        """Draw parts of it; the other pixels of the result are undefined."""
 
 
 class VoltageSource(Protocol):

@@ -1,4 +1,4 @@
-"""Priorities of processes, and their threads for linear algebra."""
+"""Priorities of processes, and the number of their threads for linear algebra."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ _SHOWN_S = 4e-3  # between two points of a trace that is kept
 _SLOWEST = 10.0  # times the duration of a task: a controller that takes longer does not return
 _LEAST_S = 20.0
 _BUSY = 4.0  # wall time over processor time that other programs explain
-_GRACE = 1.5  # a process that has not ended by itself then is ended
+_GRACE = 1.5  # times the longest wall time: a process that still runs then is killed
 _EXCESS = 1.02  # of the permitted field: what a sensed length may miss
 
 
@@ -58,8 +58,8 @@ class Plan:
         classes: names.
         seed: of all random numbers.
         seeds: how often each task is played.
-        workers: number of processes, in which a controller cannot affect other tasks; 0: none but
-            this one.
+        workers: number of processes; 0: everything runs in this process, where a controller can
+            affect other tasks.
     """
 
     controllers: tuple[str, ...]
@@ -175,8 +175,8 @@ def _design(job: _DesignJob) -> Entry:
         return Entry(job.controller, job.loop, job.device, reason=job.status)
     known = known_in_class(job.known, device, loop)
     try:
-        about = zlib.crc32(f"{job.controller} {job.loop} {job.device}".encode())
-        with _seeded([about]), _deadline(600.0, "the design takes longer than 10 minutes"):
+        seed = zlib.crc32(f"{job.controller} {job.loop} {job.device}".encode())
+        with _seeded([seed]), _deadline(600.0, "the design takes longer than 10 minutes"):
             found = designed(CONTROLLERS.find(job.controller), loop, known)
     except TimeoutError as error:
         found = Designed(None, str(error))
@@ -191,7 +191,7 @@ class _PlayJob:
     index: int
     seed: int
     known: KnownActuator | None
-    lost: str = ""  # why its process has ended; empty: it has not been played
+    lost: str = ""  # how its process ended when it was played; empty: it has not been played
 
 
 def _play(job: _PlayJob) -> Played:
@@ -395,11 +395,12 @@ def _mapper(workers: int, bar: Progress) -> Iterator[_Mapped]:
 
 
 def _all_done(found: list[Result | Lost]) -> list[Result]:
-    """The results of jobs without code of other packages."""
+    """The results of jobs that run no code of other packages, so that each must have one."""
     lost = [one.reason for one in found if isinstance(one, Lost)]
     if lost:
         raise DeviceError(
-            f"A job did not end: {lost[0]}. Check the memory of the computer, or use fewer workers."
+            f"A job has no result: {lost[0]}. Check the memory of the computer, or use fewer "
+            "workers."
         )
     return [one for one in found if not isinstance(one, Lost)]
 
@@ -413,7 +414,7 @@ def _entries(mapped: _Mapped, jobs: Sequence[_DesignJob]) -> tuple[Entry, ...]:
 
 
 def _all_played(mapped: _Mapped, jobs: Sequence[_PlayJob]) -> tuple[Played, ...]:
-    """Play; a task whose process ended is not done."""
+    """Play all tasks; one whose process ended counts as not done, with the reason."""
     found = mapped("play", _play, jobs)
     lost = {k: one.reason for k, one in enumerate(found) if isinstance(one, Lost)}
     again = mapped("play", _play, [replace(jobs[k], lost=reason) for k, reason in lost.items()])

@@ -1,8 +1,8 @@
-"""Jobs in processes of their own, so that code of another package cannot end the others.
+"""Jobs in processes of their own, so that the code of one package cannot end the jobs of others.
 
-A controller may end its process, start threads, change a module or print. A worker therefore plays
-each job in a copy of itself (`fork`), which ends with the job. Where the system has no `fork`, the
-worker does the job itself, and is replaced if it ends.
+A controller may end its process, start threads, change a module or print. On Linux, a worker
+therefore forks a child process for each job, which ends with the job. On other systems, the worker
+does the job itself, and is replaced if it ends.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ __all__ = ["Lost", "Workers", "announce_limit"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Message = tuple[str, Any]  # "result", "error", "lost" or "limit", and what belongs to it
-_POLL_S = 0.2  # to find that a copy has ended, whose threads or copies keep its pipe open
-_EXIT_S = 0.01  # between the end of its pipe and that of a process
-_END_S = 5.0
-_TRIES = 2  # of a job whose process ends: memory may have been short, or a person may have ended it
-_COPIES = sys.platform == "linux"
-_TOO_LONG = "\0"  # before a reason: another try would take as long
+_POLL_S = 0.2  # between checks of a child that has ended while its own children keep its pipe open
+_EXIT_S = 0.01  # a process may end a little later than its pipe
+_END_S = 5.0  # for a worker to end by itself, before it is killed
+_TRIES = 2  # of a job whose process ends: it may have been killed for another reason
+_FORKS = sys.platform == "linux"
+_TOO_LONG = "\0"  # prefix of a reason after which there is no second try: it would take as long
 _limits: list[Callable[[float, str], None]] = []  # where the process of a job announces its limit
 
 
@@ -50,14 +50,14 @@ class Lost:
 
 
 def announce_limit(longest_s: float, reason: str) -> None:
-    """State how long this process may take from now on; after that it is killed.
+    """State how long this process may take from now on; then its worker kills it.
 
-    It stops code that catches every exception, or that keeps Python's interpreter lock. Without
-    workers it has no effect.
+    This also ends code that catches every exception or keeps Python's interpreter lock. It has no
+    effect outside a forked child process.
 
     Args:
-        longest_s: wall time.
-        reason: of `Lost`.
+        longest_s: wall time, in s.
+        reason: for `Lost`.
     """
     for announce in _limits:
         announce(longest_s, reason)
@@ -79,15 +79,15 @@ class Workers:
         """Do a job with each item.
 
         Args:
-            job: of a module, not of a class or a function.
-            items: that pickle supports.
-        Returns:
-            Places of the items and results, in the order in which they are done.
+            job: a function at the top level of a module, which pickle supports.
+            items: arguments of the job, which pickle supports.
+        Yields:
+            The index of an item and its result, in the order in which the results arrive.
         Raises:
             DeviceError: The processes end at their start.
             Exception: Whatever the job raises.
         """
-        waiting = [(place, 1) for place in range(len(items))][::-1]
+        waiting = [(index, 1) for index in range(len(items))][::-1]
         while True:
             for worker in self._workers:
                 if waiting and worker.given is None:
@@ -97,19 +97,19 @@ class Workers:
                 return
             for pipe in wait(list(busy)):
                 worker = busy[pipe]  # type: ignore[index]
-                place, tries = worker.given or (0, 0)
+                index, tries = worker.given or (0, 0)
                 what, value = worker.answer()
                 if what == "error":
                     raise value
                 if what == "result":
-                    yield place, value
+                    yield index, value
                 elif tries < _TRIES and not value.startswith(_TOO_LONG):
-                    waiting.append((place, tries + 1))
+                    waiting.append((index, tries + 1))
                 else:
-                    yield place, Lost(value.removeprefix(_TOO_LONG))
+                    yield index, Lost(value.removeprefix(_TOO_LONG))
 
     def close(self) -> None:
-        """End the processes, and what they are doing."""
+        """End the processes and their jobs."""
         for worker in self._workers:
             worker.pipe.close()
         for worker in self._workers:
@@ -117,7 +117,7 @@ class Workers:
 
 
 class _Worker:
-    """One process, and the place and number of tries of its item."""
+    """One process, with the index of its item and the number of tries."""
 
     def __init__(self) -> None:
         self.given: tuple[int, int] | None = None
@@ -142,25 +142,25 @@ class _Worker:
     def give(
         self, given: tuple[int, int], job: Callable[[Any], object], items: Sequence[object]
     ) -> None:
-        """Give it an item."""
+        """Send an item to the process."""
         self.given = given
-        with contextlib.suppress(OSError):  # it has just ended, which `answer` finds
+        with contextlib.suppress(OSError):  # if it has just ended, `answer` reports it
             self.pipe.send((job, items[given[0]]))
 
     def answer(self) -> Message:
-        """What it has sent; a process that has ended is replaced."""
+        """Receive the answer of the process; replace the process if it has ended."""
         self.given = None
         try:
             message: Message = self.pipe.recv()
         except (EOFError, OSError):
             self.end()
-            reason = _ended(-(self._process.exitcode or 0))
+            reason = _exit_reason(self._process.exitcode or 0)
             self._start()
             return "lost", reason
         return message
 
     def end(self) -> None:
-        """Wait for its end."""
+        """Wait for the end of the process; kill it if it does not end."""
         self.pipe.close()
         self._process.join(_END_S)
         if self._process.is_alive():
@@ -168,12 +168,12 @@ class _Worker:
             self._process.join()
 
 
-def _ended(number: int) -> str:
-    """How a process has ended, from minus its exit code or the number of a signal."""
-    if number > 0:
+def _exit_reason(code: int) -> str:
+    """Say how a process has ended; a negative exit code is the number of a signal."""
+    if code < 0:
         with contextlib.suppress(ValueError):
-            return f"its process was ended by {signal.Signals(number).name}"
-    return f"its process ended with exit code {-number}"
+            return f"its process was ended by {signal.Signals(-code).name}"
+    return f"its process ended with exit code {code}"
 
 
 # ---- in the worker -------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ def _serve(pipe: Connection) -> None:
             job, item = pipe.recv()
         except (EOFError, OSError):
             os._exit(0)  # without waiting for a controller's threads
-        answer = _in_copy(pipe, job, item) if _COPIES else _done(job, item)
+        answer = _in_child(pipe, job, item) if _FORKS else _done(job, item)
         try:
             pipe.send(answer)
         except OSError:
@@ -197,62 +197,63 @@ def _serve(pipe: Connection) -> None:
 
 
 def _done(job: Callable[[Any], object], item: object) -> Message:
+    """Do a job; return its result or its exception."""
     try:
         return "result", job(item)
     except Exception as error:
         error.add_note(traceback.format_exc())
         try:
             pickle.loads(pickle.dumps(error))
-        except Exception:  # an error of another package may not survive
+        except Exception:  # pickle does not support every exception of other packages
             return "error", RuntimeError(traceback.format_exc())
         return "error", error
 
 
-def _in_copy(pipe: Connection, job: Callable[[Any], object], item: object) -> Message:
-    """Do a job in a copy of this process; nothing of it is left afterwards."""
-    here, there = multiprocessing.Pipe(duplex=False)
+def _in_child(pipe: Connection, job: Callable[[Any], object], item: object) -> Message:
+    """Do a job in a child process, and end it with all processes of its group."""
+    receiver, sender = multiprocessing.Pipe(duplex=False)
     sys.stdout.flush()
     sys.stderr.flush()
-    copy = os.fork()
-    if copy == 0:
-        here.close()
+    child = os.fork()
+    if child == 0:
+        receiver.close()
         pipe.close()  # so that the program notices when its worker ends
-        _be_copy(there, job, item)
-    there.close()
+        _run_child(sender, job, item)
+    sender.close()
     with contextlib.suppress(OSError):
-        os.setpgid(copy, copy)
+        os.setpgid(child, child)
     try:
-        return _answer_of(copy, here, pipe)
+        return _answer_of(child, receiver, pipe)
     finally:
-        _end_group(copy)
-        here.close()
+        _end_group(child)
+        receiver.close()
 
 
-def _be_copy(there: Connection, job: Callable[[Any], object], item: object) -> None:
-    """Do the job, send the answer, and end."""
+def _run_child(sender: Connection, job: Callable[[Any], object], item: object) -> None:
+    """Do the job, send the answer, and end this process."""
     with contextlib.suppress(OSError):
         os.setpgid(0, 0)  # so that what a controller starts can be ended with it
     own = os.getpid()
-    _limits.append(lambda longest_s, reason: there.send(("limit", (longest_s, reason))))
+    _limits.append(lambda longest_s, reason: sender.send(("limit", (longest_s, reason))))
     try:
         answer = _done(job, item)
-        if os.getpid() == own:  # a controller may have copied the process, too
-            there.send(answer)
+        if os.getpid() == own:  # a controller may have forked, too
+            sender.send(answer)
     finally:
         os._exit(0)
 
 
-def _answer_of(copy: int, here: Connection, pipe: Connection) -> Message:
-    """Wait for the answer, the end or the limit of a copy."""
+def _answer_of(child: int, receiver: Connection, pipe: Connection) -> Message:
+    """Wait for the answer, the end or the limit of a child process."""
     until_s, late = math.inf, ""
     while True:
-        if pipe in wait([here, pipe], _POLL_S):  # during a job only the end of the program
-            _end_group(copy)
+        if pipe in wait([receiver, pipe], _POLL_S):  # the program has ended: it sends nothing now
+            _end_group(child)
             os._exit(0)
-        ended, status = os.waitpid(copy, os.WNOHANG)
-        while here.poll():
+        ended, status = os.waitpid(child, os.WNOHANG)
+        while receiver.poll():
             try:
-                message: Message = here.recv()
+                message: Message = receiver.recv()
             except (EOFError, OSError, pickle.UnpicklingError):
                 time.sleep(_EXIT_S)
                 break
@@ -260,16 +261,16 @@ def _answer_of(copy: int, here: Connection, pipe: Connection) -> Message:
                 return message
             until_s, late = time.monotonic() + message[1][0], message[1][1]
         if ended:
-            return "lost", _ended(-os.waitstatus_to_exitcode(status))
+            return "lost", _exit_reason(os.waitstatus_to_exitcode(status))
         if time.monotonic() > until_s:
             return "lost", _TOO_LONG + late
 
 
-def _end_group(copy: int) -> None:
-    """End a copy and all that it has started."""
+def _end_group(child: int) -> None:
+    """Kill a child process and the processes of its group."""
     with contextlib.suppress(OSError):
-        os.killpg(copy, signal.SIGKILL)
+        os.killpg(child, signal.SIGKILL)
     with contextlib.suppress(OSError):
-        os.kill(copy, signal.SIGKILL)
-    with contextlib.suppress(OSError):  # it may have been waited for
-        os.waitpid(copy, 0)
+        os.kill(child, signal.SIGKILL)
+    with contextlib.suppress(OSError):  # `_answer_of` may have waited for it already
+        os.waitpid(child, 0)

@@ -28,7 +28,7 @@ Poses = NDArray[np.void]  # centre_px and deformation of each subset; native/tra
 Model = Literal["translation", "neighbours", "affine"]
 
 
-Span = tuple[int, int]  # from the first row or column to before the last
+Span = tuple[int, int]  # the first row or column, and the one after the last
 FramePart = tuple[Span, Sequence[Span]]  # rows, and which of their columns
 
 
@@ -39,7 +39,7 @@ class PartialFrame(Protocol):
         """Make all of it."""
 
     def with_parts(self, parts: Sequence[FramePart]) -> NDArray[np.uint8]:
-        """Make parts; the other pixels may hold anything."""
+        """Make parts of it; the other pixels of the result are undefined."""
 
 
 _LARGEST_SUBSET_PX = 101

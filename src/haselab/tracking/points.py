@@ -49,7 +49,7 @@ _SIGNIFICANT = 3.0  # standard deviations by which the audit's ratio must exceed
 _LEAST_LEFT = 0.05  # of a template's power; below, the pattern may be the texture
 _DOTS_IN_SUBSET = 6.0  # distance, in sides of a subset, at which a dot's gradients differ
 _MOVED_PX = 1.5  # along x or y, after which an offset is outside its pixel
-_NEAR_PX = 22.0  # around expected points, of the parts made first; subsets of 21 px reach 18.5
+_NEAR_PX = 22.0  # around expected points, of the parts drawn first; subsets of 21 px reach 18.5
 _DUE = 0.1  # share of strongly deformed points at which the reference is renewed
 
 
@@ -203,7 +203,7 @@ class PointTracker:
                 part = frame.with_parts(parts)
                 _check_frame(part, state.reference.shape)
                 attempt = self._attempt(state, part)
-                if attempt.summary.reach_px <= _NEAR_PX:  # it has read nothing but these parts
+                if attempt.summary.reach_px <= _NEAR_PX:  # it has only read these parts
                     return self._judged(state, part, attempt)
             frame = frame.whole()
         _check_frame(frame, state.reference.shape)
@@ -212,7 +212,7 @@ class PointTracker:
         return (after if after.textured is None else self._decided(after, frame)), found
 
     def _parts(self, state: TrackState) -> list[FramePart]:
-        """Pixels around the expected points; none if more than these may be looked at."""
+        """Parts around the expected points; none if the tracker may read other pixels, too."""
         if self._together or state.pattern is not None or state.textured is not None:
             return []
         height, width = state.reference.shape

@@ -42,7 +42,7 @@ def test_model_and_measurement_lie_on_the_closed_form() -> None:
     points, model = magnitude.curves
     true = _closed_form(model.x)
     assert model.std is not None and np.all(model.std > 0.0)
-    # Five parameters determine the whole curve, so its errors move together: 4 deviations.
+    # Few parameters determine the whole curve, so its errors move together: 4 deviations.
     assert np.all(np.abs(model.y - np.abs(true)) < 4.0 * model.std)
     drawn, turns = phase.curves[1], np.degrees(np.unwrap(np.angle(true)))
     assert drawn.std is not None

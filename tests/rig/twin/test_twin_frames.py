@@ -50,7 +50,11 @@ def test_frames_drawn_one_by_one_are_those_that_are_drawn_together():
     for k in reversed(range(len(images))):
         view = apart.view(k)
         parts = [((40, 80), [(0, 512)]), ((200, 230), [(3, 40), (101, 200)])]
-        assert (view.with_parts(parts)[200:230, 101:200] == images[k, 200:230, 101:200]).all()
+        drawn = view.with_parts(parts)
+        for rows, columns in parts:
+            for first, stop in columns:
+                there = slice(*rows), slice(first, stop)
+                assert (drawn[there] == images[k][there]).all()
         assert (view.whole() == images[k]).all()
         assert (apart.image(k) == images[k]).all()
 

@@ -26,7 +26,7 @@ _STOP_S, _STOP_TRIALS = 4.0, 3  # if STOP answers none of these trials, the pane
 
 
 def _check_lan(context: click.Context, option: click.Parameter, value: str) -> str:
-    """An address of the network that a page can name; the loopback address is always served."""
+    """Check that --lan is one IPv4 address other than 127.0.0.1, which is always served."""
     if not value:
         return value
     try:
@@ -66,7 +66,8 @@ def _check_lan(context: click.Context, option: click.Parameter, value: str) -> s
 @click.option(
     "--lan", default="", metavar="IP", callback=_check_lan,
     help="Serve the page also on this IPv4 address of this computer, for a tablet in the same "
-    "network. The connection is not encrypted. Default: this computer only.",
+    "network. Whoever has the printed address can arm the bench, and the connection is not "
+    "encrypted. Default: this computer only.",
 )  # fmt: skip
 @shared_option("--no-browser", is_flag=True)
 def command(

@@ -46,7 +46,7 @@ from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["command"]
 
-_BAND, _BY_CHANCE = 0.95, 1e-4  # share of the samples inside; probability of fewer by noise alone
+_BAND, _BY_CHANCE = 0.95, 1e-4  # share of the samples inside; probability of fewer by chance
 _NO_BAND = "no uncertainty: the model has no covariance"
 _NO_NOISE = (
     "none: the model file does not state residual_std, without which the band would be too narrow. "
@@ -264,14 +264,14 @@ def _answer(found: Prediction, no_band: str) -> dict[str, object]:
 
 
 def _notes(found: Prediction) -> list[str]:
-    """Say so if the error is larger than the band explains, whatever the colour of the noise."""
+    """Note that fewer samples are inside the band than its 95 % and coloured noise explain."""
     from scipy.stats import binom  # slow to import
 
-    worth = round(effective_count([found.measured - found.predicted]))
-    if found.inside_band * worth >= binom.ppf(_BY_CHANCE, worth, _BAND):
+    independent = round(effective_count([found.measured - found.predicted]))
+    if found.inside_band * independent >= binom.ppf(_BY_CHANCE, independent, _BAND):
         return []
     return [
-        f"Only {100.0 * found.inside_band:.0f} % of the samples are inside the band of 95 %: the "
+        f"Only {100.0 * found.inside_band:.4g} % of the samples are inside the band of 95 %: the "
         "model does not describe this record within its uncertainty, or the noise is larger than "
         "in the record of the fit."
     ]

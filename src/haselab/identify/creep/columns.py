@@ -15,7 +15,7 @@ _MOVING = 0.5  # ... and of an output that creeps or is noisy, at least
 
 
 def are_swapped(u: Floats, y: Floats) -> bool:
-    """Whether the output is held like an input while the input varies like an output.
+    """Whether the output changes as rarely as an input, and the input as often as an output.
 
     Args:
         u: inputs. Shape `(N,)`.
@@ -26,7 +26,7 @@ def are_swapped(u: Floats, y: Floats) -> bool:
 
 
 def is_noisy(u: Floats) -> bool:
-    """Whether most rows only differ by noise, whose differences reverse two times out of three.
+    """Whether most changes of the input are noise: small, and about two thirds reverse the last.
 
     Args:
         u: inputs. Shape `(N,)`.

@@ -53,7 +53,7 @@ _BEYOND = 3.0  # record lengths: longer time constants are not identifiable
 _STRAIGHT = 0.999  # order at which a power of time counts as a straight line
 _WEAK = 2.0  # standard deviations of a gain below which its time constant is not identifiable
 _HELD_OUT = 0.25
-_REPEATED = 0.5  # share of the samples that repeat the one before, where steps hide the noise
+_REPEATED = 0.5  # share of the samples that repeat the one before: quantisation hides the noise
 _LEAST_EFFECTIVE = 8.0  # samples, as for coloured residuals
 _UNKNOWN = (-math.inf, math.inf)
 
@@ -77,13 +77,13 @@ class _Setting:
 
     @property
     def step(self) -> float:
-        """Step of a converter that hides the noise: most samples repeat; 0: there is none."""
+        """Quantisation step of the output, if most samples repeat the one before; else 0."""
         held = self.y[self.kept]
         return grid_step(held) if np.mean(np.diff(held) == 0.0) > _REPEATED else 0.0
 
     @property
     def runs(self) -> NDArray[np.int64]:
-        """Number of the run of equal outputs to which each fitted sample belongs."""
+        """Index of the run of equal outputs to which each fitted sample belongs."""
         return np.cumsum(np.diff(self.y[self.kept], prepend=self.y[self.kept][0]) != 0.0)
 
     def thinned(self) -> _Setting:
@@ -133,10 +133,10 @@ class _Fitted:
         return self.solution.search.size + self.solution.shared.size
 
     def covariance(self, setting: _Setting) -> Floats:
-        """Covariance of search and shared, with the rounding errors of a converter.
+        """Covariance of the search and shared parameters, rounding errors included.
 
-        These are a function of the output, so all samples of a run of equal outputs may have the
-        same one, of a variance of `step**2 / 12`.
+        A rounding error has the variance `step**2 / 12`. It depends on the output alone, so all
+        samples of a run of equal outputs are assumed to have the same one.
         """
         solution = self.solution
         covariance = coloured_covariance(solution.columns, solution.residuals, self.parameters)
@@ -425,7 +425,7 @@ def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
     count = int(setting.kept.sum())
     effective = effective_count(richest.solution.residuals)
     floor = max(_ROUNDING * float(np.ptp(setting.y)), setting.step / math.sqrt(12.0)) ** 2
-    if setting.step > 0.0:  # the rounding error of a run is one error
+    if setting.step > 0.0:  # a run of equal outputs has one rounding error
         effective = min(effective, max(setting.runs[-1] + 1.0, _LEAST_EFFECTIVE))
     scored = [
         _Fitted(
@@ -448,7 +448,7 @@ def _describe(
     best = scored[0]
     candidates = tuple(entry for entry in scored if entry.bic - best.bic < APART)
     estimates, covariance = _estimates(best, setting)
-    if _kind(best) == _NONE:  # a creep that is not excluded is part of this response
+    if _kind(best) == _NONE:  # the instant response may include a creep that is not excluded
         lows, highs = zip(*(_instant(entry, setting).ci95 for entry in candidates), strict=True)
         estimates["instant"] = replace(estimates["instant"], ci95=(min(lows), max(highs)))
     residuals = best.solution.residuals[0]
@@ -564,9 +564,9 @@ def _notes(
         )
     if setting.step > 0.0:
         notes.append(
-            f"The output has steps of {setting.step:.3g} that hide its noise. The intervals allow "
-            "for the same rounding error in all samples of a run of equal values. Record more "
-            "digits, or a larger step of the input."
+            f"The output is quantised in steps of {setting.step:.3g}, which hide its noise. The "
+            "intervals allow for the same rounding error in all samples of a run of equal values. "
+            "Record more digits, or a larger step of the input."
         )
     spikes = np.abs(residuals) > _SPIKE * 1.4826 * float(np.median(np.abs(residuals)))
     if spikes.any() and setting.step == 0.0:

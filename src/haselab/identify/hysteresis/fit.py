@@ -49,7 +49,7 @@ _ROWS = 20_000
 _HELD_OUT = 0.25
 _MOST_OPERATORS = 20
 _COLOURED = 0.01
-_OTHER_FORM = 1e-12  # whiteness far below that of a small remainder
+_OTHER_FORM = 1e-12  # whiteness p-value below which residuals may be loops of another form
 _EXACT = 1e-9  # of the output's span
 _AS_ROUNDING = 1.5  # mean square over that of rounding errors, below which residuals are rounding
 _TOLD = 3.0  # standard deviations of a significant loop width
@@ -396,9 +396,9 @@ def _notes(
         )
         if chosen.kind != CURVE and white < _OTHER_FORM:
             notes.append(
-                "The loops may also have another form than the model. Its numbers of operators and "
-                "dead zones, its thresholds and its weights then only approximate these loops, and "
-                "another record or processor gives others. Use the model as a whole."
+                "The loops may also have another form than the model. Its operators and dead "
+                "zones, their number, thresholds and weights, then only approximate these loops, "
+                "and differ for another record or on another computer. Use the model as a whole."
             )
     if blind:
         notes.append(f"Not identifiable from these loops: {', '.join(blind)}.")

@@ -19,7 +19,7 @@ __all__ = ["bode_panels"]
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _POINTS, _DRAWS, _SEED = 300, 200, 1
-_MOST_POINTS = 20000  # of the records, for which the lines are estimated within about a second
+_MOST_POINTS = 20000  # samples of the records; more would make the figure slow
 
 
 def bode_panels(
@@ -30,8 +30,9 @@ def bode_panels(
     Args:
         model: the fitted model.
         posterior: with the covariance of its parameters; None: no band is drawn.
-        records: that were fitted. Their frequency response is drawn if input and output have the
-            same times and the input varies enough.
+        records: that were fitted. Their frequency response is drawn if it can be estimated: input
+            and output have the same times, the input varies enough, and there are at most 20,000
+            samples.
     Returns:
         The panel of the magnitude and that of the phase.
     """
@@ -59,7 +60,7 @@ def bode_panels(
 def _deviations(
     posterior: PlantPosterior | None, frequency_hz: Floats, response: Complexes
 ) -> tuple[Floats | None, Floats | None]:
-    """Standard deviation of the magnitude and of the phase in degrees."""
+    """Standard deviations of the magnitude and of the phase, in degrees; None: not known."""
     if posterior is None:
         return None, None
     plants = posterior.draw(_DRAWS, np.random.default_rng(_SEED))

@@ -187,11 +187,11 @@ def actuator_records(seed: int) -> ActuatorRecords:
 
 
 def film(seed: int, path: Path) -> None:
-    """Film one triangle of the drive with 50 pictures a second, the first 20 of them at rest.
+    """Record a video of one triangle of the drive, 50 frames a second, the first 20 at rest.
 
     Args:
         seed: of all noise.
-        path: of the new video, `.mkv` or `.avi`; the times of the frames go to a CSV file beside
+        path: of the new video, `.mkv` or `.avi`. The times of the frames go to a CSV file next to
             it.
     """
     bench = _bench(seed, carrier=False)

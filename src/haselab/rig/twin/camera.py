@@ -194,7 +194,7 @@ class TwinCamera:
                 Shape `(F, samples)`.
             first_index: number of the first of these frames in the recording; chooses the noise.
             out: where the frames go, of the shape and type that is returned; None: a new array.
-            part: that is drawn; the other pixels of `out` stay. None: all is drawn.
+            part: what is drawn; the other pixels of `out` stay. None: the whole frame.
 
         Returns:
             Grey levels of mean `expected_levels` and variance `shot_gain_grey` times the mean plus

@@ -1,7 +1,7 @@
-"""Frames of the twin's camera, which are drawn when somebody looks at them.
+"""Frames of the twin's camera, which are drawn when they are needed.
 
-Most frames of a study are tracked and not kept, and a tracker looks at a small part of each. A
-pixel has the same bits in whichever part of a frame it is drawn.
+Most frames of a study are tracked and not kept, and a tracker reads a small part of each. A pixel
+has the same value whichever part of the frame is drawn.
 """
 
 from __future__ import annotations

@@ -278,7 +278,7 @@ class Delay:
         level, drive = np.array(self._level), np.array(self._drive)
         level -= level.mean()
         if _residuals(level, drive[np.newaxis, _LAGS : _LAGS + _FOLLOWED])[0] < _LEAST_CODES:
-            return 0  # as nearly always: no lag fits decisively better
+            return 0  # as nearly always; what is left is converter noise, so no lag matters
         # Row j: the drive j blocks before the one that should be in force.
         shifted = np.lib.stride_tricks.sliding_window_view(drive, _FOLLOWED)
         left = _residuals(level, shifted[: _LAGS + 1][::-1])
@@ -287,7 +287,10 @@ class Delay:
 
 
 def _residuals(level: NDArray[np.float64], drives: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What each row of drives leaves of the level, in codes RMS, at the best gain and offset."""
+    """RMS of what each row of drives does not explain of a level of mean 0, in codes.
+
+    Gain and offset of each row are fitted.
+    """
     moved = drives - drives.mean(axis=1, keepdims=True)
     power = np.einsum("ij,ij->i", moved, moved)
     slope = moved @ level / (power + 1e-12)

@@ -24,7 +24,8 @@ __all__ = ["Envelope", "Free", "PrintedFit", "fit_free", "fit_printed"]
 _FEWEST = 16  # frames of a motion
 _WITH_CREEP = 3  # parameters that are searched: decay, frequency, and time constant of the creep
 _ONE_TRIAL = (
-    "one trial: the interval only includes the change without the last peak, not the scatter"
+    "one trial: the interval only includes how the decay changes if the last peak is left out, not "
+    "the scatter between trials"
 )
 _LEAST_PEAKS = 2  # of one sign, through which an envelope is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks are below the residuals of eq. 6

@@ -320,20 +320,31 @@ def test_no_file_outside_of_the_static_folder_is_served(
 
 def test_more_pages_than_can_be_served_are_refused(shared_panel: RunningPanel) -> None:
     async def play() -> None:
-        sockets = []
-        try:
+        async with contextlib.AsyncExitStack() as opened:
             for _ in range(40):
-                sockets.append(
-                    await websockets.connect(
-                        f"ws://{shared_panel.host}/live", origin=f"http://{shared_panel.host}"
-                    )
-                )
-        finally:
-            for socket in sockets:
-                await socket.close()
+                await opened.enter_async_context(connected(shared_panel))
 
-    with pytest.raises(CLOSED, match=REFUSED):
+    with pytest.raises(websockets.ConnectionClosed, match="too many pages"):
         asyncio.run(play())
+
+
+def test_pages_without_the_token_do_not_keep_one_with_it_from_connecting(
+    shared_panel: RunningPanel,
+) -> None:
+    async def play() -> None:
+        address, origin = f"ws://{shared_panel.host}/live", f"http://{shared_panel.host}"
+        async with contextlib.AsyncExitStack() as opened:
+            silent = [
+                await opened.enter_async_context(websockets.connect(address, origin=origin))  # type: ignore[arg-type]
+                for _ in range(70)
+            ]
+            async with connected(shared_panel) as page:
+                assert page.holder
+            for one in silent:  # the oldest at once, the others after 3 s
+                with pytest.raises(websockets.ConnectionClosed, match="wrong token"):
+                    await asyncio.wait_for(one.recv(), WAIT_S)
+
+    asyncio.run(play())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -49,7 +49,12 @@ def test_a_panel_whose_stop_hangs_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 
         monkeypatch.setattr(command, "serve", until_exit)
         panel: Any = SimpleNamespace(
-            bench=Process(), stop=Process(), stop_port=port, server=server, listeners=[]
+            bench=Process(),
+            stop=Process(),
+            stop_port=port,
+            ips=("127.0.0.1",),
+            server=server,
+            listeners=[],
         )
         with pytest.raises(DeviceError, match="The stop process does not answer, so the panel"):
             command._serve(panel)

@@ -27,6 +27,7 @@ from haselab.scoreboard import (
 from haselab.scoreboard.devices import drawn, find_device
 from haselab.scoreboard.entrants import designed, plant_at_zero
 from haselab.scoreboard.knowledge import identified, known_by, true_actuator
+from haselab.scoreboard.processes import Lost
 
 HZ = find_device("hz")
 
@@ -162,15 +163,35 @@ def test_the_results_do_not_depend_on_the_number_of_processes():
     jobs = [board._PlayJob(entry, "T8-drawn", index, 7, known)
             for entry in entries for index in range(2)]  # fmt: skip
     results = []
-    for workers in (1, 2):
+    for workers in (0, 1, 2):
         with board._mapper(workers, board.SilentProgress()) as mapped:
             results.append(mapped("play", board._play, jobs))
-    assert [json.dumps(one.numbers) for one in results[0]] == [
-        json.dumps(one.numbers) for one in results[1]
-    ]
+    texts = [[json.dumps(one.numbers) for one in result] for result in results]
+    assert texts[0] == texts[1] == texts[2]
     assert results[0][0].bounds != results[0][1].bounds  # another seed, another device
     assert results[0][0].bounds == results[0][2].bounds  # of the same seed in the other class
     assert results[0][0].trace is not None and results[0][1].trace is None
+
+
+def test_a_task_or_design_whose_process_ended_has_its_reason_and_no_numbers():
+    known = true_actuator(HZ)
+    ended, jobs = Lost("its process was ended by SIGSEGV"), []
+
+    def mapped(what, job, items):
+        """The second job of each list ends its process, until it is only reported."""
+        jobs.append(items)
+        return [ended if k == 1 else job(item) for k, item in enumerate(items)]
+
+    entry = Entry("open-loop", "host-100hz", "hz")
+    plays = [board._PlayJob(entry, "T1", index, 7, known) for index in range(3)]
+    first, second, third = board._all_played(mapped, plays)
+    assert [len(items) for items in jobs] == [3, 1]
+    assert second.failure == "Controller 'open-loop': its process was ended by SIGSEGV"
+    assert second.violates and all(math.isnan(value) for value in second.numbers.values())
+    assert second.bounds and not first.failure and not third.failure
+    designs = [board._DesignJob("open-loop", "host-100hz", "hz", known, "ok")] * 2
+    good, bad = board._entries(mapped, designs)
+    assert good.reason == "" and bad.reason == "no design: its process was ended by SIGSEGV"
 
 
 def test_rows_have_the_median_and_worst_over_the_seeds_and_count_what_was_not_done():

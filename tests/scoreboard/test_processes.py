@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import multiprocessing
 import os
 import signal
 import sys
@@ -24,12 +25,15 @@ def _job(what: str) -> tuple[str, int]:
         os._exit(3)
     if what == "crashes":
         os.kill(os.getpid(), signal.SIGSEGV)
-    if what == "cancels":
-        raise asyncio.CancelledError
     if what == "starts a thread":
         threading.Thread(target=time.sleep, args=(1000.0,)).start()
     if what == "copies itself":
         os.fork()
+    if what == "starts a process":
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            assert pool.apply(os.getppid) == os.getpid()
+    if what == "returns a lambda":
+        return (lambda: None), 1  # type: ignore[return-value]
     if what == "prints":
         print("text")
     if what == "hangs":
@@ -39,6 +43,8 @@ def _job(what: str) -> tuple[str, int]:
                 time.sleep(1000.0)
             except Exception:
                 continue
+    if what == "cancels":
+        raise asyncio.CancelledError
     if what == "refuses":
         raise InputError("This is wrong.")
     return what, len(_SEEN)
@@ -54,14 +60,15 @@ def _found(items: list[str]) -> dict[str, object]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks a process for each job")
 def test_what_a_job_does_to_its_process_does_not_affect_the_others(capfd):
-    good = ["first", "starts a thread", "copies itself", "prints", "last"]
+    good = ["first", "starts a thread", "starts a process", "copies itself", "prints", "last"]
     bad = {
         "exits": "its process ended with exit code 3",
         "crashes": "its process was ended by SIGSEGV",
-        "cancels": "its process ended with exit code 0",
         "hangs": "it takes too long",
     }
-    found = _found(["first", *bad, *good[1:]])
+    found = _found(["first", *bad, "returns a lambda", *good[1:]])
+    lost = found.pop("returns a lambda")
+    assert isinstance(lost, Lost) and lost.reason.startswith("its result cannot be sent: ")
     assert {name: found[name] for name in bad} == {k: Lost(why) for k, why in bad.items()}
     # no job sees that another one was done before
     assert {name: found[name] for name in good} == {name: (name, 1) for name in good}
@@ -72,3 +79,5 @@ def test_what_a_job_does_to_its_process_does_not_affect_the_others(capfd):
 def test_an_error_of_a_job_is_raised_where_the_jobs_were_given():
     with pytest.raises(InputError, match="This is wrong"):
         _found(["refuses"])
+    with pytest.raises(RuntimeError, match="CancelledError"):
+        _found(["cancels"])

@@ -45,6 +45,7 @@ STATIC = Path(__file__).parent / "static"
 _NO_OBJECT = "The request must be one JSON object of at most 1 MB, sent as application/json."
 NO_TOKEN = "The token is missing or wrong. Open the address that haselab printed."
 _MOST_BODY_BYTES = 1 << 20  # of a request
+_TRIALS = 20  # to find a port that is free on all addresses
 
 Requests = Mapping[str, Callable[[JsonObject], JsonObject]]
 """By name: called in a thread of the web server. A `HaselabError` becomes the page's message."""
@@ -249,26 +250,43 @@ def listening(port: int, lan: str = "") -> Iterator[list[socket.socket]]:
         DeviceError: the port is in use.
         InputError: this computer does not have the address.
     """
-    listeners: list[socket.socket] = []
     with contextlib.ExitStack() as opened:
-        for ip in served_ips(lan):
-            listener = opened.enter_context(socket.socket())
+        for trial in range(_TRIALS):
             try:
-                listener.bind((ip, port))
-                listener.listen(128)  # a browser that is early waits
+                listeners = _bound(port, served_ips(lan))
+                break
             except OSError as error:
                 if error.errno == errno.EADDRNOTAVAIL:
                     raise InputError(
-                        f"--lan is {ip}, but this computer does not have this address. Use one "
+                        f"--lan is {lan}, but this computer does not have this address. Use one "
                         "that its network settings show."
                     ) from None
-                raise DeviceError(
-                    f"Port {port} cannot be used ({error.strerror}). Choose another one with "
-                    "--page-port, or leave it out for a free one."
-                ) from None
+                if port or trial == _TRIALS - 1:
+                    raise DeviceError(
+                        f"Port {port} cannot be used ({error.strerror}). Choose another one with "
+                        "--page-port, or leave it out for a free one."
+                    ) from None
+        for listener in listeners:
+            opened.enter_context(listener)
+        yield listeners
+
+
+def _bound(port: int, ips: tuple[str, ...]) -> list[socket.socket]:
+    """Sockets that listen on all addresses with one port.
+
+    Raises:
+        OSError: The port is in use on one of them, or the computer does not have the address.
+    """
+    with contextlib.ExitStack() as opened:
+        listeners: list[socket.socket] = []
+        for ip in ips:
+            listener = opened.enter_context(socket.socket())
+            listener.bind((ip, port))
+            listener.listen(128)  # a browser that is early waits
             port = listener.getsockname()[1]
             listeners.append(listener)
-        yield listeners
+        opened.pop_all()
+    return listeners
 
 
 def serve(server: uvicorn.Server, listeners: list[socket.socket]) -> int:

@@ -38,6 +38,7 @@ class Panel(NamedTuple):
         bench: its bench process.
         stop: its stop process.
         stop_port: TCP port of the stop process.
+        ips: addresses on which page and STOP are served.
         server: its web server, to be run by the caller.
         listeners: sockets of the web server.
     """
@@ -46,18 +47,20 @@ class Panel(NamedTuple):
     bench: subprocess.Popen[str]
     stop: subprocess.Popen[str]
     stop_port: int
+    ips: tuple[str, ...]
     server: uvicorn.Server
     listeners: list[socket.socket]
 
 
-def stop_answers(port: int, within_s: float) -> bool:
+def stop_answers(port: int, within_s: float, ip: str = "127.0.0.1") -> bool:
     """Whether the stop process answers.
 
     Args:
         port: TCP port of STOP.
         within_s: longest wait, in s.
+        ip: address of this computer on which it is asked.
     """
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=within_s)
+    connection = http.client.HTTPConnection(ip, port, timeout=within_s)
     with contextlib.closing(connection):
         try:
             connection.request("GET", "/ready")
@@ -146,4 +149,5 @@ def running_panel(
                 ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             )
         )  # fmt: skip
-        yield Panel(access.addresses, bench, stop, settings.stop_port, server, listeners)
+        ips = served_ips(lan)
+        yield Panel(access.addresses, bench, stop, settings.stop_port, ips, server, listeners)

@@ -34,6 +34,7 @@ _REASON = "STOP was pressed on the panel"
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
 _PROMPT_S = 0.5  # after which the guardians are called
+_TRIALS = 20  # to find a port that is free on all addresses
 _MOST_CONNECTIONS = 128  # at the same time; more than the pages need
 
 
@@ -179,6 +180,25 @@ class _Stop:
             if self._safe is None or self._safe.poll() is not None:
                 command = [sys.executable, "-m", "haselab.cli", "rig", "safe", self._rig]
                 self._safe = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+
+
+def _on_one_port(
+    ips: list[str], stop: Callable[[], dict[str, object]], origins: tuple[str, ...]
+) -> list[StopServer]:
+    """Serve on all addresses with one port, which is free on each of them."""
+    for trial in range(_TRIALS):
+        servers: list[StopServer] = []
+        try:
+            for ip in ips:
+                port = servers[0].port if servers else 0
+                servers.append(StopServer(port, stop, origins, ip))
+            return servers
+        except OSError:  # another program uses the port on one of the addresses
+            for server in servers:
+                server.server_close()
+            if trial == _TRIALS - 1:
+                raise
+    raise AssertionError
 
 
 def main(words: list[str]) -> None:

@@ -52,7 +52,7 @@ SCHEMA = 1  # of a binary frame
 _FRAME_S = 1.0 / 30.0
 _REPEAT_S = 0.3  # after which a frame is sent without new data, while the bench process answers
 _TOKEN_S = 3.0  # for the first message of a page
-_MOST_PAGES = 32
+_MOST_PAGES, _MOST_UNKNOWN = 32, 64  # with the token; without it yet
 _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
 _COLUMN_STEP = 100  # so that windows of almost the same width share their frames
@@ -196,6 +196,7 @@ class _Server:
         self._bench = _Bench(settings.folder, settings.files)
         self._picture = CameraPicture(settings.folder / "camera.jpg")
         self._pages: set[int] = set()
+        self._unknown: dict[int, asyncio.Future[str]] = {}  # have not sent the token, oldest first
         self._tasks: set[asyncio.Task[None]] = set()  # so that none is collected while it runs
         self._made: tuple[int, dict[_View, bytes]] = (0, {})  # frames of one tick
 
@@ -227,17 +228,17 @@ class _Server:
         return Response(found.jpeg, 200, headers, "image/jpeg")
 
     async def live(self, socket: WebSocket) -> None:
-        if len(self._pages) >= _MOST_PAGES:
-            await socket.close(1013, "too many pages")
-            return
         await socket.accept()
         page = _Page(socket)
-        self._pages.add(id(page))
         tasks: list[asyncio.Task[None]] = []
         try:
             if not await self._known(socket):
                 await socket.close(1008, "wrong token")
                 return
+            if len(self._pages) >= _MOST_PAGES:
+                await socket.close(1013, "too many pages")
+                return
+            self._pages.add(id(page))
             await socket.send_text(json.dumps({"holder": page.holder}))
             tasks = [asyncio.create_task(self._frames(page))]
             await self._messages(page)
@@ -251,11 +252,24 @@ class _Server:
                 self._start(self._leave(page))
 
     async def _known(self, socket: WebSocket) -> bool:
+        """Whether a page sends the token; of too many that have not yet sent it, the oldest ends.
+
+        So those who do not know the token cannot keep a page from connecting.
+        """
+        if len(self._unknown) >= _MOST_UNKNOWN:
+            self._unknown.pop(next(iter(self._unknown))).cancel()
+        receiving = asyncio.ensure_future(socket.receive_text())
+        self._unknown[id(socket)] = receiving
         try:
-            text = await asyncio.wait_for(socket.receive_text(), _TOKEN_S)
-            token = json.loads(text)["token"]
+            token = json.loads(await asyncio.wait_for(receiving, _TOKEN_S))["token"]
         except (TimeoutError, ValueError, KeyError, TypeError):
             return False
+        except asyncio.CancelledError:
+            if receiving.cancelled() and id(socket) not in self._unknown:
+                return False
+            raise
+        finally:
+            self._unknown.pop(id(socket), None)
         return isinstance(token, str) and self._settings.access.is_token(token)
 
     async def _messages(self, page: _Page) -> None:

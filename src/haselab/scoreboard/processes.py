@@ -21,20 +21,21 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
-from haselab.base import DeviceError
+from haselab.base import DeviceError, described
+from haselab.base.exits import no_exit
 from haselab.runtime.scheduling import one_thread
 
 __all__ = ["Lost", "Workers", "announce_limit"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Message = tuple[str, Any]  # "result", "error", "lost" or "limit", and what belongs to it
+# What it is and its value: "result", "error", "limit", "lost" (another try may help), "failed".
+Message = tuple[str, Any]
 _POLL_S = 0.2  # between checks of a child that has ended while its own children keep its pipe open
 _EXIT_S = 0.01  # a process may end a little later than its pipe
 _END_S = 5.0  # for a worker to end by itself, before it is killed
 _TRIES = 2  # of a job whose process ends: it may have been killed for another reason
 _FORKS = sys.platform == "linux"
-_TOO_LONG = "\0"  # prefix of a reason after which there is no second try: it would take as long
 _limits: list[Callable[[float, str], None]] = []  # where the process of a job announces its limit
 
 
@@ -71,7 +72,13 @@ class Workers:
     """
 
     def __init__(self, count: int) -> None:
-        self._workers = [_Worker() for _ in range(count)]
+        self._workers: list[_Worker] = []
+        try:
+            for _ in range(count):
+                self._workers.append(_Worker())
+        except BaseException:  # also Ctrl-C
+            self.close()
+            raise
 
     def each(
         self, job: Callable[[Item], Result], items: Sequence[Item]
@@ -103,10 +110,10 @@ class Workers:
                     raise value
                 if what == "result":
                     yield index, value
-                elif tries < _TRIES and not value.startswith(_TOO_LONG):
+                elif what == "lost" and tries < _TRIES:
                     waiting.append((index, tries + 1))
                 else:
-                    yield index, Lost(value.removeprefix(_TOO_LONG))
+                    yield index, Lost(value)
 
     def close(self) -> None:
         """End the processes and their jobs."""
@@ -126,7 +133,8 @@ class _Worker:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other,), daemon=True)
+        # A daemon could not have children, which a controller may start with multiprocessing.
+        self._process = context.Process(target=_serve, args=(other,))
         with one_thread():
             self._process.start()
         other.close()
@@ -199,7 +207,8 @@ def _serve(pipe: Connection) -> None:
 def _done(job: Callable[[Any], object], item: object) -> Message:
     """Do a job; return its result or its exception."""
     try:
-        return "result", job(item)
+        with no_exit():
+            return "result", job(item)
     except Exception as error:
         error.add_note(traceback.format_exc())
         try:
@@ -238,9 +247,19 @@ def _run_child(sender: Connection, job: Callable[[Any], object], item: object) -
     try:
         answer = _done(job, item)
         if os.getpid() == own:  # a controller may have forked, too
-            sender.send(answer)
+            _send(sender, answer)
     finally:
         os._exit(0)
+
+
+def _send(sender: Connection, answer: Message) -> None:
+    """Send an answer; say so if pickle does not support the result."""
+    try:
+        sender.send(answer)
+    except OSError:
+        raise
+    except Exception as error:
+        sender.send(("failed", f"its result cannot be sent: {described(error)}"))
 
 
 def _answer_of(child: int, receiver: Connection, pipe: Connection) -> Message:
@@ -250,7 +269,8 @@ def _answer_of(child: int, receiver: Connection, pipe: Connection) -> Message:
         if pipe in wait([receiver, pipe], _POLL_S):  # the program has ended: it sends nothing now
             _end_group(child)
             os._exit(0)
-        ended, status = os.waitpid(child, os.WNOHANG)
+        # The child stays a zombie, so that its number is not used for another process.
+        ended = os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT)
         while receiver.poll():
             try:
                 message: Message = receiver.recv()
@@ -261,16 +281,16 @@ def _answer_of(child: int, receiver: Connection, pipe: Connection) -> Message:
                 return message
             until_s, late = time.monotonic() + message[1][0], message[1][1]
         if ended:
-            return "lost", _exit_reason(os.waitstatus_to_exitcode(status))
+            exited = ended.si_code == os.CLD_EXITED
+            return "lost", _exit_reason(ended.si_status if exited else -ended.si_status)
         if time.monotonic() > until_s:
-            return "lost", _TOO_LONG + late
+            return "failed", late  # another try would take as long
 
 
 def _end_group(child: int) -> None:
-    """Kill a child process and the processes of its group."""
+    """Kill a child process and the processes of its group, and wait for the child."""
     with contextlib.suppress(OSError):
         os.killpg(child, signal.SIGKILL)
     with contextlib.suppress(OSError):
         os.kill(child, signal.SIGKILL)
-    with contextlib.suppress(OSError):  # `_answer_of` may have waited for it already
-        os.waitpid(child, 0)
+    os.waitpid(child, 0)

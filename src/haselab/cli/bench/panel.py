@@ -38,6 +38,12 @@ def _check_lan(context: click.Context, option: click.Parameter, value: str) -> s
             f"--lan is {shown(value)}. Use one IPv4 address of this computer in its network, for "
             "example 192.168.1.20."
         )
+    if not ip.is_private:
+        click.echo(
+            f"haselab: warning: --lan is {value}, an address of the Internet. A firewall must keep "
+            "other networks from the panel, or use a private address.",
+            err=True,
+        )
     return value
 
 
@@ -111,7 +117,8 @@ def _serve(panel: Panel) -> None:
     def watch_stop() -> None:
         failed = 0
         while not panel.server.should_exit:
-            failed = 0 if stop_answers(panel.stop_port, _STOP_S) else failed + 1
+            answers = all(stop_answers(panel.stop_port, _STOP_S, ip) for ip in panel.ips)
+            failed = 0 if answers else failed + 1
             if failed == _STOP_TRIALS and not panel.server.should_exit:
                 lost.append("stop process does not answer")
                 panel.server.should_exit = True

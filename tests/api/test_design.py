@@ -9,7 +9,7 @@ import haselab as hl
 from haselab.base import InputError
 from haselab.cli.main import main
 from haselab.controllers.builtin import pid_controller
-from haselab.models import RationalModel, VoltageMap
+from haselab.models import Plant, RationalModel, VoltageMap
 from haselab.models.actuator.strain_map import StrainMap
 from tests.cli.model.physical_files import ZERO_M, written
 
@@ -71,6 +71,15 @@ def test_python_and_the_command_make_the_same_design(tmp_path, capsys):
     for name in ("kp", "ki", "kd", "derivative_filter_s"):
         assert command[name] == pytest.approx(getattr(found.gains, name), rel=1e-6, abs=1e-12)
     assert found.gains.kd > 0.0 and found.setting.measurement_delay_s == 0.01
+
+
+def test_the_usual_limits_are_for_a_model_from_strain_to_strain():
+    metres_per_volt = Plant(3.1e-6, 60.0, 0.2)
+    with pytest.raises(InputError, match=r"gain of the model is 3.1e-06.*Give limits=\(LOW"):
+        hl.design(metres_per_volt)
+    found = hl.design(metres_per_volt, limits=(0.0, 5000.0))
+    assert "with an output of 0 to 5000, 100 Hz and a delay of 0.01 s" in found.summary()
+    assert found.spec.step == pytest.approx(0.5 * 3.1e-6 * 5000.0)
 
 
 def test_what_cannot_be_designed_is_refused():

@@ -15,6 +15,7 @@ from haselab.control import (
     design_controller,
 )
 from haselab.control.plausible_design import USUAL_STRUCTURE, Structure
+from haselab.control.reach import usual_limits
 from haselab.controllers import ChosenController, KnownActuator, known_actuator
 from haselab.controllers.registry import chosen_controller
 from haselab.identify import TransferFit
@@ -38,7 +39,7 @@ def design(
     spec: DesignSpec | Mapping[str, float | bool] | None = None,
     *,
     controller: Structure = USUAL_STRUCTURE,
-    limits: tuple[float, float] = (_USUAL.saturation.low, _USUAL.saturation.high),
+    limits: tuple[float, float] | None = None,
     rate_hz: float = _USUAL.rate_hz,
     delay_s: float = _USUAL.measurement_delay_s,
     probability: float | None = None,
@@ -55,6 +56,7 @@ def design(
         spec: demands; None: the usual ones.
         controller: "pi" or "pid".
         limits: lowest and highest output of the controller, in the unit of the model's input.
+            None: -0.05 to 0.1, for a model from strain to strain.
         rate_hz: updates of the loop a second, in Hz.
         delay_s: age of a measurement when the output computed from it takes effect, in s.
         probability: share of the plausible plants that has to keep the margins; a fit only.
@@ -62,7 +64,8 @@ def design(
     Returns:
         Gains, margins and the predicted step; `shortfalls` names the demands that are not met.
     Raises:
-        InputError: an unknown kind, or a probability for a plant without covariance.
+        InputError: an unknown kind, a probability for a plant without covariance, or no limits for
+            a model whose gain is not that from strain to strain.
         ResultError: the fit has no result, or a number that is not identifiable.
     Example:
         >>> found = design(Plant(1.0, 32.0, 0.3), {"phase_margin_deg": 60.0})
@@ -70,8 +73,10 @@ def design(
         ((), True)
     """
     demands = spec if isinstance(spec, DesignSpec) else DesignSpec.from_mapping(spec or {})
-    loop, rng = LoopSetting(rate_hz, delay_s, Saturation(*limits)), generator(seed)
     known = model.posterior if isinstance(model, TransferFit) else model
+    plant = known.nominal if isinstance(known, PlantPosterior) else known
+    range_ = usual_limits(plant) if limits is None else Saturation(*limits)
+    loop, rng = LoopSetting(rate_hz, delay_s, range_), generator(seed)
     return design_controller(
         known, demands, loop, rng=rng, structure=controller, probability=probability
     )

@@ -131,6 +131,11 @@ class Design:
             "settling_time_s": (step.settling_time_s, "s"),
         }
         lines = [f"{n:{_NAME_WIDTH}s} {v:12.6g}  {unit}".rstrip() for n, (v, unit) in rows.items()]
+        loop, limits = self.setting, self.setting.saturation
+        lines.append(
+            f"For a step of {self.spec.step:g} with an output of {limits.low:g} to "
+            f"{limits.high:g}, {loop.rate_hz:g} Hz and a delay of {loop.measurement_delay_s:g} s."
+        )
         if self.plausible is not None:
             share = 100.0 * self.plausible.share.value
             lines.append(f"{share:.3g} % of the plausible plants keep the margins.")

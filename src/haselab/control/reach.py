@@ -10,15 +10,39 @@ from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.models.maps import VoltageMap, allow_start
 from haselab.models.plant import Plant
 
-__all__ = ["default_step", "integrates", "reachable_range"]
+__all__ = ["default_step", "integrates", "reachable_range", "usual_limits"]
 
 _STEP = 0.04  # of the reference study
 _OF_REACH = 0.5
+_GAINS = (0.01, 100.0)  # of a model from strain to strain; it is 1 without creep
 
 
 def integrates(plant: AnyPlant) -> bool:
     """Whether a plant reaches any output with any input."""
     return not isinstance(plant, Plant) and plant.denominator[-1] == 0.0
+
+
+def usual_limits(plant: AnyPlant) -> Saturation:
+    """Limits of a controller whose output is a strain, where none are given.
+
+    Args:
+        plant: from strain to strain.
+    Returns:
+        Those of the reference study.
+    Raises:
+        InputError: the static gain is far from 1, so the model maps from or to something else.
+    Example:
+        >>> usual_limits(Plant(0.8, 60.0, 0.2)).high
+        0.1
+    """
+    gain, usual = abs(PlantScale.of(plant).gain), Saturation()
+    if not integrates(plant) and not _GAINS[0] <= gain <= _GAINS[1]:
+        raise InputError(
+            f"The static gain of the model is {gain:.3g}, so it is not a model from strain to "
+            f"strain, but the usual limits {usual.low:g} to {usual.high:g} are strains. Give "
+            "limits=(LOW, HIGH) in the unit of the model's input."
+        )
+    return usual
 
 
 def default_step(plant: AnyPlant, limits: Saturation) -> float:

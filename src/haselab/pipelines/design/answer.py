@@ -103,6 +103,10 @@ def design_answer(design: Design) -> JsonObject:
         "worst_gain_margin_db": min(item.gain_margin_db for item in worst),
         "worst_overshoot": max(item.step.overshoot for item in design.spread),
         "frequency_spread": design.spec.frequency_spread,
+        "step": design.spec.step,
+        "limits": [design.setting.saturation.low, design.setting.saturation.high],
+        "rate_hz": design.setting.rate_hz,
+        "delay_s": design.setting.measurement_delay_s,
         "shortfalls": list(design.shortfalls),
         **more,
     }

@@ -126,8 +126,8 @@ class ControllerKind:
         if faults:
             where = f" {source}" if source else ""
             raise InputError(
-                f"Controller of kind {self.name!r}: {'; '.join(faults)}. Change the section "
-                f"[controller].{where}"
+                f"Controller of kind {self.name!r}: {'; '.join(faults)}. Change the "
+                f"parameters of the controller.{where}"
             )
         return ChosenController(self, tuple(checked))
 

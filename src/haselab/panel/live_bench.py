@@ -26,7 +26,7 @@ from haselab.panel.bench_state import BenchState
 from haselab.panel.columns import LiveWriter
 from haselab.panel.page_leases import PageLeases
 from haselab.panel.pages.study_job import StudyJob
-from haselab.panel.pages.values import number
+from haselab.panel.pages.values import number, up_to_millivolts
 from haselab.panel.study_player import PictureFile, StudyPlayer
 from haselab.runtime.closed_loop import ClosedLoop
 from haselab.runtime.lockin import lockin_of
@@ -228,7 +228,8 @@ class LiveBench:
             "output)."
         )
         if self._loop is not None:
-            manual += f" In closed loop: up to {self._loop_v():.3g} V at the amplifier's input."
+            highest_v = up_to_millivolts(self._loop_v())
+            manual += f" In closed loop: up to {highest_v} V at the amplifier's input."
         return {"number": self._request.number, "limits": f"{self._request.limits} {manual}",
                 "reason": self._request.reason}  # fmt: skip
 
@@ -283,8 +284,8 @@ class LiveBench:
         highest_v = 0.0 if job is None else job.highest_v(self._rig.description)
         if highest_v > limit_v:
             raise LimitError(
-                f"The study needs {highest_v:.4g} V, but the typed limit is {limit_v:g} V. Type at "
-                f"least {highest_v:.4g} V, or change the study."
+                f"The study needs {up_to_millivolts(highest_v)} V, but the typed limit is "
+                f"{limit_v:g} V. Type this value, or change the study."
             )
         self._request = None
         self._rig.safety.arm(request, str(values.get("acknowledged", "")))
@@ -379,8 +380,8 @@ class LiveBench:
             highest_v = self._loop_v()
             if highest_v > self._limit_v:
                 raise LimitError(
-                    f"The controller may use up to {highest_v:.3g} V, but the bench was armed for "
-                    f"{self._limit_v:g} V. Arm with a limit of at least {highest_v:.3g} V."
+                    f"The controller may use up to {up_to_millivolts(highest_v)} V, but the bench "
+                    f"was armed for {self._limit_v:g} V. Arm with a limit of at least that."
                 )
             carrier = (CARRIER_HZ, CARRIER_V)
             self._closed = ClosedLoop(self._rig, _NoCamera(), carrier, self._loop, "panel")

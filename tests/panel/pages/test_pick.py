@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import tifffile
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from haselab.base import InputError
 from haselab.panel.pages.pick import PICK_REQUESTS, Videos
@@ -196,6 +196,23 @@ def test_picked_points_are_those_that_track_finds_and_give_its_strain(
         std = np.hypot(float(one["strain_std"]), float(other["strain_std"]))
         assert float(one["strain"]) == pytest.approx(float(other["strain"]), abs=5 * std)
     assert tracked["strain"]["largest"] > 0.04
+
+
+def test_points_whose_dot_is_still_searched_for_are_saved_too(
+    picking: Picking, tmp_path: Path
+) -> None:
+    held: list[Route] = []
+    picking.page.route("**/request/pick-snap", lambda route: held.append(route))
+    save = picking.page.get_by_role("button", name=re.compile("Save"))
+    for x, y in UPPER:
+        picking.page.mouse.click(*picking.place(x + 2, y + 1))
+    picking.page.wait_for_function("document.body.innerText.includes('3 searches')")
+    for number, route in enumerate(held):
+        expect(save).to_be_disabled(timeout=WAIT_MS)
+        route.continue_()
+        expect(picking.page.locator(".marks button")).to_have_count(number + 1, timeout=WAIT_MS)
+    assert len(held) == 3 and picking.save()["points"] == 3
+    assert len(table(tmp_path / "points.csv")) == 3
 
 
 def test_undo_redo_delete_and_arrow_keys(picking: Picking) -> None:

@@ -101,6 +101,10 @@ def command(
             running_panel(PanelFiles(rig, actuator, runs), page_port, lease_s, lan)
         )
         click.echo("\n".join(panel.addresses))
+        also = " or, on another computer, the second one" if lan else ""
+        click.echo(
+            f"haselab: Open this address in a browser{also}. Ctrl-C ends the panel.", err=True
+        )
         if not no_browser:
             webbrowser.open(panel.addresses[0])
         _serve(panel)

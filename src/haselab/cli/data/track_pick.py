@@ -13,6 +13,11 @@ __all__ = ["save_picked"]
 _WITH_PICK = {"video", "pick", "no_browser", "out", "force", "as_json", "debug"}
 
 
+def _announce(address: str, as_json: bool) -> None:
+    click.echo(address, err=as_json)
+    click.echo("haselab: Open this address in a browser. Ctrl-C saves nothing.", err=True)
+
+
 def _refuse_others() -> None:
     """Refuse options that the page does not use.
 
@@ -43,7 +48,7 @@ def save_picked(video: Path, out: Path | None, *, no_browser: bool, as_json: boo
 
     _refuse_others()
     found = pick_points(
-        video, out, browser=not no_browser, announce=lambda text: click.echo(text, err=as_json)
+        video, out, browser=not no_browser, announce=lambda address: _announce(address, as_json)
     )
     if isinstance(found, int):
         raise KeyboardInterrupt

@@ -6,7 +6,7 @@ import math
 
 from haselab.base import InputError, JsonObject, is_real, shown
 
-__all__ = ["number"]
+__all__ = ["number", "up_to_millivolts"]
 
 
 def number(values: JsonObject, name: str) -> float:
@@ -27,3 +27,13 @@ def number(values: JsonObject, name: str) -> float:
     if not is_real(found) or not math.isfinite(found):
         raise InputError(f"{name} is {shown(found)}, but it must be a finite number.")
     return float(found)
+
+
+def up_to_millivolts(volt: float) -> str:
+    """A voltage rounded up, so that a limit typed as shown is high enough.
+
+    Example:
+        >>> up_to_millivolts(1.8142), up_to_millivolts(1.815)
+        ('1.815', '1.815')
+    """
+    return f"{math.ceil(1e3 * volt - 1e-9) / 1e3:g}"

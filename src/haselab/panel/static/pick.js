@@ -209,6 +209,8 @@ function Picker({ link }) {
   const [scale, setScale] = useState("");
   const [said, say] = useState({ text: "", bad: false });
   const [done, setDone] = useState(null);
+  const [pending, setPending] = useState(0); // searches for dots without an answer yet
+  const searches = useRef(0);
   const wanted = useRef(null);
   const frame = useRef(null);
   const card = useRef(null);
@@ -273,12 +275,18 @@ function Picker({ link }) {
     return () => { current = false; };
   }, [JSON.stringify(ruler)]);
 
+  // Until all answers have come, nothing is saved: marks would be missing.
+  async function searched(name, values) {
+    setPending(++searches.current);
+    const found = await link.request(name, values);
+    setPending(--searches.current);
+    return found;
+  }
   // The dot near a place, if there is one and snapping is on.
   async function snapped(at, kind, always = false) {
     const here = { ...inside(at.x, at.y, picture), name: "" };
     if (!(snaps || always) || kind === "region") return here;
-    say({ text: "Looking for a dot …", bad: false });
-    const found = await link.request("pick-snap", { video, frame: index, place: [here.x, here.y], reach: SNAP * view.pixel });
+    const found = await searched("pick-snap", { video, frame: index, place: [here.x, here.y], reach: SNAP * view.pixel });
     if (found.error) return fail(found);
     say({ text: found.snapped ? "Moved to the centre of the dot." : "There is no dot here that haselab track would find. The mark is where you placed it.", bad: false });
     return { x: fixed(found.place[0]), y: fixed(found.place[1]), name: found.name };
@@ -314,9 +322,8 @@ function Picker({ link }) {
     work.change((old) => ({ ...old, marks: old.marks.filter((one) => one.id !== chosen) }));
   }
   async function find() {
-    say({ text: "Looking for dots …", bad: false });
     const corners = pair("region").flatMap((one) => [one.x, one.y]);
-    const found = await link.request("pick-region", { video, frame: 0, corners, count: Number(count) });
+    const found = await searched("pick-region", { video, frame: 0, corners, count: Number(count) });
     if (found.error) { fail(found); return; }
     work.change((old) => {
       const free = found.points.filter(([, x, y]) => !old.marks.some((one) => one.kind === "point" && Math.hypot(one.x - x, one.y - y) < 3));
@@ -333,7 +340,8 @@ function Picker({ link }) {
   }
 
   if (list === null) return html`<p role=${said.bad ? "alert" : "status"} class=${said.bad ? "error" : ""}>${said.text || "Looking for videos …"}</p>`;
-  const message = html`<p role=${said.bad ? "alert" : "status"} class=${said.bad ? "error" : ""}>${said.text}</p>`;
+  const searching = pending > 0 ? `Looking for dots: ${pending} ${pending > 1 ? "searches" : "search"} …` : "";
+  const message = html`<p role=${said.bad ? "alert" : "status"} class=${said.bad && !searching ? "error" : ""}>${searching || said.text}</p>`;
   const mark = work.marks.find((one) => one.id === chosen);
   const points = work.marks.filter((one) => one.kind === "point");
   const saved = done && done.marks === work.marks && html`<div class="card" role="status" ref=${card}><h2>Saved</h2>
@@ -380,7 +388,7 @@ function Picker({ link }) {
         <div class="card"><h2>Save</h2>
           ${list.only ? html`<p><code>${table}</code></p>` : html`<label>File name of the table <input type="text" value=${table} onInput=${(e) => setTable(e.target.value)} /></label>`}
           <label><input type="checkbox" checked=${moveAside} onChange=${(e) => setMoveAside(e.target.checked)} /> Move an existing file to NAME.previous-1</label>
-          <button type="button" disabled=${!points.length} onClick=${save}>Save ${points.length} points</button></div>
+          <button type="button" disabled=${!points.length || pending > 0} onClick=${save}>Save ${points.length} points</button></div>
         ${saved}
       </section></div>`}`;
 }

@@ -157,6 +157,10 @@ def test_two_campaigns_are_compared_by_their_medians(campaigns: Any) -> None:
     # the standard deviation of a median of 400 is 1.253 / 20
     assert low < 1.0 < high and high - low == pytest.approx(3.92 * 1.253 / 20 * 2**0.5, rel=0.35)
     assert compared(rows, {"y": np.full(400, math.nan)}) == []
+    # results that were not reached count as infinite, and most were reached
+    (found,) = compared(rows, {"y": np.r_[np.full(300, -1.0), np.full(100, math.inf)]})
+    assert found["there"]["value"] == -1.0 and found["difference"]["ci95"] is not None
+    assert compared(rows, {"y": np.r_[np.zeros(100), np.full(300, math.inf)]}) == []
     (found,) = compared(rows, {"y": np.r_[np.zeros(400), np.full(7, math.nan)]})
     assert (found["here"]["without_value"], found["there"]["without_value"]) == (0, 7)
 

@@ -387,8 +387,8 @@ def compared(
         independent: the cases of both are independent draws, see `draws_are_independent` and
             `is_random`.
     Returns:
-        For each result of both: the medians, the number of cases without a value, which they leave
-        out, and the difference of the medians with its bootstrap interval.
+        For each result with finite medians in both: the medians, the number of cases without a
+        value, which they leave out, and the difference of the medians with its bootstrap interval.
     """
     rng = np.random.default_rng(_SEED)
     group, found = Group("", tuple(here)), list[Json]()
@@ -398,13 +398,14 @@ def compared(
         second = others[~np.isnan(others)]
         if min(first.size, second.size) < LEAST_CASES:
             continue
-        if not (np.isfinite(first).all() and np.isfinite(second).all()):
+        medians = [float(np.median(part)) for part in (first, second)]
+        if not np.isfinite(medians).all():
             continue  # medians that were not reached have no difference
         drawn = [np.median(rng.choice(part, (_RESAMPLED, part.size)), axis=1)
                  for part in (first, second)]  # fmt: skip
-        ends = np.quantile(drawn[0] - drawn[1], [_SIDE, 1.0 - _SIDE])
-        medians = [float(np.median(part)) for part in (first, second)]
-        intervals = [median_interval(first), median_interval(second), ends.tolist()]
+        intervals = [median_interval(first), median_interval(second), None]
+        if np.isfinite(drawn).all():
+            intervals[2] = np.quantile(drawn[0] - drawn[1], [_SIDE, 1.0 - _SIDE]).tolist()
         if not independent:
             intervals = [None, None, None]
         found.append({

@@ -146,7 +146,8 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     yield _Table(
         "Comparison",
         f"This campaign against that in {summary.get('compared_with', '')}. The interval of the "
-        "difference is from resampling both. Cases without a value are left out. "
+        "difference is from resampling both; without draws there is none. Cases without a value "
+        "are left out, and so are results whose median was not reached. "
         f"{_differences(summary.get('differs_in', ()))}",
         ("Result", "Median here", "Median there", "Difference", "Without a value, here and there"),
         [

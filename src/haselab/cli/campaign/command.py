@@ -123,8 +123,8 @@ def command(
             comparison = compared(rows, there[0], independent=independent)
             if not comparison:
                 click.echo(
-                    f"haselab: No comparison: no result has at least {LEAST_CASES} values in both "
-                    f"campaigns, all of them finite. {other}", err=True,
+                    f"haselab: No comparison: no result has at least {LEAST_CASES} values and a "
+                    f"finite median in both campaigns. {other}", err=True,
                 )  # fmt: skip
             summary |= {
                 "comparison": comparison, "compared_with": str(other),

@@ -94,7 +94,7 @@ def command(
     text = json.dumps(to_plain(_answer(game, rows)), indent=2)
     write_text(out / "scoreboard.json", text + "\n")
     write_text(out / "scoreboard.html", scoreboard_page(game))
-    lines = [*_table(rows), *(f"bound of {task} {', '.join(names)}: {limit}."
+    lines = [*_table(rows), *_reasons(game), *(f"bound of {task} {', '.join(names)}: {limit}."
                               for task, limit, names in limits_of(plan.tasks))]  # fmt: skip
     click.echo(text if as_json else "\n".join([*lines, f"written to {out}"]))
 
@@ -122,6 +122,18 @@ def _answer(game: Game, rows: list[Row]) -> JsonObject:
         "simulated": True,
         "version": __version__,
     }  # fmt: skip
+
+
+def _reasons(game: Game) -> list[str]:
+    """Why tasks were not done: each reason of a controller once, with its tasks."""
+    tasks: dict[tuple[str, str], list[str]] = {}
+    for one in game.played:
+        if one.failure:
+            tasks.setdefault((one.controller, one.failure), []).append(one.task)
+    return [
+        f"{controller}, {', '.join(dict.fromkeys(names))}: {reason}"
+        for (controller, reason), names in tasks.items()
+    ]
 
 
 def _table(rows: list[Row]) -> list[str]:

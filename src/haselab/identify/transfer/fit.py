@@ -53,6 +53,10 @@ _UNEXPLAINED = (
     "no result: the model explains {:.1f} % of the output, and the residuals still follow the "
     "input; check --input and --output, or fit more poles"
 )
+_NOT_WHITE = (
+    "The residuals are not white: the model does not explain everything, and the intervals hold "
+    "only if its structure is right. Add slow modes (creep) or poles: --slow-modes 1, --choose all."
+)
 _FEEDBACK = 1e-6  # probability below which the input follows the residuals
 _NO_DISTURBANCE = 99.0  # per cent of fit above which no disturbance matters
 _FED_BACK = (
@@ -546,5 +550,5 @@ def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estima
     if structure.zeros == structure.poles and structure.delay == "auto":
         notes.append("With as many zeros as poles the delay is assumed to be 0 s.")
     if best.whiteness_p < 0.05:
-        notes.append("The residuals are not white: the model does not explain everything.")
+        notes.append(_NOT_WHITE)
     return notes

@@ -62,6 +62,17 @@ def test_counts_are_words_and_what_a_run_lacks_is_listed():
     assert "no result: S26.rise, S26.error: only 'haselab reproduce' plays it." in text
 
 
+def test_results_that_the_record_does_not_determine_are_named():
+    row = {"id": "S14.a1", "measured": {"value": 1.6, "std": 0.3, "ci95": [1.1, 2.1], "unit": "V"}}
+    other = {**row, "id": "S14.zero", "note": "recomputed: eq. 4"}
+    text = results_table(
+        {"quantities": [{**row, "note": "not identifiable from this loop"}, other]}
+    )
+    (line,) = [line for line in text.splitlines() if line.startswith("not identifiable")]
+    assert line.endswith("(reasons in the report): S14.a1")
+    assert "not identifiable" not in results_table({"quantities": [other]})
+
+
 def test_a_simulated_table_says_that_no_verdict_is_evidence():
     row = {"id": "S20.omega_n", "paper": 5.1, "verdict": "agrees", "follows_from_twin": "mass"}
     text = results_table({"quantities": [row], "simulated": True})

@@ -68,6 +68,7 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
             *lines,
             "",
             *_missing(found, columns),
+            *_blind(found, columns),
             *textwrap.wrap(_count(found), columns, break_on_hyphens=False),
         ]
     )
@@ -134,6 +135,15 @@ def _count(results: Results) -> str:
         compared = any(row.has_paper for row in rows)
         text += ". SIMULATED" + (": no verdict is evidence about the paper" if compared else "")
     return text
+
+
+def _blind(results: Results, columns: int) -> list[str]:
+    """Lines that name the results which the record does not determine."""
+    ids = [row.id for row in results.quantities if row.note.startswith("not identifiable")]
+    if not ids:
+        return []
+    text = f"not identifiable, so use no number alone (reasons in the report): {', '.join(ids)}"
+    return textwrap.wrap(text, columns, subsequent_indent="  ", break_on_hyphens=False)
 
 
 def _missing(results: Results, columns: int) -> list[str]:

@@ -160,7 +160,7 @@ CALLS = {
         "model": (PLANT, OBJECT),
         "spec": ({"phase_margin_deg": 60.0}, without(OBJECT, "nothing")),
         "controller": ("pi", WORD),
-        "limits": ((-0.05, 0.1), without(OBJECT) | {"order": (1, 0)}),
+        "limits": ((-0.05, 0.1), without(OBJECT, "nothing") | {"order": (1, 0)}),
         "rate_hz": (100.0, POSITIVE),
         "delay_s": (0.005, FINITE | {"negative": -1.0}),
         "probability": (None, NUMBER_OR_NONE),

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from haselab.cli.main import main
+from haselab.panel import stop_process
+from haselab.panel.stop_process import StopServer
 from tests.panel.running import WAIT_S, RunningPanel, connected, ended, started
 
 LAN = "127.0.0.2"  # Linux has all of 127.0.0.0/8; a network is not needed
@@ -87,6 +91,26 @@ def test_stop_from_the_network_trips_the_bench_that_the_local_page_armed(
             await watching.until(lambda state: bool(state["stage"] == "tripped"))
 
     asyncio.run(play())
+
+
+def test_stop_takes_a_port_that_is_free_on_both_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[socket.socket] = []
+
+    def made(port: int, stop: Any, origins: Any, ip: str) -> StopServer:
+        server = StopServer(port, stop, origins, ip)
+        if not taken:  # another program has this port on the second address
+            taken.append(socket.create_server((LAN, server.port)))
+        return server
+
+    monkeypatch.setattr(stop_process, "StopServer", made)
+    servers = stop_process._on_one_port(["127.0.0.1", LAN], dict, ())
+    try:
+        assert [server.server_address[0] for server in servers] == ["127.0.0.1", LAN]
+        assert servers[0].port == servers[1].port != taken[0].getsockname()[1]
+    finally:
+        taken[0].close()
+        for server in servers:
+            server.server_close()
 
 
 @pytest.mark.parametrize("bad", ["0.0.0.0", "127.0.0.1", "::1", "lab-pc", "224.0.0.1", "1.2.3"])

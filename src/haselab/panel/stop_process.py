@@ -183,22 +183,23 @@ class _Stop:
 
 
 def _on_one_port(
-    ips: list[str], stop: Callable[[], dict[str, object]], origins: tuple[str, ...]
+    ips: list[str],
+    stop: Callable[[], dict[str, object]],
+    origins: tuple[str, ...],
+    trials: int = _TRIALS,
 ) -> list[StopServer]:
     """Serve on all addresses with one port, which is free on each of them."""
-    for trial in range(_TRIALS):
-        servers: list[StopServer] = []
-        try:
-            for ip in ips:
-                port = servers[0].port if servers else 0
-                servers.append(StopServer(port, stop, origins, ip))
-            return servers
-        except OSError:  # another program uses the port on one of the addresses
-            for server in servers:
-                server.server_close()
-            if trial == _TRIALS - 1:
-                raise
-    raise AssertionError
+    servers: list[StopServer] = []
+    try:
+        for ip in ips:
+            servers.append(StopServer(servers[0].port if servers else 0, stop, origins, ip))
+    except OSError:  # another program uses the port on one of the addresses
+        for server in servers:
+            server.server_close()
+        if trials == 1:
+            raise
+        return _on_one_port(ips, stop, origins, trials - 1)
+    return servers
 
 
 def main(words: list[str]) -> None:
@@ -212,12 +213,10 @@ def main(words: list[str]) -> None:
     with contextlib.suppress(AttributeError, OSError):  # it needs little processor time
         os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     stop = _Stop(folder, key, words[4] if len(words) > 4 else "")
-    port = 0  # the first server takes a free one; the next uses the same
-    for ip in words[0].split(","):
-        server = StopServer(port, stop, origins, ip)
+    servers = _on_one_port(words[0].split(","), stop, origins)
+    for server in servers:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        port = server.port
-    print(f"ready {port}", flush=True)
+    print(f"ready {servers[0].port}", flush=True)
     sys.stdin.read()
 
 

@@ -23,7 +23,7 @@ from haselab.store.optional import library
 
 __all__ = [
     "LEAST_CASES", "Group", "compared", "draws_are_independent", "groups_of", "is_random",
-    "median_interval", "result_names", "summarised", "without_effect",
+    "median_interval", "result_names", "summarised",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
@@ -140,7 +140,7 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         ],
         "sensitivities": list(_sensitivities(campaign, groups, names, independent=independent)),
         "failures": _failures(rows),
-        "without_effect": [*without_effect(campaign, rows)],
+        "without_effect": [*_without_effect(campaign, rows)],
     }
 
 
@@ -346,7 +346,7 @@ def _failures(rows: Sequence[CaseRow]) -> list[Json]:
     ]  # fmt: skip
 
 
-def without_effect(campaign: Campaign, rows: Sequence[CaseRow]) -> list[str]:
+def _without_effect(campaign: Campaign, rows: Sequence[CaseRow]) -> list[str]:
     """Axes along which no result of any case changes: the kind may not use the parameter.
 
     Noise that differs between the points of an axis changes the results, too, so such an axis is

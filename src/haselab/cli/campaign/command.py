@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import cast
 
 import click
 import numpy as np
@@ -33,7 +34,6 @@ from haselab.campaign.summary import (
     is_random,
     result_names,
     summarised,
-    without_effect,
 )
 from haselab.cli.common import WORKERS, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
@@ -110,7 +110,7 @@ def command(
         rows = finished_rows(plan, out)
         write_table(plan, rows, out)
         summary = summarised(plan, rows)
-        for path in without_effect(plan.campaign, rows):
+        for path in cast("list[str]", summary["without_effect"]):
             click.echo(
                 f"haselab: warning: no result depends on {path}; the kind "
                 f"{plan.campaign.kind!r} may not use it", err=True,

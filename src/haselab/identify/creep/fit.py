@@ -21,13 +21,13 @@ from haselab.identify.creep.laws import (
     PronyLaw,
     Span,
 )
+from haselab.identify.creep.setting import Fitted, Setting
 from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.model_choice import APART, bic, effective_count, is_decisive
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
-from haselab.identify.projection import Basis, Solution, minimise, project
+from haselab.identify.projection import minimise, project
 from haselab.identify.record import Record
 from haselab.identify.sampled.record import single_record
-from haselab.identify.training_output import grid_step
 from haselab.models.creep import Creep
 
 __all__ = ["CreepFit", "fit_creep"]
@@ -46,107 +46,14 @@ _POLISHED = 3
 _MOST_BRANCHES = 4
 _COLOURED = 1e-3  # whiteness below which a note says so
 _SPIKE = 8.0  # standard deviations, estimated by the median, that normal noise does not reach
-_ROWS = 800  # used to compare starts
 _ROUNDING = 1e-9  # of the output's span
 _LARGEST_STD = 1.0  # of the logarithm of an identifiable time constant
 _BEYOND = 3.0  # record lengths: longer time constants are not identifiable
 _STRAIGHT = 0.999  # order at which a power of time counts as a straight line
 _WEAK = 2.0  # standard deviations of a gain below which its time constant is not identifiable
 _HELD_OUT = 0.25
-_REPEATED = 0.5  # share of the samples that repeat the one before: quantisation hides the noise
 _LEAST_EFFECTIVE = 8.0  # samples, as for coloured residuals
 _UNKNOWN = (-math.inf, math.inf)
-
-
-@dataclass(frozen=True)
-class _Setting:
-    """A record prepared for the fit.
-
-    Args:
-        span: its input minus the input before the record.
-        y: outputs. Shape `(N,)`.
-        kept: samples that are fitted. Shape `(N,)`.
-        offset: whether the output before the first step is fitted besides the instantaneous
-            response.
-    """
-
-    span: Span
-    y: Floats
-    kept: NDArray[np.bool_]
-    offset: bool
-
-    @property
-    def step(self) -> float:
-        """Quantisation step of the output, if most samples repeat the one before; else 0."""
-        held = self.y[self.kept]
-        return grid_step(held) if np.mean(np.diff(held) == 0.0) > _REPEATED else 0.0
-
-    @property
-    def runs(self) -> NDArray[np.int64]:
-        """Index of the run of equal outputs to which each fitted sample belongs."""
-        return np.cumsum(np.diff(self.y[self.kept], prepend=self.y[self.kept][0]) != 0.0)
-
-    def thinned(self) -> _Setting:
-        """At most 800 of the fitted samples."""
-        rows = np.flatnonzero(self.kept)
-        kept = np.zeros_like(self.kept)
-        kept[rows[:: max(1, math.ceil(rows.size / _ROWS))]] = True
-        return _Setting(self.span, self.y, kept, self.offset)
-
-    def before(self, cut: int) -> _Setting:
-        """The samples before index `cut`."""
-        return _Setting(self.span, self.y, self.kept & (np.arange(self.y.size) < cut), self.offset)
-
-    def bases(self, law: CreepLaw, search: Floats) -> list[Basis]:
-        """Offset, input and creep on the fitted samples."""
-        columns, slopes = law.columns(search, self.span)
-        fixed = [self.span.inputs, np.ones(self.y.size)][: 1 + self.offset]
-        shared = np.column_stack([*fixed, columns])[self.kept]
-        by_search = np.zeros((search.size, *shared.shape))
-        by_search[:, :, len(fixed) :] = slopes[:, self.kept]
-        count = shared.shape[0]
-        return [
-            Basis(
-                self.y[self.kept],
-                shared,
-                np.zeros((count, 0)),
-                by_search,
-                np.zeros(count),
-                np.zeros((search.size, count)),
-            )
-        ]
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    """A law with its parameters: `solution.shared` is instant, offset if fitted, and gains."""
-
-    law: CreepLaw
-    solution: Solution
-    bic: float = math.nan
-
-    def gains(self, setting: _Setting) -> Floats:
-        return self.solution.shared[1 + setting.offset :]
-
-    @property
-    def parameters(self) -> int:
-        return self.solution.search.size + self.solution.shared.size
-
-    def covariance(self, setting: _Setting) -> Floats:
-        """Covariance of the search and shared parameters, rounding errors included.
-
-        A rounding error has the variance `step**2 / 12`. It depends on the output alone, so all
-        samples of a run of equal outputs are assumed to have the same one.
-        """
-        solution = self.solution
-        covariance = coloured_covariance(solution.columns, solution.residuals, self.parameters)
-        step, runs = setting.step, setting.runs
-        if step == 0.0 or not np.isfinite(covariance).all():
-            return covariance
-        inverse = np.linalg.pinv(np.vstack(list(solution.columns)))
-        by_run = np.zeros((inverse.shape[0], int(runs[-1]) + 1))
-        np.add.at(by_run.T, runs, inverse.T)
-        return np.asarray(covariance + step**2 / 12.0 * by_run @ by_run.T)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,8 +83,8 @@ class CreepFit(RecordFit[Record]):
     validation_fit_percent: float = math.nan
     residual_whiteness_p: float = math.nan
     fitted: Creep | None = None
-    candidates: tuple[_Fitted, ...] = field(default=(), repr=False)
-    setting: _Setting = field(repr=False)
+    candidates: tuple[Fitted, ...] = field(default=(), repr=False)
+    setting: Setting = field(repr=False)
 
     @property
     def model(self) -> Creep:
@@ -327,7 +234,7 @@ def _rest(record: Record) -> float:
     return 0.0 if np.ptp(record.u) == 0.0 else float(record.u[0])
 
 
-def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
+def _setting(record: Record, leave_out_s: float) -> tuple[Setting, bool]:
     inputs, outputs, rate_hz = record.u, record.y, record.input_rate_hz
     if not 0.0 <= leave_out_s < math.inf:
         raise InputError(f"leave_out_s is {leave_out_s:g} s, but it must be 0 s or more.")
@@ -351,10 +258,10 @@ def _setting(record: Record, leave_out_s: float) -> tuple[_Setting, bool]:
         )
     # A step at the first sample: the output before it and the instantaneous response are
     # indistinguishable.
-    return _Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
+    return Setting(Span(moved, rate_hz), outputs, kept, not stepped), stepped
 
 
-def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:
+def _drift_before(setting: Setting, *, rest_known: bool) -> str | None:
     """Reason for no fit where the output already drifts before the input changes."""
     still = int(np.argmax(setting.span.inputs != 0.0))
     if not rest_known or still < _LEAST_SAMPLES:
@@ -373,7 +280,7 @@ def _drift_before(setting: _Setting, *, rest_known: bool) -> str | None:
     )
 
 
-def _tried(kinds: tuple[str, ...], setting: _Setting) -> list[_Fitted]:
+def _tried(kinds: tuple[str, ...], setting: Setting) -> list[Fitted]:
     """Fits of no creep, of a growing number of branches, and of the other laws."""
     wanted: list[CreepLaw] = [PowerLaw(), FractionalLaw()] if "fractional" in kinds else []
     wanted += [LogarithmicLaw()] if "logarithmic" in kinds else []
@@ -393,11 +300,11 @@ def _tried(kinds: tuple[str, ...], setting: _Setting) -> list[_Fitted]:
     return found
 
 
-def _kind(entry: _Fitted) -> str:
+def _kind(entry: Fitted) -> str:
     return entry.law.kind if entry.solution.search.size else _NONE
 
 
-def _fit(law: CreepLaw, setting: _Setting) -> _Fitted | None:
+def _fit(law: CreepLaw, setting: Setting) -> Fitted | None:
     """The best of several starts, refined on all samples."""
     few, bounds = setting.thinned(), law.bounds(setting.span)
     starts = [project(start, few.bases(law, start)) for start in law.starts(setting.span)]
@@ -410,16 +317,16 @@ def _fit(law: CreepLaw, setting: _Setting) -> _Fitted | None:
         return None
     best = min(polished, key=lambda solution: solution.cost)
     solution, settled = minimise(lambda x: setting.bases(law, x), best.search, bounds, gain=1e-8)
-    return _Fitted(law, solution) if settled else None
+    return Fitted(law, solution) if settled else None
 
 
-def _one_sided(entry: _Fitted, setting: _Setting) -> bool:
+def _one_sided(entry: Fitted, setting: Setting) -> bool:
     """Whether all branches creep in one direction; opposed branches fit noise."""
     gains = entry.gains(setting)
     return bool((gains >= 0.0).all() or (gains <= 0.0).all())
 
 
-def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
+def _scored(found: list[Fitted], setting: Setting) -> list[Fitted]:
     """All laws with their BIC, the best first."""
     richest = min(found, key=lambda entry: entry.solution.cost)
     count = int(setting.kept.sum())
@@ -428,7 +335,7 @@ def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
     if setting.step > 0.0:  # a run of equal outputs has one rounding error
         effective = min(effective, max(setting.runs[-1] + 1.0, _LEAST_EFFECTIVE))
     scored = [
-        _Fitted(
+        Fitted(
             entry.law,
             entry.solution,
             bic(entry.solution.cost, count, effective, entry.parameters, floor),
@@ -439,8 +346,8 @@ def _scored(found: list[_Fitted], setting: _Setting) -> list[_Fitted]:
 
 
 def _describe(
-    setting: _Setting,
-    scored: list[_Fitted],
+    setting: Setting,
+    scored: list[Fitted],
     scores: dict[str, float],
     verdict: str,
     stepped: bool,
@@ -472,13 +379,13 @@ def _describe(
     )
 
 
-def _instant(entry: _Fitted, setting: _Setting) -> Estimate:
+def _instant(entry: Fitted, setting: Setting) -> Estimate:
     at = entry.solution.search.size
     variance = float(entry.covariance(setting)[at, at])
     return Estimate.normal(float(entry.solution.shared[0]), math.sqrt(max(variance, 0.0)), "")
 
 
-def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], Floats]:
+def _estimates(entry: Fitted, setting: Setting) -> tuple[dict[str, Estimate], Floats]:
     """All parameters by name, and their covariance.
 
     A time constant that the record cannot tell takes its gain with it.
@@ -515,14 +422,14 @@ def _estimates(entry: _Fitted, setting: _Setting) -> tuple[dict[str, Estimate], 
     return ordered, rescaled(inner[np.ix_(at, at)], spread)
 
 
-def _forecast(setting: _Setting, entry: _Fitted, after_s: float) -> Estimate:
+def _forecast(setting: Setting, entry: Fitted, after_s: float) -> Estimate:
     """One law's output after the record, with the covariance of its parameters."""
     span = setting.span
     more = max(1, round(after_s * span.rate_hz))
     longer = Span(np.concatenate([span.inputs, np.full(more, span.inputs[-1])]), span.rate_hz)
     kept = np.zeros(longer.inputs.size, dtype=bool)
     kept[-1] = True
-    ahead = _Setting(longer, np.zeros(longer.inputs.size), kept, setting.offset)
+    ahead = Setting(longer, np.zeros(longer.inputs.size), kept, setting.offset)
     basis = ahead.bases(entry.law, entry.solution.search)[0]
     value = float(basis.shared[0] @ entry.solution.shared)
     row = np.concatenate([basis.by_search[:, 0] @ entry.solution.shared, basis.shared[0]])
@@ -532,7 +439,7 @@ def _forecast(setting: _Setting, entry: _Fitted, after_s: float) -> Estimate:
     return Estimate.normal(value, math.sqrt(max(float(row @ covariance @ row), 0.0)), "")
 
 
-def _validation(setting: _Setting, best: _Fitted) -> float:
+def _validation(setting: Setting, best: Fitted) -> float:
     """Fit percentage of the last quarter of the samples, forecast by a fit to the rest."""
     rows = np.flatnonzero(setting.kept)
     cut = int(rows[round((1.0 - _HELD_OUT) * rows.size)])
@@ -553,7 +460,7 @@ def _validation(setting: _Setting, best: _Fitted) -> float:
 
 
 def _notes(
-    setting: _Setting, estimates: dict[str, Estimate], stepped: bool, residuals: Floats
+    setting: Setting, estimates: dict[str, Estimate], stepped: bool, residuals: Floats
 ) -> tuple[str, ...]:
     notes = []
     if whiteness_p([residuals]) < _COLOURED:
@@ -595,5 +502,5 @@ def _notes(
     return tuple(notes)
 
 
-def _no_result(setting: _Setting, reason: str) -> CreepFit:
+def _no_result(setting: Setting, reason: str) -> CreepFit:
     return CreepFit(status=f"no result: {reason}", setting=setting)

@@ -48,7 +48,7 @@ def bench(tmp_path: Path, clock: Clock) -> Iterator[tuple[LiveBench, GuardedRig]
     about = rig.description
     with LiveWriter(tmp_path / "live", about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
         found = LiveBench(rig, writer, lease_s=LEASE_S)
-        found._leases = PageLeases(LEASE_S, clock)
+        found._leases = found._study._leases = PageLeases(LEASE_S, clock)
         yield found, rig
         found.close()
 
@@ -231,11 +231,12 @@ def test_no_command_is_carried_out_once_the_panel_has_ended(
 def test_a_study_whose_page_goes_says_so(bench: tuple[LiveBench, GuardedRig], clock: Clock) -> None:
     live, _ = bench
     live._mode, live._holder = "study", "page"
+    live._study._page = "page"
     live._leases.begin("page")
-    assert live._why_not() == ""
+    assert live._study.why_not() == ""
     live.do("leave", "page", {}, clock.now_s)
-    assert live._why_not() == "The page that started the study has disconnected."
+    assert live._study.why_not() == "The page that started the study has disconnected."
     live.end_study("The panel has ended.")
     gone = "The page that started the study has disconnected."
-    assert live._why_not() == gone, "the first reason"
+    assert live._study.why_not() == gone, "the first reason"
     live._mode, live._holder = "idle", ""

@@ -22,6 +22,7 @@ from haselab.base import (
     described,
     shown,
 )
+from haselab.panel.armed_study import CHECK, ArmedStudy
 from haselab.panel.bench_state import BenchState
 from haselab.panel.columns import LiveWriter
 from haselab.panel.page_leases import PageLeases
@@ -41,9 +42,6 @@ CARRIER_HZ, CARRIER_V = 2000.0, 0.02  # of the reference study
 _RAMP_V_PER_S = 1.0  # at the amplifier's input: 5 kV/s with a gain of 5000
 _HEARTBEAT_S = 0.5
 _PICTURES_HZ = 5.0
-_CHECK = "Check the instruments, then arm the bench again."
-_CATCH_UP_S, _WATCH_S = 0.2, 0.1
-_COMPUTES_S = 0.5  # without a block, after which a study does not look whether it must end
 _MOST_EVENTS = 40  # that a page shows
 _RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old command could energise the bench
 _IDLE_BLOCKS = 20  # this many blocks in a row with an unexpected voltage trip the bench
@@ -109,10 +107,7 @@ class LiveBench:
         self._beat_s = 0.0
         self._prepare, self._player = prepare, player or StudyPlayer()
         self._player.note = self._note
-        self._job: StudyJob | None = None
-        self._block_s = 0.0  # when the last block was read
-        self._recorded = ""  # folder of the last study that was played to its end
-        self._end_study = ""  # why the study must end; empty: it may go on
+        self._study = ArmedStudy(rig, self._leases, self._player)
         self._extrapolated = False  # the strain of the last block
         self._unexpected = 0  # blocks in a row with an unexpected voltage
         self._over = False  # the panel has ended: commands are refused
@@ -130,7 +125,7 @@ class LiveBench:
         if stage is Stage.OFF and latched:  # a request was withdrawn
             stage = Stage.TRIPPED
         low, high = about.drive_limits.low, about.drive_limits.high
-        limits = None
+        limits, job = None, self._study.job
         if self._loop is not None:
             limits = (self._loop.saturation.low, self._loop.saturation.high)
         return BenchState(
@@ -138,7 +133,7 @@ class LiveBench:
             self._limit_v, self._holder, latched or self._reason, low, high,
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, self._player.step, tuple(self._events),
-            self._recorded, "" if self._job is None else self._job.options.folder.name,
+            self._study.recorded, "" if job is None else job.options.folder.name,
             self._extrapolated,
         )  # fmt: skip
 
@@ -214,7 +209,7 @@ class LiveBench:
         Args:
             reason: one sentence; the first one is kept.
         """
-        self._end_study = self._end_study or reason
+        self._study.end(reason)
 
     def _note(self, what: str) -> None:
         self._events.append((self._rig.bench.time_s, what))
@@ -290,10 +285,11 @@ class LiveBench:
         self._request = None
         self._rig.safety.arm(request, str(values.get("acknowledged", "")))
         self._note("armed")
-        self._reason, self._end_study = "", ""
+        self._reason = ""
         self._leases.begin(holder)
         if job is not None:  # `step` plays it
-            self._mode, self._holder, self._limit_v, self._job = "study", holder, limit_v, job
+            self._mode, self._holder, self._limit_v = "study", holder, limit_v
+            self._study.begin(holder, job)
             return {"folder": str(job.options.folder)}
         try:
             self._rig.safety.run()
@@ -433,13 +429,13 @@ class LiveBench:
 
     def step(self) -> None:
         """Put out the next drive and read one block; or play the study that is due."""
-        if (job := self._job) is not None:
+        if (job := self._study.job) is not None:
             self._play(job)
             return
         with self._turn:  # a thread that releases a lock and takes it again keeps others waiting
             pass
         with self._mutex:
-            if self._job is not None:  # a page has armed the bench for it meanwhile
+            if self._study.job is not None:  # a page has armed the bench for it meanwhile
                 return
             try:
                 self._block()
@@ -451,7 +447,7 @@ class LiveBench:
                 self._failed(error)
                 return
             except Exception as error:  # of a driver, for example if STOP interrupts its call
-                self._failed(DeviceError(f"A driver failed: {described(error)}. {_CHECK}"))
+                self._failed(DeviceError(f"A driver failed: {described(error)}. {CHECK}"))
                 return
             if self._holder and self._rig.safety.stage is Stage.TRIPPED:
                 self._end(self._rig.safety.reason)
@@ -472,49 +468,16 @@ class LiveBench:
         self._end(self._rig.safety.reason or str(error))
 
     def _play(self, job: StudyJob) -> None:
-        """Play a study. Meanwhile, pages can confirm a step, disarm, leave and renew leases."""
-        about, folder = self._rig.description, job.options.folder
-        self._lockin = lockin_of(about, job.study.sensing.carrier_hz)
-        reason, over = f"The study has ended. Its recording is in {folder}.", threading.Event()
-        threading.Thread(target=self._watch_study, args=(over,), daemon=True).start()
+        """Play a study, and end at 0 V."""
+        self._lockin = lockin_of(self._rig.description, job.study.sensing.carrier_hz)
+        reason = ""
         try:
-            self._player.play(job, self._rig, self._limit_v, self._why_not, self._picture)
-            self._recorded = folder.name
-        except HaselabError as error:
-            kept = f" The data recorded so far are in {folder}." if folder.is_dir() else ""
-            reason = f"{error}{kept}"
-        except OSError as error:  # a disk or a folder that has gone
-            reason = (
-                f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"
-            )
-            self._rig.safety.trip(reason)
-        except Exception as error:  # of a driver, for example if STOP interrupts its call
-            reason = f"A driver or an experiment failed: {described(error)}. {_CHECK}"
-            self._rig.safety.trip(reason)
+            reason = self._study.play(job, self._limit_v, self._picture)
         finally:
-            over.set()
-            self._rig.safety.record_with(lambda what: None)  # the recording is closed
-            self._lockin = lockin_of(about, CARRIER_HZ)
+            self._lockin = lockin_of(self._rig.description, CARRIER_HZ)
             with self._mutex:
-                self._job = None
+                self._study.job = None
                 self._end(reason)
-
-    def _watch_study(self, over: threading.Event) -> None:
-        """End a study that must end while no block is read: it computes, with its last output."""
-        while not over.wait(_WATCH_S):
-            idle = time.monotonic() > self._block_s + _COMPUTES_S
-            if idle and self._rig.safety.live and (reason := self._why_not()):
-                self._rig.safety.trip(reason)
-
-    def _why_not(self) -> str:
-        """Why the study must end; empty while it may go on."""
-        if not self._end_study and self._leases.is_lost(self._holder):
-            time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
-        if not self._end_study and self._leases.is_lost(self._holder):
-            return (
-                f"No message for {self._leases.lease_s:g} s from the page that started the study."
-            )
-        return self._end_study
 
     def _block(self) -> None:
         rig = self._rig
@@ -572,11 +535,9 @@ class LiveBench:
     def _on_block(self, codes: NDArray[np.int16]) -> None:
         """Write the live signals of each block that is read, and end a study that must end."""
         about, time_s = self._rig.description, self._rig.bench.time_s
-        self._block_s = time.monotonic()
-        if self._job is not None:
+        if self._study.job is not None:
             self._drive_v = self._rig.present_drive_v
-            if self._rig.safety.live:
-                self._player.require_wanted()
+        self._study.passed()
         capacitance_f, _, valid = self._lockin.step(codes)
         sensed_f = capacitance_f if valid and self._holder else math.nan
         strain = math.nan

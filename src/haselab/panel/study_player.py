@@ -135,7 +135,7 @@ class StudyPlayer:
         rig.plain.description = played.description = narrowed  # both are asked
         try:
             job.begin()
-            run_study(job.study, played, job.options, self)
+            run_study(job.study, played, job.options, self).require_complete()
         finally:
             rig.plain.description = full
             self.task = self.prompt = ""

@@ -1,0 +1,117 @@
+"""The study that a page has armed the bench for: it is played, and ended when it must end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+from haselab.base import HaselabError, described
+from haselab.panel.page_leases import PageLeases
+from haselab.panel.pages.study_job import StudyJob
+from haselab.panel.study_player import PictureFile, StudyPlayer
+from haselab.safety.guarded import GuardedRig
+
+__all__ = ["CHECK", "ArmedStudy"]
+
+CHECK = "Check the instruments, then arm the bench again."
+_CATCH_UP_S, _WATCH_S = 0.2, 0.1
+_COMPUTES_S = 0.5  # without a block, after which a study does not look whether it must end
+
+
+class ArmedStudy:
+    """The studies of a panel, one after the other.
+
+    Args:
+        rig: the bench behind its safety chain.
+        leases: of the pages.
+        player: plays a study.
+    """
+
+    def __init__(self, rig: GuardedRig, leases: PageLeases, player: StudyPlayer) -> None:
+        self._rig, self._leases, self.player = rig, leases, player
+        self._page = ""  # that has armed the bench
+        self._end = ""  # why the study must end; empty: it may go on
+        self._block_s = 0.0  # when the last block was read
+        self.job: StudyJob | None = None  # that is due or played
+        self.recorded = ""  # folder of the last study that was played to its end
+
+    def begin(self, page: str, job: StudyJob) -> None:
+        """The bench was armed for a study.
+
+        Args:
+            page: that armed it.
+            job: the study.
+        """
+        self._page, self._end, self.job = page, "", job
+
+    def end(self, reason: str) -> None:
+        """End the study; the bench goes to 0 V and the recording is kept.
+
+        Args:
+            reason: one sentence; the first one is kept.
+        """
+        self._end = self._end or reason
+
+    def passed(self) -> None:
+        """A block was read.
+
+        Raises:
+            StudyEndedError: the study must end.
+        """
+        self._block_s = time.monotonic()
+        if self.job is not None and self._rig.safety.live:
+            self.player.require_wanted()
+
+    def play(self, job: StudyJob, limit_v: float, picture: PictureFile | None) -> str:
+        """Play the study. Meanwhile, pages can confirm a step, disarm, leave and renew leases.
+
+        Args:
+            job: the study.
+            limit_v: highest drive that was typed when the bench was armed, in V.
+            picture: takes the last frame; None: no pictures.
+        Returns:
+            Why it has ended. After a fault of a disk or a driver the bench has tripped.
+        """
+        folder, over = job.options.folder, threading.Event()
+        threading.Thread(target=self._watch, args=(over,), daemon=True).start()
+        try:
+            self.player.play(job, self._rig, limit_v, self.why_not, picture)
+            self.recorded = folder.name
+        except HaselabError as error:
+            kept = f" The data recorded so far are in {folder}." if folder.is_dir() else ""
+            return f"{error}{kept}"
+        except OSError as error:
+            return self._tripped(_unwritable(error, folder))
+        except Exception as error:  # of a driver, for example if STOP interrupts its call
+            return self._tripped(f"A driver or an experiment failed: {described(error)}. {CHECK}")
+        finally:
+            over.set()
+            self._rig.safety.record_with(lambda what: None)  # the recording is closed
+        return f"The study has ended. Its recording is in {folder}."
+
+    def _tripped(self, reason: str) -> str:
+        self._rig.safety.trip(reason)
+        return reason
+
+    def _watch(self, over: threading.Event) -> None:
+        """End a study that must end while no block is read: it computes, with its last output."""
+        while not over.wait(_WATCH_S):
+            idle = time.monotonic() > self._block_s + _COMPUTES_S
+            if idle and self._rig.safety.live and (reason := self.why_not()):
+                self._rig.safety.trip(reason)
+
+    def why_not(self) -> str:
+        """Why the study must end; empty while it may go on."""
+        if not self._end and self._leases.is_lost(self._page):
+            time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
+        if not self._end and self._leases.is_lost(self._page):
+            return (
+                f"No message for {self._leases.lease_s:g} s from the page that started the study."
+            )
+        return self._end
+
+
+def _unwritable(error: OSError, folder: Path) -> str:
+    """Why a disk or a folder that has gone ends a study."""
+    return f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"

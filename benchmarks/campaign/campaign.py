@@ -3,12 +3,14 @@
     python -m benchmarks.campaign.campaign [--cases 10000]
 
 A case identifies a virtual device: parameters drawn, its record simulated in C and fitted. T1 is
-the time of one process. All times include the start of the workers.
+the time of one process. All times include the start of the workers, except for a running scheduler,
+whose two workers wait for the command, as on a cluster.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import pickle
 import resource
@@ -19,6 +21,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from distributed import Client
 
 from benchmarks.rows import Row
 from haselab.base import SilentProgress
@@ -85,6 +89,34 @@ class _Times:
     workers_s: float
 
 
+@contextlib.contextmanager
+def _running_cluster(folder: Path) -> Iterator[str]:
+    """Address of a scheduler with two workers, started as docs/study/campaign.md says."""
+    file = str(folder / "scheduler.json")
+    environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
+    workers = ["--scheduler-file", file, "--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
+    lines = (
+        ["scheduler", "--scheduler-file", file, "--port", "0", "--no-dashboard"],
+        ["worker", *workers],
+    )
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *line], env=environment, cwd=folder,
+            stderr=subprocess.DEVNULL,
+        )
+        for line in lines
+    ]  # fmt: skip
+    try:
+        with Client(scheduler_file=file, set_as_default=False) as client:
+            client.wait_for_workers(2)
+            address = str(client.scheduler.address)
+        yield address
+    finally:
+        for one in reversed(running):
+            one.terminate()
+            one.wait()
+
+
 def _timed(plan: Plan, out: Path, make: Callable[[Problem], Executor]) -> _Times:
     open_folder(plan, out)
     wall_s, own_s, before = time.perf_counter(), time.process_time(), _children_s()
@@ -112,8 +144,14 @@ def rows(cases: int = CASES, finished: int = FINISHED) -> Iterator[Row]:
         one = _timed(plan, folder / "one", lambda problem: ProcessExecutor(problem, 1))
         two = _timed(plan, folder / "two", lambda problem: ProcessExecutor(problem, 2))
         dask = _timed(plan, folder / "dask", lambda problem: DaskExecutor(problem, LOCAL, 2))
+        with _running_cluster(folder) as address:
+            running = _timed(
+                plan, folder / "running", lambda problem: DaskExecutor(problem, address, 2)
+            )
         about = f"{cases:,} devices, {1e3 * one.wall_s / cases:.2g} ms each"
         load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        share = one.wall_s / (2.0 * running.wall_s)
+        yield Row("T1 / (2 T2), 2 workers of a running Dask scheduler", share, "", 0.9)
         for what, found in (("2 processes", two), ("2 Dask workers", dask)):
             share = one.wall_s / (2.0 * found.wall_s)
             yield Row(f"T1 / (2 T2), {what}", share, "", 0.9, note=f"{about}, {load}")

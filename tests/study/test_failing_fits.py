@@ -1,7 +1,8 @@
-"""A fit that refuses what the run itself recorded: no result, exit 3, and the recording is kept."""
+"""A fit that refuses what the run itself recorded: exit 3; recording and other results are kept."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,10 @@ class _Anything:
     """Stands for every result of a fit that went well."""
 
     def __getattr__(self, name: str) -> Any:
-        return {} if name in {"quantities", "notes", "figures"} else self
+        return {} if name in {"quantities", "notes", "figures", "groups", "missing"} else self
+
+    def reason(self, key: str) -> str:
+        return ""
 
 
 def _stand_in(kind: type) -> Any:
@@ -72,12 +76,14 @@ def test_a_fit_that_refuses_recorded_data_is_a_missing_result(
     fixed = {"design.measured_latency": 0.0, "free_response._against_chirp": {}}
     for name, value in (fixed | {"free_response._discussed": ""}).items():
         monkeypatch.setattr(where + name, lambda *_, value=value: value)
-    monkeypatch.setattr(where + "steps.further_trials", lambda *_: ({}, {}, {}))
+    monkeypatch.setattr(where + "steps.further_trials", lambda *_: _Anything())
     for name in ("triangle", "operating_point"):
         monkeypatch.setattr(f"{where}{name}.Cycles.of", lambda *_: _Anything())
     monkeypatch.setattr(where + failing, _refuse)
-    with pytest.raises(ResultError, match=rf"{FITS[failing]}.*y has 3 samples.*are kept"):
-        pipeline.play_and_fit(lambda name: _Anything(), builtin_study(quick=True), _Anything())
+    found = pipeline.play_and_fit(lambda name: _Anything(), builtin_study(quick=True), _Anything())
+    assert len(found.failed) == 1, "one cause, named once"
+    with pytest.raises(ResultError, match=rf"{FITS[failing]}.*y has 3 samples.*are kept\. There\."):
+        found.require_complete("There.")
 
 
 def test_a_missing_experiment_is_still_bad_input() -> None:
@@ -105,3 +111,8 @@ def test_a_run_whose_fit_refuses_its_data_exits_with_3_and_keeps_them(
     assert stop.value.code == 3, printed
     assert printed.count("\n") == 1
     assert (tmp_path / "out" / "session.h5").is_file()
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    (missing,) = [one for one in results["not_played"] if "y has 3 samples" in one["reason"]]
+    assert {"S14.a1", "S24.rise_open"} <= set(missing["ids"])
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert "y has 3 samples" in manifest["ended"]

@@ -82,7 +82,7 @@ class Analysis:
         self._source, self._on_fit, self._fitted = source, on_fit, fitted
         self._given = given or Given()
         self._seen: dict[str, Observation] = {}
-        self._outcomes: dict[str, ExperimentResult | NotPlayedError] = {}
+        self._outcomes: dict[str, ExperimentResult | ResultError] = {}
         self._under_way: list[str] = []
 
     def observe(self, name: str) -> Observation:
@@ -157,7 +157,7 @@ class Analysis:
             ResultError: no result, or the fit refuses the recorded data.
         """
         known = self._outcomes.get(experiment.table)
-        if isinstance(known, NotPlayedError):
+        if isinstance(known, ResultError):
             raise known
         if known is not None:
             return known
@@ -174,7 +174,7 @@ class Analysis:
                 found = experiment.fit(self)
             with foreign(experiment, "fit"):
                 check_result(experiment, found)
-        except NotPlayedError as reason:
+        except ResultError as reason:
             self._outcomes[experiment.table] = reason
             raise
         finally:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
-from haselab.base import Estimate
+from haselab.base import Estimate, ResultError
 from haselab.rig import RigDescription
 from haselab.runtime.runner import Runner
 from haselab.study.analysis import Analysis, Given
@@ -35,6 +35,8 @@ class Findings:
         direct: results of the experiments' own fits, by id, where those of the identified physical
             model stand in `quantities`.
         observations: what the fits have seen, by the recording's name.
+        failed: why an experiment could not be played or fitted; not those that only need another
+            one that is not in the study.
     """
 
     quantities: Mapping[str, Estimate]
@@ -45,10 +47,25 @@ class Findings:
     missing: Mapping[str, str] = field(default_factory=dict)
     direct: Mapping[str, Estimate] = field(default_factory=dict)
     observations: Mapping[str, Observation] = field(default_factory=dict, repr=False)
+    failed: tuple[str, ...] = ()
 
     def find(self, kind: type[Value]) -> Value | None:
         """Return a value by its type; None if this study has not found one."""
         return cast("Value | None", self.values.get(kind))
+
+    def require_complete(self, where: str = "") -> None:
+        """Raise the error of the first experiment that failed.
+
+        Args:
+            where: one sentence on where the other results are.
+        Raises:
+            ResultError: with its reason, and how many others failed for another one.
+        """
+        if not self.failed:
+            return
+        first, *others = self.failed
+        more = f" Without a result for another reason: {len(others)} more." if others else ""
+        raise ResultError(f"{first}{more}{f' {where}' if where else ''}")
 
 
 def play_and_fit(
@@ -77,8 +94,10 @@ def play_and_fit(
         known: values of an actuator file that no experiment of the study finds.
     Returns:
         All results.
+    An experiment that fails costs its own results and those that need it. If this happens while
+    the study is played, the rest of the study is not played.
+
     Raises:
-        ResultError: a fit without a result.
         InputError: an experiment is missing from the source.
     """
 
@@ -89,25 +108,18 @@ def play_and_fit(
 
     given = Given({} if repeated is None else repeated, known or {})
     analysis = Analysis(study, rig, source, begin, fitted, given)
-    left_out: dict[str, str] = {}
-    if runner is not None:
-        for experiment in analysis.experiments:
-            try:
-                with foreign(experiment, "play"):
-                    experiment.play(Player(runner, experiment, analysis))
-            except NotPlayedError as missing:
-                left_out[experiment.table] = str(missing)
+    left_out = {} if runner is None else _play(analysis, runner)
     outcomes = []
     for experiment in analysis.experiments:
-        reason = left_out.get(experiment.table, "")
-        try:
-            if not reason:
+        if experiment.table not in left_out:
+            try:
                 outcomes.append(analysis.outcome(experiment))
-        except NotPlayedError as missing:
-            reason = str(missing)
-        if reason:
-            unfound = dict.fromkeys(rows_of_experiment(experiment), reason)
-            outcomes.append(ExperimentResult(missing=unfound))
+                continue
+            except ResultError as reason:
+                left_out[experiment.table] = reason
+        unfound = dict.fromkeys(rows_of_experiment(experiment), str(left_out[experiment.table]))
+        outcomes.append(ExperimentResult(missing=unfound))
+    failed = [str(one) for one in left_out.values() if not isinstance(one, NotPlayedError)]
     return Findings(
         quantities=_joined([part.quantities for part in outcomes]),
         notes=_joined_notes([part.notes for part in outcomes]),
@@ -116,7 +128,26 @@ def play_and_fit(
         charts=tuple(chart for part in outcomes for chart in part.charts),
         missing=_joined([part.missing for part in outcomes]),
         observations=analysis.observed,
+        failed=tuple(dict.fromkeys(failed)),
     )
+
+
+def _play(analysis: Analysis, runner: Runner) -> dict[str, ResultError]:
+    """Play the experiments; return why some were not played, by their tables."""
+    left_out: dict[str, ResultError] = {}
+    waiting = list(analysis.experiments)
+    while waiting:
+        experiment = waiting.pop(0)
+        try:
+            with foreign(experiment, "play"):
+                experiment.play(Player(runner, experiment, analysis))
+        except NotPlayedError as reason:
+            left_out[experiment.table] = reason
+        except ResultError as failure:  # nobody knows whether the rest may be played
+            runner.rest()
+            left_out |= dict.fromkeys((one.table for one in (experiment, *waiting)), failure)
+            break
+    return left_out
 
 
 def _joined_notes(parts: Sequence[Mapping[str, str]]) -> dict[str, str]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from haselab import __version__
-from haselab.base import InputError, JsonObject, Limits, Progress, SilentProgress
+from haselab.base import InputError, JsonObject, Limits, Progress, ResultError, SilentProgress
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig, RigDescription
 from haselab.rig.protocols import MonitorCalibration
@@ -167,11 +167,10 @@ def run_study(
         progress: in seconds of the rig.
         fitted: see `play_and_fit`.
     Returns:
-        All findings.
+        All findings; an experiment that failed is in `failed`.
     Raises:
         DeviceError: disk or instrument failed; the recorded data are kept.
         SafetyError: the bench protected itself.
-        ResultError: a fit has no result; the recorded data are kept.
     """
     sensing = study.sensing
     lockin = lockin_of(rig.description, sensing.carrier_hz)
@@ -186,22 +185,28 @@ def run_study(
             seconds += float(each.seconds(rig.description))
     progress.start(seconds)
     header = session_header(study, rig.description, options)
-    with recording(rig, options, header, planned) as (session, observer):
+    findings: Findings | None = None
+    try:
+        with recording(rig, options, header, planned) as (session, observer):
 
-        def source(name: str) -> Observation:
-            record = session.experiment(name)
-            return observe(record, session.events(), lockin, sensing, rig.description)
+            def source(name: str) -> Observation:
+                record = session.experiment(name)
+                return observe(record, session.events(), lockin, sensing, rig.description)
 
-        with Runner(
-            rig, session, observer, sensing.carrier_hz, sensing.carrier_v, progress
-        ) as runner:
-            findings = play_and_fit(
-                source, study, rig.description, runner,
-                lambda what: progress.advance(0.0, f"fit: {what}"), fitted=fitted,
-                known={} if options.known is None else known_values(options.known),
-            )  # fmt: skip
-        if study.has("triangle"):
-            findings = _with_sheet(findings, session, rig.description)
+            with Runner(
+                rig, session, observer, sensing.carrier_hz, sensing.carrier_v, progress
+            ) as runner:
+                findings = play_and_fit(
+                    source, study, rig.description, runner,
+                    lambda what: progress.advance(0.0, f"fit: {what}"), fitted=fitted,
+                    known={} if options.known is None else known_values(options.known),
+                )  # fmt: skip
+            if study.has("triangle"):
+                findings = _with_sheet(findings, session, rig.description)
+            findings.require_complete()  # the manifest keeps the reason
+    except ResultError:
+        if findings is None or not findings.failed:
+            raise
     return findings
 
 
@@ -237,7 +242,6 @@ def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, 
         Findings, the study, and the session's header.
     Raises:
         InputError: no session, a damaged one, or one that lacks an experiment.
-        ResultError: a fit without a result.
     """
     path = session_file(path)
     with SessionReader(path, unverified=unverified) as session:

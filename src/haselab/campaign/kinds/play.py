@@ -64,6 +64,8 @@ class _Play(CaseKind):
             options = RunOptions(Path(folder), seed, "none", twin.model_dump(mode="json"))
             with armed(make_twin(twin, seed)) as bench:
                 found = run_study(_study_of(inputs), bench, options, SilentProgress())
+        if not case.results:
+            found.require_complete()
         wanted = case.results or tuple(found.quantities)
         missing = [name for name in wanted if name not in found.quantities]
         if missing:

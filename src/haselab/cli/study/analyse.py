@@ -15,7 +15,7 @@ from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import analyse_on_chip
 from haselab.cli.study.physical_model import identify_physical_model
 from haselab.cli.study.recommended_mass import with_mass_limit
-from haselab.cli.study.study_run import mark_found, print_results, with_date
+from haselab.cli.study.study_run import mark_found, print_results, require_complete, with_date
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import read_json
 from haselab.store.session.reader import session_file
@@ -102,7 +102,7 @@ def command(
             return
     found, study, header = analyse_session(session, unverified=unverified)
     model = None
-    if physical_model:
+    if physical_model and not found.failed:
         model = identify_physical_model(path, study, found, unverified=unverified)
         found = model.joined(found)
     if study.is_reference:
@@ -116,6 +116,7 @@ def command(
     if model is not None:
         model.save(target, path)
     print_results(results, target, as_json)
+    require_complete(found, target)
 
 
 def _earlier_noise_free(folder: Path) -> dict[str, float] | None:

@@ -96,8 +96,8 @@ class NoiseFreeRun:
             lines = self._errors.read().decode(errors="replace").strip().splitlines()
             last = lines[-1] if lines else f"exit code {self._process.returncode}"
             raise ResultError(f"The process of the noise-free run ended early: {last}.") from None
-        if isinstance(found, HaselabError):
-            raise found
+        if isinstance(found, HaselabError):  # whatever it is: the study keeps its own results
+            raise ResultError(str(found))
         return found  # type: ignore[no-any-return]
 
     def __exit__(self, *_: object) -> None:

@@ -48,6 +48,7 @@ __all__ = [
     "mark_found",
     "physical_model_option",
     "print_results",
+    "require_complete",
     "twin_rig",
     "with_date",
 ]
@@ -171,7 +172,7 @@ def _execute(
         found = run_study(study, rig, options, progress, fitted)
         model = None
         by_model: Findings | str = NOT_HERE
-        if modelled is not None:
+        if modelled is not None and not found.failed:
             progress.advance(0.0, "physical model")
             model = identify_physical_model(folder, study, found)
             found = model.joined(found)
@@ -205,6 +206,19 @@ def _execute(
     if model is not None:
         model.save(folder, folder)
     print_results(results, folder, as_json)
+    require_complete(found, folder)
+
+
+def require_complete(found: Findings, folder: Path) -> None:
+    """End the command with the reason if an experiment failed; the other results are written.
+
+    Args:
+        found: by the study.
+        folder: of the results.
+    Raises:
+        ResultError: see `Findings.require_complete`.
+    """
+    found.require_complete(f"The results of the other experiments are in {folder}.")
 
 
 def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> JsonObject:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from haselab.base import ResultError
 from haselab.controllers import KnownActuator
 from haselab.rig import RigDescription
 from haselab.runtime.loop import LoopSettings
@@ -14,7 +15,7 @@ from haselab.safety.feasibility import Drive
 from haselab.signals import constant
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
-from haselab.study.experiment import Experiment, ExperimentResult, NotPlayedError
+from haselab.study.experiment import Experiment, ExperimentResult
 from haselab.study.fits.further import further_trials, saturating_reference
 from haselab.study.fits.loops import Loops, loop_saturation
 from haselab.study.fits.maps import Maps
@@ -174,9 +175,12 @@ class StepTest(Experiment[Steps]):
         opened = [analysis.observe(name) for name in open_names(self.study)]
         try:
             loops = analysis.need(Loops)
-        except NotPlayedError as reason:
+        except ResultError as reason:  # also a design that failed
             alone = compare_trials(self._without_design(analysis, opened), maps, self.study, scale)
-            missing = {key: str(reason) for key in self.rows() if key not in alone.quantities}
+            missing = {
+                key: alone.reason(key) or str(reason)
+                for key in self.rows() if key not in alone.quantities
+            }  # fmt: skip
             return ExperimentResult(
                 alone.quantities, alone.notes, figures=alone.figures, values=(alone,),
                 missing=missing,
@@ -188,14 +192,14 @@ class StepTest(Experiment[Steps]):
         closed = {"PI": trials["pi"], "PID": trials["pid"], OWN: trials[OWN]}
         groups = {"open loop": opened} | {name: seen for name, seen in closed.items() if seen}
         found = compare_trials(groups, maps, self.study, scale)
-        further, notes, drawn = further_trials(
-            trials, found.groups.get("PI"), maps, loops, self.study, scale
-        )
+        further = further_trials(trials, found.groups.get("PI"), maps, loops, self.study, scale)
+        reasons = {key: why for key in self.rows() if (why := found.reason(key))}
         return ExperimentResult(
-            {**found.quantities, **further},
-            {**found.notes, **notes},
-            figures={**found.figures, **drawn},
+            {**found.quantities, **further.quantities},
+            {**found.notes, **further.notes},
+            figures={**found.figures, **further.figures},
             values=(found,),
+            missing={**reasons, **further.missing},
         )
 
     def _without_design(

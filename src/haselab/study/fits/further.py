@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from haselab.base import Estimate, JsonObject
+from haselab.base import Estimate, InputError
 from haselab.control import StepNumbers, over_trials
 from haselab.signals import constant
 from haselab.study.definition import Study
+from haselab.study.experiment import ExperimentResult
 from haselab.study.fits.loops import Loops
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
@@ -45,8 +46,8 @@ def further_trials(
     loops: Loops,
     study: Study,
     scale_m_per_px: float,
-) -> tuple[dict[str, Estimate], dict[str, str], JsonObject]:
-    """Results S10, S22 and S24 of the further trials, notes, and data for figure S7.
+) -> ExperimentResult:
+    """Results S10, S22 and S24 of the further trials, and data for figure S7.
 
     Args:
         observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.
@@ -61,10 +62,16 @@ def further_trials(
     quantities: dict[str, Estimate] = {}
     notes: dict[str, str] = {}
     drawn: dict[str, Any] = {}
+    missing: dict[str, str] = {}
     for group, (row, name) in _ROWS.items():
         if not observed.get(group):
             continue
-        trials = collect_trials(observed[group], maps.length_m, maps.strain_map, steps)
+        try:
+            trials = collect_trials(observed[group], maps.length_m, maps.strain_map, steps)
+        except InputError as refusal:
+            why = f"step trials {group!r}: {refusal}"
+            missing |= {f"{row}.rise_{name}": why, f"{row}.error_{name}": why}
+            continue
         known = trials if pi is None else pi
         rise, error = (
             _like(trials.metrics.trials, known.metrics.trials, which)
@@ -93,7 +100,8 @@ def further_trials(
             "drive_v": np.interp(seen.frame_time_s, seen.block_start_s, seen.drive_v),
             "limit_v": _limit_v(maps, loops, study),
         }
-    return quantities, notes, {"further": drawn} if drawn else {}
+    figures = {"further": drawn} if drawn else {}
+    return ExperimentResult(quantities, notes, figures=figures, missing=missing)
 
 
 def _scatter_note(trials: int, pi_trials: int) -> str:

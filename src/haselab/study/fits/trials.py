@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, JsonObject
+from haselab.base import Estimate, InputError, JsonObject
 from haselab.base.estimate import Z95
 from haselab.control import StepMetrics, step_metrics
 from haselab.models.actuator.strain_map import StrainMap
@@ -110,6 +110,7 @@ class Comparison:
         figures: sections of analysis.json.
         sensing_error: rms difference of self-sensed and camera strain, fraction of the span.
         notes: by id, remarks for the reader.
+        failed: by group, why its trials give no result.
     """
 
     groups: dict[str, Trials]
@@ -117,6 +118,11 @@ class Comparison:
     figures: JsonObject
     sensing_error: float
     notes: dict[str, str] = field(default_factory=dict)
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+    def reason(self, key: str) -> str:
+        """Why there is no result of this id; empty if there is one, or if no trial is the cause."""
+        return "" if key in self.quantities else self.failed.get(_group_of(key), "")
 
 
 def compare_trials(
@@ -131,12 +137,21 @@ def compare_trials(
         scale_m_per_px: of the camera, for its resolution.
     Returns:
         Results S24 and S25, data for figure 6 and for the comparison of self-sensing and camera.
+        A closed loop whose trials cannot be evaluated costs its own results alone.
+    Raises:
+        InputError: the trials in open loop cannot be evaluated.
     Source: reference study, rows S24 and S25.
     """
-    groups = {
-        name: collect_trials(trials, maps.length_m, maps.strain_map, study.steps)
-        for name, trials in observed.items()
-    }
+    groups: dict[str, Trials] = {}
+    failed: dict[str, str] = {}
+    for name, trials in observed.items():
+        try:
+            groups[name] = collect_trials(trials, maps.length_m, maps.strain_map, study.steps)
+        except InputError as error:
+            if name == "open loop":
+                raise
+            shown = f"the controller {study.control.kind!r}" if name == OWN else name
+            failed[name] = f"step trials with {shown}: {error}"
     opened = groups["open loop"].metrics
     quantities = {
         "S24.rise_open": opened.rise_time_s,
@@ -171,13 +186,15 @@ def compare_trials(
     shown = "PI" if "PI" in named else list(named)[-1]
     strain_per_px = scale_m_per_px / maps.length_m
     found = make_comparison(named, quantities, study.steps, strain_per_px, shown, maps.zero_px)
-    return replace(found, notes=notes)
+    return replace(found, notes=notes, failed=failed)
 
 
 def _group_of(key: str) -> str:
     """The trials that a result comes from."""
     if key.startswith("S25."):
         return OWN if key.endswith("_own") else "PID"
+    if not key.startswith("S24."):
+        return ""  # of the further trials
     return "open loop" if "_open" in key else "PI"
 
 

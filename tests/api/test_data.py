@@ -82,6 +82,41 @@ def test_times_in_a_unit_come_out_in_seconds():
         hl.records({"t [ticks]": TIME_S, "u": U, "y": Y})
 
 
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [("clock", 1.0), ("clock [ms]", 1e3), ("t [ms]", 1e3), ("frame_min", 1 / 60)],
+)
+)
+def test_times_of_any_name(name, factor, tmp_path):
+    path = tmp_path / "a.csv"
+    rows = np.c_[factor * TIME_S, U, Y]
+    np.savetxt(path, rows, "%.17g", ",", header=f"{name},u,y", comments="")
+    columns = {name: factor * TIME_S, "u": U, "y": Y}
+    for data in (columns, pd.DataFrame(columns), path, hl.load(path)):
+        (found,) = hl.records(data, time=name)
+        assert found.input_rate_hz == pytest.approx(50.0)
+
+
+def test_the_named_times_are_used_and_must_be_times():
+    both = {"time_s": TIME_S, "late_s": 2.0 * TIME_S, "u": U, "y": Y}
+    assert hl.records(both, time="late_s")[0].input_rate_hz == pytest.approx(25.0)
+    with pytest.raises(InputError, match=r"^Column 'u \[V\]' is in V, not in s\. Name"):
+        hl.records({"u [V]": TIME_S, "u": U, "y": Y}, time="u [V]")
+    with pytest.raises(InputError, match=r"^There is no column 'clok'; the data have time_s, "):
+        hl.records(both, time="clok")
+
+
+def test_what_print_shows_of_a_table():
+    found = hl.table({"time_s": TIME_S, "u": U})
+    assert str(found) == repr(found) == "Table of 200 rows at 50 Hz: time_s, u"
+
+
+def test_a_loaded_table_shows_the_units_of_its_values(tmp_path):
+    path = tmp_path / "a.csv"
+    np.savetxt(path, np.c_[1e3 * TIME_S, U], "%.17g", ",", header="t [ms],u [mV]", comments="")
+    assert str(hl.load(path)) == "Table of 200 rows at 50 Hz: t (s), u (V)"
+
+
 @pytest.mark.parametrize("name", ["time [V]", "t (V)", "time_s [V]"])
 def test_times_in_another_unit_are_named(name, tmp_path):
     path = tmp_path / "a.csv"

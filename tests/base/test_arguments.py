@@ -92,6 +92,16 @@ def test_what_does_not_is_refused_with_the_value_found(wrong, match):
         call(**wrong)
 
 
+def test_an_unknown_argument_is_reported_with_the_function_and_its_arguments():
+    @checked
+    def halved(length_m: float) -> float:
+        return 0.5 * length_m
+
+    said = r"halved\(\) got an unexpected keyword argument 'mass_kg'\. Its arguments are length_m\."
+    with pytest.raises(TypeError, match=said):
+        halved(1.0, mass_kg=1.0)
+
+
 def test_fields_of_a_dataclass_are_checked_too():
     with pytest.raises(InputError, match=r"gap_m is '1'; it must be a number\."):
         Bench("1")

@@ -190,5 +190,6 @@ def test_compare_in_python_knows_half_of_the_record():
     assert found.used_for_fit == 1.0
     assert found.status.startswith("not a validation: 100 % of the samples were used for the fit")
     assert (fit.compare(second).status, fit.compare(second).used_for_fit) == ("ok", 0.0)
+    assert str(fit.compare(second)).startswith("Prediction: ok\nfit_percent ")
     wrong = Record(-second.u, 100.0, second.y, time_s, None)
     assert fit.compare(wrong).status.startswith("the prediction is worse than the mean")

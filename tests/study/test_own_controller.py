@@ -10,7 +10,7 @@ import pytest
 
 from haselab.base import Estimate, InputError
 from haselab.cli.main import main
-from haselab.control import LoopSetting, PidGains
+from haselab.control import DesignSpec, LoopSetting, PidGains
 from haselab.controllers import chosen_controller
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.strain_map import StrainMap
@@ -21,7 +21,7 @@ from haselab.store.actuator_file import ACTUATOR, read_actuator
 from haselab.store.toml import validated
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study, builtin_study, load_study
-from haselab.study.fits.loops import Loops
+from haselab.study.fits.loops import Loops, pid_demands
 from haselab.study.fits.maps import Maps
 from haselab.study.folder import write_design
 from haselab.study.own_controller import (
@@ -123,6 +123,8 @@ def test_an_own_pid_is_an_alternative_and_never_replaces_the_designed_one(tmp_pa
         "kp": 0.2, "ki": 0.7, "kd": 0.0, "derivative_filter_s": 0.0
     }  # fmt: skip
     assert set(tables.controller.all_kinds) == {"pid", "pi", "own"}
+    demands = DesignSpec.from_mapping(tables.controller.demands)
+    assert demands == pid_demands(study), "what the PID was designed for"
 
 
 def test_an_own_controller_alone_is_in_the_actuator_file_with_its_limits(tmp_path):

@@ -17,9 +17,9 @@ from haselab.pipelines.examples.data_sets import find_data_set, write_data_set
 from haselab.pipelines.sensing.series import derived_series
 from haselab.pipelines.time_axis import records_of, time_axis
 from haselab.store.columns.reader import rate_of_times, rates_agree
-from haselab.store.columns.selection import TIME_NAMES
+from haselab.store.columns.selection import TIME_NAMES, ColumnOptions
 from haselab.store.columns.table import Table, read_every_column, read_table
-from haselab.store.columns.units import parse_unit, split_header
+from haselab.store.columns.units import Unit, parse_unit, split_header
 from haselab.store.export.frames import session_dataset, session_tables
 from haselab.store.session.reader import SessionReader, session_file
 
@@ -129,13 +129,16 @@ def table(data: Data, *, rate_hz: float | None = None) -> Table:
     return _at_rate(found, rate_hz)
 
 
-def numeric_table(data: Data, names: Sequence[str], rate_hz: float | None) -> Table:
+def numeric_table(
+    data: Data, names: Sequence[str], rate_hz: float | None, time: str | None = None
+) -> Table:
     """Columns of any source as a table in which some are numbers.
 
     Args:
         data: as of `table`.
         names: columns that must be there.
         rate_hz: rows a second, in Hz. None: as the data state it.
+        time: column of the times, in s or in the unit that it states. None: found by its name.
     Returns:
         The table; of a file, these columns alone.
     Raises:
@@ -148,14 +151,23 @@ def numeric_table(data: Data, names: Sequence[str], rate_hz: float | None) -> Ta
     if isinstance(data, (str, Path)):
         if (file := _session_in(Path(data))) is not None:
             raise _is_session(file)
-        return _at_rate(read_table(data, names), rate_hz)
-    found = table(data, rate_hz=rate_hz)
+        return _at_rate(read_table(data, names, ColumnOptions(time)), rate_hz)
+    found = table(data)
+    # A column such as "t [ms]" has become "time_s" already.
+    if time is not None and (time in found or isinstance(data, Table) or time not in data):
+        _require_columns(found, [time], data)
+        time_s = found[time] * (1.0 if isinstance(data, Table) else _factor_to_s(time, data[time]))
+        found = replace(found, rate_hz=rate_of_times(time_s), time_name=time, time_s=time_s)
+    _require_columns(found, names, data)
+    return _at_rate(found, rate_hz)
+
+
+def _require_columns(found: Table, names: Sequence[str], data: Any) -> None:
     for name in names:
         if name not in found:
             reasons = {} if isinstance(data, Table) else _columns(data)[1]
             listed = f"There is no column {name!r}; the data have {', '.join(found)}."
             raise InputError(f"{reasons.get(name, listed)} Name another column.")
-    return found
 
 
 def is_uneven(found: Table) -> bool:
@@ -287,14 +299,30 @@ def _base(name: str) -> str:
 
 def _seconds(name: object, values: Any) -> float | None:
     """Factor to s of times in the unit that their name or attribute states; None for others."""
-    text = str(name)
-    unit = split_header(text)[1] or str(getattr(values, "attrs", {}).get("units", ""))
     if getattr(getattr(values, "dtype", None), "kind", "") in ("m", "M"):
         return 1.0  # `_column` makes seconds of them
-    if _base(text) not in TIME_NAMES:
-        return None
-    found = parse_unit(unit or "s", f"Column '{text}'")
-    return found.factor if found.si == "s" else None
+    found = _time_unit(str(name), values) if _base(str(name)) in TIME_NAMES else None
+    return found.factor if found is not None and found.si == "s" else None
+
+
+def _time_unit(name: str, values: Any) -> Unit:
+    """The unit that the name or the attribute of a column states; s if neither does."""
+    unit = split_header(name)[1] or str(getattr(values, "attrs", {}).get("units", ""))
+    return parse_unit(unit or "s", f"Column '{name}'")
+
+
+def _factor_to_s(name: str, values: Any) -> float:
+    """Factor to s of a column that the caller names as that of times.
+
+    Raises:
+        InputError: it states another unit.
+    """
+    if getattr(getattr(values, "dtype", None), "kind", "") in ("m", "M"):
+        return 1.0
+    found = _time_unit(name, values)
+    if found.si != "s":
+        raise InputError(f"Column {name!r} is in {found.si}, not in s. Name a column of times.")
+    return found.factor
 
 
 def _column(name: str, values: Any) -> Floats:
@@ -317,6 +345,7 @@ def records(
     output: str = "y",
     *,
     rate_hz: float | None = None,
+    time: str | None = None,
     hold: str | None = None,
 ) -> list[Record]:
     """Input and output of any source as the fits of `haselab.identify` take them.
@@ -326,6 +355,8 @@ def records(
         input: column of the input.
         output: column of the output.
         rate_hz: rows a second, in Hz, which the times must not contradict. None: from the times.
+        time: column of the times, in s or in the unit that it states. None: found by its name, such
+            as `time_s` or `t [ms]`.
         hold: the input between its rows: "zero" (held), "first" (straight lines) or
             "band-limited". None: assumed to be held; a fit adds a note if its result depends on it.
     Returns:
@@ -342,14 +373,16 @@ def records(
         return [data]
     if isinstance(data, Sequence) and data and all(isinstance(each, Record) for each in data):
         return list(data)
-    found = numeric_table(data, (input, output), rate_hz)
+    found = numeric_table(data, (input, output), rate_hz, time)
     assumed, hold = hold is None, "zero" if hold is None else hold
     if found.rate_hz is not None and not is_uneven(found):
         record = Record.sampled(found[input], found[output], found.rate_hz, hold=hold)
         return [replace(record, hold_assumed=assumed)]
     if found.time_s is None or found.time_name is None:
         why = f" {found.why_no_times}" if found.why_no_times else ""
-        raise InputError(f"The data state no sampling rate.{why} Give rate_hz, or a column time_s.")
+        raise InputError(
+            f"The data state no sampling rate.{why} Give rate_hz, or name the column with time=."
+        )
     axis = time_axis(found.time_s, Path("data"), found.time_name)
     kept = records_of(found, (input, output), axis, hold, hold_assumed=assumed)
     if not kept:

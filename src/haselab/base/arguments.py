@@ -52,9 +52,13 @@ def checked(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
         kinds = _kinds(owner)
         try:
             given = signature.bind(*args, **kwargs).arguments
-        except TypeError:  # perhaps arrays where a record is needed, which is the better reason
+        except TypeError as error:
+            # Perhaps arrays where a record is needed, which is the better reason.
             _check_all(dict(zip(signature.parameters, args, strict=False)), kinds)
-            raise
+            known = ", ".join(signature.parameters)
+            raise TypeError(
+                f"{function.__qualname__}() {error}. Its arguments are {known}."
+            ) from None
         _check_all(given, kinds)
         return function(*args, **kwargs)
 

@@ -134,7 +134,8 @@ class Design:
         loop, limits = self.setting, self.setting.saturation
         lines.append(
             f"For a step of {self.spec.step:g} with an output of {limits.low:g} to "
-            f"{limits.high:g}, {loop.rate_hz:g} Hz and a delay of {loop.measurement_delay_s:g} s."
+            f"{limits.high:g}, {loop.rate_hz:g} Hz and a delay of {loop.measurement_delay_s:g} s. "
+            "Gains: unit of the model's input per unit of its output."
         )
         if self.plausible is not None:
             share = 100.0 * self.plausible.share.value

@@ -90,6 +90,15 @@ class Prediction:
             measured=np.concatenate(list(measured)),
         )
 
+    def summary(self) -> str:
+        """The numbers as plain text, which `print` shows."""
+        names = ("fit_percent", "rms_error", "inside_band", "used_for_fit")
+        rows = [f"{name:{_NAME_WIDTH}s} {getattr(self, name):12.5g}" for name in names]
+        return "\n".join([f"{type(self).__name__}: {self.status}", *rows])
+
+    def __str__(self) -> str:
+        return self.summary()
+
 
 def _status(used: float, percent: float) -> str:
     """What a prediction is worth."""

@@ -12,6 +12,7 @@ from haselab.base.chart import Chart, Curve, Panel
 from haselab.report.chart_file import draw_chart
 from haselab.report.numbers import number_text
 from haselab.report.style import figure_style, inline_svg, to_svg
+from haselab.report.summary import counted
 from haselab.scoreboard import TASKS, Entry, Game, Played, Row, board_rows, limits_of
 
 __all__ = ["scoreboard_page"]
@@ -71,9 +72,10 @@ def scoreboard_page(game: Game) -> str:
     return environment.from_string(text).render(
         title="SIMULATED: scoreboard of controllers",
         style=_packaged("style.css"),
-        summary=f"{len(plan.controllers)} controllers, {len(plan.tasks)} tasks, {plan.seeds} "
-        f"seeds from {plan.seed}, on simulated devices. Each controller knows the model that "
-        "was identified from one simulated record of the public device, with noise.",
+        summary=f"{len(plan.controllers)} controllers, {len(plan.tasks)} tasks, "
+        f"{counted(plan.seeds, 'seed', 'seeds')} from {plan.seed}, on simulated devices. Each "
+        "controller knows the model that was identified from one simulated record of the public "
+        "device, with noise.",
         columns=[f"{task} {metric}" for task, metric in limited],
         ratios=_ratios(rows, limited),
         tasks=[_part(game, name, rows) for name in plan.tasks],

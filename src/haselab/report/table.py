@@ -131,6 +131,8 @@ def _count(results: Results) -> str:
         )
     if any(row.noise_free_inside is False for row in rows):
         text += ". (outside): the noise-free result is outside the measured 95 % interval"
+        if any(row.noise_free_inside is False and row.note for row in rows):
+            text += " (see the notes of these rows in the report)"
     if results.simulated:
         compared = any(row.has_paper for row in rows)
         text += ". SIMULATED" + (": no verdict is evidence about the paper" if compared else "")

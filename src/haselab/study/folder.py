@@ -17,7 +17,7 @@ from haselab.store.folder import write_json
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
 from haselab.study.fits.dynamics import Dynamics
-from haselab.study.fits.loops import Loops
+from haselab.study.fits.loops import Loops, pid_demands
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.trials import Comparison
 from haselab.study.paper.paper_check import recompute_paper, recompute_steps
@@ -238,7 +238,7 @@ def write_design(
     if dynamics is not None:
         sections["model"] = _model(dynamics, loops, maps)
     if loops is not None:
-        sections["controller"] = _controllers(loops, study.control)
+        sections["controller"] = _controllers(loops, study)
     elif maps is not None and drive_limits is not None and not path.exists():
         sections["controller"] = _own_alone(study, maps.voltage_map, drive_limits)
     if drive_limits is not None:
@@ -285,12 +285,14 @@ def _own_alone(
     return {"alternatives": [own]}
 
 
-def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:
+def _controllers(loops: Loops, study: Study) -> Mapping[str, object]:
     """The designed PID, and as alternatives the paper's PI and the study's own controller.
 
     The designed one has margins, so an own controller never replaces it: one of the same kind gets
     the name "own".
     """
+    control = study.control
+    demands = {key: value for key, value in asdict(pid_demands(study)).items() if value is not None}
     tables: list[dict[str, object]] = []
     for kind, gains, key in (("pid", loops.pid, "S25"), ("pi", loops.pi, "S21")):
         phase, gain = (loops.quantities[f"{key}.{name}_margin"] for name in ("phase", "gain"))
@@ -319,4 +321,5 @@ def _controllers(loops: Loops, control: Control) -> Mapping[str, object]:
         if control.kind in (table["kind"] for table in tables):
             own["name"] = "own"
         tables.append(own | {key: tables[0][key] for key in ("limits", "loop")})
-    return {**dict.fromkeys(_OF_AN_OLDER_DESIGN), **tables[0], "alternatives": tables[1:]}
+    designed = {**tables[0], "demands": demands, "alternatives": tables[1:]}
+    return {**dict.fromkeys(_OF_AN_OLDER_DESIGN), **designed}

@@ -9,7 +9,16 @@ import click
 from haselab.base import InputError
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, SEED, answer_options
-from haselab.cli.identify.common import FILE, INPUT, OUTPUT, RATE, emit_fit, rate_hz_of, read_valid
+from haselab.cli.identify.common import (
+    FILE,
+    INPUT,
+    OUTPUT,
+    RATE,
+    axis_names,
+    emit_fit,
+    rate_hz_of,
+    read_valid,
+)
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.record import Record
@@ -90,7 +99,7 @@ def arx(
     record = Record.sampled(table[source][used], table[output][used], rate)
     fit = fit_arx(record, orders, criterion=criterion, remove_means=not keep_means)
     emit_fit(fit, [file], as_json, out)
-    save_plot(plot, lambda: fit.chart((source, output)))
+    save_plot(plot, lambda: fit.chart(axis_names(source, output, table)))
 
 
 @click.command("subspace")
@@ -138,4 +147,4 @@ def subspace(
         bootstrap=options["bootstrap"], seed=options["seed"],
     )  # fmt: skip
     emit_fit(fit, [file], as_json, out)
-    save_plot(plot, lambda: fit.chart((source, output)))
+    save_plot(plot, lambda: fit.chart(axis_names(source, output, table)))

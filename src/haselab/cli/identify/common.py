@@ -39,6 +39,7 @@ __all__ = [
     "VOLTAGE",
     "Fit",
     "Recorded",
+    "axis_names",
     "emit_fit",
     "name_files_in_errors",
     "rate_hz_of",
@@ -204,6 +205,17 @@ def read_recorded(
 def unit_of_name(name: str) -> str:
     """SI unit of columns with such a name, as haselab writes them; "" where it says nothing."""
     return "1" if name.endswith("strain") else "V" if name.endswith("_v") else ""
+
+
+def axis_names(source: str, output: str, units: tuple[str, str] | Table) -> tuple[str, str]:
+    """Names of input and output for the axes of a figure, with the units that are known."""
+    if isinstance(units, Table):
+        units = (_unit(units, source), _unit(units, output))
+    first, second = (
+        name if unit in ("", "1") else f"{name} ({unit})"
+        for name, unit in zip((source, output), units, strict=True)
+    )
+    return first, second
 
 
 def unit_text(unit: str) -> str:

@@ -18,6 +18,7 @@ from haselab.cli.identify.common import (
     INPUT,
     OUTPUT,
     RATE,
+    axis_names,
     emit_fit,
     rate_hz_of,
     read_valid,
@@ -76,7 +77,7 @@ def hysteresis(
         records.append(LoopRecord(table[source], table[output], rate, from_s))
     fit = fit_hysteresis(records, model, operators=operators)
     emit_fit(fit, files, as_json, out)
-    save_plot(plot, lambda: fit.chart((source, output)))
+    save_plot(plot, lambda: fit.chart(axis_names(source, output, table)))
 
 
 @dataclass(frozen=True)
@@ -157,4 +158,4 @@ def creep(
     record = Record.sampled(u, table[output], rate, input_before)
     fit = fit_creep(record, model, leave_out_s=leave_out_s)
     emit_fit(_Forecast(fit, forecast_s), [file], as_json, out)
-    save_plot(plot, lambda: fit.chart((source, output)))
+    save_plot(plot, lambda: fit.chart(axis_names(source, output, table)))

@@ -19,6 +19,7 @@ from haselab.cli.identify.common import (
     INPUT,
     OUTPUT,
     RATE,
+    axis_names,
     emit_fit,
     name_files_in_errors,
     read_recorded,
@@ -178,6 +179,8 @@ def transfer(
     modelled = "strain" if options["through_voltage_map"] else source
     more: dict[str, Any] = {"input": modelled, "output": output}
     more |= {f"{end}_unit": unit for end, unit in zip(more, units, strict=True) if unit}
+    if all(units):
+        more["gain_unit"] = units[1] if units[0] == "1" else f"{units[1]}/{units[0]}"
     if options["bootstrap"] is not None and fit.succeeded:
         rng = np.random.default_rng(options["seed"])
         if isinstance(fit, NonlinearFit):
@@ -188,7 +191,7 @@ def transfer(
     emit_fit(found, files, as_json, out, more)
     if actuator is not None:
         _save(actuator, fit, (modelled, output), units, files, options["through_voltage_map"])
-    save_plot(plot, lambda: fit.chart((source, output)))
+    save_plot(plot, lambda: fit.chart(axis_names(modelled, output, units)))
 
 
 def _save(

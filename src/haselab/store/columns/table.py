@@ -37,7 +37,7 @@ _SHOWN_ROWS = 5
 _LARGEST = 1e30  # powers of it do not overflow in a fit
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Table:
     """Columns of equal length, in SI units.
 
@@ -62,7 +62,17 @@ class Table:
     time_s: Floats | None = None
     assumed_seconds: bool = False
     why_no_times: str = ""
-    full_names: Mapping[str, str] = field(default_factory=dict, repr=False)
+    full_names: Mapping[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Size, rate and columns, with the units that they state."""
+        rows = next(iter(self.columns.values())).size if self.columns else 0
+        rate = "" if self.rate_hz is None else f" at {self.rate_hz:g} Hz"
+        stated = {
+            n: unit.si for n, unit in self.units.items() if unit is not None and unit.si != "1"
+        }
+        names = [f"{name} ({stated[name]})" if stated.get(name) else name for name in self]
+        return f"Table of {rows} rows{rate}: {', '.join(names)}"
 
     def __contains__(self, name: object) -> bool:
         return name in self.columns or name in self.full_names

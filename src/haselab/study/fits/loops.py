@@ -36,6 +36,7 @@ __all__ = [
     "loop_setting",
     "margin_estimates",
     "measured_latency",
+    "pid_demands",
     "printed_gains",
     "reduce_gains",
 ]
@@ -210,6 +211,15 @@ def _margin_note(gains: PidGains, plant: Plant, setting: LoopSetting) -> str:
     return f"{delay}; with the loop's delay only {alone.gain_margin_db:.3g} dB"
 
 
+def pid_demands(study: Study) -> DesignSpec:
+    """The demands that a study's PID is designed for.
+
+    Args:
+        study: with its step.
+    """
+    return replace(_PID, step=study.steps.step or None)
+
+
 def design_loops(
     found: Dynamics,
     to_volt: VoltageMap,
@@ -240,7 +250,7 @@ def design_loops(
     scaled = printed_gains(study, found.plant)
     pi = given.pi if given else reduce_gains(found.plant, scaled, setting)
     delayed_pi = given.delayed_pi if given else reduce_gains(found.plant, scaled, late)
-    demands = replace(_PID, step=study.steps.step or None)
+    demands = pid_demands(study)
     pid = given.pid if given else design_pid(found.plant, demands, setting, rng=rng).gains
     as_printed = PidGains(study.control.kp, study.control.ki)
     alone = LoopSetting(rate_hz=setting.rate_hz, measurement_delay_s=0.0)

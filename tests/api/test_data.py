@@ -86,7 +86,6 @@ def test_times_in_a_unit_come_out_in_seconds():
     ("name", "factor"),
     [("clock", 1.0), ("clock [ms]", 1e3), ("t [ms]", 1e3), ("frame_min", 1 / 60)],
 )
-)
 def test_times_of_any_name(name, factor, tmp_path):
     path = tmp_path / "a.csv"
     rows = np.c_[factor * TIME_S, U, Y]

@@ -34,6 +34,9 @@ def test_lognormal_interval_is_that_of_the_logarithm_and_stays_positive(value, r
 
 def test_the_lognormal_interval_of_an_unknown_number_is_from_0_to_infinity():
     assert Estimate.lognormal(4.2, math.inf, "s").ci95 == (0.0, math.inf)
+    assert Estimate.lognormal(-4.2, math.inf, "s").ci95 == (-math.inf, 0.0)
+    zero = Estimate.lognormal(0.0, math.inf, "s")
+    assert (zero.std, zero.ci95) == (math.inf, (0.0, math.inf))
 
 
 @given(value=FINITE, std=SPREAD, factor=st.floats(-1e3, 1e3))

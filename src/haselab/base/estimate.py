@@ -43,11 +43,12 @@ class Estimate:
     def lognormal(cls, value: float, relative_std: float, unit: str) -> Estimate:
         """Estimate of a positive quantity whose logarithm has standard deviation `relative_std`.
 
-        If `relative_std` is infinite, the interval is from 0 to infinity.
+        If `relative_std` is infinite, the interval is from 0 to infinity, with the sign of `value`.
         """
         value, relative_std = float(value), float(relative_std)
-        if math.isinf(relative_std) and value > 0.0:
-            return cls(value, math.inf, (0.0, math.inf), unit)
+        if math.isinf(relative_std):
+            whole = (0.0, math.inf) if value >= 0.0 else (-math.inf, 0.0)
+            return cls(value, math.inf, whole, unit)
         factor = math.exp(Z95 * min(relative_std, 300.0))
         low, high = sorted((value / factor, value * factor))
         return cls(value, abs(value) * relative_std, (low, high), unit)

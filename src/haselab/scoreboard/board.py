@@ -176,7 +176,7 @@ def _design(job: _DesignJob) -> Entry:
     known = known_in_class(job.known, device, loop)
     try:
         seed = zlib.crc32(f"{job.controller} {job.loop} {job.device}".encode())
-        with _seeded([seed]), _deadline(600.0, "the design takes longer than 10 minutes"):
+        with _seeded([seed]), _deadline(600.0, "the design"):
             found = designed(CONTROLLERS.find(job.controller), loop, known)
     except TimeoutError as error:
         found = Designed(None, str(error))
@@ -217,7 +217,7 @@ def _play(job: _PlayJob) -> Played:
     try:
         with (
             _seeded(_seed(job.seed, job.task, job.index)),
-            _deadline(longest_s, f"the controller takes longer than {_SLOWEST:g} times the task"),
+            _deadline(longest_s, "the controller"),
         ):
             trace = play(scenario, chosen, loop, known, rng)
     except TimeoutError as error:
@@ -264,22 +264,28 @@ def _seeded(seed: Sequence[int]) -> Iterator[None]:
 
 
 @contextmanager
-def _deadline(duration_s: float, reason: str) -> Iterator[None]:
+def _deadline(duration_s: float, what: str) -> Iterator[None]:
     """Raise `TimeoutError` in code that does not return, where the system can.
 
     Args:
         duration_s: of the processor; code that waits has `_BUSY` times as long.
-        reason: of the error.
+        what: has this limit, for the error.
     """
+    wall_s = _BUSY * duration_s
+    longest_wall_s = _GRACE * wall_s
 
-    def stop(*_: object) -> None:
-        raise TimeoutError(reason)
+    def stop(number: int, frame: object) -> None:
+        of_processor = number == signal.SIGPROF
+        raise TimeoutError(
+            f"{what} takes longer than {duration_s:.3g} s of processor time" if of_processor
+            else f"{what} takes longer than {wall_s:.3g} s"
+        )  # fmt: skip
 
-    announce_limit(_GRACE * _BUSY * duration_s, reason)
+    announce_limit(longest_wall_s, f"{what} takes longer than {longest_wall_s:.3g} s")
     try:
         timers = (
             (signal.ITIMER_PROF, signal.SIGPROF, duration_s),
-            (signal.ITIMER_REAL, signal.SIGALRM, _BUSY * duration_s),
+            (signal.ITIMER_REAL, signal.SIGALRM, wall_s),
         )
         before = [signal.signal(number, stop) for _, number, _ in timers]
     except (AttributeError, ValueError):  # no such signals, or not the main thread

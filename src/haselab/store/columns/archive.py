@@ -303,6 +303,10 @@ class Archive(Closing, ABC):
         """The unit that the file states for a column, as text; empty if there is none."""
         return split_header(full.rpartition("/")[2])[1] or split_header(full)[1]
 
+    def is_clock(self, full: str) -> bool:
+        """Whether a column has clock times, which are read as seconds."""
+        return False
+
     def locate_all(self, names: Sequence[str]) -> list[str]:
         """Full names of columns that must be there.
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Archive, MissingColumnsError, Take, positive
+from haselab.store.columns.clock import clock_s
 from haselab.store.columns.labview import labview_header
 from haselab.store.columns.text_layout import (
     HEAD_BYTES,
@@ -108,9 +109,15 @@ class CsvArchive(Archive):
         """The name of a column without its unit."""
         return split_header(full)[0]
 
+    def is_clock(self, full: str) -> bool:
+        """Whether the first rows have clock times, with or without a date."""
+        return self._names.index(full) in self._layout.clocks
+
     def unit_text(self, full: str) -> str:
         """From the row of units below or above the header, else from the header."""
         place = self._names.index(full)
+        if place in self._layout.clocks:
+            return "s"
         header = super().unit_text(full)
         below = self._units[place].strip("[]() ") if place < len(self._units) else ""
         if header and below and parse_unit(header, full) != parse_unit(below, full):
@@ -213,6 +220,8 @@ class _Rows:
         self._layout, self._names, self._places, self._file = layout, names, places, file
         self._decimal = layout.decimal
         self._line_number = layout.first_line + 1
+        self._clocks = layout.clocks.intersection(places)
+        self._first_days: dict[int, int | None] = dict.fromkeys(self._clocks)
 
     def numbers(self, lines: Sequence[str]) -> NDArray[np.float64]:
         """The rows of the next lines, shape `(rows, columns)`."""
@@ -220,7 +229,7 @@ class _Rows:
         if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
             return np.empty((0, len(self._names)))
         try:
-            if self._has_equal_rows(lines):
+            if not self._clocks and self._has_equal_rows(lines):
                 return self._load(self._plain(lines))
         except ValueError:
             pass
@@ -272,6 +281,9 @@ class _Rows:
         row = []
         for name, place in zip(self._names, self._places, strict=True):
             cell = cells[place] if place < len(cells) else ""
+            if place in self._clocks:
+                row.append(self._clock(name, place, cell, number))
+                continue
             text = cell.replace("∞", "inf")
             two_marks = self._decimal == "," and "." in text
             if self._decimal == ",":
@@ -284,6 +296,18 @@ class _Rows:
                 )
             row.append(float(text))
         return row
+
+    def _clock(self, name: str, place: int, cell: str, number: int) -> float:
+        """Seconds of a clock time since midnight of the first day."""
+        found = clock_s(cell, self._first_days[place])
+        if found is None:
+            raise InputError(
+                f"Column {name} has '{cell}' in line {number}, which is no clock time, or the date "
+                "has changed and is written with slashes, whose order is not known. Change or "
+                f"remove the line, or write dates as 2026-03-29: {self._file}"
+            )
+        seconds, self._first_days[place] = found
+        return seconds
 
 
 def _is_float(cell: str) -> bool:

@@ -18,6 +18,7 @@ from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
     ColumnOptions,
     assumed_seconds,
+    certain_times,
     check_assumed_seconds,
     stated_unit,
     time_column,
@@ -280,12 +281,12 @@ class ColumnStream(Closing):
             self._archive.rows([*self._names, full])
             (head,) = self._archive.start([full])(_HEAD_ROWS)
         except InputError:
-            if self._options.time is not None or full == "time_s" or unit is not None:
+            if certain_times(self._archive, full, self._options):
                 raise
             return  # a column that is only called like one of times
         self._time_factor = 1.0 if unit is None else unit.factor
         falls = np.flatnonzero(~(np.diff(head) > 0.0))
-        if falls.size and (self._options.time is not None or unit or full == "time_s"):
+        if falls.size and certain_times(self._archive, full, self._options):
             raise InputError(
                 f"Column {full} does not increase after row {falls[0] + 1}. Sort the rows, or "
                 f"remove repeated ones: {self._archive.file}"

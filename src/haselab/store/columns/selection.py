@@ -15,6 +15,7 @@ __all__ = [
     "TIME_NAMES",
     "ColumnOptions",
     "assumed_seconds",
+    "certain_times",
     "check_assumed_seconds",
     "stated_unit",
     "time_column",
@@ -76,7 +77,8 @@ def time_column(
     """Full name of the column of times.
 
     A column is used as the time if it is the only one with the first of the names time, Zeit, t,
-    X_Value and the like, and if its unit, if stated, is a time. Where a file has several groups of
+    X_Value and the like, and if its unit, if stated, is a time; or if it is the only one with clock
+    times. Where a file has several groups of
     columns, such as the structures of a MATLAB file, those of the group of the data come first.
 
     Args:
@@ -124,7 +126,8 @@ def _times_among(
         times = [full for full in found if _is_time(archive, full, options)]
         if len(times) == 1:
             return times[0]
-    return None
+    clocks = [full for full in names if archive.is_clock(full) and full not in used]
+    return clocks[0] if len(clocks) == 1 else None
 
 
 def why_no_times(archive: Archive, options: ColumnOptions) -> str:
@@ -142,6 +145,21 @@ def why_no_times(archive: Archive, options: ColumnOptions) -> str:
         ):
             return f"Column {full} states a unit that is not a time."
     return ""
+
+
+def certain_times(archive: Archive, full: str, options: ColumnOptions) -> bool:
+    """Whether a column must have rising times, as the user or the file says that it has times.
+
+    Clock times may have too few digits for the rate of the rows.
+
+    Args:
+        archive: the file.
+        full: name of the column.
+        options: of the user.
+    """
+    if options.time is not None or full == "time_s":
+        return True
+    return stated_unit(archive, full, options) is not None and not archive.is_clock(full)
 
 
 def assumed_seconds(archive: Archive, full: str, options: ColumnOptions) -> bool:

@@ -18,7 +18,7 @@ from haselab.store.columns.selection import (
     AS_THE_FILE_STATES,
     ColumnOptions,
     assumed_seconds,
-    stated_unit,
+    certain_times,
     time_column,
     why_no_times,
 )
@@ -252,7 +252,8 @@ def _times(
     name = time_column(archive, options, beside=archive.locate_all(beside))
     if name is None:
         return None, None
-    if name == "time_s" or stated_unit(archive, name, options):  # certainly times, so they must be
+    surely = certain_times(archive, name, options)
+    if surely:
         times: NDArray[Any] | None = _numbers(archive, name, options)
     else:
         times = _column(archive, name, options)
@@ -264,7 +265,6 @@ def _times(
             )
         return None, None
     time_s = np.asarray(times[kept], dtype=np.float64)
-    surely = options.time is not None or name == "time_s" or stated_unit(archive, name, options)
     if not surely and not (np.diff(time_s) > 0.0).all():
         return name, None  # a column that is only called like one of times, such as t
     return name, time_s

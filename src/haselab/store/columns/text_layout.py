@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from haselab.base import InputError
+from haselab.store.columns.clock import clock_s
 from haselab.store.columns.labview import without_tags
 from haselab.store.columns.units import is_unit
 
@@ -43,6 +44,7 @@ class TextLayout:
         first_line: number of lines before the first row of numbers.
         mixed: columns whose numbers have another decimal mark than those of other columns.
         newline: that ends a line.
+        clocks: columns of clock times.
     """
 
     encoding: str
@@ -54,6 +56,7 @@ class TextLayout:
     first_line: int
     mixed: frozenset[int]
     newline: str
+    clocks: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,14 @@ def layout_of(head: bytes, file: Path, *, whole: bool) -> TextLayout:
     decimal, mixed = _decimal_mark(best.rows)
     return TextLayout(
         encoding, best.delimiter, decimal, best.names, best.units, best.cells, best.first_line,
-        mixed, newline,
+        mixed, newline, _clocks(best.rows),
     )  # fmt: skip
+
+
+def _clocks(rows: Sequence[Sequence[str]]) -> frozenset[int]:
+    """Columns of which each cell is a clock time."""
+    columns = range(min((len(row) for row in rows), default=0))
+    return frozenset(k for k in columns if all(clock_s(row[k]) is not None for row in rows))
 
 
 def _encoding(head: bytes) -> str:

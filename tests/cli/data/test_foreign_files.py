@@ -404,10 +404,11 @@ REFUSED: dict[str, tuple[str, Sequence[str], str]] = {
         ("--time", "t"),
         "a column in V, which is",
     ),
-    "clock times": (
-        "z;u;y\n10:00:01;2;3\n10:00:02;3;4\n",
-        ("--time", "z"),
-        "Column z has no times",
+    "times of a word": ("z;u;y\na;2;3\nb;3;4\n", ("--time", "z"), "Column z has no times"),
+    "a word among clock times": (
+        "z;u;y\n10:00:01;2;3\n10:00:02;3;4\n" + 200000 * "10:00:03;3;4\n" + "lost;3;4\n",
+        (),
+        "no sampling rate. Column z has 'lost' in line 200004, which is no clock time",
     ),
     "times that fall": (
         "t [s];u;y\n3;1;2\n2;3;1\n1;2;2\n",

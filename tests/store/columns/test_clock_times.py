@@ -78,7 +78,7 @@ def test_a_word_among_clock_times_is_named(tmp_path: Path) -> None:
     times = stamps("%Y-%m-%dT%H:%M:%S.%f")
     times[450] = "lost"
     with pytest.raises(InputError, match=r"Column Zeitstempel has 'lost' in line 452"):
-        hl.records(write(tmp_path, times))
+        hl.records(write(tmp_path, times), time="Zeitstempel")
 
 
 def test_a_column_of_numbers_called_time_comes_first(tmp_path: Path) -> None:

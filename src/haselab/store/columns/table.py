@@ -19,6 +19,7 @@ from haselab.store.columns.selection import (
     ColumnOptions,
     assumed_seconds,
     certain_times,
+    stated_unit,
     time_column,
     why_no_times,
 )
@@ -202,14 +203,11 @@ def read_table(
         }
         left_out = int(np.count_nonzero(~valid))
         rate_hz = stream.rate_hz if kept.all() else None
-        name, time_s = _times(archive, kept, options, wanted) if rate_hz is None else (None, None)
+        time_name, time_s, why = None, None, ""
+        if rate_hz is None:
+            time_name, time_s, why = _times(archive, kept, options, wanted)
         if time_s is not None:
             rate_hz = rate_of_times(time_s)
-        time_name, why = (
-            (name, "") if time_s is not None else (None, why_no_times(archive, options))
-        )
-        if name is not None and time_s is None:
-            why = f"Column {name} does not rise everywhere."
         units = dict(zip(wanted, stream.units, strict=True))
         assumed = time_name is not None and assumed_seconds(archive, time_name, options)
     return Table(values, rate_hz, left_out, units, time_name, time_s, assumed, why)
@@ -247,27 +245,30 @@ def _numbers(archive: Archive, name: str, options: ColumnOptions) -> NDArray[Any
 
 def _times(
     archive: Archive, kept: NDArray[np.bool_], options: ColumnOptions, beside: Sequence[str]
-) -> tuple[str | None, Floats | None]:
-    """Read the column of times; no values if it does not rise, no name if it has no numbers."""
+) -> tuple[str | None, Floats | None, str]:
+    """Read the column of times: its name and values, or why there is none."""
     name = time_column(archive, options, beside=archive.locate_all(beside))
     if name is None:
-        return None, None
-    surely = certain_times(archive, name, options)
-    if surely:
-        times: NDArray[Any] | None = _numbers(archive, name, options)
-    else:
-        times = _column(archive, name, options)
+        return None, None, why_no_times(archive, options)
+    surely, why = certain_times(archive, name, options), why_no_times(archive, options)
+    times: NDArray[Any] | None = None
+    try:
+        times = _numbers(archive, name, options)
+    except InputError as error:
+        if surely and (name == "time_s" or stated_unit(archive, name, options)):
+            raise
+        why = str(error) if archive.is_clock(name) else why
     if times is None or times.size != kept.size or not np.isfinite(times[kept]).all():
         if options.time is not None:
             raise InputError(
                 f"Column {options.time} has no times: each row needs a number of seconds, or of "
                 f"the unit that --unit states. Name another column with --time: {archive.file}"
             )
-        return None, None
+        return None, None, why
     time_s = np.asarray(times[kept], dtype=np.float64)
     if not surely and not (np.diff(time_s) > 0.0).all():
-        return name, None  # a column that is only called like one of times, such as t
-    return name, time_s
+        return None, None, f"Column {name} does not rise everywhere."
+    return name, time_s, ""
 
 
 def _finite(name: str, values: NDArray[Any], file: Path, *, may_lack: bool) -> Floats:

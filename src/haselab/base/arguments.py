@@ -36,6 +36,8 @@ def checked(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
         function: with annotations that exist at run time.
     Returns:
         The function, which raises `InputError` instead of whatever such a value led to.
+    Raises:
+        TypeError: by the function: an argument that it does not have, or one that is missing.
     Example:
         >>> @checked
         ... def halved(length_m: float) -> float:

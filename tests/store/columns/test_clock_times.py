@@ -11,8 +11,8 @@ import pytest
 
 import haselab as hl
 from haselab.base import InputError
-from haselab.store.columns.clock import clock_s
 from haselab.store.columns.reader import open_columns
+from haselab.store.columns.text.clock import clock_s
 
 START = datetime(2026, 3, 29, 23, 59, 57)  # the record passes midnight
 TIME_S = np.arange(500) / 50.0

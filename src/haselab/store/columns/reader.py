@@ -60,7 +60,7 @@ FORMATS: Registry[Callable[[Path, contextlib.ExitStack], Archive]] = Registry(
     {
         ending: f"haselab.store.columns.{place}"
         for ending, place in {
-            **dict.fromkeys(_TEXT_ENDINGS, "csv_file:CsvArchive"),
+            **dict.fromkeys(_TEXT_ENDINGS, "text.csv_file:CsvArchive"),
             ".mat": "mat:MatArchive",
             ".npz": "numpy_file:NpzArchive",
             ".npy": "numpy_file:NpyArchive",

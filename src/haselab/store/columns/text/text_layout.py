@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from haselab.base import InputError
-from haselab.store.columns.clock import clock_s
-from haselab.store.columns.labview import without_tags
+from haselab.store.columns.text.clock import clock_s
+from haselab.store.columns.text.labview import without_tags
 from haselab.store.columns.units import is_unit
 
 __all__ = ["HEAD_BYTES", "TextLayout", "is_number", "layout_of", "split_cells"]

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Archive, MissingColumnsError, Take, positive
-from haselab.store.columns.clock import clock_s
-from haselab.store.columns.labview import labview_header
-from haselab.store.columns.text_layout import (
+from haselab.store.columns.text.clock import clock_s
+from haselab.store.columns.text.labview import labview_header
+from haselab.store.columns.text.text_layout import (
     HEAD_BYTES,
     TextLayout,
     is_number,

@@ -1,0 +1,1 @@
+"""Text tables: their layout, numbers and clock times."""

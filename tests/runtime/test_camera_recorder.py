@@ -22,10 +22,12 @@ CLOSE_PX = 0.05
 
 
 class Jumps:
-    """A camera that shows ten frames at rest, then the lower clamp at each of the shifts."""
+    """A camera that shows some frames at rest, then the lower clamp at each of the shifts."""
 
-    def __init__(self, shifts: list[tuple[float, float]], hidden: frozenset[int]) -> None:
-        self._shifts, self._hidden = [(0.0, 0.0)] * 10 + shifts, hidden
+    def __init__(
+        self, shifts: list[tuple[float, float]], hidden: frozenset[int], at_rest: int = 10
+    ) -> None:
+        self._shifts, self._hidden = [(0.0, 0.0)] * at_rest + shifts, hidden
         self._given = 0
 
     def start(self, rate_hz: float) -> None:
@@ -73,6 +75,20 @@ def test_fiducials_that_jump_keep_their_names(tmp_path: Path, jump: tuple[float,
     truth = np.stack([camera.places(k) for k in range(15)])
     np.testing.assert_allclose(tracks["x_px"], truth[..., 0], rtol=0, atol=CLOSE_PX)
     np.testing.assert_allclose(tracks["y_px"], truth[..., 1], rtol=0, atol=CLOSE_PX)
+
+
+@pytest.mark.parametrize("at_rest", [1, 3, 9])
+def test_motion_in_the_first_frames_does_not_blur_the_reference(
+    tmp_path: Path, at_rest: int
+) -> None:
+    """A trial may begin with a step of the drive; the mean of ten frames then shows no dots."""
+    camera = Jumps([(0.0, 6.0 * k) for k in range(1, 12)], frozenset(), at_rest)
+    tracks = followed(tmp_path, camera)
+    assert tracks["valid"].all()
+    truth = np.stack([camera.places(k) for k in range(at_rest + 11)])
+    # The reference has `at_rest` frames instead of ten.
+    close_px = CLOSE_PX * np.sqrt((1.0 + 1.0 / at_rest) / (1.0 + 1.0 / 10.0))
+    np.testing.assert_allclose(tracks["y_px"], truth[..., 1], rtol=0, atol=close_px)
 
 
 def test_fiducials_whose_names_are_in_doubt_are_not_valid(tmp_path: Path) -> None:

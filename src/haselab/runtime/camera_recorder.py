@@ -27,6 +27,7 @@ __all__ = ["CameraRecorder", "FrameRecorder", "KeepVideo"]
 KeepVideo = Literal["none", "sample", "all"]
 _REST_FRAMES = 10
 _SAMPLE_S = 1.0
+_STILL_PX = 0.3  # a fiducial that moves farther between the first frames is in motion
 _SURE = 0.9  # correlation above which a fiducial found near its last position needs no search
 _PARTICLE_RATE_HZ = 20.0
 _CLAMP_PX = 28.0  # half height of the clamp's bar around its row of fiducials
@@ -116,8 +117,8 @@ class CameraRecorder:
     """Tracks the fiducials of both clamps through all experiments of a session.
 
     Use as a context: after a run in real time, leaving it makes videos of the raw frames. The first
-    ten frames of the session, without motion, are the reference of all experiments, so that a
-    length has the same error in each.
+    ten frames of the session, or those before the first motion, are the reference of all
+    experiments, so that a length has the same error in each.
 
     Args:
         camera: of the rig.
@@ -197,7 +198,7 @@ class CameraRecorder:
     def _place(self, images: NDArray[np.uint8]) -> None:
         """Find the fiducials; in the session's first frames, also make them the reference."""
         if self._tracker is None:
-            rest = images[:_REST_FRAMES]
+            rest = images[: self._still(images[:_REST_FRAMES])]
             points = self._call(_fiducials_of, rest)
             self._tracker = PointTracker(points, _OPTIONS)
             self._state = self._tracker.init(list(rest))
@@ -210,6 +211,21 @@ class CameraRecorder:
         if self._particles is not None:
             self._particles.refer(images[:_REST_FRAMES], points)
             write_png(self._folder / f"{self._name}.png", images[0])
+
+    def _still(self, images: NDArray[np.uint8]) -> int:
+        """Number of frames before the first motion: their mean must not be blurred."""
+        try:
+            points = self._call(_fiducials_of, images[:1])
+        except ResultError:  # too noisy; the mean of all frames may be good enough
+            return len(images)
+        tracker = PointTracker(points, _OPTIONS)
+        state = tracker.init([images[0]])
+        for count, image in enumerate(images[1:], start=1):
+            state, found = tracker.step(state, image)
+            moved_px = np.hypot(found.x_px - points[:, 0], found.y_px - points[:, 1])
+            if not found.valid.all() or moved_px.max() > _STILL_PX:
+                return count
+        return len(images)
 
     def _find(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
         """Find the fiducials, near their last positions first, then in the whole image."""

@@ -93,6 +93,22 @@ def test_a_kind_with_a_linear_feedback_has_margins(actuator, capsys) -> None:
         assert found[name] == pytest.approx(same[name], rel=1e-6)
 
 
+@pytest.mark.parametrize("command", ["margins", "design"])
+def test_default_parameters_are_stated_for_a_kind_that_the_file_does_not_have(
+    actuator, capsys, command
+) -> None:
+    text = actuator.read_text()
+    assert 'kind = "integral"' in text
+    actuator.write_text(text.replace('kind = "integral"', 'kind = "silent"'))
+    code, found, error = run(capsys, command, actuator, "--controller", "integral", "--json")
+    assert code == 0 and json.loads(found)["stable"]
+    said = "'integral' is not in the file, so its default parameters are used (integral, gain_per_s"
+    assert said in error
+    if command == "design":
+        held = tomllib.loads(actuator.read_text())["controller"]
+        assert set(held["parameters"]) == {"gain_per_s"}, "they are in the file now"
+
+
 def test_a_design_of_such_a_kind_writes_its_margins_and_keeps_the_others(actuator, capsys) -> None:
     code, text, _ = run(capsys, "design", actuator, "--controller", "integral", "--json")
     answer = json.loads(text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ MAPS = Maps(
 
 class Trial:
     """A step trial that reaches a share of the step within a time constant of 50 ms."""
+
+    name = "trial"
 
     def __init__(self, share: float) -> None:
         steps = STUDY.steps
@@ -62,6 +65,26 @@ def test_a_wrong_sign_costs_the_results_of_this_controller_alone(
     assert found.quantities == right.quantities
     assert found.reason(key).startswith(f"step trials with {shown}: response moves by -0.0")
     assert found.reason("S24.error_open") == found.reason("S22.saturated_fraction") == ""
+
+
+@pytest.mark.parametrize("kept", [0, 1, 30, -30])
+def test_a_trial_without_frames_is_named(kept: int) -> None:
+    """No frame, one, those of a beginning or those of an end: nothing is extrapolated."""
+    lost: Any = Trial(1.0)
+    lost.sensed_s, part = lost.frame_time_s, slice(kept) if kept >= 0 else slice(kept, None)
+    lost.frame_time_s, lost.length_m = lost.frame_time_s[part], lost.length_m[part]
+    given = {"open loop": trials(0.8), "PI": [Trial(1.0), lost]}
+    found = compare_trials(given, MAPS, STUDY, 1e-4)
+    said = r"step trials with PI: 'trial' has no valid camera frame for [\d.]+ s \(at most 0\.5 s\)"
+    assert re.match(said, found.reason("S24.rise_closed"))
+
+
+def test_a_trial_without_capacitance_is_named() -> None:
+    lost = Trial(1.0)
+    lost.capacitance_f[100:130] = np.nan
+    given = {"open loop": trials(0.8), "PI": [lost]}
+    found = compare_trials(given, MAPS, STUDY, 1e-4)
+    assert "'trial' has no valid capacitance for 1.55 s" in found.reason("S24.rise_closed")
 
 
 def test_the_open_loop_is_needed() -> None:

@@ -34,7 +34,7 @@ from haselab.controllers import (
 )
 from haselab.models.posterior import PlantPosterior
 from haselab.pipelines.design.answer import design_answer, margins_answer, plausible_sentence
-from haselab.pipelines.design.feedback import feedback_of, read_controller
+from haselab.pipelines.design.feedback import default_note, feedback_of, read_controller
 from haselab.pipelines.design.model_file import (
     loop_of,
     read_any_plant,
@@ -240,6 +240,8 @@ def _judge(
             f"the model is not an actuator file. Name one: {model}"
         )
     held = read_controller(model, kind)
+    if note := default_note(model, kind):
+        click.echo(f"haselab: {note}", err=True)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
     setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
     plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)

@@ -14,7 +14,7 @@ from haselab.cli.plot import save_plot
 from haselab.control import LinearController, LoopSetting, PidGains, margins
 from haselab.control.charts import loop_chart
 from haselab.pipelines.design.answer import margins_answer
-from haselab.pipelines.design.feedback import feedback_of, read_controller
+from haselab.pipelines.design.feedback import default_note, feedback_of, read_controller
 from haselab.pipelines.design.model_file import loop_of, read_any_plant
 
 __all__ = ["command"]
@@ -64,6 +64,8 @@ def command(
     given, held = (kp, ki, kd, derivative_filter_s), None
     if model.suffix.lower() == ".toml" and all(value is None for value in given):
         held = read_controller(model, kind)
+        if note := default_note(model, kind):
+            click.echo(f"haselab: {note}", err=True)
     loop = None if held is None else held.loop
     usual = (None, None) if loop is None else (loop.rate_hz, loop.measurement_delay_s)
     setting = LoopSetting(*loop_of(model, rate_hz, delay_s, usual))

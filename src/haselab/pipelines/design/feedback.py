@@ -11,10 +11,10 @@ from haselab.base import HaselabError, InputError, described
 from haselab.base.exits import no_exit
 from haselab.control import LinearController, PidGains
 from haselab.controllers import CONTROLLERS, LinearisableController
-from haselab.models.actuator import ControllerSection
+from haselab.models.actuator import ActuatorTables, ControllerSection
 from haselab.pipelines.design.model_file import read_tables
 
-__all__ = ["feedback_of", "read_controller"]
+__all__ = ["default_note", "feedback_of", "read_controller"]
 
 
 def read_controller(path: Path, kind: str | None) -> ControllerSection:
@@ -24,18 +24,45 @@ def read_controller(path: Path, kind: str | None) -> ControllerSection:
         path: of the actuator file.
         kind: its kind or name; None: the one of `[controller]` itself.
     Returns:
-        Its section; without parameters for a registered kind that is not in the file.
+        Its section; with the default parameters for a registered kind that is not in the file.
     Raises:
-        InputError: the file has no such controller, and no such kind is registered.
+        InputError: the file has no such controller, and no such kind is registered, or it has a
+            parameter without a default.
     """
     tables = read_tables(path)
-    held = {} if tables.controller is None else tables.controller.all_kinds
-    if kind is not None and kind not in held and kind not in ("pi", "pid"):
-        return ControllerSection(kind=CONTROLLERS.find(kind).name)
+    if kind is not None and _is_absent(tables, kind):
+        chosen = CONTROLLERS.find(kind).choose(source=path)
+        return ControllerSection(kind=chosen.kind.name, parameters=dict(chosen.values))
     try:
         return tables.designed(kind)
     except InputError as error:
         raise InputError(f"{error} {path}") from None
+
+
+def default_note(path: Path, kind: str | None) -> str:
+    """Say which parameters are used for a controller that an actuator file does not have.
+
+    Args:
+        path: of the actuator file.
+        kind: as in `read_controller`.
+    Returns:
+        One sentence; empty if the controller is in the file, or has no parameters.
+    """
+    if kind is None or not _is_absent(read_tables(path), kind):
+        return ""
+    chosen = CONTROLLERS.find(kind).choose(source=path)
+    if not chosen.values:
+        return ""
+    return (
+        f"{kind!r} is not in the file, so its default parameters are used ({chosen.summary()}). "
+        f"Others belong to [controller.parameters] or to an alternative. {path}"
+    )
+
+
+def _is_absent(tables: ActuatorTables, kind: str) -> bool:
+    """Whether a kind other than PI and PID is not in a file."""
+    held = {} if tables.controller is None else tables.controller.all_kinds
+    return kind not in held and kind not in ("pi", "pid")
 
 
 def _gains(held: ControllerSection) -> PidGains:

@@ -32,6 +32,7 @@ __all__ = [
     "with_camera_resolution",
 ]
 
+_LONGEST_GAP_S, _GAP_FRAMES = 0.25, 10  # without a value, whichever is longer
 ONE_TRIAL = "one trial: the interval only includes the camera's resolution, not the scatter"
 
 
@@ -63,6 +64,22 @@ def normal_equivalent(estimate: Estimate) -> Estimate:
     return Estimate(estimate.value, (high - low) / (2.0 * Z95), estimate.ci95, estimate.unit)
 
 
+def _require_covered(seen: Observation, steps: StepTimes) -> None:
+    """Refuse a trial in which camera or self-sensing found nothing for too long."""
+    start_s = seen.block_start_s[0]
+    ends_s = np.array([start_s, start_s + steps.zero_s + steps.step_s - 0.1])
+    longest_s = max(_LONGEST_GAP_S, _GAP_FRAMES / steps.frame_rate_hz)
+    sensed_s = seen.sensed_s[np.isfinite(seen.capacitance_f)]
+    for what, time_s in (("camera frame", seen.frame_time_s), ("capacitance", sensed_s)):
+        times_s = np.sort(np.concatenate([ends_s, time_s]))
+        gap_s = float(np.diff(times_s).max())
+        if time_s.size < 2 or gap_s > longest_s:
+            raise InputError(
+                f"{seen.name!r} has no valid {what} for {gap_s:.3g} s (at most {longest_s:.3g} s). "
+                "Check the light, the points and the monitors, then play it again."
+            )
+
+
 def collect_trials(
     trials: Sequence[Observation],
     zero_length_m: float,
@@ -76,7 +93,12 @@ def collect_trials(
         zero_length_m: of the sheet at zero strain.
         to_strain: of the capacitance.
         steps: their times.
+    Raises:
+        InputError: a trial without camera frames or capacitance for a while, or one that moves in
+            the wrong direction.
     """
+    for seen in trials:
+        _require_covered(seen, steps)
     count = round((steps.zero_s + steps.step_s - 0.1) * steps.frame_rate_hz)
     # At the frame times: interpolation half-way between frames at 20 frames/s attenuates ringing of
     # 5 Hz by a third.

@@ -128,9 +128,9 @@ def command(
     offset of each record, unless --at-rest is given. Samples that were used for the fit are
     recognised by their values, also in a part of a record, in another format and with fewer digits.
     Their share is used_for_fit; it is null if the steps of the converter hide whether the record is
-    a copy or a repetition. The exit code is 3 if this share is above 5 %, if the prediction is worse
-    than the mean of the record, if the rms error is more than twice that which the band states, or
-    if the record is explained as well without its input.
+    a copy or a repetition. The exit code is 3 if this share is above 5 %, if the prediction is
+    worse than the mean of the record, if its rms error is more than twice that which the band
+    states, or if the record is explained as well without its input.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None
@@ -260,4 +260,3 @@ def _answer(found: Prediction, no_band: str) -> dict[str, object]:
         "notes": list(found.notes),
         "status": found.status,
     }
-

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
+from haselab.identify.band import BandCheck
 from haselab.identify.noise import fit_percent
 from haselab.identify.training_output import TrainingOutput, hash_output, share_used
 
@@ -28,6 +29,7 @@ Part = TypeVar("Part")
 _QUALITIES = ("fit_percent", "r_squared", "residual_whiteness_p", "chi_squared_ratio")
 _NAME_WIDTH = 28
 _USED = 0.05  # share of samples that a fit has used, from which a prediction is no validation
+_NO_BETTER = 0.95  # rms error over that of a prediction without the input
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Prediction:
         predicted: of all records, one after the other. Shape `(M,)`.
         half_band: half the width of the band at each sample. Shape `(M,)`; empty without a band.
         measured: of all records. Shape `(M,)`.
+        notes: remarks for the user, one sentence or two each.
     """
 
     status: str
@@ -55,6 +58,7 @@ class Prediction:
     predicted: Floats = field(repr=False)
     half_band: Floats = field(repr=False)
     measured: Floats = field(repr=False)
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -63,6 +67,8 @@ class Prediction:
         modelled: Sequence[Floats],
         half_band: Floats | None = None,
         *,
+        noise_std: float = 0.0,
+        without_input: Sequence[Floats] = (),
         training_output: TrainingOutput | None = None,
     ) -> Prediction:
         """Judge the modelled outputs of some records.
@@ -71,23 +77,31 @@ class Prediction:
             measured: outputs of each record. Shape `(M_r,)` each.
             modelled: the same by the model. Shape `(M_r,)` each.
             half_band: half the width of the band, of all records. None: there is no band.
+            noise_std: standard deviation of the noise that the band contains.
+            without_input: outputs by what is fitted to each record alone, such as its initial
+                state. Shape `(M_r,)` each; empty: nothing is.
             training_output: what is kept of the outputs of the fit; None: not known.
         Returns:
             Both, with the error between them.
         """
         used = math.nan if training_output is None else share_used(measured, training_output)
         percent = fit_percent(measured, modelled)
-        error = np.abs(np.concatenate(list(measured)) - np.concatenate(list(modelled)))
+        errors = [y - m for y, m in zip(measured, modelled, strict=True)]
         half = np.zeros(0) if half_band is None else half_band
+        band = BandCheck.of(errors, half, noise_std) if half.size else None
+        alone = [y - m for y, m in zip(measured, without_input, strict=False)]
+        status = _status(used, percent) or (band.error if band is not None else "")
+        note = band.note if band is not None and not band.error else ""
         return cls(
-            status=_status(used, percent),
+            status=status or _idle_input(_rms(errors), _rms(alone)) or "ok",
             used_for_fit=used,
             fit_percent=percent,
-            rms_error=float(np.sqrt(np.mean(error**2))),
-            inside_band=float(np.mean(error <= half)) if half.size else math.nan,
+            rms_error=_rms(errors),
+            inside_band=math.nan if band is None else band.inside,
             predicted=np.concatenate(list(modelled)),
             half_band=half,
             measured=np.concatenate(list(measured)),
+            notes=(note,) if note else (),
         )
 
     def summary(self) -> str:
@@ -100,8 +114,12 @@ class Prediction:
         return self.summary()
 
 
+def _rms(errors: Sequence[Floats]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) if errors else math.inf
+
+
 def _status(used: float, percent: float) -> str:
-    """What a prediction is worth."""
+    """Why a prediction is worth nothing; empty if it is."""
     if used > _USED:
         return (
             f"not a validation: {100.0 * used:.0f} % of the samples were used for the fit. Use "
@@ -112,7 +130,19 @@ def _status(used: float, percent: float) -> str:
             "the prediction is worse than the mean of the record. Check the columns, their units "
             "and the operating point"
         )
-    return "ok"
+    return ""
+
+
+def _idle_input(rms: float, alone: float) -> str:
+    """Say that the input of a record, through the model, explains nothing of its output."""
+    if rms <= _NO_BETTER * alone:
+        return ""
+    return (
+        "not a validation: the initial state and the constant, which are fitted to this record, "
+        f"explain it without the input as well as with it (rms error {alone:.3g} and {rms:.3g}). "
+        "Use a record in which the input changes more, check the units of input and output, or "
+        "use --at-rest (Python: free_start=False) if the record began at rest"
+    )
 
 
 def _no_covariance() -> Floats:

@@ -68,9 +68,12 @@ def predict(
     if posterior is not None:
         spread = [_spread(posterior, record, free_start, rng) for record in records]
         half = _HALF_WIDTH * np.sqrt(np.concatenate(spread) ** 2 + noise_std**2)
+    alone = [_fitted(record.y, _free_columns(np.asarray(model.poles), record))
+             for record in records if free_start]  # fmt: skip
     return Prediction.of(
-        [record.y for record in records], modelled, half, training_output=training_output
-    )
+        [record.y for record in records], modelled, half, noise_std=noise_std,
+        without_input=alone, training_output=training_output,
+    )  # fmt: skip
 
 
 def _spread(
@@ -98,8 +101,12 @@ def fitted_output(model: Plant | RationalModel, record: Record, free_start: bool
     if not free_start:
         return output
     columns = _free_columns(np.asarray(model.poles), record)
-    factors = np.linalg.lstsq(columns, record.y - output, rcond=1e-10)[0]
-    return np.asarray(output + columns @ factors)
+    return output + _fitted(record.y - output, columns)
+
+
+def _fitted(values: Floats, columns: Floats) -> Floats:
+    """Combination of columns that is nearest to values. Shape `(M,)`."""
+    return np.asarray(columns @ np.linalg.lstsq(columns, values, rcond=1e-10)[0])
 
 
 def _free_columns(poles: NDArray[np.complex128], record: Record) -> Floats:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["TrainingOutput", "grid_step", "hash_output", "is_comparable", "share_used"]
+__all__ = ["TrainingOutput", "find_copy", "grid_step", "hash_output", "is_comparable", "share_used"]
 
 Floats = NDArray[np.float64]
 Hashes = NDArray[np.uint64]
@@ -29,6 +29,7 @@ _FEW_OFF_GRID = 0.05  # share of the levels
 _ROUNDING = 1e-9  # of the span of the levels: closer ones are the same
 _FEW_LEVELS, _MANY_SAME = 0.25, 0.1  # share of the samples, and of their differences
 _MOST_BY_CHANCE = 0.05  # share of quantised windows; below it the records are new
+_COPIED = 0.05  # share of the samples of a record, above which it is a copy
 _LEAST_ALIKE, _LEAST_WINDOWS = 0.99, 100  # share and number of windows that show a copy of them
 
 
@@ -113,6 +114,31 @@ def share_used(outputs: Sequence[ArrayLike], known: TrainingOutput) -> float:
     share = float(np.isin(hashes, known.hashes).mean())
     copied = share >= _LEAST_ALIKE and hashes.size >= _LEAST_WINDOWS
     return math.nan if known.quantised and share > _MOST_BY_CHANCE and not copied else share
+
+
+def find_copy(outputs: Sequence[ArrayLike]) -> tuple[int, int, float] | None:
+    """Find two records of which one repeats samples of the other.
+
+    Args:
+        outputs: of the records, all of one quantity. Shape `(M_r,)` each.
+    Returns:
+        Places of both records, and the share of the samples of the second that are in the first;
+        None if there are none.
+    Example:
+        >>> y = np.random.default_rng(1).normal(size=(2, 1000))
+        >>> find_copy(y), find_copy([y[0], y[1], np.round(y[0, 100:600], 4)])
+        (None, (0, 2, 1.0))
+    """
+    for one in range(len(outputs)):
+        known = hash_output([outputs[one]])
+        for other in range(one + 1, len(outputs)):
+            # of a long record few windows are kept, so a short part may have none of them
+            both = (share_used([outputs[other]], known),
+                    share_used([outputs[one]], hash_output([outputs[other]])))  # fmt: skip
+            share = max((share for share in both if math.isfinite(share)), default=0.0)
+            if share > _COPIED:
+                return one, other, share
+    return None
 
 
 def is_comparable(outputs: Sequence[ArrayLike], known: TrainingOutput) -> bool:

@@ -8,6 +8,7 @@ import pytest
 
 from haselab.actuators import GRAVITY_M_S2, DeaStack, Drive, SampledLaw
 from haselab.cli.main import main
+from haselab.identify.physical.plausible import motion_before_drive
 from haselab.pipelines.motion_table import motion_of_table
 
 LAW = DeaStack(shear_modulus_pa=18e3, permittivity=3.3, damping_n_s_per_m=1.6)
@@ -22,11 +23,11 @@ def run(capsys, *arguments):
     return stop.value.code, printed.out, printed.err
 
 
-def table(path, mass_kg, *, seed=1, law=LAW, gain=GAIN, rows=1200, shift_m=0.0):
+def table(path, mass_kg, *, seed=1, law=LAW, gain=GAIN, rows=1200, shift_m=0.0, high_v=9e3):
     """Held random voltages of 0 to 9 kV, what the law does, and noise."""
     rng = np.random.default_rng(seed)
     time_s = 0.01 * np.arange(rows)
-    u = np.repeat(rng.uniform(0.0, 9e3 / gain, rows // 25), 25)
+    u = np.repeat(rng.uniform(0.0, high_v / gain, rows // 25), 25)
     u[:50] = 0.0
     same = np.ones(rows)
     drive = Drive(
@@ -190,6 +191,47 @@ def test_times_that_fall_and_records_given_twice_are_refused(actuator, tmp_path,
     file.write_text("\n".join([head, second, first, *rest]))
     code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS)
     assert code == 2 and "does not increase after row 1" in error, error
+
+
+def test_a_part_of_a_record_in_another_format_is_refused(actuator, tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, rows=300)
+    rows = np.loadtxt(file, delimiter=";", skiprows=1)
+    header = "Zeit (s),U (mV),length_m,C (pF)"
+    part = tmp_path / "part.csv"
+    np.savetxt(part, rows[60:260], "%.10g", ",", header=header, comments="")
+    code, _, error = run(capsys, file, part, "--actuator", actuator, *COLUMNS)
+    assert code == 2 and "have the same measured values" in error, error
+
+
+def test_an_actuator_that_does_not_move_gives_no_numbers(actuator, tmp_path, capsys):
+    for volt in (0.0, 1250.0):
+        file = table(tmp_path / f"{volt}.csv", 0.3, rows=300, high_v=2.0)
+        rows = np.loadtxt(file, delimiter=";", skiprows=1)
+        rows[:, 1] = volt
+        np.savetxt(file, rows, "%.12g", ";", header="Zeit (s);U (mV);length_m;C (pF)", comments="")
+        code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS, "--json")
+        assert code == 3 and "the actuator does not move" in error, error
+
+
+def test_a_load_without_equilibrium_is_named(actuator, tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, rows=300)
+    code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS, "--mass-kg", "100")
+    assert code == 3 and "(981 N, 0 V). Check the mass (kg)" in error, error
+
+
+def test_a_record_that_begins_in_motion_is_named():
+    time_s = 0.01 * np.arange(60)
+    voltage_v = np.where(time_s < 0.2, 0.0, 3e3)
+    rng = np.random.default_rng(1)
+    still_m = np.where(time_s < 0.2, 0.035, 0.034) + 1e-6 * rng.standard_normal(60)
+    moving_m = still_m - 4e-4 * np.exp(-time_s / 0.1)
+    for length_m, words in ((still_m, ""), (moving_m, "before the voltage first changes")):
+        record = motion_of_table(
+            "a", time_s, voltage_v, mass_kg=0.3, length_m=length_m, length_std_m=1e-6
+        )
+        assert words in motion_before_drive([record]) and bool(words) == bool(
+            motion_before_drive([record])
+        )
 
 
 def test_rows_without_a_measured_value_keep_their_voltage():

@@ -44,12 +44,16 @@ def is_estimate(entry):
     return set(entry) == {"value", "std", "ci95", "unit"}
 
 
-@pytest.fixture
-def sweep(tmp_path):
-    rng = np.random.default_rng(1)
+def recorded(path, seed):
+    rng = np.random.default_rng(seed)
     u = np.sin(2 * np.pi * (0.1 * TIME_S + 0.1 * TIME_S**2))
     y = PLANT.simulate(u, 100.0, TIME_S) + 0.005 * rng.normal(size=TIME_S.size)
-    return write(tmp_path / "sweep.csv", u=u, y=y)
+    return write(path, u=u, y=y)
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    return recorded(tmp_path / "sweep.csv", 1)
 
 
 def test_transfer_answers_with_the_keys_of_the_contract(sweep, tmp_path):
@@ -66,8 +70,9 @@ def test_transfer_answers_with_the_keys_of_the_contract(sweep, tmp_path):
     assert json.loads(out.read_text()) == answer
 
 
-def test_transfer_takes_known_numbers_and_several_files(sweep):
-    answer = ask("transfer", sweep, sweep, "--rate-hz", "100", "--delay", "0.02", "--at-rest",
+def test_transfer_takes_known_numbers_and_several_files(sweep, tmp_path):
+    again = recorded(tmp_path / "again.csv", 2)
+    answer = ask("transfer", sweep, again, "--rate-hz", "100", "--delay", "0.02", "--at-rest",
                  "--no-offset", "--fix", "damping_ratio=0.09")  # fmt: skip
     assert answer["delay_s"]["value"] == 0.02
     assert answer["damping_ratio"]["std"] == 0.0

@@ -75,10 +75,11 @@ def test_a_prediction_takes_the_hold_of_the_fit(tmp_path):
     other = tmp_path / "other.csv"
     later = rows[250:] - [time_s[250], 0.0, 0.0]
     np.savetxt(other, later, "%.17g", ",", header="time_s,u,y", comments="")
-    errors = [
-        answer("compare", model, other, "--hold", hold)["rms_error"]
-        for hold in ("band-limited", "zero")
-    ]
+    right = answer("compare", model, other, "--hold", "band-limited")
+    wrong = CliRunner().invoke(cli, ["compare", str(model), str(other), "--hold", "zero", "--json"])
+    held = json.loads(wrong.stdout)
+    assert held["status"].startswith("model error: ") and right["status"] == "ok"
+    errors = right["rms_error"], held["rms_error"]
     assert errors[0] < 0.2 * errors[1]
     fit = hl.fit_transfer(hl.records(path, hold="band-limited"))
     found = fit.compare(hl.records(other, hold="band-limited"))

@@ -363,10 +363,11 @@ def test_a_model_from_volts_takes_no_strain_map_and_no_limits_of_strain(driven, 
 def test_another_actuator_is_seen_by_the_band(known, tmp_path, capsys):
     actuator, *_ = known
     other = record(tmp_path / "other.csv", 3, Plant(0.8, 20.0, 0.15, 0.004))
-    answer = json.loads(run(capsys, "compare", actuator, other, "--json")[1])
+    code, text, _ = run(capsys, "compare", actuator, other, "--json")
+    answer = json.loads(text)
     assert answer["inside_band"] < 0.5 and answer["fit_percent"] < 70
-    (note,) = answer["notes"]
-    assert "does not describe this record within its uncertainty" in note
+    assert code == 3 and answer["status"].startswith("model error: the rms error is ")
+    assert answer["notes"] == []
 
 
 def test_a_file_without_a_model_says_which_command_writes_one(files, capsys):

@@ -16,7 +16,7 @@ from haselab.base import InputError, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
 from haselab.cli.common import POSITIVE, REAL, actuator_option, answer_options, unverified_option
-from haselab.cli.identify.common import FILES, RATE, emit_fit
+from haselab.cli.identify.common import FILES, RATE, emit_fit, refuse_copies
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -116,6 +116,8 @@ def actuator(
         )
     inputs = [session_file(file) for file in files]
     _refuse_twice(inputs)
+    refuse_copies(files, [record.length_m for record in records])
+    refuse_copies(files, [record.capacitance_f for record in records])
     _warn_of_stated(files, records, gains_v_per_v, tables, actuator)
     tracked = all(file.is_dir() or is_session(file) for file in files)
     fit = fit_actuator(

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.cli.actuator_file import save_section
 from haselab.cli.columns import check_strain, check_unit
-from haselab.cli.identify.common import CAPACITANCE, STRAIN, read_valid
+from haselab.cli.identify.common import CAPACITANCE, STRAIN, name_files_in_errors, read_valid
+from haselab.identify.statics.columns import plausible_capacitance
 from haselab.identify.statics.voltage_map import VoltageMapFit
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.strain_map import StrainMap
@@ -102,7 +103,10 @@ def read_pairs(
     strain_unit = other.units[strain_name]
     check_unit(strain_name, strain_unit, STRAIN, strain_file)
     check_strain(strain_name, other[strain_name], strain_unit, strain_file, known)
-    return Pairs(capacitance, strain, name, _in_farads(table, name))
+    if in_farads := _in_farads(table, name):
+        with name_files_in_errors(file):
+            plausible_capacitance(name, capacitance)
+    return Pairs(capacitance, strain, name, in_farads)
 
 
 def _in_farads(table: Table, name: str) -> bool:

@@ -19,6 +19,7 @@ from haselab.cli.common import REAL, emit
 from haselab.cli.options import shared_option
 from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
+from haselab.identify.training_output import find_copy
 from haselab.models.actuator import ActuatorTables
 from haselab.pipelines.time_axis import check_complete, check_rising, records_of, time_axis
 from haselab.store.columns.reader import check_rate
@@ -48,6 +49,7 @@ __all__ = [
     "read_record",
     "read_recorded",
     "read_valid",
+    "refuse_copies",
     "unit_of_name",
     "unit_text",
 ]
@@ -113,6 +115,25 @@ def name_files_in_errors(*files: Path) -> Iterator[None]:
         text = str(error)
         names = " ".join(str(file) for file in files)
         raise InputError(text if names in text else f"{text.rstrip('.')}: {names}") from error
+
+
+def refuse_copies(files: Sequence[Path], outputs: Sequence[NDArray[np.float64]]) -> None:
+    """Refuse records with samples of each other: they would count twice, and narrow the intervals.
+
+    Args:
+        files: one for each record.
+        outputs: measured values of one quantity. Shape `(M_r,)` each.
+    Raises:
+        InputError: a record has samples of another one.
+    """
+    found = find_copy(outputs)
+    if found is not None:
+        one, other, share = found
+        raise InputError(
+            f"{files[one]} and {files[other]} have the same measured values (up to "
+            f"{100.0 * share:.0f} % of them). They would count twice. Leave out one of them, or "
+            "the part that both have."
+        )
 
 
 def read_record(

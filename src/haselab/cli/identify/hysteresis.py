@@ -22,6 +22,7 @@ from haselab.cli.identify.common import (
     emit_fit,
     rate_hz_of,
     read_valid,
+    refuse_copies,
 )
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -75,6 +76,7 @@ def hysteresis(
         table = read_valid(file, [source, output], columns)
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate, from_s))
+    refuse_copies(files, [record.y for record in records])
     fit = fit_hysteresis(records, model, operators=operators)
     emit_fit(fit, files, as_json, out)
     save_plot(plot, lambda: fit.chart(axis_names(source, output, table)))

@@ -19,6 +19,7 @@ from haselab.cli.identify.common import (
     name_files_in_errors,
     rate_hz_of,
     read_record,
+    refuse_copies,
 )
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -106,11 +107,9 @@ def model_comparison(
         if options["linear"]
         else hypotheses_of(question, slew_v_s=options["slew"])
     )
-    found = compare(
-        candidates,
-        [_record(file, columns, options) for file in files],
-        risk=options["risk"],
-    )
+    records = [_record(file, columns, options) for file in files]
+    refuse_copies(files, [record.y for record in records])
+    found = compare(candidates, records, risk=options["risk"])
     if not found.succeeded:
         listed = " ".join(str(file) for file in files)
         raise ResultError(f"{found.status}: {listed}")

@@ -23,6 +23,7 @@ from haselab.cli.identify.common import (
     emit_fit,
     name_files_in_errors,
     read_recorded,
+    refuse_copies,
     unit_text,
 )
 from haselab.cli.options import shared_option
@@ -145,6 +146,7 @@ def transfer(
     if actuator is not None:
         load_actuator(actuator, to_write=True)  # before a long fit
     records: list[Record] = []
+    origins: list[Path] = []
     units = ("", "")
     for file in files:
         with name_files_in_errors(file):
@@ -158,7 +160,9 @@ def transfer(
                 through=actuator if options["through_voltage_map"] else None,
             )
             records += found_records.records
+            origins += [file] * len(found_records.records)
             units = _agreed(units, found_records.units, (source, output))
+    refuse_copies(origins, [record.y for record in records])
     found: TransferFit | TransferChoice
     fit: TransferFit
     if options["nonlinear"] and options["choose"]:

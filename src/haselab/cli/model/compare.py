@@ -36,7 +36,6 @@ from haselab.cli.model.physical_model import has_physical_model
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
-from haselab.identify.model_choice import effective_count
 from haselab.identify.prediction import predict
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.training_output import TrainingOutput, is_comparable
@@ -46,7 +45,6 @@ from haselab.store.columns.selection import ColumnOptions
 
 __all__ = ["command"]
 
-_BAND, _BY_CHANCE = 0.95, 1e-4  # share of the samples inside; probability of fewer by chance
 _NO_BAND = "no uncertainty: the model has no covariance"
 _NO_NOISE = (
     "none: the model file does not state residual_std, without which the band would be too narrow. "
@@ -130,8 +128,9 @@ def command(
     offset of each record, unless --at-rest is given. Samples that were used for the fit are
     recognised by their values, also in a part of a record, in another format and with fewer digits.
     Their share is used_for_fit; it is null if the steps of the converter hide whether the record is
-    a copy or a repetition. The exit code is 3 if this share is above 5 %, or if the prediction is
-    worse than the mean of the record.
+    a copy or a repetition. The exit code is 3 if this share is above 5 %, if the prediction is
+    worse than the mean of the record, if its rms error is more than twice that which the band
+    states, or if the record is explained as well without its input.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None
@@ -258,20 +257,6 @@ def _answer(found: Prediction, no_band: str) -> dict[str, object]:
         "band": no_band or "95 %, from the covariance of the model and its residuals",
         "samples": found.measured.size,
         "used_for_fit": None if math.isnan(found.used_for_fit) else found.used_for_fit,
-        "notes": [] if no_band else _notes(found),
+        "notes": list(found.notes),
         "status": found.status,
     }
-
-
-def _notes(found: Prediction) -> list[str]:
-    """Note that fewer samples are inside the band than its 95 % and coloured noise explain."""
-    from scipy.stats import binom  # slow to import
-
-    independent = round(effective_count([found.measured - found.predicted]))
-    if found.inside_band * independent >= binom.ppf(_BY_CHANCE, independent, _BAND):
-        return []
-    return [
-        f"Only {100.0 * found.inside_band:.4g} % of the samples are inside the band of 95 %: the "
-        "model does not describe this record within its uncertainty, or the noise is larger than "
-        "in the record of the fit."
-    ]

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import time_chart
+from haselab.identify.clipped import clipping_of
 from haselab.identify.creep.columns import are_swapped, is_noisy
 from haselab.identify.creep.laws import (
     CreepLaw,
@@ -206,6 +207,8 @@ def fit_creep(
             "the input is noisy, which biases every parameter; use the commanded input, or the "
             "mean of each level",
         )
+    if clipped := clipping_of(setting.y, "outputs"):
+        return _no_result(setting, clipped)
     found = [entry for entry in _tried(_KINDS[model], setting) if _one_sided(entry, setting)]
     if not found:
         return _no_result(setting, "no law converged; record longer")

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, InputError, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import loop_chart
+from haselab.identify.clipped import clipping_of
 from haselab.identify.fit import RecordFit, rescaled, several
 from haselab.identify.hysteresis.lag import fit_lag
 from haselab.identify.hysteresis.loops import (
@@ -286,8 +287,10 @@ def _describe(
     residuals = tuple(r.y - fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records)
     counted = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
     measured = [r.y[mask] for r, mask in zip(records, masks, strict=True)]
-    if not _related(measured, counted):
-        reason = "no result: the output does not follow the input; check the columns"
+    clipped = next(filter(None, (clipping_of(r.y, "outputs") for r in records)), "")
+    if clipped or not _related(measured, counted):
+        reason = clipped or "the output does not follow the input; check the columns"
+        reason = f"no result: {reason}"
         return HysteresisFit(status=reason, records=tuple(records))
     modelled = [  # a model with an unknown past may start outside the range of the outputs
         np.clip(r.y - e, r.y.min(), r.y.max())[r.first :]

@@ -13,7 +13,7 @@ residuals and a model error (`model_error`) make it larger.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from haselab.actuators import ActuatorLaw
 from haselab.base import InputError
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, TRACKED_ZERO_M, Misfit
-from haselab.identify.physical.plausible import find_implausible
+from haselab.identify.physical.plausible import find_implausible, motion_before_drive
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
     channel_of,
@@ -90,6 +90,26 @@ def fit_actuator(
     if added_inertia_kg is None:
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
+    known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
+    fit = _fit(law, records, start, known)
+    if moving := motion_before_drive(records):
+        if fit.succeeded:
+            return replace(fit, notes=(*fit.notes, f"{moving}."))
+        return replace(fit, status=f"{fit.status}. {moving}")
+    return fit
+
+
+def _fit(
+    law: ActuatorLaw, records: Sequence[MotionRecord], start: Unknowns, known: Mapping[str, float]
+) -> ActuatorFit:
+    """Identify a model from plausible records.
+
+    Args:
+        law: kind of the actuator.
+        records: of one actuator.
+        start: where the search begins.
+        known: standard deviations of what is known of the camera beforehand.
+    """
     count = sum(record.length_m.size + record.capacitance_f.size for record in records)
     if count < _LEAST_VALUES * start.values.size:
         return ActuatorFit(
@@ -97,7 +117,6 @@ def fit_actuator(
             "of the model. Record longer",
             kind=law.kind,
         )
-    known: dict[str, float] = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
     # far from the minimum, errors of tracking that a pixel shares would only hide the misfit
     plain = Misfit([replace(record, pixel_m=0.0) for record in records], known=known)
     # records hardly separate the camera's scale from the actuator's size: it is estimated last
@@ -105,7 +124,8 @@ def fit_actuator(
     if found is None:
         return ActuatorFit(
             status="the start values describe no motion: the actuator has no equilibrium under the "
-            "first load and voltage",
+            f"first load and voltage ({_first_acts(records)}). Check the mass (kg), the voltage "
+            "(V) and the start values in [actuator.parameters]",
             kind=law.kind,
         )
     rejected: list[Rival] = []
@@ -136,6 +156,12 @@ def fit_actuator(
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
     return result_of(misfit, _ordered(found), rejected, preferred)
+
+
+def _first_acts(records: Sequence[MotionRecord]) -> str:
+    """Load and voltage with which each record begins, the heaviest one."""
+    drive = max((record.drive for record in records), key=lambda drive: float(drive.load_n[0]))
+    return f"{drive.load_n[0]:.3g} N, {drive.voltage_v[0]:.3g} V"
 
 
 def _moved_zero(misfit: Misfit, found: SearchResult) -> str:

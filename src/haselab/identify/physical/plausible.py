@@ -16,7 +16,7 @@ from haselab.identify.physical.misfit import model_record
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.unknowns import Unknowns
 
-__all__ = ["find_implausible"]
+__all__ = ["find_implausible", "motion_before_drive"]
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +38,9 @@ _LOW = 0.3  # of the highest voltage, below which the load decides the length
 _HEAVIER = 1.1  # load over another one, whose lengths are compared
 _REVERSED = 0.25  # of the simulated difference of two lengths
 _LEAST_LENGTHS = 5  # of a load
+_MOVES = 1.5  # spread of all values over their noise; below, nothing moves
+_LEAST_STILL = 30  # values, whose spread is then certain to 13 %
+_BEFORE, _SHARE_BEFORE = 5.0, 0.1  # spread before the drive changes, over noise; of the whole range
 _DECIDES = 0.5  # simulated difference over that at rest; above, creep does not reverse it
 
 
@@ -57,6 +60,8 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
         ):  # fmt: skip
             if fault:
                 return f"{record.name}: {fault}"
+    if fault := _still(records):
+        return fault
     beginnings = [_beginning(record) for record in records if _seen_early(record).any()]
     lengths = [_simulated_m(law, record) for record in beginnings]
     for record, length_m in zip(beginnings, lengths, strict=True):
@@ -64,6 +69,52 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
             if fault:
                 return f"{record.name}: {fault}"
     return _loads(law, beginnings, lengths)
+
+
+def motion_before_drive(records: Sequence[MotionRecord]) -> str:
+    """Say which record begins in motion, although each is assumed to begin at rest.
+
+    Args:
+        records: to be fitted.
+    Returns:
+        A sentence without its full stop; empty if no record shows it.
+    """
+    for record in records:
+        drive = record.drive
+        changes = np.flatnonzero((np.diff(drive.voltage_v) != 0.0) | (np.diff(drive.load_n) != 0.0))
+        end_s = drive.edge_s[changes[0] + 1] if changes.size else drive.edge_s[-1]
+        early_m = record.length_m[record.length_time_s < end_s]
+        if early_m.size < _LEAST_LENGTHS:
+            continue
+        moved_m, noise_m = float(np.ptp(early_m)), float(np.median(record.length_std_m))
+        most_m = max(_SHARE_BEFORE * float(np.ptp(record.length_m)), _BEFORE * noise_m)
+        if float(np.std(early_m)) > _BEFORE * noise_m and moved_m > most_m:
+            return (
+                f"{record.name}: the length changes by {1e6 * moved_m:.3g} um before the voltage "
+                f"first changes, after {end_s - drive.edge_s[0]:.3g} s, but each record is assumed "
+                "to begin at rest under its first voltage. Give the record from its beginning"
+            )
+    return ""
+
+
+def _still(records: Sequence[MotionRecord]) -> str:
+    """Whether nothing moves in all records together: they say nothing of the actuator."""
+    spreads = []
+    for values, stds in (
+        ([r.length_m for r in records], [r.length_std_m for r in records]),
+        ([r.capacitance_f for r in records], [r.capacitance_std_f for r in records]),
+    ):
+        joined = np.concatenate(values)
+        if joined.size >= _LEAST_STILL:
+            spreads.append(float(np.std(joined) / np.median(np.concatenate(stds))))
+    if not spreads or max(spreads) > _MOVES:
+        return ""
+    highest_v = max(float(np.abs(record.drive.voltage_v).max()) for record in records)
+    return (
+        f"the actuator does not move: the measured values vary by {max(spreads):.2g} times their "
+        f"noise, at voltages up to {highest_v:.3g} V. Record a voltage that changes and moves it, "
+        "or check the voltage column and the amplifier's gain"
+    )
 
 
 def _length(law: ActuatorLaw, record: MotionRecord) -> str:

@@ -143,7 +143,10 @@ def status_of(
             "actuator, or start nearer, by [actuator.parameters]"
         ), False
     if not converged:
-        return "the search did not converge; start nearer, by [actuator.parameters]", False
+        return (
+            "the search did not converge. Check that each table begins at rest under its first "
+            "voltage, or start nearer, by [actuator.parameters]"
+        ), False
     if abs(scale - 1.0) > _SCALE:
         return (
             f"the records contradict each other: the capacitances are {scale:.3g} times those that "

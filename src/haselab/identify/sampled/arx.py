@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtrc
 
 from haselab.base import (
     Estimate,
@@ -21,10 +22,11 @@ from haselab.base import (
 )
 from haselab.base.chart import Chart
 from haselab.base.estimate import Z95
+from haselab.identify.clipped import clipping_of
 from haselab.identify.fit import RecordFit
 from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
 from haselab.identify.record import Record, finite_vector
-from haselab.identify.sampled.arx_bias import instrumental_numbers, regressors
+from haselab.identify.sampled.arx_bias import instrumental_coefficients, regressors
 from haselab.identify.sampled.record import (
     check_same_rate,
     sampled_chart,
@@ -44,7 +46,8 @@ _SEARCH_DELAY = 12
 _WHITE = 0.05
 _COLOURED = 1e-3  # whiteness below which a difference from unbiased coefficients counts
 _BIASED = 1.5  # times the error of a simulation with unbiased coefficients: no result
-_LEVEL = 2.5  # standard deviations of a constant that is part of the equation
+_RESPONDS = 0.01  # probability above which an output does not depend on its input
+_CONSTANT = 2.5  # standard deviations of a constant that is part of the equation
 _UNKNOWN = (-math.inf, math.inf)
 
 
@@ -301,15 +304,15 @@ def fit_arx(
     inputs, outputs = record.u - point[0], record.y - point[1]
     if orders is None:
         least_delay = 1 if record.hold == "zero" else 0
-        orders = _chosen(inputs, outputs, criterion, level=remove_means, least_delay=least_delay)
+        orders = _chosen(inputs, outputs, criterion, constant=remove_means, least_delay=least_delay)
     least = orders.memory + 2 * (orders.na + orders.nb)
     if inputs.size <= least:
         raise InputError(
             f"The record has {inputs.size} samples; it must have more than {least} for na = "
             f"{orders.na}, nb = {orders.nb}, nk = {orders.nk}. Record longer, or lower the orders."
         )
-    level = remove_means and _has_level(inputs, outputs, orders)
-    return _fit(record, inputs, outputs, orders, point, level)
+    constant = remove_means and _has_constant(inputs, outputs, orders)
+    return _fit(record, inputs, outputs, orders, point, constant)
 
 
 @dataclass(frozen=True)
@@ -317,56 +320,56 @@ class _Solved:
     """Least-squares solution.
 
     Args:
-        numbers: `a`, then `b`.
+        coefficients: `a`, then `b`.
         covariance: of them.
         errors: prediction errors.
-        columns: regressors. Shape `(M, P)`, with a column of ones if there is a level.
-        level: the constant of the equation and its standard deviation; 0 if it has none.
+        columns: regressors. Shape `(M, P)`, with a column of ones if there is a constant.
+        constant: the constant of the equation and its standard deviation; 0 if it has none.
     """
 
-    numbers: Floats
+    coefficients: Floats
     covariance: Floats
     errors: Floats
     columns: Floats
-    level: tuple[float, float] = (0.0, math.inf)
+    constant: tuple[float, float] = (0.0, math.inf)
 
 
-def _solved(u: Floats, y: Floats, orders: ArxOrders, *, level: bool) -> _Solved:
+def _solved(u: Floats, y: Floats, orders: ArxOrders, *, constant: bool) -> _Solved:
     """Solve the equations, with a constant if asked to."""
     columns = regressors(u, y, orders.numbers, orders.memory)
-    columns = np.hstack([columns, np.ones((columns.shape[0], int(level)))])
+    columns = np.hstack([columns, np.ones((columns.shape[0], int(constant)))])
     target = y[orders.memory :]
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0.0] = 1.0
     left, sizes, right = np.linalg.svd(columns / scale, full_matrices=False)
     regular = sizes > 1e-12 * sizes[0]
     sizes = np.where(regular, sizes, np.inf)
-    numbers = right.T @ ((left.T @ target) / sizes) / scale
-    errors = target - columns @ numbers
-    freedom = max(target.size - numbers.size, 1)
+    coefficients = right.T @ ((left.T @ target) / sizes) / scale
+    errors = target - columns @ coefficients
+    freedom = max(target.size - coefficients.size, 1)
     covariance = (right.T / sizes**2) @ right * float(errors @ errors) / freedom
     blind = (np.abs(right[~regular]) > 1e-6).any(axis=0)
     covariance[blind, blind] = np.inf
     covariance = covariance / np.outer(scale, scale)
-    if not level:
-        return _Solved(numbers, covariance, errors, columns)
-    constant = float(numbers[-1]), math.sqrt(max(float(covariance[-1, -1]), 0.0))
-    return _Solved(numbers[:-1], covariance[:-1, :-1], errors, columns, constant)
+    if not constant:
+        return _Solved(coefficients, covariance, errors, columns)
+    fitted = float(coefficients[-1]), math.sqrt(max(float(covariance[-1, -1]), 0.0))
+    return _Solved(coefficients[:-1], covariance[:-1, :-1], errors, columns, fitted)
 
 
-def _has_level(u: Floats, y: Floats, orders: ArxOrders) -> bool:
+def _has_constant(u: Floats, y: Floats, orders: ArxOrders) -> bool:
     """Whether the equation needs a constant, as for a record that begins far from its means."""
-    constant, std = _solved(u, y, orders, level=True).level
-    return abs(constant) > _LEVEL * std
+    value, std = _solved(u, y, orders, constant=True).constant
+    return abs(value) > _CONSTANT * std
 
 
-def _chosen(u: Floats, y: Floats, criterion: str, *, level: bool, least_delay: int) -> ArxOrders:
+def _chosen(u: Floats, y: Floats, criterion: str, *, constant: bool, least_delay: int) -> ArxOrders:
     """The orders of the lowest criterion; all are compared on the samples left by the largest."""
     most_delay = min(_SEARCH_DELAY, max(1, y.size // 8))
     drives = most_delay + _SEARCH_ORDER - least_delay
     largest = ArxOrders(_SEARCH_ORDER, drives, least_delay)
     columns = regressors(u, y, largest.numbers, largest.memory)
-    ones = np.ones((columns.shape[0], int(level)))
+    ones = np.ones((columns.shape[0], int(constant)))
     all_columns = np.column_stack([ones, columns, y[largest.memory :]])
     # Least squares on the triangular factor equals that on the record for any choice of columns.
     triangle: Floats = np.asarray(np.linalg.qr(all_columns, mode="r"))
@@ -379,49 +382,62 @@ def _chosen(u: Floats, y: Floats, criterion: str, *, level: bool, least_delay: i
         if nb > na + (nk == 0) or nb + nk - least_delay > drives:
             continue
         kept = np.concatenate([np.arange(na), _SEARCH_ORDER + nk - least_delay + np.arange(nb)])
-        kept = np.concatenate([np.arange(int(level)), level + kept])
-        numbers = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
-        cost = float(((triangle[:, -1] - triangle[:, kept] @ numbers) ** 2).sum())
+        kept = np.concatenate([np.arange(int(constant)), constant + kept])
+        coefficients = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
+        cost = float(((triangle[:, -1] - triangle[:, kept] @ coefficients) ** 2).sum())
         score = _criteria(cost + floor, count, na + nb)[criterion]
         if score < lowest:
             best, lowest = ArxOrders(na, nb, nk), score
     return best
 
 
-def _criteria(cost: float, count: int, numbers: int) -> dict[str, float]:
+def _criteria(cost: float, count: int, coefficients: int) -> dict[str, float]:
     likelihood = count * math.log(max(cost / count, 1e-300))
     return {
-        "aic": likelihood + 2.0 * (numbers + 1),
-        "bic": likelihood + math.log(count) * (numbers + 1),
+        "aic": likelihood + 2.0 * (coefficients + 1),
+        "bic": likelihood + math.log(count) * (coefficients + 1),
     }
 
 
 def _fit(
-    record: Record, u: Floats, y: Floats, orders: ArxOrders, point: tuple[float, float], level: bool
+    record: Record,
+    u: Floats,
+    y: Floats,
+    orders: ArxOrders,
+    point: tuple[float, float],
+    constant: bool,
 ) -> ArxFit:
     rate_hz = record.input_rate_hz
-    solved = _solved(u, y, orders, level=level)
-    numbers, errors = solved.numbers, solved.errors
-    model = ArxModel(numbers[: orders.na], numbers[orders.na :], orders.nk, rate_hz)
-    criteria = _criteria(float(errors @ errors), errors.size, numbers.size)
+    solved = _solved(u, y, orders, constant=constant)
+    coefficients, errors = solved.coefficients, solved.errors
+    model = ArxModel(coefficients[: orders.na], coefficients[orders.na :], orders.nk, rate_hz)
+    criteria = _criteria(float(errors @ errors), errors.size, coefficients.size)
     whiteness = whiteness_p([errors])
     status, covariance = "ok", solved.covariance
-    if not np.isfinite(np.diag(covariance)).all():
+    if clipped := clipping_of(record.y, "outputs"):
+        status = f"no result: {clipped}"
+    elif not np.isfinite(np.diag(covariance)).all():
         status = (
             "no result: the data do not support these orders; lower na or nb, or excite "
             "the plant with more frequencies"
         )
     elif whiteness < _WHITE:
         status, covariance = _with_bias(solved, u, y, orders, rate_hz, whiteness)
+    elif _response_p(solved, orders) > _RESPONDS:
+        status = (
+            "no result: the output does not respond to the input; check the columns and the sensor"
+        )
     names = [f"a_{i + 1}" for i in range(orders.na)] + [f"b_{i + 1}" for i in range(orders.nb)]
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     estimates = {
         name: Estimate.normal(value, spread, "")
-        for name, value, spread in zip(names, numbers, std, strict=True)
+        for name, value, spread in zip(names, coefficients, std, strict=True)
     }
     below = float(model.denominator.sum())
-    if level and below > Z95 * math.sqrt(max(float(covariance[: orders.na, : orders.na].sum()), 0)):
-        point = point[0], point[1] + solved.level[0] / below
+    if constant and below > Z95 * math.sqrt(
+        max(float(covariance[: orders.na, : orders.na].sum()), 0)
+    ):
+        point = point[0], point[1] + solved.constant[0] / below
     fit = ArxFit(
         status=status,
         parameters=estimates if status == "ok" else {},
@@ -431,9 +447,9 @@ def _fit(
         model=model if status == "ok" else None,
         record=record,
         operating_point=point,
-        fit_percent=_simulation_percent(model, u, y, level=level),
+        fit_percent=_simulation_percent(model, u, y, constant=constant),
         prediction_fit_percent=fit_percent([y[orders.memory :]], [y[orders.memory :] - errors]),
-        validation_fit_percent=_validation_percent(u, y, rate_hz, orders, level=level),
+        validation_fit_percent=_validation_percent(u, y, rate_hz, orders, constant=constant),
         residual_whiteness_p=whiteness,
         aic=criteria["aic"],
         bic=criteria["bic"],
@@ -441,24 +457,37 @@ def _fit(
     return replace(fit, notes=_notes(fit, model))
 
 
+def _response_p(solved: _Solved, orders: ArxOrders) -> float:
+    """Probability of such coefficients of the input if the output does not depend on it.
+
+    It allows for the choice of the delay, the one of largest effect, among `_SEARCH_DELAY`.
+    """
+    b = solved.coefficients[orders.na :]
+    part = solved.covariance[orders.na :, orders.na :]
+    if not np.abs(solved.errors).max() > 0.0:
+        return 0.0
+    size = float(b @ np.linalg.pinv(part, hermitian=True) @ b)
+    return float(min(_SEARCH_DELAY * chdtrc(b.size, size), 1.0))
+
+
 def _with_bias(
     solved: _Solved, u: Floats, y: Floats, orders: ArxOrders, rate_hz: float, whiteness: float
 ) -> tuple[str, Floats]:
     """Status, and a covariance that includes the bias, where the prediction errors are coloured."""
-    size, level = solved.numbers.size, solved.columns.shape[1] > solved.numbers.size
+    size, constant = solved.coefficients.size, solved.columns.shape[1] > solved.coefficients.size
     wide = coloured_covariance([solved.columns], [solved.errors], solved.columns.shape[1])
     covariance = wide[:size, :size]
-    free = instrumental_numbers(u, y, orders.numbers, orders.memory, level=level)
-    if free is None or not np.isfinite(covariance).all():
-        return "ok", solved.covariance if free is None else covariance
+    unbiased = instrumental_coefficients(u, y, orders.numbers, orders.memory, constant=constant)
+    if unbiased is None or not np.isfinite(covariance).all():
+        return "ok", solved.covariance if unbiased is None else covariance
     fits = [
         _simulation_percent(
             ArxModel(each[: orders.na], each[orders.na : size], orders.nk, rate_hz), u, y,
-            level=level,
+            constant=constant,
         )
-        for each in (solved.numbers, free)
+        for each in (solved.coefficients, unbiased)
     ]  # fmt: skip
-    off = solved.numbers - free[:size]
+    off = solved.coefficients - unbiased[:size]
     covariance = covariance + np.outer(off, off)
     errors = [100.0 - fit for fit in fits]
     if not math.isfinite(errors[0]) and math.isfinite(errors[1]):
@@ -473,14 +502,14 @@ def _with_bias(
     return "ok", covariance
 
 
-def _simulation_percent(model: ArxModel, u: Floats, y: Floats, *, level: bool) -> float:
+def _simulation_percent(model: ArxModel, u: Floats, y: Floats, *, constant: bool) -> float:
     """Fit of the output simulated from the input alone, with the best initial state."""
     if not model.is_stable:
         return math.nan
     free = _free(model, y.size)
-    if level:
-        constant = lfilter([1.0], model.denominator, np.ones(y.size))
-        free = np.column_stack([free, constant])
+    if constant:
+        ones = lfilter([1.0], model.denominator, np.ones(y.size))
+        free = np.column_stack([free, ones])
     forced = model.simulate(u)
     state = np.linalg.lstsq(free, y - forced, rcond=None)[0]
     return fit_percent([y], [forced + free @ state])
@@ -495,15 +524,15 @@ def _free(model: ArxModel, count: int) -> Floats:
 
 
 def _validation_percent(
-    u: Floats, y: Floats, rate_hz: float, orders: ArxOrders, *, level: bool
+    u: Floats, y: Floats, rate_hz: float, orders: ArxOrders, *, constant: bool
 ) -> float:
     """Fit to three quarters of the record, validated on the last quarter."""
     cut = (3 * y.size) // 4
     if min(cut, y.size - cut) <= orders.memory + 2 * (orders.na + orders.nb):
         return math.nan
-    numbers = _solved(u[:cut], y[:cut], orders, level=level).numbers
-    model = ArxModel(numbers[: orders.na], numbers[orders.na :], orders.nk, rate_hz)
-    return _simulation_percent(model, u[cut:], y[cut:], level=level)
+    coefficients = _solved(u[:cut], y[:cut], orders, constant=constant).coefficients
+    model = ArxModel(coefficients[: orders.na], coefficients[orders.na :], orders.nk, rate_hz)
+    return _simulation_percent(model, u[cut:], y[cut:], constant=constant)
 
 
 def _notes(fit: ArxFit, model: ArxModel) -> tuple[str, ...]:

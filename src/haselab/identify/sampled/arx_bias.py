@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from haselab.models.filters import lfilter
 
-__all__ = ["instrumental_numbers", "regressors"]
+__all__ = ["instrumental_coefficients", "regressors"]
 
 Floats = NDArray[np.float64]
 _ROUNDS = 3
@@ -32,8 +32,8 @@ def regressors(u: Floats, y: Floats, orders: tuple[int, int, int], first: int) -
     return np.column_stack([*past, *(u[k - nk - j] for j in range(nb))])
 
 
-def instrumental_numbers(
-    u: Floats, y: Floats, orders: tuple[int, int, int], first: int, *, level: bool
+def instrumental_coefficients(
+    u: Floats, y: Floats, orders: tuple[int, int, int], first: int, *, constant: bool
 ) -> Floats | None:
     r"""Coefficients that noise of the output does not bias, if the input is independent of it.
 
@@ -44,21 +44,21 @@ def instrumental_numbers(
         y: outputs. Shape `(N,)`.
         orders: na, nb and nk.
         first: sample of the first equation.
-        level: whether the equation has a constant.
+        constant: whether the equation has a constant.
     Returns:
         `a`, then `b`, and the constant if there is one; None if the equations are singular.
     Source: Ljung, System Identification (1999), section 7.6.
     """
     na, nb, nk = orders
-    ones = np.ones((y.size - first, int(level)))
+    ones = np.ones((y.size - first, int(constant)))
     columns = np.hstack([regressors(u, y, orders, first), ones])
     # First outputs simulated by an equation of high order, which noise biases little, else earlier
     # inputs; then outputs simulated with the last coefficients.
-    late = _simulated(u, y, nk)
-    if late is None:
-        late = np.concatenate([np.zeros(nb + nk - 1), u])[: u.size]
+    simulated = _simulated(u, y, nk)
+    if simulated is None:
+        simulated = np.concatenate([np.zeros(nb + nk - 1), u])[: u.size]
     for _ in range(_ROUNDS):
-        instruments = np.hstack([regressors(u, late, orders, first), ones])
+        instruments = np.hstack([regressors(u, simulated, orders, first), ones])
         scale = np.sqrt((instruments**2).sum(axis=0))
         if not np.isfinite(scale).all() or not (scale > 0.0).all():
             return None
@@ -66,12 +66,14 @@ def instrumental_numbers(
         sizes = np.linalg.svd(matrix / np.abs(matrix).max(axis=0), compute_uv=False)
         if not sizes[-1] > _SINGULAR * sizes[0]:
             return None
-        numbers = np.asarray(np.linalg.solve(matrix, (instruments / scale).T @ y[first:]))
-        bottom = np.concatenate([[1.0], numbers[:na]])
+        coefficients = np.asarray(np.linalg.solve(matrix, (instruments / scale).T @ y[first:]))
+        bottom = np.concatenate([[1.0], coefficients[:na]])
         if (np.abs(np.roots(bottom)) >= 1.0).any():
-            return numbers
-        late = np.asarray(lfilter(np.concatenate([np.zeros(nk), numbers[na : na + nb]]), bottom, u))
-    return numbers
+            return coefficients
+        simulated = np.asarray(
+            lfilter(np.concatenate([np.zeros(nk), coefficients[na : na + nb]]), bottom, u)
+        )
+    return coefficients
 
 
 def _simulated(u: Floats, y: Floats, nk: int) -> Floats | None:
@@ -81,9 +83,9 @@ def _simulated(u: Floats, y: Floats, nk: int) -> Floats | None:
     if order < 1:
         return None
     columns = np.hstack([regressors(u, y, (order, order, nk), first), np.ones((y.size - first, 1))])
-    numbers = np.linalg.lstsq(columns, y[first:], rcond=None)[0]
-    bottom = np.concatenate([[1.0], numbers[:order]])
+    coefficients = np.linalg.lstsq(columns, y[first:], rcond=None)[0]
+    bottom = np.concatenate([[1.0], coefficients[:order]])
     if (np.abs(np.roots(bottom)) >= 1.0).any():
         return None
-    top = np.concatenate([np.zeros(nk), numbers[order : 2 * order]])
+    top = np.concatenate([np.zeros(nk), coefficients[order : 2 * order]])
     return np.asarray(lfilter(top, bottom, u))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import Estimate, InputError, JsonObject, checked, generator
 from haselab.base.chart import Chart
+from haselab.identify.clipped import clipping_of
 from haselab.identify.fit import RecordFit, rescaled
 from haselab.identify.noise import autoregression, fit_percent, whiteness_p
 from haselab.identify.record import Record, finite_vector
@@ -161,9 +162,11 @@ def fit_subspace(
     inputs, outputs = record.u - point[0], record.y - point[1]
     values, space = _space(inputs, outputs, block_rows)
     count = _gap(values) if order is None else order
-    if values[count - 1] <= _LEAST_GAP * values[0]:
+    clipped = clipping_of(record.y, "outputs")
+    if clipped or values[count - 1] <= _LEAST_GAP * values[0]:
         none = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
-        reason = f"no result: the data do not support {count} states; lower the order"
+        why = clipped or f"the data do not support {count} states; lower the order"
+        reason = f"no result: {why}"
         return SubspaceFit(
             status=reason, record=record, operating_point=point, model=None,
             singular_values=values, static_gain=none, modes=(), fit_percent=math.nan,

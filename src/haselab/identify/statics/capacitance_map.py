@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
+from haselab.identify.clipped import clipping_of
 from haselab.identify.fit import CurveFit, rescaled
 from haselab.identify.noise import autoregression, coloured_covariance, r_squared
 from haselab.identify.statics.columns import check_pair, plausible_strain
@@ -101,8 +102,10 @@ def fit_capacitance_map(relative_capacitance: ArrayLike, strain: ArrayLike) -> C
         ('ok', True)
     """
     c, e, doubts = _checked(relative_capacitance, strain)
-    if trend(c, e) == 0:
-        reason = "no result: the strain does not depend on the capacitance; check the columns"
+    clipped = clipping_of(c, "capacitances") or clipping_of(e, "strains")
+    if clipped or trend(c, e) == 0:
+        why = clipped or "the strain does not depend on the capacitance; check the columns"
+        reason = f"no result: {why}"
         return CapacitanceMapFit(status=reason, x=c, strain=e)
     middle, half = float(c.mean()), 0.5 * float(np.ptp(c))
     columns = np.column_stack([(c - middle) / half, np.ones_like(c)])

@@ -8,7 +8,13 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.identify.record import finite_vector
 
-__all__ = ["check_pair", "plausible_strain", "plausible_stretch", "plausible_voltage"]
+__all__ = [
+    "check_pair",
+    "plausible_capacitance",
+    "plausible_strain",
+    "plausible_stretch",
+    "plausible_voltage",
+]
 
 Floats = NDArray[np.float64]
 _LONGEST = 30.0  # stretch: above the break of any elastomer
@@ -17,6 +23,7 @@ _LARGE_STRAIN = 1.0
 _LARGE = "The strain reaches {:.3g} times the length. If it is in per cent, divide it by 100."
 _SMALLEST_STRAIN = 1e-7  # span that no camera or gauge of such a test resolves
 _HIGHEST_V = 1e5
+_HIGHEST_F = 1e-3  # a million times the capacitance of a HASEL actuator
 _KILOVOLTS_V = 20.0  # span below which volts of an amplifier's output could be kilovolts
 
 
@@ -103,6 +110,24 @@ def plausible_strain(strain: Floats, other: str, values: Floats) -> tuple[str, .
         f"strain spans {span:g}; it must be at least {_SMALLEST_STRAIN:g}. "
         f"{hint if fits else 'Name the right column.'}"
     )
+
+
+def plausible_capacitance(name: str, capacitance_f: Floats) -> None:
+    """Refuse a column in F whose values are in another unit.
+
+    Args:
+        name: of the column.
+        capacitance_f: its values. Shape `(N,)`.
+    Raises:
+        InputError: a capacitance above 1 mF.
+    """
+    size = float(np.abs(capacitance_f).max())
+    if size > _HIGHEST_F:
+        raise InputError(
+            f"Column {name} reaches {size:g} F; it must be at most {_HIGHEST_F:g} F. If it is in "
+            f"pF, add --unit {name}=pF. If it is a relative capacitance, give it a name without "
+            "the unit F."
+        )
 
 
 def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:

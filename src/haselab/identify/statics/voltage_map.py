@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, JsonObject, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import curve_chart
+from haselab.identify.clipped import clipping_of
 from haselab.identify.fit import CurveFit, propagated, rescaled
 from haselab.identify.noise import coloured_covariance, r_squared
 from haselab.identify.projection import Solution
@@ -209,8 +210,10 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
     middle, half = 0.5 * float(e.max() + e.min()), 0.5 * float(np.ptp(e))
     x = (e - middle) / half
     sign = trend(x, v)
-    if sign == 0:
-        reason = "no result: the voltage does not depend on the strain; check the columns"
+    clipped = clipping_of(e, "strains")
+    if clipped or sign == 0:
+        why = clipped or "the voltage does not depend on the strain; check the columns"
+        reason = f"no result: {why}"
         return VoltageMapFit(status=reason, strain=e, voltage_v=v)
     reach = 1.0 + 2.0 * _MARGIN
     solution = search_free(x, v)

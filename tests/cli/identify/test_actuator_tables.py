@@ -2,11 +2,14 @@
 
 import json
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from haselab.actuators import GRAVITY_M_S2, DeaStack, Drive, SampledLaw
+from haselab.base import InputError
+from haselab.cli.identify.common import refuse_copies
 from haselab.cli.main import main
 from haselab.identify.physical.plausible import motion_before_drive
 from haselab.pipelines.motion_table import motion_of_table
@@ -201,6 +204,20 @@ def test_a_part_of_a_record_in_another_format_is_refused(actuator, tmp_path, cap
     np.savetxt(part, rows[60:260], "%.10g", ",", header=header, comments="")
     code, _, error = run(capsys, file, part, "--actuator", actuator, *COLUMNS)
     assert code == 2 and "have the same measured values" in error, error
+
+
+def test_records_that_share_a_part_give_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As two sessions on one twin that begin with the same experiment."""
+    shared, one, other = np.random.default_rng(2).normal(size=(3, 500))
+    files = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    refuse_copies(files, [np.r_[shared, one], np.r_[shared, other]])
+    assert "warning: " in (said := capsys.readouterr().err) and "50 % of them" in said
+    refuse_copies(files, [one, other])
+    assert capsys.readouterr().err == ""
+    with pytest.raises(InputError, match=r"b\.csv have the same .* They would count twice"):
+        refuse_copies(files, [np.r_[shared, one], shared])
 
 
 def test_an_actuator_that_does_not_move_gives_no_numbers(actuator, tmp_path, capsys):

@@ -60,6 +60,8 @@ RATE = shared_option("--rate-hz", type=REAL, detail="Default: the rate in the fi
 INPUT = shared_option("--input", "source", default="u", show_default=True)
 OUTPUT = shared_option("--output", default="y", show_default=True)
 
+_COPY = 0.9  # share of the samples of a record above which it is a copy of another one
+
 STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch")
 STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
 VOLTAGE = Quantity("--voltage", ("voltage_v", "voltage"), "V", "the voltage")
@@ -118,22 +120,34 @@ def name_files_in_errors(*files: Path) -> Iterator[None]:
 
 
 def refuse_copies(files: Sequence[Path], outputs: Sequence[NDArray[np.float64]]) -> None:
-    """Refuse records with samples of each other: they would count twice, and narrow the intervals.
+    """Refuse a record that repeats another one: it would count twice, and narrow the intervals.
+
+    If they only share a part, such as the same first experiment of two sessions on one twin, a
+    warning says so.
 
     Args:
         files: one for each record.
         outputs: measured values of one quantity. Shape `(M_r,)` each.
     Raises:
-        InputError: a record has samples of another one.
+        InputError: most samples of a record are those of another one.
     """
     found = find_copy(outputs)
-    if found is not None:
-        one, other, share = found
+    if found is None:
+        return
+    one, other, share = found
+    text = (
+        f"{files[one]} and {files[other]} have the same measured values (up to "
+        f"{100.0 * share:.0f} % of them)."
+    )
+    if share > _COPY:
         raise InputError(
-            f"{files[one]} and {files[other]} have the same measured values (up to "
-            f"{100.0 * share:.0f} % of them). They would count twice. Leave out one of them, or "
-            "the part that both have."
+            f"{text} They would count twice. Leave out one of them, or the part that both have."
         )
+    click.echo(
+        f"haselab: warning: {text} These count twice, so the intervals are too narrow. Leave out "
+        "the part that both have, or give a twin another seed",
+        err=True,
+    )
 
 
 def read_record(

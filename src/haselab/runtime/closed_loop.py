@@ -56,7 +56,7 @@ class ClosedLoop:
         self._rig, self._loop, self._name = rig, loop, name
         block_s = rig.description.block_s
         setting = setting_on_rig(rig.description, carrier[0], loop)
-        limits_s = (None, None)
+        limits_s: tuple[float | None, float | None] = (None, None)
         if (settings := rig.safety.settings).real_time:  # where the guardians would act anyway
             limits_s = settings.idle_s, settings.lease_s
         self._controller = RunningController(loop.controller, setting, *limits_s)

@@ -286,7 +286,7 @@ def _ended_early(session: Path, cut: tuple[str, ...]) -> str:
         found = str(read_manifest(session.parent).get("ended", ""))
     except InputError:
         found = ""
-    reason = found.partition(": ")[2] or found
+    reason = "interrupted" if found == "KeyboardInterrupt" else found.partition(": ")[2] or found
     known = f": {reason.rstrip('.')}" if reason not in ("", "complete") else ""
     return f"The run ended {when}{known}."
 

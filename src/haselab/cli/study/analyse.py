@@ -95,7 +95,7 @@ def command(
         warn_unverified(recorded.doubt, path)
         doubt = recorded.doubt
         on_chip = is_chip_session(recorded.header)
-        if on_chip or not set(recorded.names) - set(recorded.cut_short()):
+        if on_chip or not recorded.complete():
             check_ends(recorded, path)
         if on_chip:
             analyse_on_chip(recorded, target, as_json)

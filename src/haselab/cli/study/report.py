@@ -74,8 +74,7 @@ def command(source: Path, as_json: bool, out: Path | None) -> None:
 
 def _require_analysis(recorded: SessionReader, folder: Path) -> None:
     """Refuse a recording that was cut short, which has no results yet."""
-    cut = set(recorded.cut_short())
-    if cut and set(recorded.names) - cut:
+    if recorded.cut_short() and recorded.complete():
         raise InputError(
             "The run ended early and has no results yet. Compute those of the complete experiments "
             f"with: haselab analyse {folder}"

@@ -225,7 +225,7 @@ def _with_advice(error: DeviceError, folder: Path) -> DeviceError:
     """The same error; if complete experiments were recorded, with the command that fits them."""
     try:
         with SessionReader(folder / "session.h5") as session:
-            complete = set(session.names) - set(session.cut_short())
+            complete = session.complete()
     except (HaselabError, OSError):  # only the advice depends on it
         return error
     if not complete:

@@ -170,15 +170,27 @@ class SessionReader(Closing):
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
 
+    def complete(self) -> tuple[str, ...]:
+        """Names of the experiments that were recorded from start to end.
+
+        Raises:
+            InputError: the events cannot be read.
+        """
+        return tuple(name for verb, name in self._named_events() if verb == "end")
+
     def cut_short(self) -> tuple[str, ...]:
         """Names of the experiments whose recording has a start and no end.
 
         Raises:
             InputError: the events cannot be read.
         """
-        events = [what.partition(" ")[::2] for _, what in self.events()]
-        ended = {name for verb, name in events if verb == "end"}
-        return tuple(name for verb, name in events if verb == "start" and name not in ended)
+        ended = self.complete()
+        started = [name for verb, name in self._named_events() if verb == "start"]
+        return tuple(name for name in started if name not in ended)
+
+    def _named_events(self) -> list[tuple[str, str]]:
+        """Verb and name of each event."""
+        return [(verb, name) for verb, _, name in (e.partition(" ") for _, e in self.events())]
 
     def conditions(self) -> NDArray[np.void]:
         """What acted on the actuator outside the blocks, in the order of time.

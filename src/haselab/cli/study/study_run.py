@@ -11,7 +11,6 @@ from typing import Any, Protocol, cast
 import click
 
 from haselab.base import (
-    DeviceError,
     HaselabError,
     InputError,
     JsonObject,
@@ -201,7 +200,7 @@ def _execute(
     except KeyboardInterrupt as stop:
         stop.add_note(kept_data_note(folder))
         raise
-    except DeviceError as error:
+    except HaselabError as error:
         raise _with_advice(error, folder) from error
     finally:
         rig.safe()
@@ -221,7 +220,7 @@ def _execute(
     require_complete(found, folder)
 
 
-def _with_advice(error: DeviceError, folder: Path) -> DeviceError:
+def _with_advice(error: HaselabError, folder: Path) -> HaselabError:
     """The same error; if complete experiments were recorded, with the command that fits them."""
     try:
         with SessionReader(folder / "session.h5") as session:
@@ -243,7 +242,8 @@ def require_complete(found: Findings, folder: Path) -> None:
     Raises:
         ResultError: see `Findings.require_complete`.
     """
-    found.require_complete(f"The results of the other experiments are in {folder}.")
+    others = f"The results of the other experiments are in {folder}."
+    found.require_complete(others if found.quantities else f"There are no results. {folder}")
 
 
 def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> JsonObject:

@@ -18,6 +18,7 @@ from haselab.base import InputError
 __all__ = [
     "CAPACITANCE_NOISE",
     "CARRIER_HZ",
+    "CURRENT_SHARE",
     "HIGHEST_DRIVE_V",
     "MOTION_RISE_V_PER_S",
     "OUTPUT_V_PER_CODE",
@@ -38,6 +39,7 @@ _SLOT_S = 125e-6
 # From the middle of the samples that are used to the end of their frame, and to the output.
 UPDATE_AGE_S, UPDATE_DELAY_S = 7.5 * _SLOT_S, 14.5 * _SLOT_S
 CAPACITANCE_NOISE = 2.7e-3  # standard deviation of one update, relative; docs/control/firmware.md
+CURRENT_SHARE = 0.2  # least amplitude in the current channel, of the carrier in the voltage channel
 HIGHEST_DRIVE_V = 1.9  # of the output, whose converter reaches 2.048 V
 MOTION_RISE_V_PER_S = 100.0  # of controllers that give the drive in V, from the identified motion
 _SKEW_S = _SLOT_S  # from a reading of the voltage to the next of the current
@@ -283,7 +285,8 @@ class ChipSettings:
         """Fields of `hs_quadrature_config`: the turn, in 1/F, and range of squared amplitudes."""
         turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
         v_low, v_high, i_low = (
-            round((4.0 * share * self.front_end.carrier_codes) ** 2) for share in (0.6, 1.4, 0.2)
+            round((4.0 * share * self.front_end.carrier_codes) ** 2)
+            for share in (0.6, 1.4, CURRENT_SHARE)
         )
         return turn.real, turn.imag, v_low, v_high, i_low
 

@@ -220,7 +220,7 @@ def test_a_clipped_converter_is_no_reference(rng):
     angle = 2 * np.pi * 2000.0 * np.arange(20 * 2000) / 200e3
     record = np.stack([1000 * np.cos(angle), -40000 * np.sin(angle)], axis=1)
     codes = np.clip(record + rng.standard_normal(record.shape), -32768, 32767).round()
-    with pytest.raises(ResultError, match="20 blocks are clipped. Lower the amplitude"):
+    with pytest.raises(ResultError, match=r"20 blocks are clipped\. Lower the amplitude"):
         read_reference(
             codes.astype(np.int16).reshape(20, 2000, 2), rate_hz=200e3, carrier_hz=2000.0
         )

@@ -49,7 +49,7 @@ class CallLimit:
 
     def _rang(self, number: int, frame: FrameType | None) -> None:
         if frame is None or frame.f_code not in _OWN:  # there the timer would stay on
-            raise TooLongError
+            raise TooLongError(f"it took longer than {self._limit_s:g} s")
 
 
 _OWN = {CallLimit.__enter__.__code__, CallLimit.__exit__.__code__}

@@ -511,7 +511,9 @@ def test_a_whole_study_is_refused_on_a_chip_in_one_line(
 @pytest.mark.parametrize(
     ("text", "wrong", "reported"),
     [
-        (CHIP_RIG + "[front_end]\ncorrection = [0.0, 0.0]\n", STEPS, "must be between 0.1 and 10"),
+        (CHIP_RIG + "[front_end]\ncorrection = [0.0, 0.0]\n", STEPS, "a magnitude of 0.1 to 10"),
+        (CHIP_RIG + "[front_end]\ncorrection = [0.0, 1.0]\n", STEPS, "a phase of -45 to 45 deg"),
+        (CHIP_RIG + "[front_end]\ncorrection = [-1.0, 0.0]\n", STEPS, "a phase of -45 to 45 deg"),
         (CHIP_RIG + "[front_end]\ncarrier_high_v = inf\n", STEPS, "front_end.carrier_high_v"),
         (CHIP_RIG + 'twin = "x.toml"\n', STEPS, "either twin or reading"),
         (CHIP_RIG, STEPS.replace("step = 0.03", "step = 0.0"), "step must not be 0"),

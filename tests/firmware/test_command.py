@@ -315,3 +315,16 @@ def test_on_a_new_sheet_the_same_gains_overshoot(settings: ChipSettings) -> None
         overshoots.append(found.trials[0].overshoot)
     assert overshoots[0] < 0.07  # the design's demand
     assert overshoots[1] > 3.0 * 0.07
+
+
+def test_a_current_channel_that_loses_the_carrier_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = tmp_path / "chip.toml"
+    rig.write_text(
+        f'kind = "chip"\nrun = "{DATA}"\n[simulator]\n[front_end]\nampere_per_monitor_volt = 1.0\n'
+    )
+    code, _, error = run(capsys, "firmware", "build", DATA, "--rig", rig, "--build-dir", tmp_path)
+    assert code == 2
+    assert "codes in the current channel of the front end, but the chip needs 59" in error
+    assert not (tmp_path / "settings.h").exists()

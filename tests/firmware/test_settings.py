@@ -102,6 +102,9 @@ def test_the_level_may_fall_by_five_times_what_the_fastest_drive_does(
     assert fall(replace(settings, rise_v_per_s=40.0)) == math.floor(10 * 0.02 * 1024 / 5.0)
     finer = FrontEnd(converter_v=3.3, converter_codes=4096)
     assert fall(replace(settings, front_end=finer)) == math.floor(5 * 0.02 * 4096 / 3.3)
+    # Of a slow module the ramp to 0 V is faster, and the last code of the converter is noise.
+    assert fall(replace(settings, rise_v_per_s=0.2)) == math.floor(5 * 0.004 * 1024 / 5.0) == 4
+    assert fall(replace(settings, rise_v_per_s=0.2, ramp_v_per_s=0.2)) == 3
 
 
 def test_another_converter_reads_the_same_world(settings: ChipSettings) -> None:
@@ -222,6 +225,17 @@ def test_a_map_that_reaches_exactly_the_highest_drive_is_used(settings: ChipSett
         ({"kp": math.nan}, "must be finite"),
         ({"strain_low": 0.2}, "low end below its high end"),
         ({"voltage_map": (0.4, -30.0, 0.4, 30.0)}, "must rise, or fall, everywhere"),
+        # 1.9 V times 5000 through the monitor is 19 V, or 0.95 V * 0.15 / (5 V / 1024) < 2 codes
+        (
+            {"front_end": FrontEnd(volt_per_monitor_volt=500.0)},
+            "the voltage monitor gives 19 V, .* at least 1900 in",
+        ),
+        (
+            {"front_end": FrontEnd(volt_per_monitor_volt=1e5, gain=500.0)},
+            r"only 1\.9 codes of the converter, but 14 are needed .* at most 14592 in",
+        ),
+        ({"front_end": FrontEnd(v_stage=100.0)}, "amplitude of 589 codes .* 30 to 461 codes"),
+        ({"front_end": FrontEnd(carrier_high_v=20.0)}, r"amplitude of 24\.6 codes"),
     ],
 )
 def test_settings_that_cannot_be_meant_are_refused(
@@ -229,6 +243,14 @@ def test_settings_that_cannot_be_meant_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=match):
         replace(settings, **changes)
+
+
+@pytest.mark.parametrize("changes", [{"kd": 1e36}, {"strain_map": (8.09e8, -0.38, 0.0, 1e39)}])
+def test_a_number_beyond_single_precision_is_refused(
+    changes: dict[str, Any], settings: ChipSettings
+) -> None:
+    with pytest.raises(InputError, match=r"is 1e\+39, but it computes in single precision"):
+        settings_header(replace(settings, **changes))
 
 
 def test_an_actuator_that_contracts_starts_at_its_longest(settings: ChipSettings) -> None:

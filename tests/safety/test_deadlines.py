@@ -82,3 +82,22 @@ def test_a_rig_s_clock_that_stood_still_is_forgiven_after_sixteen_blocks() -> No
     for _ in range(40):  # 6 ms behind from here on
         assert wall.tick(0.007, arrival_s=0.006) == ""
     assert wall.deadlines.ticks.late == 15  # until the last of the soonest has left the sixteen
+
+
+def test_a_lost_deadline_names_the_part_that_took_most_of_the_time() -> None:
+    wall = Wall(missed=3)
+    wall.tick(0.001)
+    for _ in range(2):
+        wall.deadlines.spent("The step of controller 'slow'", 0.012)
+        assert wall.tick(0.013) == ""
+    wall.deadlines.spent("The step of controller 'slow'", 0.0)
+    fault = wall.tick(0.013)
+    assert "The step of controller 'slow' took up to 12.0 ms of this time. Make it faster" in fault
+
+
+def test_a_quick_part_is_not_blamed_for_a_late_computer() -> None:
+    wall = Wall(missed=3)
+    wall.tick(0.001)
+    wall.deadlines.spent("The step of controller 'quick'", 0.004)
+    assert [wall.tick(0.013), wall.tick(0.013)] == ["", ""]
+    assert "Close other programs" in wall.tick(0.013)

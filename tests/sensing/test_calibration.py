@@ -194,7 +194,7 @@ def test_references_that_contradict_each_other_are_refused_and_the_worst_is_name
     [(0.0,), (-1e-9,), (float("nan"),), (1e-9, -1.0), (1e-9, 0.0, 1.0), (1e-9, 0.0, -0.1)],
 )
 def test_a_reference_that_cannot_be_is_refused(values):
-    with pytest.raises(InputError, match=r"Reference of .* must be in"):
+    with pytest.raises(InputError, match=r"Reference of .* must be in .* 1e-9 for 1 nF"):
         Reference(*values)
 
 
@@ -206,11 +206,21 @@ def test_too_few_blocks_and_a_missing_carrier_are_refused():
         read_reference(no_carrier, rate_hz=RATE_HZ, carrier_hz=CARRIER_HZ)
 
 
+@pytest.mark.parametrize("mistake", ["swapped channels", "reversed polarity"])
+def test_miswired_monitors_are_named_as_such(rng, mistake):
+    angle = 2 * np.pi * 2000.0 * np.arange(8 * 2000) / 200e3
+    record = np.stack([np.cos(angle), -0.5 * np.sin(angle)], axis=1)  # of a capacitor
+    wrong = record[:, ::-1] if mistake == "swapped channels" else record * [1.0, -1.0]
+    noisy = (wrong + 1e-3 * rng.standard_normal(record.shape)).reshape(8, 2000, 2)
+    with pytest.raises(ResultError, match=r"8 of 8 blocks have a phase .* polarity .* swapped"):
+        read_reference(noisy, rate_hz=RATE_HZ, carrier_hz=CARRIER_HZ)
+
+
 def test_a_clipped_converter_is_no_reference(rng):
     angle = 2 * np.pi * 2000.0 * np.arange(20 * 2000) / 200e3
     record = np.stack([1000 * np.cos(angle), -40000 * np.sin(angle)], axis=1)
     codes = np.clip(record + rng.standard_normal(record.shape), -32768, 32767).round()
-    with pytest.raises(ResultError, match="clipped"):
+    with pytest.raises(ResultError, match=r"20 blocks are clipped\. Lower the amplitude"):
         read_reference(
             codes.astype(np.int16).reshape(20, 2000, 2), rate_hz=200e3, carrier_hz=2000.0
         )

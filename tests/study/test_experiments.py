@@ -180,6 +180,19 @@ def test_what_was_not_declared_is_not_played(drive_v: list[float], fault: str) -
     assert len(bench.played) == before
 
 
+def test_a_recording_that_is_not_planned_or_was_made_is_not_played() -> None:
+    """Two drives in one recording would be fitted as one."""
+    bench: Any = _Bench()
+    player = Player(bench, _Own(REFERENCE, _Settings()), analysis_of(REFERENCE))
+    drive_v = np.linspace(0.0, 1.0, 11)
+    with pytest.raises(InputError, match=r"plays 'other', which its method 'recordings' does not"):
+        player.play("other", drive_v, 100.0)
+    player.play("own", drive_v, 100.0)
+    with pytest.raises(InputError, match=r"plays 'own' twice"):
+        player.play("own", drive_v, 100.0)
+    assert len(bench.played) == drive_v.size
+
+
 class _Failing(_Own):
     def play(self, player: Player) -> None:
         raise KeyError("nothing here")

@@ -86,6 +86,14 @@ def test_a_fit_that_refuses_recorded_data_is_a_missing_result(
         found.require_complete("There.")
 
 
+def test_a_reason_without_a_full_stop_gets_one() -> None:
+    found = pipeline.Findings({}, {}, {}, failed=("no sense in it", "nor here"))
+    with pytest.raises(
+        ResultError, match=r"^no sense in it\. .* another reason: 1 more\. There\.$"
+    ):
+        found.require_complete("There.")
+
+
 def test_a_missing_experiment_is_still_bad_input() -> None:
     def source(name: str) -> Any:
         raise InputError(f"The session holds no experiment {name}.")

@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["SignalExit", "exit_code_text", "no_exit"]
+__all__ = ["SignalExit", "TooLongError", "exit_code_text", "no_exit"]
 
 
 class SignalExit(SystemExit):
     """A signal ends the program. It may be raised while code of another package runs."""
+
+
+class TooLongError(BaseException):
+    """A call took longer than its limit. It is no `Exception`, so that few handlers swallow it."""
 
 
 @contextlib.contextmanager
@@ -32,7 +36,7 @@ def no_exit() -> Iterator[None]:
     """
     try:
         yield
-    except SignalExit:
+    except (SignalExit, TooLongError):
         raise
     except SystemExit as stop:
         raise RuntimeError(f"it called sys.exit({exit_code_text(stop)})") from stop

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
+import sys
+import threading
 import traceback
 from dataclasses import dataclass
 from types import FrameType
 
-__all__ = ["ForeignFailure", "foreign_failure"]
+__all__ = ["ForeignFailure", "foreign_failure", "packages_of_threads"]
 
 _OWN = __name__.partition(".")[0]
 
@@ -44,6 +46,26 @@ def foreign_failure(error: BaseException) -> ForeignFailure | None:
         if package == _OWN:
             return None
     return None
+
+
+def packages_of_threads() -> list[str]:
+    """Find the packages of extension points whose threads keep this program from ending.
+
+    Returns:
+        Names, in alphabetical order; none if only daemon threads and those of haselab run.
+    """
+    main = threading.main_thread()
+    lasting = [one for one in threading.enumerate() if one is not main and not one.daemon]
+    if not lasting:
+        return []
+    extensions, frames = _extensions(), sys._current_frames()
+    found: set[str] = set()
+    for thread in lasting:
+        frame = frames.get(thread.ident or 0)
+        while frame is not None:
+            found.add(str(frame.f_globals.get("__name__", "")).partition(".")[0])
+            frame = frame.f_back
+    return sorted(found & set(extensions))
 
 
 def _extensions() -> dict[str, set[str]]:

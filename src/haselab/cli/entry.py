@@ -93,10 +93,15 @@ def main() -> None:
     """Run the command line; the entry point of the console script."""
     try:
         start_up = StartUp()
+        from haselab.cli.main import end_despite_threads
         from haselab.cli.main import main as run_command
 
         try:
             run_command(on_command=start_up.imported)
+        except SystemExit as stop:
+            start_up.finished()
+            end_despite_threads(stop)
+            raise
         finally:
             start_up.finished()
     except KeyboardInterrupt:

@@ -14,12 +14,12 @@ import click
 
 from haselab.base.errors import HaselabError, described, text_of
 from haselab.base.exits import SignalExit, exit_code_text
-from haselab.base.foreign_code import foreign_failure
+from haselab.base.foreign_code import foreign_failure, packages_of_threads
 from haselab.cli.bench.revoke_first import revoke_first
 from haselab.cli.invocation import Invocation
 from haselab.cli.lazy_group import LazyGroup
 
-__all__ = ["cli", "main"]
+__all__ = ["cli", "end_despite_threads", "main"]
 
 # name: (module with an attribute `command`, one line of help). Modules load when they are used.
 _COMMANDS = {
@@ -159,6 +159,27 @@ def _broken_pipe(error: BrokenPipeError) -> int:
     if unread:
         return _CLOSED_PIPE
     return _fail(f"A connection was lost ({error.strerror}). Check the instrument.", 4)
+
+
+def end_despite_threads(stop: SystemExit) -> None:
+    """End the program if threads of other packages would keep it from ending.
+
+    Args:
+        stop: what ends the command.
+    """
+    packages = packages_of_threads()
+    if not packages:
+        return
+    code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
+    _fail(
+        f"warning: A thread of the package {', '.join(packages)} still runs. The command ends "
+        "without waiting for it. Make it a daemon thread, or end it.",
+        code,
+    )
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def _exit_if_foreign(error: Exception) -> None:

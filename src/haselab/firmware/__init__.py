@@ -10,6 +10,7 @@ from haselab.firmware.frames import (
 from haselab.firmware.settings import (
     CAPACITANCE_NOISE,
     CARRIER_HZ,
+    CURRENT_SHARE,
     HIGHEST_DRIVE_V,
     MOTION_RISE_V_PER_S,
     OUTPUT_V_PER_CODE,
@@ -27,6 +28,7 @@ from haselab.firmware.settings import (
 __all__ = [
     "CAPACITANCE_NOISE",
     "CARRIER_HZ",
+    "CURRENT_SHARE",
     "HIGHEST_DRIVE_V",
     "MOTION_RISE_V_PER_S",
     "OUTPUT_V_PER_CODE",

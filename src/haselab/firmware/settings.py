@@ -18,6 +18,7 @@ from haselab.base import InputError
 __all__ = [
     "CAPACITANCE_NOISE",
     "CARRIER_HZ",
+    "CURRENT_SHARE",
     "HIGHEST_DRIVE_V",
     "MOTION_RISE_V_PER_S",
     "OUTPUT_V_PER_CODE",
@@ -38,6 +39,7 @@ _SLOT_S = 125e-6
 # From the middle of the samples that are used to the end of their frame, and to the output.
 UPDATE_AGE_S, UPDATE_DELAY_S = 7.5 * _SLOT_S, 14.5 * _SLOT_S
 CAPACITANCE_NOISE = 2.7e-3  # standard deviation of one update, relative; docs/control/firmware.md
+CURRENT_SHARE = 0.2  # least amplitude in the current channel, of the carrier in the voltage channel
 HIGHEST_DRIVE_V = 1.9  # of the output, whose converter reaches 2.048 V
 MOTION_RISE_V_PER_S = 100.0  # of controllers that give the drive in V, from the identified motion
 _SKEW_S = _SLOT_S  # from a reading of the voltage to the next of the current
@@ -45,9 +47,14 @@ _OUTPUT_V, _OUTPUT_CODES = 2.048, 4096
 OUTPUT_V_PER_CODE = _OUTPUT_V / _OUTPUT_CODES
 _TABLE_STEPS = 32
 _SINGLE = 1e-6  # relative error of the map in single precision; the firmware limits the drive
+_LARGEST = float(np.finfo(np.float32).max)
 _PARAMETERS = 8  # HS_CONTROLLER_PARAMETERS of core/include/hs_controller.h
 _BAND_PASS = 0.5996  # at 5 kHz, of one pole at 5 kHz and one at 8 kHz: the same in both channels
 _FALLS = 5.0  # largest fall of the level per frame, relative to the fastest drive
+_FILLED = 0.9  # of the converter's range, by the largest amplitude of the carrier
+_FEWEST_CARRIER_CODES = 30  # where the quantisation is 1 % of the amplitude
+_FEWEST_LEVEL_CODES = 2.0  # smallest deviation of the level that is a fault
+_LEAST_FALL = 3  # codes, above the noise of a level that hardly changes
 _MARGIN = 0.1  # plausible strain beyond the saturation: 0 V, creep
 
 
@@ -215,6 +222,7 @@ class ChipSettings:
                 f"drive_high_v is {self.drive_high_v:g} V, but it must be above 0 and below the "
                 f"converter's {_OUTPUT_V:g} V. Change drive_high_v."
             )
+        self._check_front_end()
         table, slack_v = self.table_v, _SINGLE * self.drive_high_v
         table = table if self.rises else table[::-1]
         ends_v = table[0] + slack_v, table[-1] - slack_v
@@ -224,6 +232,36 @@ class ChipSettings:
                 "the saturation, but it must rise, or fall, everywhere within [0, "
                 f"{self.drive_high_v:g}] V. Give narrower --limits to 'haselab design', or measure "
                 "the voltage map again."
+            )
+
+    def _check_front_end(self) -> None:
+        """Refuse monitors and stages that saturate the converter, or that it cannot resolve."""
+        front = self.front_end
+        high_v = self.drive_high_v * front.gain
+        monitor_v = high_v / front.volt_per_monitor_volt
+        if monitor_v > front.converter_v:
+            raise InputError(
+                f"At the highest output, {high_v:g} V, the voltage monitor gives {monitor_v:.3g} "
+                f"V, but the converter reads at most {front.converter_v:g} V. Use a monitor with "
+                f"volt_per_monitor_volt of at least {math.ceil(high_v / front.converter_v)} in "
+                "[front_end], or lower drive_high_v."
+            )
+        codes, fewest = monitor_v / front.volt_per_code, _FEWEST_LEVEL_CODES / self.level_off
+        if codes < fewest:
+            raise InputError(
+                f"At the highest output, {high_v:g} V, the voltage monitor gives only "
+                f"{codes:.2g} codes of the converter, but {math.ceil(fewest)} are needed to detect "
+                "a wrong output. Use a monitor with volt_per_monitor_volt of at most "
+                f"{math.floor(front.volt_per_monitor_volt * codes / fewest)} in [front_end]."
+            )
+        carrier, most = front.carrier_codes, _FILLED * 0.5 * front.converter_codes
+        if not _FEWEST_CARRIER_CODES <= carrier <= most:
+            advice = front.v_stage * 0.5 * (most + _FEWEST_CARRIER_CODES) / carrier
+            raise InputError(
+                f"The carrier of {front.carrier_high_v:g} V has an amplitude of {carrier:.3g} "
+                f"codes in the voltage channel, but it must be {_FEWEST_CARRIER_CODES} to "
+                f"{most:.0f} codes. Change carrier_high_v or v_stage in [front_end], for example "
+                f"v_stage = {advice:.2g}."
             )
 
     @property
@@ -247,7 +285,8 @@ class ChipSettings:
         """Fields of `hs_quadrature_config`: the turn, in 1/F, and range of squared amplitudes."""
         turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
         v_low, v_high, i_low = (
-            round((4.0 * share * self.front_end.carrier_codes) ** 2) for share in (0.6, 1.4, 0.2)
+            round((4.0 * share * self.front_end.carrier_codes) ** 2)
+            for share in (0.6, 1.4, CURRENT_SHARE)
         )
         return turn.real, turn.imag, v_low, v_high, i_low
 
@@ -328,6 +367,11 @@ def settings_from_dict(data: Mapping[str, Any]) -> ChipSettings:
 
 def _single(value: float) -> str:
     """A C float literal that reads back as the nearest float."""
+    if abs(value) > _LARGEST:
+        raise InputError(
+            f"A setting of the microcontroller is {value:.3g}, but it computes in single "
+            f"precision, up to {_LARGEST:.3g}. Check the gains and the maps."
+        )
     return f"{np.format_float_scientific(np.float32(value), unique=True)}f"
 
 
@@ -383,7 +427,8 @@ def _body(s: ChipSettings) -> str:
     period_s = 1.0 / RATE_HZ
     low_f, high_f = s.capacitance_range_f
     steps = _TABLE_STEPS / (s.strain_high - s.strain_low)
-    fall = math.floor(_FALLS * s.rise_v_per_s * period_s * level_per_v)
+    fastest_v = max(s.rise_v_per_s, s.ramp_v_per_s) * period_s
+    fall = max(math.floor(_FALLS * fastest_v * level_per_v), _LEAST_FALL)
 
     re, im, *squares = s.sensing
     sensing = ", ".join([_single(re), _single(im), *map(str, squares)])

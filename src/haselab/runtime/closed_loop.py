@@ -56,7 +56,11 @@ class ClosedLoop:
         self._rig, self._loop, self._name = rig, loop, name
         block_s = rig.description.block_s
         setting = setting_on_rig(rig.description, carrier[0], loop)
-        self._controller = RunningController(loop.controller, setting)
+        limits_s: tuple[float | None, float | None] = (None, None)
+        if (settings := rig.safety.settings).real_time:  # where the guardians would act anyway
+            limits_s = settings.idle_s, settings.lease_s
+        self._controller = RunningController(loop.controller, setting, *limits_s)
+        self._step_name = f"The step of controller {loop.controller.kind.name!r}"
         self._in_volts = loop.controller.kind.output == "voltage"
         self._ahead = loop.controller.kind.preview_steps(block_s)
         self._sensor = _sensor(rig, camera_recorder, carrier[0], loop)
@@ -118,7 +122,10 @@ class ClosedLoop:
                 for value in preview:
                     coming.append(value if value == value else coming[-1])
                 measured = self._measured(strain, tuple(coming[1:]))
+                deadlines = self._rig.deadlines
+                begun_s = deadlines.now_s
                 drive = self._controller.step(desired, measured)
+                deadlines.spent(self._step_name, deadlines.now_s - begun_s)
             except SafetyError as error:
                 raise safety.trip(str(error)) from error
             if drive is not None:

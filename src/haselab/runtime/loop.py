@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from haselab.base import InputError, SafetyError, described, is_real, shown
-from haselab.base.exits import no_exit
+from haselab.base.exits import TooLongError, no_exit
 from haselab.control import Saturation
 from haselab.controllers import (
     ChosenController,
@@ -17,6 +17,7 @@ from haselab.controllers import (
 )
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
+from haselab.runtime.call_limit import CallLimit
 
 __all__ = ["LoopSettings", "RunningController"]
 
@@ -84,19 +85,33 @@ class RunningController:
     Args:
         chosen: the controller with its parameters.
         setting: of the loop.
+        start_limit_s: longest time until it has started, in s; None: there is no limit.
+        step_limit_s: longest time of a step, in s; None: there is no limit.
     Raises:
         InputError: The controller does not start, or the setting lacks what its kind needs.
     """
 
-    def __init__(self, chosen: ChosenController, setting: ControllerSetting) -> None:
+    def __init__(
+        self,
+        chosen: ChosenController,
+        setting: ControllerSetting,
+        start_limit_s: float | None = None,
+        step_limit_s: float | None = None,
+    ) -> None:
         kind = chosen.kind
         kind.check(setting)
         self._name, self._voltage = kind.name, kind.output == "voltage"
         self._low, self._high = setting.drive_low, setting.drive_high
+        self._step_limit_s = step_limit_s
         try:
-            with no_exit():
+            with CallLimit(start_limit_s), no_exit():
                 self._controller = chosen.make()
                 self._controller.start(setting)
+        except TooLongError as error:
+            raise InputError(
+                f"Controller {self._name!r} has not started within {start_limit_s:g} s. Shorten "
+                "its start, or compute what takes so long when the package is imported."
+            ) from error
         except Exception as error:  # code of another package may raise anything
             raise InputError(
                 f"Controller {self._name!r} does not start: {described(error)}. "
@@ -118,26 +133,31 @@ class RunningController:
             The drive, in strain within the saturation or in V within the limits; None: keep the
             output, because the measurement is not valid.
         Raises:
-            SafetyError: The controller failed, or returned something other than a finite number or
-                a voltage outside the limits.
+            SafetyError: The controller failed or did not return in time, or it returned something
+                other than a finite number or a voltage outside the limits.
         """
         try:
-            with no_exit():
+            with CallLimit(self._step_limit_s), no_exit():
                 drive: object = self._controller.step(reference, measurement)
-        except Exception as error:
+                value = float(drive) if is_real(drive) else math.nan
+        except TooLongError as error:
+            raise SafetyError(
+                f"Controller {self._name!r} did not return from its step within "
+                f"{self._step_limit_s:g} s (safety.lease_s). Fix it and test it on the twin."
+            ) from error
+        except (Exception, GeneratorExit) as error:
             raise SafetyError(
                 f"Controller {self._name!r} failed: {described(error)}. Fix it and test it on the "
                 "twin."
             ) from error
         if not measurement.valid:
             return None
-        if not is_real(drive) or not math.isfinite(drive):
+        if not math.isfinite(value):
             raise SafetyError(
                 f"Controller {self._name!r} returned {shown(drive)} for a strain of "
                 f"{measurement.strain:.6g}, but a step must return one finite number. Fix it and "
                 "test it on the twin."
             )
-        value = float(drive)
         if self._voltage and not self._low <= value <= self._high:
             raise SafetyError(
                 f"Controller {self._name!r} returned {value:.6g} V, outside its limits of "

@@ -448,8 +448,7 @@ class Runner:
         if self._missed_row >= limit and self._safety.settings.real_time:
             raise self._safety.trip(
                 f"Lost deadline: outputs of {self._missed_row} blocks in a row came too late and "
-                f"were skipped (missed_limit = {limit}). Close other programs, or raise "
-                "daq.ahead_blocks or daq.block_samples."
+                f"were skipped (missed_limit = {limit}). {self._rig.deadlines.advice}"
             )
         if index % _LOOK_EVERY == _LOOK_EVERY - 1:
             if look:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
 from haselab.sensing.lockin import Lockin
-from haselab.sensing.sensed import LockinConfig
+from haselab.sensing.sensed import LockinConfig, reason_text
 
 __all__ = [
     "Calibration",
@@ -58,7 +59,8 @@ class Reference:
         ):
             raise InputError(
                 f"Reference of {self.capacitance_f:g} F, {self.series_ohm:g} ohm, tolerance "
-                f"{self.tolerance:g}; they must be in (0, 1) F, 0 ohm or more, and in [0, 1)."
+                f"{self.tolerance:g}; they must be in (0, 1) F, 0 ohm or more, and in [0, 1). "
+                "State the capacitance in F, for example 1e-9 for 1 nF."
             )
 
     def admittance_s(self, carrier_hz: float) -> complex:
@@ -248,9 +250,8 @@ def read_reference(
     good = sensed.valid
     if good.sum() < max(_FEWEST_BLOCKS, _LEAST_SHARE * len(readings)):
         raise ResultError(
-            f"{int((~good).sum())} of {len(readings)} blocks show no carrier at {carrier_hz:g} Hz "
-            "on both monitors, or a disturbed or clipped one. Check the generator and the "
-            "reference's leads."
+            f"{int((~good).sum())} of {len(readings)} blocks "
+            f"{_unusable(sensed.reason[~good], carrier_hz)}"
         )
     ratios = (sensed.i_pp / sensed.v_pp * np.exp(1j * sensed.phase_rad))[good]
     scatter = float(np.sqrt(0.5 * np.var(ratios, ddof=1)))  # of one quadrature
@@ -258,6 +259,25 @@ def read_reference(
     return ReferenceReading(
         complex(ratios.mean()), scatter / math.sqrt(len(ratios)), (float(volt_v), float(ampere_v))
     )
+
+
+def _unusable(reasons: NDArray[np.integer[Any]], carrier_hz: float) -> str:
+    """What is wrong with most of the blocks that are not valid, and what to check."""
+    values, counts = np.unique(reasons, return_counts=True)
+    most = reason_text(int(values[np.argmax(counts)]))
+    if "amplitude lost" in most or "carrier off" in most:
+        return (
+            f"show no carrier at {carrier_hz:g} Hz on both monitors. Check the generator and the "
+            "reference's leads."
+        )
+    if "phase out of band" in most:
+        return (
+            "have a phase between the monitors that no capacitor has. Check the polarity of the "
+            "monitors, that their channels are not swapped, and the reference's leads."
+        )
+    if "clipped" in most:
+        return "are clipped. Lower the amplitude of the carrier, or use a smaller reference."
+    return f"cannot be used ({most}). Check the generator and the reference's leads."
 
 
 def fit_calibration(

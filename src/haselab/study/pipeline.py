@@ -64,6 +64,7 @@ class Findings:
         if not self.failed:
             return
         first, *others = self.failed
+        first = first if first.endswith((".", "?", "!")) else f"{first}."
         more = f" Without a result for another reason: {len(others)} more." if others else ""
         raise ResultError(f"{first}{more}{f' {where}' if where else ''}")
 

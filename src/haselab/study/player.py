@@ -7,10 +7,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import LimitError
+from haselab.base import InputError, LimitError
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.runner import Runner
 from haselab.safety.feasibility import Drive
+from haselab.store.session.layout import ExperimentPlan
 from haselab.study.analysis import Analysis
 from haselab.study.experiments.foreign import AnyExperiment, declared
 
@@ -33,6 +34,8 @@ class Player:
 
     def __init__(self, runner: Runner, experiment: AnyExperiment, analysis: Analysis) -> None:
         self._runner, self._name, self.analysis = runner, experiment.table, analysis
+        plans = declared(experiment, "plans", ExperimentPlan, experiment.plans)
+        self._planned, self._played = {plan.name for plan in plans}, set[str]()
         self.rig, self._hung_kg = analysis.rig, runner.mass_kg
         listed = declared(experiment, "drives", Drive, partial(experiment.drives, self.rig))
         drives = [np.append(0.0, drive.values_v) for drive in listed]
@@ -57,11 +60,13 @@ class Player:
             frame_rate_hz: of the camera.
             particles: name of the recording of the sheet's particles; empty: not recorded.
         Raises:
+            InputError: the recording is not planned, or was made before.
             LimitError: a drive was not declared, or is beyond the drive limits.
             SafetyError: the bench protected itself.
             DeviceError: disk or instrument failed.
         """
         self._check(drive_v)
+        self._begin(name)
         self._runner.play(name, drive_v, frame_rate_hz, self._hung_kg, particles=particles)
 
     def settle(self, drive_v: float, duration_s: float) -> None:
@@ -79,12 +84,14 @@ class Player:
     ) -> None:
         """Lift the mass, wait, drop it and record; see `Runner.release`."""
         self._check(np.array([drive_v]))
+        self._begin(name)
         self._runner.release(name, drive_v, settle_s, record_s, frame_rate_hz, self._hung_kg)
 
     def hang(
         self, name: str, masses_kg: list[float], settle_s: float, frame_rate_hz: float
     ) -> None:
         """Hang each mass in turn at 0 V, then the rig's own again; see `Runner.hang`."""
+        self._begin(name)
         self._runner.hang(name, masses_kg, settle_s, frame_rate_hz)
         self.load(self.mass_kg)
 
@@ -101,11 +108,26 @@ class Player:
         self, name: str, reference: Floats, loop: LoopSettings, frame_rate_hz: float
     ) -> None:
         """Close the loop, with one desired strain per block; see `Runner.close_loop`."""
+        self._begin(name)
         self._runner.close_loop(name, reference, loop, frame_rate_hz, self._hung_kg)
 
     def rest(self) -> None:
         """Set the drive to 0 V at once; the sensing signal stays on."""
         self._runner.rest()
+
+    def _begin(self, name: str) -> None:
+        """Refuse a recording that is not planned, or that was made before."""
+        if name in self._played:
+            raise InputError(
+                f"The experiment [{self._name}] plays {name!r} twice, but one recording is one "
+                "drive. List a second name in its method 'recordings'."
+            )
+        if name not in self._planned:
+            raise InputError(
+                f"The experiment [{self._name}] plays {name!r}, which its method 'recordings' does "
+                "not list. Add the name there."
+            )
+        self._played.add(name)
 
     def _check(self, drive_v: Floats) -> None:
         """Refuse drives that were not declared to the feasibility check."""

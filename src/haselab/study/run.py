@@ -29,7 +29,7 @@ from haselab.safety.armed import arm_simulated
 from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
-from haselab.store.manifest import Manifest
+from haselab.store.manifest import Manifest, read_manifest
 from haselab.store.session.reader import session_file
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.store.source_commit import source_commit
@@ -239,7 +239,8 @@ def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, 
         path: session.h5, or its folder.
         unverified: continue if a checksum does not match.
     Returns:
-        Findings, the study, and the session's header.
+        Findings, the study, and the session's header. If the run ended early, `Findings.failed`
+        says why.
     Raises:
         InputError: no session, a damaged one, or one that lacks an experiment.
     """
@@ -260,15 +261,34 @@ def analyse_session(path: Path, *, unverified: bool = False) -> tuple[Findings, 
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"The session's header is damaged ({error}). {path}") from None
         lockin = lockin_of(rig, study.sensing.carrier_hz)
-        events = session.events()
+        events, cut = session.events(), session.cut_short()
+        unread: list[str] = []
 
         def source(name: str) -> Observation:
+            if name in cut or (name in session.planned and name not in session.names):
+                unread.append(name)
+                raise ResultError(_ended_early(path, cut))
             return observe(session.experiment(name), events, lockin, study.sensing, rig)
 
         findings = play_and_fit(source, study, rig, known=known_values(tables))
-        if "particles" in session.names:
+        if unread:
+            failed = dict.fromkeys((_ended_early(path, cut), *findings.failed))
+            findings = replace(findings, failed=tuple(failed))
+        if "particles" in session.names and "triangle" not in cut:
             findings = _with_sheet(findings, session, rig)
         return findings, study, session.header
+
+
+def _ended_early(session: Path, cut: tuple[str, ...]) -> str:
+    """Say that a run ended before all experiments were recorded, and why if that is known."""
+    when = f"in {cut[-1]!r}" if cut else "before its last experiment"
+    try:
+        found = str(read_manifest(session.parent).get("ended", ""))
+    except InputError:
+        found = ""
+    reason = "interrupted" if found == "KeyboardInterrupt" else found.partition(": ")[2] or found
+    known = f": {reason.rstrip('.')}" if reason not in ("", "complete") else ""
+    return f"The run ended {when}{known}."
 
 
 def noise_free_results(

@@ -32,3 +32,22 @@ def test_each_package_that_a_user_may_need_is_reported(reported, extra: str) -> 
     needed = PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"]
     names = {re.split(r"[\[>=<; ]", line)[0].lower() for line in needed} - {"haselab"}
     assert {NAMES.get(name, name) for name in names} <= reported.keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('kind = "twin"\ntwin = "lost.toml"\n', "No such twin file"),
+        ('kind = "replay"\nsession = "lost/session.h5"\n', "No session here"),
+    ],
+)
+def test_a_rig_file_that_names_a_missing_file_is_not_valid(
+    text: str, words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    done = CliRunner().invoke(command, ["--rig", str(path), "--json"])
+    found = json.loads(done.stdout)["findings"][-1]
+    assert (found["kind"], found["found"]) == ("rig", False)
+    assert words in found["detail"]
+    assert found["advice"]

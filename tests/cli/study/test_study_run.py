@@ -129,11 +129,16 @@ def play(
     return Ended(done.returncode, done.stdout, lines[0], out, output_v, carrier_v, sent)
 
 
-def refused_by_analyse(folder: Path) -> str:
+def analysed(folder: Path, code: int) -> str:
     command = [sys.executable, "-m", "haselab.cli", "analyse", str(folder), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert (done.returncode, done.stderr.count("\n")) == (code, 1), done.stderr
+    assert (done.stdout == "") == (code == 2)
     return done.stderr
+
+
+def refused_by_analyse(folder: Path) -> str:
+    return analysed(folder, 2)
 
 
 INTERRUPTED = (  # and the folder
@@ -161,10 +166,13 @@ def test_a_signal_anywhere_ends_at_zero_with_130_and_the_recording_is_kept(
     assert run.events[-1] == "ended by KeyboardInterrupt; output at 0 V"
     if cut is None:
         assert run.events[-2] == "end hold-5"
-        assert "No experiment 'free-1'" in refused_by_analyse(run.folder)
+        assert "The run ended before its last experiment: interr" in analysed(run.folder, 3)
     else:
         assert f"start {cut}" in run.events and f"end {cut}" not in run.events
-        assert f"The recording of {cut} was cut short" in refused_by_analyse(run.folder)
+        if any(what.startswith("end ") for what in run.events):  # the complete ones are analysed
+            assert f"The run ended in {cut!r}: interrupted." in analysed(run.folder, 3)
+        else:
+            assert f"The recording of {cut} was cut short" in refused_by_analyse(run.folder)
 
 
 def test_further_ctrl_c_in_the_clean_up_leave_it_alone(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from haselab.actuators import DeaStack, PlanarHasel
 from haselab.base import InputError
+from haselab.models.actuator.sections import PhysicalCovariance
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import SETTLE_S, Amplifier, TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_file import identified_twin, is_actuator_file, load_twin
@@ -207,6 +208,50 @@ def test_a_draw_without_a_distribution_is_refused_with_the_reason(path: Path) ->
     refused(parts, path, r"not that of its parameters \(load\.added_inertia_kg, shell", 1)
     parts = Parts(covariance={"names": ["sensing.scale"], "matrix": [[1e-6, 0.0]]})
     refused(parts, path, r"1 names need as many rows of as many numbers", 1)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ((0, 0, -1.0), r"covariance: the matrix has a negative variance \(-1\)"),
+        ((0, 1, 1e9), r"covariance: the matrix is not symmetric"),
+        ((None, 0, 1.01), r"covariance: the matrix has a negative eigenvalue"),
+    ],
+)
+def test_an_edited_covariance_gives_no_draw(
+    path: Path, changed: tuple[int | None, int, float], words: str
+) -> None:
+    parts = Parts()
+    parts.written(path)
+    matrix = parts.covariance["matrix"]
+    row, column, value = changed
+    if row is None:  # a correlation above 1, both ways
+        matrix[0][1] = matrix[1][0] = value * np.sqrt(matrix[0][0] * matrix[1][1])
+    else:
+        matrix[row][column] = value
+    refused(Parts(covariance=parts.covariance), path, words, 1)
+
+
+def test_an_infinite_variance_is_no_fault_of_the_covariance() -> None:
+    matrix = ((1.0, 0.0, np.nan), (0.0, 0.0, np.nan), (np.nan, np.nan, np.inf))
+    assert PhysicalCovariance(names=("a", "b", "c"), matrix=matrix).matrix[0] == matrix[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("mass_kg", 5000.0, r"mass_kg is 5000 kg, but a twin carries less than 20 kg"),
+        ("sensing.scale", 1e6, r"sensing\.scale is 1e\+06, but a twin's current monitor"),
+    ],
+)
+def test_a_value_beyond_the_twin_is_named_as_in_the_file(
+    path: Path, key: str, value: float, words: str
+) -> None:
+    parts = Parts()
+    assert parts.physical is not None
+    table = parts.actuator if key == "mass_kg" else parts.physical["parameters"]
+    table[key] = value
+    refused(parts, path, words)
 
 
 def test_a_rig_file_names_the_actuator_the_instruments_and_the_draw(

@@ -217,9 +217,9 @@ def _check_sane(answer: dict[str, Any]) -> None:
     if not 1.0 / _WORST_GAIN < factor < _WORST_GAIN:
         raise ResultError(
             f"The monitors have {factor:.3g} times their nominal gain, but the factor should "
-            f"be {1 / _WORST_GAIN:g} to {_WORST_GAIN:g}. Check that each reference was "
-            "connected in "
-            "turn, and the monitors' scales in the rig file."
+            f"be {1 / _WORST_GAIN:g} to {_WORST_GAIN:g}. Check that the capacitances are stated in "
+            "F (1e-9 for 1 nF), that each reference was connected in turn, and the monitors' "
+            "scales in the rig file."
         )
     if abs(answer["phase_rad"]) > _WORST_PHASE_RAD:
         raise ResultError(

@@ -30,7 +30,7 @@ from haselab.rig.chip.build import simavr_header
 from haselab.rig.instruments.instrument import Instrument, SystemNeeds
 from haselab.rig.instruments.registry import INSTRUMENTS, camera_of
 from haselab.rig.real_bench import identify
-from haselab.rig.rig_file import load_rig
+from haselab.rig.rig_file import ReplayFile, RigFile, TwinFile, load_rig, opened_rig
 from haselab.safety.gate import Gate
 from haselab.store.folder import write_text
 
@@ -167,6 +167,16 @@ def _chip(file: ChipFile, path: Path) -> Finding:
         return Finding("instrument", "chip", False, what, advice)
 
 
+def _simulated(file: TwinFile | ReplayFile, path: Path) -> Finding:
+    """Open a twin, or a recorded session; the files that the rig file names may be missing."""
+    try:
+        with opened_rig(file, path, Gate()):
+            return Finding("rig", file.kind, True, f"{path} is valid")
+    except HaselabError as error:
+        what, _, advice = str(error).partition(". ")
+        return Finding("rig", file.kind, False, what, advice)
+
+
 def _needs(file: object) -> SystemNeeds:
     """What the instruments of a rig file need from the operating system."""
     if isinstance(file, BenchConfig):
@@ -179,12 +189,12 @@ def _needs(file: object) -> SystemNeeds:
     return SystemNeeds()
 
 
-def _instruments(file: object, path: Path) -> list[Finding]:
+def _instruments(file: RigFile, path: Path) -> list[Finding]:
     """Identify every instrument of a rig file, each on its own."""
     if isinstance(file, ChipFile):
         return [_chip(file, path)]
     if not isinstance(file, BenchConfig):
-        return [Finding("rig", str(getattr(file, "kind", "rig")), True, f"{path} is valid")]
+        return [_simulated(file, path)]
     found = []
     for name, reported in identify(file):
         wrong = reported if isinstance(reported, HaselabError) else None
@@ -229,7 +239,7 @@ def command(rig: Path | None, as_json: bool, out: Path | None) -> None:
     findings = _examine()
     file = None if rig is None else load_rig(rig)
     findings += examine_system(Machine(), _needs(file))
-    if rig is not None:
+    if rig is not None and file is not None:
         findings += _instruments(file, rig)
     structured = {"findings": [asdict(item) for item in findings]}
     if out is not None:

@@ -19,7 +19,7 @@ from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_opti
 from haselab.control import PidGains, Saturation
 from haselab.control.reach import default_step
 from haselab.controllers import known_actuator
-from haselab.firmware import ChipSettings, FrontEnd
+from haselab.firmware import CURRENT_SHARE, ChipSettings, FrontEnd
 from haselab.models.plant import Plant
 from haselab.pipelines.design.stated_margins import controller_doubt, model_doubt
 from haselab.rig.chip import (
@@ -152,7 +152,8 @@ def _check_gain(recorded: float | None, module: float, run: Path) -> None:
 
 
 def _check_current(design: ChipDesign, front_end: FrontEnd, run: Path, advice: str) -> None:
-    """Refuse capacitances whose current saturates the converter: the chip would trip."""
+    """Refuse capacitances whose current saturates the converter or is lost: the chip would trip."""
+    _check_least_current(design.settings.capacitance_range_f[1], front_end, run)
     recorded_f = design.tables.strain_map().range_f
     if recorded_f is None:
         return
@@ -164,6 +165,18 @@ def _check_current(design: ChipDesign, front_end: FrontEnd, run: Path, advice: s
             f"front end saturates at {1e9 * highest_f * most / codes:.3g} nF. {advice} "
             f"i_stage = {front_end.i_stage * _FILLED * most / codes:.2g} in [front_end] of a rig "
             f"file with kind 'chip' (haselab firmware build --rig). {run}"
+        )
+
+
+def _check_least_current(highest_f: float, front_end: FrontEnd, run: Path) -> None:
+    """Refuse a current channel whose carrier is below the limit of the chip at each capacitance."""
+    least, codes = CURRENT_SHARE * front_end.carrier_codes, front_end.current_codes(highest_f)
+    if codes < least:
+        raise InputError(
+            f"At {1e9 * highest_f:.3g} nF, the highest capacitance of the strain map, the carrier "
+            f"has {codes:.2g} codes in the current channel of the front end, but the chip needs "
+            f"{least:.0f}. Check i_stage and ampere_per_monitor_volt in [front_end] of the rig "
+            f"file (haselab firmware build --rig). {run}"
         )
 
 

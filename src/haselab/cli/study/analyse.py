@@ -52,10 +52,7 @@ def check_ends(session: SessionReader, path: Path) -> None:
     Raises:
         InputError: an experiment has no end.
     """
-    events = [what.partition(" ")[::2] for _, what in session.events()]
-    ended = {name for verb, name in events if verb == "end"}
-    cut = [name for verb, name in events if verb == "start" and name not in ended]
-    if cut:
+    if cut := session.cut_short():
         raise InputError(
             f"The recording of {', '.join(cut)} was cut short, but the analysis needs complete "
             "experiments. Run the study again, or read the recorded data with 'haselab sense "
@@ -80,8 +77,9 @@ def command(
     """Repeat fits, design and report from a recording.
 
     SESSION is the folder of a run or its session.h5. The results replace those in that folder,
-    unless --out is given; the recording itself is never changed. The noise-free reference values of
-    a twin cannot be computed from recorded data; they are copied from an earlier results.json.
+    unless --out is given; the recording itself is never changed. If the run ended early, the
+    command analyses the complete experiments and exits with code 3. The noise-free reference values
+    of a twin cannot be computed from recorded data; they are copied from an earlier results.json.
     """
     folder = _own_folder({"session": session})
     if out is None and folder is None:
@@ -95,9 +93,11 @@ def command(
     path = session_file(session)
     with SessionReader(path, unverified=unverified) as recorded:
         warn_unverified(recorded.doubt, path)
-        check_ends(recorded, path)
         doubt = recorded.doubt
-        if is_chip_session(recorded.header):
+        on_chip = is_chip_session(recorded.header)
+        if on_chip or not recorded.complete():
+            check_ends(recorded, path)
+        if on_chip:
             analyse_on_chip(recorded, target, as_json)
             return
     found, study, header = analyse_session(session, unverified=unverified)

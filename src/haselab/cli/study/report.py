@@ -62,7 +62,7 @@ def command(source: Path, as_json: bool, out: Path | None) -> None:
     session = source / "session.h5"
     if session.is_file() and not (source / "results.json").exists():
         with SessionReader(session, unverified=True) as recorded:
-            check_ends(recorded, session)  # of a run that was interrupted
+            _require_analysis(recorded, source)  # of a run that was interrupted
     page = compose_page(read_folder(source))
     save_page(page, source, page_path)
     drawn = [drawing.plan.name for drawing in page.drawings if drawing.document]
@@ -70,6 +70,16 @@ def command(source: Path, as_json: bool, out: Path | None) -> None:
         click.echo(f"haselab: {name}: {reason}", err=True)
     answer = {"report": str(page_path), "figures": drawn, "left_out": page.left_out}
     emit(answer, as_json=as_json, out=None)
+
+
+def _require_analysis(recorded: SessionReader, folder: Path) -> None:
+    """Refuse a recording that was cut short, which has no results yet."""
+    if recorded.cut_short() and recorded.complete():
+        raise InputError(
+            "The run ended early and has no results yet. Compute those of the complete experiments "
+            f"with: haselab analyse {folder}"
+        )
+    check_ends(recorded, folder / "session.h5")
 
 
 def _report_actuator(path: Path, page_path: Path, as_json: bool) -> None:

@@ -10,7 +10,15 @@ from typing import Any, Protocol, cast
 
 import click
 
-from haselab.base import InputError, JsonObject, ResultError, table_at, to_plain
+from haselab.base import (
+    HaselabError,
+    InputError,
+    JsonObject,
+    ResultError,
+    table_at,
+    text_of,
+    to_plain,
+)
 from haselab.cli.actuator_file import mark_sections
 from haselab.cli.common import progress_bar
 from haselab.cli.interrupt import Interruptible
@@ -27,6 +35,7 @@ from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.manifest import read_manifest, recorded_when
+from haselab.store.session.writer import SessionReader
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.definition import Study
 from haselab.study.experiment import ExperimentResult
@@ -191,6 +200,8 @@ def _execute(
     except KeyboardInterrupt as stop:
         stop.add_note(kept_data_note(folder))
         raise
+    except HaselabError as error:
+        raise _with_advice(error, folder) from error
     finally:
         rig.safe()
         progress.stop()
@@ -209,6 +220,19 @@ def _execute(
     require_complete(found, folder)
 
 
+def _with_advice(error: HaselabError, folder: Path) -> HaselabError:
+    """The same error; if complete experiments were recorded, with the command that fits them."""
+    try:
+        with SessionReader(folder / "session.h5") as session:
+            complete = session.complete()
+    except (HaselabError, OSError):  # only the advice depends on it
+        return error
+    if not complete:
+        return error
+    advice = f"Compute the results of the complete experiments with: haselab analyse {folder}"
+    return type(error)(f"{text_of(error).rstrip('.')}. {advice}")
+
+
 def require_complete(found: Findings, folder: Path) -> None:
     """End the command with the reason if an experiment failed; the other results are written.
 
@@ -218,7 +242,8 @@ def require_complete(found: Findings, folder: Path) -> None:
     Raises:
         ResultError: see `Findings.require_complete`.
     """
-    found.require_complete(f"The results of the other experiments are in {folder}.")
+    others = f"The results of the other experiments are in {folder}."
+    found.require_complete(others if found.quantities else f"There are no results. {folder}")
 
 
 def with_date(header: Mapping[str, Any], recorded_in: Path | None) -> JsonObject:

@@ -11,6 +11,8 @@ import operator
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -48,6 +50,7 @@ __all__ = [
     "missing",
 ]
 
+_ROUNDED = 1e-3  # of a correlation, by the rounding of an ill-conditioned fit
 _SAME = 1e-9  # largest relative difference by writing and reading a number
 _Positive = Annotated[float, Field(strict=True, gt=0, le=1e12, allow_inf_nan=False)]
 _Length = Annotated[float, Field(strict=True, gt=0, le=10, allow_inf_nan=False)]
@@ -226,6 +229,27 @@ class DriveSection(_Section):
     voltage_map: VoltageMapTable | None = None
 
 
+def _covariance_fault(matrix: NDArray[np.float64]) -> str:
+    """What a matrix has that no covariance can have; empty if there is nothing.
+
+    The variance of a parameter that is not identifiable may be infinite.
+    """
+    variances = np.diag(matrix)
+    if (variances < 0.0).any():
+        return f"has a negative variance ({variances.min():.3g})"
+    known = np.isfinite(variances)
+    finite = matrix[np.ix_(known, known)]
+    std = np.sqrt(variances[known])
+    unit = np.where(std > 0.0, std, 1.0)
+    correlations = finite / np.outer(unit, unit)
+    if not np.isfinite(correlations).all():
+        return "has a covariance that is not finite beside finite variances"
+    if (np.abs(correlations - correlations.T) > _ROUNDED).any():
+        return "is not symmetric"
+    least = float(np.linalg.eigvalsh(correlations).min()) if len(correlations) else 0.0
+    return f"has a negative eigenvalue ({least:.3g})" if least < -_ROUNDED * len(std) else ""
+
+
 class PhysicalCovariance(_Section):
     """`[model.physical.covariance]`."""
 
@@ -245,6 +269,12 @@ class PhysicalCovariance(_Section):
             raise ValueError(f"{len(self.names)} names need as many rows of as many numbers")
         if self.widening and len(self.widening) != len(self.names):
             raise ValueError(f"{len(self.names)} names need as many values of widening")
+        matrix = np.array(self.matrix, dtype=np.float64).reshape(len(sizes), len(sizes))
+        if fault := _covariance_fault(matrix):
+            raise ValueError(
+                f"the matrix {fault}, so it is no covariance. Restore it, or identify the actuator "
+                "again"
+            )
         return self
 
 

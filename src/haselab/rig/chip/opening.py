@@ -62,8 +62,12 @@ class FrontEndConfig(PrintableSection):
 
     @model_validator(mode="after")
     def _near_one(self) -> Self:
-        if not 0.1 <= abs(complex(*self.correction)) <= 10.0:
-            raise ValueError("correction (measured over expected) must be between 0.1 and 10")
+        found = complex(*self.correction)
+        if not (0.1 <= abs(found) <= 10.0 and found.real >= abs(found.imag)):
+            raise ValueError(
+                "correction (measured over expected) must have a magnitude of 0.1 to 10 and a "
+                "phase of -45 to 45 degrees"
+            )
         return self
 
     def front_end(self) -> FrontEnd:

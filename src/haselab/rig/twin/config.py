@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from haselab.actuators import ActuatorLaw, PlanarHasel
 
 __all__ = [
+    "HIGHEST_GAIN_ERROR",
+    "HIGHEST_LOAD_KG",
     "READINGS",
     "SETTLE_S",
     "AcquisitionConfig",
@@ -32,6 +34,8 @@ __all__ = [
     "twin_of_reading",
 ]
 
+HIGHEST_LOAD_KG = 20.0
+HIGHEST_GAIN_ERROR = 0.5  # of the current monitor
 SETTLE_S = 120.0  # how long the mass has hung when a study begins
 _PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "hysteresis", "dielectric")
 
@@ -107,7 +111,7 @@ class Unmodelled(Section):
 class Load(Section):
     """Load on the moving end."""
 
-    mass_kg: float = Field(0.25, gt=0, lt=20)
+    mass_kg: float = Field(0.25, gt=0, lt=HIGHEST_LOAD_KG)
     added_inertia_kg: float = Field(
         0.0, ge=0, lt=1000, description="inertia without weight: clamp, oil, linkage"
     )
@@ -144,7 +148,7 @@ class Amplifier(Section):
     volt_per_monitor_volt: float = Field(5000.0, gt=0)
     ampere_per_monitor_volt: float = Field(2e-3, gt=0)
     v_monitor_gain_error: float = Field(0.0, gt=-0.5, lt=0.5)
-    i_monitor_gain_error: float = Field(0.0, gt=-0.5, lt=0.5)
+    i_monitor_gain_error: float = Field(0.0, gt=-HIGHEST_GAIN_ERROR, lt=HIGHEST_GAIN_ERROR)
     v_monitor_lag_s: float = Field(
         0.0, ge=0, lt=1e-3, description="first order: 1 / (2 pi bandwidth)"
     )

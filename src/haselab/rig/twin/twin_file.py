@@ -23,7 +23,14 @@ from haselab.base import InputError, JsonObject, LimitError, table_at
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.sections import PhysicalTable
 from haselab.rig.protocols import PLANAR_HASEL
-from haselab.rig.twin.config import READINGS, SETTLE_S, Origin, TwinConfig
+from haselab.rig.twin.config import (
+    HIGHEST_GAIN_ERROR,
+    HIGHEST_LOAD_KG,
+    READINGS,
+    SETTLE_S,
+    Origin,
+    TwinConfig,
+)
 from haselab.store.actuator_file import read_actuator
 from haselab.store.manifest import sha256_of
 from haselab.store.toml import read_toml, validated
@@ -135,6 +142,16 @@ def identified_twin(path: Path, bench: TwinConfig, draw: int | None = None) -> T
     data = _with_law(bench.model_dump(), law)
     mass_kg = about.mass_kg or model.mass_kg or bench.load.mass_kg
     monitor = (1.0 + bench.amplifier.i_monitor_gain_error) * scale - 1.0
+    if not mass_kg < HIGHEST_LOAD_KG:
+        raise InputError(
+            f"mass_kg is {mass_kg:g} kg, but a twin carries less than {HIGHEST_LOAD_KG:g} kg. "
+            f"Correct it. {path}"
+        )
+    if not abs(monitor) < HIGHEST_GAIN_ERROR:
+        raise InputError(
+            f"{_SCALE} is {scale:g}, but a twin's current monitor has a gain error of less than "
+            f"{HIGHEST_GAIN_ERROR:g}. Identify the actuator again. {path}"
+        )
     data |= {
         "name": f"twin of the identified actuator {name!r}",
         "load": {"mass_kg": mass_kg, "added_inertia_kg": added_kg},

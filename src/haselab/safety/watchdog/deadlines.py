@@ -67,6 +67,13 @@ class Deadlines:
         self._ahead_s: deque[float] = deque(maxlen=_SOONEST)
         self._recent: deque[bool] = deque(maxlen=_WINDOW)
         self._pending_s: float | None = None
+        self._spent = ("", 0.0)  # on the pending output
+        self._slow = ("", 0.0)  # the longest of those that made an output late
+
+    @property
+    def now_s(self) -> float:
+        """Wall clock, in s."""
+        return self._clock()
 
     def arrived(self, rig_s: float) -> None:
         """Note that a block has arrived.
@@ -76,6 +83,15 @@ class Deadlines:
         """
         self._ahead_s.append(self._clock() - rig_s)
         self._pending_s = rig_s
+
+    def spent(self, by: str, took_s: float) -> None:
+        """Note which part of the program computed the next output, and how long it took.
+
+        Args:
+            by: its name, for the message.
+            took_s: by the same clock.
+        """
+        self._spent = by, took_s
 
     def answered(self) -> str:
         """Note that the next output was given; return why the loop must stop, or an empty text."""
@@ -90,6 +106,10 @@ class Deadlines:
         self._row = self._row + 1 if missed else 0
         self._recent.append(late)
         self._worst_s = max(self._worst_s, delay_s)
+        by, took_s = self._spent
+        self._spent = "", 0.0
+        if late and took_s > max(0.5 * delay_s, self._slow[1]):
+            self._slow = by, took_s
         if self._row >= self._missed_limit:
             return self._fault(
                 f"{self._row} deadlines missed in a row (missed_limit = {self._missed_limit})"
@@ -105,9 +125,19 @@ class Deadlines:
     def _fault(self, what: str) -> str:
         return (
             f"Lost deadline: {what} (worst {1e3 * self._worst_s:.1f} ms, limit "
-            f"{1e3 * self._deadline_s:g} ms). Close other programs, or raise daq.ahead_blocks or "
-            "daq.block_samples."
+            f"{1e3 * self._deadline_s:g} ms). {self.advice}"
         )
+
+    @property
+    def advice(self) -> str:
+        """What to do about late outputs, with the part of the program that made them late."""
+        by, took_s = self._slow
+        if by:
+            return (
+                f"{by} took up to {1e3 * took_s:.1f} ms of this time. Make it faster, or raise "
+                "daq.ahead_blocks or daq.block_samples."
+            )
+        return "Close other programs, or raise daq.ahead_blocks or daq.block_samples."
 
     @property
     def ticks(self) -> Ticks:

@@ -53,6 +53,9 @@ class SessionReader(Closing):
         path: of session.h5 or the folder that holds it.
         unverified: continue if a checksum does not match; `doubt` then gives the reason.
 
+    `planned` are the names of the experiments that the run was to record, `names` those of which
+    there are data.
+
     `doubt` says why the data are not verified: they were changed, or recorded before sessions had
     checksums. It is empty if every byte is as recorded.
     Raises:
@@ -65,7 +68,7 @@ class SessionReader(Closing):
         if not path.is_file():
             raise InputError(f"No session here; run a study first. {path}")
         self._open()
-        if self._live and len(self.names) < self._planned:
+        if self._live and len(self.names) < len(self.planned):
             # rows may have moved from the tail to their table between the two looks
             self._file.close()
             self._open()
@@ -83,7 +86,7 @@ class SessionReader(Closing):
             self.header: dict[str, Any] = decode_json(self._file.attrs["header"])
             self._tail = TailReader(self._file, self._path)
             groups = self._file["experiments"]
-            self._planned = len(groups)
+            self.planned: tuple[str, ...] = tuple(groups)
             self.names: list[str] = [name for name, group in groups.items() if self._began(group)]
         except HDF5_ERRORS as error:
             self._file.close()
@@ -166,6 +169,28 @@ class SessionReader(Closing):
                 return read_events(self._file)
         except HDF5_ERRORS as error:
             raise self._damaged(error) from None
+
+    def complete(self) -> tuple[str, ...]:
+        """Names of the experiments that were recorded from start to end.
+
+        Raises:
+            InputError: the events cannot be read.
+        """
+        return tuple(name for verb, name in self._named_events() if verb == "end")
+
+    def cut_short(self) -> tuple[str, ...]:
+        """Names of the experiments whose recording has a start and no end.
+
+        Raises:
+            InputError: the events cannot be read.
+        """
+        ended = self.complete()
+        started = [name for verb, name in self._named_events() if verb == "start"]
+        return tuple(name for name in started if name not in ended)
+
+    def _named_events(self) -> list[tuple[str, str]]:
+        """Verb and name of each event."""
+        return [(verb, name) for verb, _, name in (e.partition(" ") for _, e in self.events())]
 
     def conditions(self) -> NDArray[np.void]:
         """What acted on the actuator outside the blocks, in the order of time.

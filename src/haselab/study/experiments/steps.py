@@ -16,7 +16,7 @@ from haselab.signals import constant
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, ExperimentResult
-from haselab.study.fits.further import further_trials, saturating_reference
+from haselab.study.fits.further import further_trials, rows_without, saturating_reference
 from haselab.study.fits.loops import Loops, loop_saturation
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
@@ -37,6 +37,7 @@ _CLOSED = {
     "late": "PI step with extra delay",
     "saturating": "PI step that saturates",
 }
+_COMPARED = {"pi": "PI", "pid": "PID", OWN: OWN}  # with the open loop
 
 
 def open_names(study: Study) -> list[str]:
@@ -176,7 +177,9 @@ class StepTest(Experiment[Steps]):
         try:
             loops = analysis.need(Loops)
         except ResultError as reason:  # also a design that failed
-            alone = compare_trials(self._without_design(analysis, opened), maps, self.study, scale)
+            own, lost = self._closed_trials(analysis, (OWN,))
+            alone = compare_trials({"open loop": opened, **own}, maps, self.study, scale)
+            alone = replace(alone, failed={**lost, **alone.failed})
             missing = {
                 key: alone.reason(key) or str(reason)
                 for key in self.rows() if key not in alone.quantities
@@ -185,28 +188,33 @@ class StepTest(Experiment[Steps]):
                 alone.quantities, alone.notes, figures=alone.figures, values=(alone,),
                 missing=missing,
             )  # fmt: skip
-        trials = {
-            group: [analysis.observe(name) for name in closed_names(self.study, group)]
-            for group in (*_CLOSED, OWN)
-        }
-        closed = {"PI": trials["pi"], "PID": trials["pid"], OWN: trials[OWN]}
-        groups = {"open loop": opened} | {name: seen for name, seen in closed.items() if seen}
-        found = compare_trials(groups, maps, self.study, scale)
-        further = further_trials(trials, found.groups.get("PI"), maps, loops, self.study, scale)
+        seen, lost = self._closed_trials(analysis, (*_CLOSED, OWN))
+        closed = {name: seen[group] for group, name in _COMPARED.items() if group in seen}
+        found = compare_trials({"open loop": opened, **closed}, maps, self.study, scale)
+        found = replace(found, failed={**lost, **found.failed})
+        further = further_trials(seen, found.groups.get("PI"), maps, loops, self.study, scale)
         reasons = {key: why for key in self.rows() if (why := found.reason(key))}
         return ExperimentResult(
             {**found.quantities, **further.quantities},
             {**found.notes, **further.notes},
             figures={**found.figures, **further.figures},
             values=(found,),
-            missing={**reasons, **further.missing},
+            missing={**reasons, **further.missing, **rows_without(lost)},
         )
 
-    def _without_design(
-        self, analysis: Analysis, opened: Sequence[Observation]
-    ) -> dict[str, Sequence[Observation]]:
-        own = [analysis.observe(name) for name in own_names(self.study)]
-        return {"open loop": opened, **({OWN: own} if own else {})}
+    def _closed_trials(
+        self, analysis: Analysis, groups: Sequence[str]
+    ) -> tuple[dict[str, Sequence[Observation]], dict[str, str]]:
+        """The trials in closed loop by group, and why others are missing if the run ended early."""
+        seen: dict[str, Sequence[Observation]] = {}
+        lost: dict[str, str] = {}
+        for group in groups:
+            try:
+                if names := closed_names(self.study, group):
+                    seen[group] = [analysis.observe(name) for name in names]
+            except ResultError as reason:
+                lost[_COMPARED.get(group, group)] = str(reason)
+        return seen, lost
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

@@ -19,11 +19,12 @@ from haselab.study.fits.observe import Observation
 from haselab.study.fits.trials import ONE_TRIAL, Trials, collect_trials, with_camera_resolution
 from haselab.study.tables import Steps
 
-__all__ = ["further_trials", "saturating_reference"]
+__all__ = ["further_trials", "rows_without", "saturating_reference"]
 
 _UPDATE_HZ = 100.0  # one new output per block, row S5
 _SATURATED_PART = 0.4  # of step_s, at the strain that saturates
 _AT_LIMIT_V = 1e-3  # distance from the voltage of the upper limit
+_SATURATED_ROWS = ("S22.saturated_fraction", "S22.recovery_time")
 _ROWS = {"printed": ("S10", "printed_chain"), "late": ("S24", "delayed")}
 
 
@@ -102,6 +103,21 @@ def further_trials(
         }
     figures = {"further": drawn} if drawn else {}
     return ExperimentResult(quantities, notes, figures=figures, missing=missing)
+
+
+def rows_without(lost: Mapping[str, str]) -> dict[str, str]:
+    """Why results of further trials are missing, by id.
+
+    Args:
+        lost: why trials were not recorded, by group.
+    """
+    found: dict[str, str] = {}
+    for group, (row, name) in _ROWS.items():
+        if group in lost:
+            found |= dict.fromkeys((f"{row}.rise_{name}", f"{row}.error_{name}"), lost[group])
+    if "saturating" in lost:
+        found |= dict.fromkeys(_SATURATED_ROWS, lost["saturating"])
+    return found
 
 
 def _scatter_note(trials: int, pi_trials: int) -> str:

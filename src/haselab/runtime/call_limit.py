@@ -1,0 +1,65 @@
+"""Interrupt a call into code of another package that does not return."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+from haselab.base.exits import TooLongError
+
+__all__ = ["CallLimit"]
+
+
+class CallLimit:
+    """A context in which one call may take a limited time; then it raises `TooLongError` there.
+
+    A signal of the timer interrupts waits and loops in Python, again after each further limit. It
+    cannot interrupt compiled code that never returns to Python. Only the main thread gets signals,
+    and Windows has no such timer: elsewhere, and if the program uses the timer itself, there is no
+    limit.
+
+    Args:
+        limit_s: longest time, in s; None: there is no limit.
+    """
+
+    def __init__(self, limit_s: float | None) -> None:
+        self._limit_s = limit_s
+        self._former: Any = None
+        self._running = False
+
+    def __enter__(self) -> Self:
+        if self._limit_s is not None and _is_free():
+            self._former = signal.signal(signal.SIGALRM, self._rang)
+            self._running = True
+            signal.setitimer(signal.ITIMER_REAL, self._limit_s, self._limit_s)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._running:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            self._running = False
+            signal.signal(signal.SIGALRM, self._former)
+
+    def _rang(self, number: int, frame: FrameType | None) -> None:
+        if frame is None or frame.f_code not in _OWN:  # there the timer would stay on
+            raise TooLongError(f"it took longer than {self._limit_s:g} s")
+
+
+_OWN = {CallLimit.__enter__.__code__, CallLimit.__exit__.__code__}
+
+
+def _is_free() -> bool:
+    """Whether the timer can be used here, and nothing else uses it."""
+    return (
+        hasattr(signal, "setitimer")
+        and threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+        and signal.getitimer(signal.ITIMER_REAL)[0] == 0.0
+    )
